@@ -1,0 +1,113 @@
+"""A table of measured steady states: the input of every identification."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+
+class SteadyStates(eqx.Module):
+    """Steady states, each measured by one or several sensors.
+
+    Phasors e^{+iΩt} relative to the force (velocity phase 0 = phase resonance), peak amplitudes.
+    A sensor that did not measure a state has `measured` False and velocity 0. A standard
+    deviation that nobody stated is NaN. A force known only as a drive voltage is in `drive`
+    and `force` is NaN.
+    """
+
+    level: Int[Array, " state"]
+    frequency: Float[Array, " state"]  # rad/s
+    force: Float[Array, " state"]  # N
+    velocity: Complex[Array, "state sensor"]  # m/s, fundamental
+    measured: Bool[Array, "state sensor"]
+    velocity_std: Float[Array, "state sensor"]  # m/s, 1σ of the amplitude, NaN = not stated
+    phase_std: Float[Array, "state sensor"]  # rad, 1σ, NaN = not stated
+    force_std: Float[Array, " state"]  # N, 1σ, NaN = not stated
+    drive: Float[Array, " state"]  # V, NaN where the force is known
+    order: Float[Array, " state"]  # test order 0…1, NaN = not stated
+    harmonics: Complex[Array, "state sensor harmonic"]  # m/s, NaN = not measured
+    harmonic_std: Float[Array, "state sensor"]  # m/s, rms of the complex error, NaN = not stated
+    harmonic_order: tuple[int, ...] = eqx.field(static=True)
+    sensors: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def n_states(self) -> int:
+        """Number of steady states."""
+        return self.frequency.shape[0]
+
+
+def steady_states(
+    level: Int[np.ndarray, " state"],
+    frequency: Float[np.ndarray, " state"],
+    force: Float[np.ndarray, " state"],
+    velocity: Complex[np.ndarray, "state sensor"],
+    *,
+    sensors: tuple[str, ...] = ("sensor 1",),
+    measured: Bool[np.ndarray, "state sensor"] | None = None,
+    velocity_std: Float[np.ndarray, "state sensor"] | None = None,
+    phase_std: Float[np.ndarray, "state sensor"] | None = None,
+    force_std: Float[np.ndarray, " state"] | None = None,
+    drive: Float[np.ndarray, " state"] | None = None,
+    order: Float[np.ndarray, " state"] | None = None,
+    harmonics: Complex[np.ndarray, "state sensor harmonic"] | None = None,
+    harmonic_std: Float[np.ndarray, "state sensor"] | None = None,
+    harmonic_order: tuple[int, ...] = (),
+) -> SteadyStates:
+    """Build `SteadyStates` from arrays; `velocity` may be a vector when there is one sensor.
+
+    Arguments: `frequency` in rad/s, `force` in N, `velocity` phasors in m/s relative to the
+    force; standard deviations in the same units, `phase_std` in rad.
+    Raises `ValueError` naming the argument whose shape does not fit.
+
+    >>> data = steady_states([1, 1], [500.0, 510.0], [1.0, 1.0], [0.6 + 0.0j, 0.5 - 0.2j])
+    >>> data.n_states, data.velocity.shape
+    (2, (2, 1))
+    """
+    omega = np.asarray(frequency, dtype=np.float64)
+    if omega.ndim != 1:
+        raise ValueError(f"`frequency` must be a vector, but has shape {omega.shape}.")
+    n_states, n_sensors = omega.size, len(sensors)
+
+    def per_state(name: str, value: object, dtype: type = np.float64) -> Array:
+        array = np.full(n_states, np.nan) if value is None else np.asarray(value, dtype=dtype)
+        if array.shape != (n_states,):
+            raise ValueError(f"`{name}` must have shape ({n_states},), but has {array.shape}.")
+        return jnp.asarray(array)
+
+    def per_sensor(name: str, value: object, dtype: type = np.float64) -> Array:
+        shape = (n_states, n_sensors)
+        array = np.full(shape, np.nan) if value is None else np.asarray(value, dtype=dtype)
+        if array.ndim == 1 and n_sensors == 1:
+            array = array[:, None]
+        if array.shape != shape:
+            raise ValueError(f"`{name}` must have shape {shape}, but has {array.shape}.")
+        return jnp.asarray(array)
+
+    if harmonics is None:
+        harmonics = np.zeros((n_states, n_sensors, 0), dtype=np.complex128)
+        if harmonic_order:
+            raise ValueError("`harmonic_order` is given without `harmonics`.")
+    harmonics = np.asarray(harmonics, dtype=np.complex128)
+    if harmonics.shape != (n_states, n_sensors, len(harmonic_order)):
+        raise ValueError(
+            f"`harmonics` must have shape {(n_states, n_sensors, len(harmonic_order))}, "
+            f"but has {harmonics.shape}."
+        )
+    return SteadyStates(
+        level=per_state("level", level, np.int64),
+        frequency=jnp.asarray(omega),
+        force=per_state("force", force),
+        velocity=per_sensor("velocity", velocity, np.complex128),
+        measured=per_sensor(
+            "measured", np.ones((n_states, n_sensors)) if measured is None else measured, np.bool_
+        ),
+        velocity_std=per_sensor("velocity_std", velocity_std),
+        phase_std=per_sensor("phase_std", phase_std),
+        force_std=per_state("force_std", force_std),
+        drive=per_state("drive", drive),
+        order=per_state("order", order),
+        harmonics=jnp.asarray(harmonics),
+        harmonic_std=per_sensor("harmonic_std", harmonic_std),
+        harmonic_order=tuple(harmonic_order),
+        sensors=tuple(sensors),
+    )

@@ -1,0 +1,215 @@
+"""Polynomial restoring forces as the gradient of one potential."""
+
+import itertools
+from collections.abc import Mapping
+from functools import lru_cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+Monomial = tuple[int, ...]
+
+
+class PolynomialPotential(eqx.Module):
+    """V(q) = Σ c_k Π q_i over the modes i of monomial k; the restoring force is f_m = ∂V/∂q_m.
+
+    A monomial is the sorted tuple of its modes, counted from zero: (0, 0, 1) is q₁²q₂.
+    The linear stiffness is not in it: that is the linear modes' own.
+    """
+
+    coefficient: Float[Array, " monomial"]
+    coefficient_std: Float[Array, " monomial"]
+    monomials: tuple[Monomial, ...] = eqx.field(static=True)
+    n_modes: int = eqx.field(static=True)
+
+    @property
+    def degree(self) -> int:
+        """Highest degree of the potential (0 when it is empty)."""
+        return max((len(m) for m in self.monomials), default=0)
+
+    def energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:
+        """Potential energy in J, without the linear stiffness's."""
+        basis = _products(displacement, self.monomials)
+        return basis @ self.coefficient
+
+    def force(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
+        """Restoring force ∂V/∂q, in the modal unit kg^1/2 m/s²."""
+        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
+        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
+        return _products(displacement, basis) @ coefficients
+
+    def stiffness(
+        self, displacement: Float[Array, "*batch mode"]
+    ) -> Float[Array, "*batch mode mode"]:
+        """Tangent stiffness ∂²V/∂q∂q, in 1/s²."""
+        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
+        n = self.n_modes
+        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), n * n)
+        flat = _products(displacement, basis) @ coefficients
+        return flat.reshape(*displacement.shape[:-1], n, n)
+
+
+def polynomial_potential(
+    coefficients: Mapping[str, float] | Mapping[Monomial, float],
+    n_modes: int,
+    *,
+    coefficient_std: Mapping[str, float] | Mapping[Monomial, float] | None = None,
+) -> PolynomialPotential:
+    """Build a potential from its monomials.
+
+    Arguments: `coefficients` maps a monomial to its coefficient; a monomial is either a text of
+    mode numbers counted from one ("1112" is q₁³q₂; with modes above 9, "1-1-12") or a tuple of
+    indices counted from zero. `coefficient_std` gives 1σ for some of them.
+    Raises `ValueError` for a monomial of degree below 2, of modes that do not exist, or given
+    twice in two orders.
+
+    >>> duffing = polynomial_potential({"1111": 0.25}, 1)
+    >>> duffing.force(jnp.array([2.0]))
+    Array([8.], dtype=float64)
+    """
+    values: dict[Monomial, float] = {}
+    for key, value in coefficients.items():
+        monomial = parse_monomial(key, n_modes)
+        if monomial in values:
+            raise ValueError(f"monomial {key!r} is given twice (the order of modes is free).")
+        values[monomial] = float(value)
+    spread = {parse_monomial(k, n_modes): float(v) for k, v in (coefficient_std or {}).items()}
+    unknown = set(spread) - set(values)
+    if unknown:
+        raise ValueError(f"`coefficient_std` names {sorted(unknown)}, which have no coefficient.")
+    monomials = tuple(sorted(values, key=lambda m: (len(m), m)))
+    return PolynomialPotential(
+        coefficient=jnp.asarray([values[m] for m in monomials], dtype=jnp.float64),
+        coefficient_std=jnp.asarray([spread.get(m, 0.0) for m in monomials], dtype=jnp.float64),
+        monomials=monomials,
+        n_modes=n_modes,
+    )
+
+
+def parse_monomial(key: str | Monomial, n_modes: int) -> Monomial:
+    """The sorted, zero-based modes of a monomial written "1112", "1-1-12" or (0, 0, 0, 1)."""
+    if isinstance(key, str):
+        parts = key.split("-") if "-" in key else list(key)
+        if not all(part.isascii() and part.isdigit() for part in parts):
+            raise ValueError(f'monomial {key!r} must be mode numbers, such as "112" for q1^2 q2.')
+        indices = [int(part) - 1 for part in parts]
+    else:
+        indices = [int(index) for index in key]
+    if len(indices) < 2:
+        raise ValueError(f"monomial {key!r} must have degree 2 or more.")
+    if not all(0 <= index < n_modes for index in indices):
+        raise ValueError(
+            f"monomial {key!r} names a mode that does not exist (there are {n_modes})."
+        )
+    return tuple(sorted(indices))
+
+
+def monomial_key(monomial: Monomial) -> str:
+    """A monomial as files write it: mode numbers counted from one, "112" or "1-1-12"."""
+    numbers = [str(index + 1) for index in monomial]
+    return "".join(numbers) if all(len(n) == 1 for n in numbers) else "-".join(numbers)
+
+
+def potential_from_force_table(
+    force_coefficients: Mapping[Monomial, Float[np.ndarray, " mode"]], n_modes: int
+) -> tuple[PolynomialPotential, dict[str, float]]:
+    """The potential behind a table of force coefficients, and what breaks its symmetry.
+
+    A table gives, for a monomial of the *force* (modes counted from zero), its coefficient in
+    every modal equation. If the force has a potential, coefficients that belong to the same
+    monomial of the potential agree; the returned potential takes their mean. The second result
+    maps each potential monomial whose estimates disagree to their relative spread,
+    (max − min)/max|estimate|; an estimate missing from the table counts as 0.
+
+    Reference: DESIGN of this package; reduced-order models from static load cases rarely come
+    out exactly symmetric.
+
+    >>> table = {(0, 0): np.array([3.0, 1.0]), (0, 1): np.array([2.0, 0.0])}
+    >>> potential, spread = potential_from_force_table(table, 2)
+    >>> potential.coefficient, spread
+    (Array([1., 1.], dtype=float64), {})
+    """
+    table: dict[Monomial, np.ndarray] = {}
+    for key, row in force_coefficients.items():
+        table[tuple(sorted(key))] = np.asarray(row, dtype=np.float64)
+    monomials = {tuple(sorted((*key, mode))) for key in table for mode in range(n_modes)}
+    coefficients: dict[Monomial, float] = {}
+    spread: dict[str, float] = {}
+    for monomial in sorted(monomials, key=lambda m: (len(m), m)):
+        estimates = []
+        for mode in sorted(set(monomial)):
+            rest = list(monomial)
+            rest.remove(mode)
+            row = table.get(tuple(rest), np.zeros(n_modes))
+            estimates.append(row[mode] / monomial.count(mode))
+        largest = max(abs(e) for e in estimates)
+        if largest == 0.0:
+            continue
+        coefficients[monomial] = float(np.mean(estimates))
+        relative = (max(estimates) - min(estimates)) / largest
+        if relative > 0.0:
+            spread[monomial_key(monomial)] = float(relative)
+    return polynomial_potential(coefficients, n_modes), spread
+
+
+def _products(
+    displacement: Float[Array, "*batch mode"], monomials: tuple[Monomial, ...]
+) -> Float[Array, "*batch monomial"]:
+    """Π q_i for every monomial, built by multiplying a padding one in (index n = the one)."""
+    n = displacement.shape[-1]
+    if not monomials:
+        return jnp.zeros((*displacement.shape[:-1], 0), dtype=displacement.dtype)
+    longest = max(1, max(len(m) for m in monomials))
+    index = np.full((len(monomials), longest), n)
+    for row, monomial in enumerate(monomials):
+        index[row, : len(monomial)] = monomial
+    padded = jnp.concatenate([displacement, jnp.ones_like(displacement[..., :1])], axis=-1)
+    product = padded[..., index[:, 0]]
+    for column in range(1, longest):
+        product = product * padded[..., index[:, column]]
+    return product
+
+
+@lru_cache(maxsize=256)
+def _derivative_map(
+    monomials: tuple[Monomial, ...], n_modes: int
+) -> tuple[tuple[Monomial, ...], np.ndarray]:
+    """Monomials of the gradient, and the constant map from coefficients to theirs."""
+    entries: list[tuple[int, Monomial, int, float]] = []
+    for k, monomial in enumerate(monomials):
+        for mode in sorted(set(monomial)):
+            rest = list(monomial)
+            rest.remove(mode)
+            entries.append((k, tuple(rest), mode, float(monomial.count(mode))))
+    return _assemble(entries, len(monomials), n_modes)
+
+
+@lru_cache(maxsize=256)
+def _second_derivative_map(
+    monomials: tuple[Monomial, ...], n_modes: int
+) -> tuple[tuple[Monomial, ...], np.ndarray]:
+    """Monomials of the Hessian, and the constant map from coefficients to theirs."""
+    entries: list[tuple[int, Monomial, int, float]] = []
+    for k, monomial in enumerate(monomials):
+        for i, j in itertools.product(range(n_modes), repeat=2):
+            if monomial.count(i) < 1 or monomial.count(j) < (2 if i == j else 1):
+                continue
+            rest = list(monomial)
+            rest.remove(i)
+            factor = monomial.count(i) * rest.count(j)
+            rest.remove(j)
+            entries.append((k, tuple(rest), i * n_modes + j, float(factor)))
+    return _assemble(entries, len(monomials), n_modes**2)
+
+
+def _assemble(
+    entries: list[tuple[int, Monomial, int, float]], n_monomials: int, n_columns: int
+) -> tuple[tuple[Monomial, ...], np.ndarray]:
+    basis = tuple(sorted({rest for _, rest, _, _ in entries}, key=lambda m: (len(m), m)))
+    where = {rest: row for row, rest in enumerate(basis)}
+    matrix = np.zeros((n_monomials, len(basis) * n_columns))
+    for k, rest, column, factor in entries:
+        matrix[k, where[rest] * n_columns + column] += factor
+    return basis, matrix

@@ -1,0 +1,185 @@
+"""A structure: linear modes, a polynomial potential and further effects."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.model.effects import AbstractEffect
+from snrmjax.model.modes import LinearModes
+from snrmjax.model.potential import PolynomialPotential, polynomial_potential
+
+
+class Structure(eqx.Module):
+    """q̈ + 2ζωq̇ + ω²q + ∂V/∂q + Σ effects = Φᵀb F(t), in modal coordinates q (kg^1/2 m).
+
+    `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ errors that all measurements
+    of one level share; they belong to the test set-up and travel with the model file.
+    """
+
+    modes: LinearModes
+    potential: PolynomialPotential
+    effects: tuple[AbstractEffect, ...] = ()
+    level_gain_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    level_phase_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    name: str = eqx.field(static=True, default="structure")
+
+    @property
+    def n_modes(self) -> int:
+        """Number of flexible modes."""
+        return self.modes.n_modes
+
+    def nonlinear_force(
+        self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
+    ) -> Float[Array, "time mode"]:
+        """Nonlinear modal force ∂V/∂q + Σ effects at time samples, in kg^1/2 m/s²."""
+        force = self.potential.force(displacement)
+        j = self.modes.mode_of_interest
+        for effect in self.effects:
+            values = jax.vmap(effect.force)(displacement[:, j], velocity[:, j])
+            force = force.at[:, j].add(values)
+        return force
+
+    def tangent_stiffness(
+        self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
+    ) -> Float[Array, "time mode mode"]:
+        """∂(nonlinear force)/∂q at time samples, in 1/s²."""
+        tangent = self.potential.stiffness(displacement)
+        j = self.modes.mode_of_interest
+        for effect in self.effects:
+            slope = jax.vmap(jax.grad(effect.force, argnums=0))
+            tangent = tangent.at[:, j, j].add(slope(displacement[:, j], velocity[:, j]))
+        return tangent
+
+    def tangent_damping(
+        self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
+    ) -> Float[Array, " time"]:
+        """∂(force of the effects)/∂q̇ on the mode of interest at time samples, in 1/s."""
+        j = self.modes.mode_of_interest
+        tangent = jnp.zeros(displacement.shape[0])
+        for effect in self.effects:
+            slope = jax.vmap(jax.grad(effect.force, argnums=1))
+            tangent = tangent + slope(displacement[:, j], velocity[:, j])
+        return tangent
+
+
+def structure(
+    modes: LinearModes,
+    potential: PolynomialPotential | None = None,
+    *,
+    effects: tuple[AbstractEffect, ...] = (),
+    level_gain_std: float = 0.0,
+    level_phase_std: float = 0.0,
+    name: str = "structure",
+) -> Structure:
+    """Build a `Structure`; without a potential it is linear but for its effects.
+
+    Arguments: `level_gain_std` relative, `level_phase_std` in rad.
+    Raises `ValueError` when potential and modes disagree about the number of modes.
+    """
+    if potential is None:
+        potential = polynomial_potential({}, modes.n_modes)
+    if potential.n_modes != modes.n_modes:
+        raise ValueError(
+            f"`potential` is for {potential.n_modes} modes, but `modes` has {modes.n_modes}."
+        )
+    return Structure(
+        modes=modes,
+        potential=potential,
+        effects=tuple(effects),
+        level_gain_std=jnp.asarray(float(level_gain_std)),
+        level_phase_std=jnp.asarray(float(level_phase_std)),
+        name=name,
+    )
+
+
+class Equilibrium(NamedTuple):
+    """A static state: its displacement (kg^1/2 m), energy (J) and whether it is stable."""
+
+    displacement: np.ndarray
+    energy: float
+    stable: bool
+
+
+def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[Equilibrium]:
+    """Static equilibria of the structure, the one with the smallest displacement first.
+
+    Solves ω²q + f(q, 0) = 0: for one mode and a polynomial restoring force by its roots,
+    otherwise by Newton's method from many starts (a search, not a proof of completeness).
+    A structure whose list has more than one stable entry is bistable: its forced response has
+    wells that a curve followed from rest does not visit.
+
+    Returns the distinct equilibria found, sorted by |q|.
+    """
+    n = model.n_modes
+    squared = np.asarray(model.modes.natural_frequency) ** 2
+    if n == 1 and not model.effects:
+        polynomial = np.zeros(max(model.potential.degree, 2))
+        polynomial[1] = squared[0]
+        for monomial, value in zip(
+            model.potential.monomials, np.asarray(model.potential.coefficient), strict=True
+        ):
+            polynomial[len(monomial) - 1] += len(monomial) * value
+        roots = np.polynomial.polynomial.polyroots(np.trim_zeros(polynomial, "b"))
+        scale = max(1.0, float(np.max(np.abs(roots), initial=0.0)))
+        real = np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)
+        candidates = np.unique(roots.real[real])[:, None]
+        tolerance = 1e-12 * scale
+    else:
+        candidates, tolerance = _equilibria_by_newton(model, squared, n_starts, seed)
+    found: list[Equilibrium] = []
+    for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
+        if any(np.linalg.norm(q - e.displacement) <= tolerance for e in found):
+            continue
+        point = jnp.asarray(q)[None]
+        rest = jnp.zeros_like(point)
+        tangent = np.diag(squared) + np.asarray(model.tangent_stiffness(point, rest))[0]
+        energy = 0.5 * float(squared @ q**2) + float(model.potential.energy(point)[0])
+        found.append(Equilibrium(q, energy, bool(np.all(np.linalg.eigvalsh(tangent) > 0))))
+    return found
+
+
+def _equilibria_by_newton(
+    model: Structure, squared: np.ndarray, n_starts: int, seed: int
+) -> tuple[np.ndarray, float]:
+    """Newton's method from random starts at the amplitudes where the potential matters."""
+    n = model.n_modes
+    scale = displacement_scale(model)
+    radius = 10.0 ** jax.random.uniform(jax.random.key(seed), (n_starts, 1), minval=-2, maxval=1)
+    direction = jax.random.normal(jax.random.key(seed + 1), (n_starts, n))
+    starts = jnp.concatenate([jnp.zeros((1, n)), radius * direction * scale])
+
+    def balance(q: Array) -> Array:
+        rest = jnp.zeros((1, n))
+        return squared * q + model.nonlinear_force(q[None], rest)[0]
+
+    def step(_: int, q: Array) -> Array:
+        rest = jnp.zeros((1, n))
+        tangent = jnp.diag(squared) + model.tangent_stiffness(q[None], rest)[0]
+        return q - jnp.linalg.solve(tangent, balance(q))
+
+    ends = jax.vmap(lambda q: jax.lax.fori_loop(0, 60, step, q))(starts)
+    residual = jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / squared))(ends)
+    good = np.asarray(jnp.all(jnp.isfinite(ends), axis=1) & (residual < 1e-9 * jnp.max(scale)))
+    return np.asarray(ends)[good], 1e-6 * float(np.max(scale))
+
+
+def displacement_scale(model: Structure) -> np.ndarray:
+    """The displacement of each mode (kg^1/2 m) at which its own potential matches its linear one.
+
+    Sets the scale of searches and continuations; modes without own terms take the median.
+    """
+    squared = np.asarray(model.modes.natural_frequency) ** 2
+    scale = np.full(model.n_modes, np.nan)
+    for monomial, value in zip(
+        model.potential.monomials, np.asarray(model.potential.coefficient), strict=True
+    ):
+        mode, degree = monomial[0], len(monomial)
+        if set(monomial) == {mode} and degree > 2 and value != 0.0:
+            own = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
+            scale[mode] = np.fmin(scale[mode], own)
+    known = scale[np.isfinite(scale)]
+    return np.where(np.isfinite(scale), scale, np.median(known) if known.size else 1e-3)
