@@ -197,4 +197,4 @@ def make_effect(kind: str, parameters: dict[str, float]) -> AbstractEffect:
     wanted = effect_parameters(kind)
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
-    return EFFECTS[kind](**{k: jnp.asarray(float(v)) for k, v in parameters.items()})
+    return EFFECTS[kind](**{k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()})

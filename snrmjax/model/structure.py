@@ -154,7 +154,7 @@ def _equilibria_by_newton(
 
     def balance(q: Array) -> Array:
         rest = jnp.zeros((1, n))
-        return squared * q + model.nonlinear_force(q[None], rest)[0]
+        return jnp.asarray(squared) * q + model.nonlinear_force(q[None], rest)[0]
 
     def step(_: int, q: Array) -> Array:
         rest = jnp.zeros((1, n))
