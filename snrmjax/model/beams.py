@@ -83,7 +83,7 @@ def flat_beam() -> Structure:
     """The flat clamped-clamped beam: four symmetric modes, 55 potential coefficients.
 
     One sensor, `midspan`. Strongly stiffening; its first nonlinear mode carries a 1:5 internal
-    resonance with the third of the model's modes between about 87.5 and 90.2 Hz.
+    resonance with the model's second mode (mode 3 of the beam) between about 87.5 and 90.2 Hz.
 
     >>> flat_beam().n_modes
     4
