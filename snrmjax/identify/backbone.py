@@ -1,0 +1,251 @@
+"""The identified backbone: natural frequency and damping of a mode as curves with bands."""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.backbone_points import AmplitudeArgument, BackbonePoints
+from snrmjax.identify.curves import (
+    AbstractCurve,
+    CurveFit,
+    fit_curve,
+    log_slope,
+    place_knots,
+    prediction_error,
+    with_zero,
+)
+from snrmjax.identify.snrm import reference_sensor
+from snrmjax.model.modes import LinearModes
+
+CurveFamily = Literal["spline", "piecewise_linear"]
+CANDIDATE_KNOTS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
+
+
+class Anchor(NamedTuple):
+    """How far curves had to be bent to meet the linear mode at zero amplitude."""
+
+    frequency_gap: float  # rad/s, free curve at zero minus linear frequency
+    frequency_gap_std: float  # rad/s
+    damping_gap: float  # free damping ratio at zero minus the linear one
+    damping_gap_std: float
+    largest_frequency_shift: float  # rad/s, anchored minus free curve among the measured points
+    largest_damping_shift: float
+
+
+class Backbone(eqx.Module):
+    """ω̃ and ζ̃ of one mode as functions of the amplitude of its motion at one sensor.
+
+    `squared_frequency` is ω̃² (rad²/s²) and `modal_damping` 2ζ̃ω̃ (1/s), against the
+    displacement (m) or the velocity (m/s) amplitude, as `argument` says. Their covariances
+    belong to the values at the knots.
+    """
+
+    squared_frequency: AbstractCurve
+    modal_damping: AbstractCurve
+    squared_frequency_covariance: Float[Array, "knot knot"]
+    modal_damping_covariance: Float[Array, "damping_knot damping_knot"]
+    modal_constant: Float[Array, ""]  # Φ_r Φᵀb, 1/kg: acceleration per newton at resonance
+    smallest: Float[Array, ""]  # amplitude of the smallest point used
+    largest: Float[Array, ""]  # amplitude of the largest point used
+    argument: AmplitudeArgument = eqx.field(static=True)
+    sensor: str = eqx.field(static=True)
+
+    def natural_frequency(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """ω̃ in rad/s."""
+        squared = self.squared_frequency(amplitude)
+        return jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
+
+    def damping_ratio(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """ζ̃ as a fraction of critical."""
+        return self.modal_damping(amplitude) / (2 * self.natural_frequency(amplitude))
+
+    def velocity(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Velocity amplitude in m/s on the backbone, where Ω = ω̃."""
+        if self.argument == "velocity":
+            return jnp.asarray(amplitude)
+        return amplitude * self.natural_frequency(amplitude)
+
+    def std(
+        self, amplitude: Float[Array, " point"]
+    ) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
+        """1σ of ω̃ (rad/s) and of ζ̃ at some amplitudes."""
+        squared = CurveFit(self.squared_frequency, self.squared_frequency_covariance, 1, 0, 0)
+        damping = CurveFit(self.modal_damping, self.modal_damping_covariance, 1, 0, 0)
+        omega, zeta = self.natural_frequency(amplitude), self.damping_ratio(amplitude)
+        omega_std = squared.std(amplitude) / (2 * omega)
+        zeta_std = jnp.hypot(damping.std(amplitude) / (2 * omega), zeta * omega_std / omega)
+        return omega_std, zeta_std
+
+
+class BackboneFit(NamedTuple):
+    """A backbone with what its fit found out."""
+
+    backbone: Backbone
+    noise_scale: tuple[float, float]  # of ω̃² and of 2ζ̃ω̃; relative noise where none is stated
+    level_frequency_std: float  # rad/s, 1σ that the points of one level share
+    level_damping_std: float  # the same of the damping ratio
+    noise_stated: bool
+    anchor: Anchor | None
+
+
+def fit_backbone(
+    points: BackbonePoints,
+    modes: LinearModes,
+    *,
+    family: CurveFamily = "spline",
+    n_knots: int | None = None,
+    anchor: bool = False,
+) -> BackboneFit:
+    """Fit smooth or piecewise linear curves of ω̃² and 2ζ̃ω̃ to identified points.
+
+    Points are weighted by the stated noise carried through the inversion, the error of their
+    amplitude included; where no noise is stated, all have the same relative error of amplitude
+    and phase, whose size the scatter gives. What the points of a level share is estimated and
+    enters the bands.
+
+    Arguments: `n_knots` of each curve, chosen by how well left-out levels are predicted when
+    not given; `anchor` pins both curves at the linear mode at zero amplitude and reports how far
+    this moves them. Returns `BackboneFit`. Raises `ValueError` when fewer than two points are
+    usable or `n_knots` exceeds their number.
+    Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
+    """
+    use = np.asarray(points.usable & jnp.isfinite(points.amplitude))
+    if use.sum() < 2:
+        raise ValueError(
+            f"a backbone needs at least 2 solved points, but only {int(use.sum())} of "
+            f"{use.size} are."
+        )
+    if family not in ("spline", "piecewise_linear"):
+        raise ValueError(f'`family` must be "spline" or "piecewise_linear", not {family!r}.')
+    relative = np.asarray(points.relative_std)[use]
+    stated = bool(np.all(np.isfinite(relative)))
+    free = _fit_pair(points, use, relative, stated, family, n_knots, None)
+    pair, report = free, None
+    j, r = modes.mode_of_interest, reference_sensor(modes)
+    omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    if anchor:
+        pair = _fit_pair(
+            points, use, relative, stated, family, n_knots, (omega**2, 2 * zeta * omega)
+        )
+        report = _anchor_report(free, pair, np.asarray(points.amplitude)[use], omega, zeta)
+    squared, damping = pair
+    amplitude = np.asarray(points.amplitude)[use]
+    backbone = Backbone(
+        squared_frequency=squared.curve,
+        modal_damping=damping.curve,
+        squared_frequency_covariance=squared.covariance,
+        modal_damping_covariance=damping.covariance,
+        modal_constant=modes.mode_shape[r, j] * modes.participation[j],
+        smallest=jnp.asarray(amplitude.min()),
+        largest=jnp.asarray(amplitude.max()),
+        argument=points.argument,
+        sensor=points.sensor,
+    )
+    middle = float(np.median(np.asarray(points.natural_frequency)[use]))
+    return BackboneFit(
+        backbone=backbone,
+        noise_scale=(squared.noise_scale, damping.noise_scale),
+        level_frequency_std=squared.level_std / (2 * middle),
+        level_damping_std=damping.level_std / (2 * middle),
+        noise_stated=stated,
+        anchor=report,
+    )
+
+
+def _fit_pair(
+    points: BackbonePoints,
+    use: np.ndarray,
+    relative: np.ndarray,
+    stated: bool,
+    family: CurveFamily,
+    n_knots: int | None,
+    anchor: tuple[float, float] | None,
+) -> tuple[CurveFit, CurveFit]:
+    amplitude = np.asarray(points.amplitude)[use]
+    level = np.asarray(points.level)[use]
+    values = (
+        np.asarray(points.natural_frequency)[use] ** 2,
+        np.asarray(points.modal_damping)[use],
+    )
+    sensitivity = np.asarray(points.sensitivity)[use]
+    linear = np.asarray(points.linear_variance)[use]
+    # Nothing stated: one relative error for amplitude and phase alike, none for the force.
+    errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
+
+    def fit(component: int) -> CurveFit:
+        fixed = None if anchor is None else anchor[component]
+        slope = np.zeros(len(amplitude))
+        count = n_knots or min(5, len(np.unique(amplitude)))
+        for first in (True, False):
+            moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
+            std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
+            std = np.maximum(std, 1e-12 * np.max(np.abs(values[component])))
+            if n_knots is None and not first:
+                count = _choose_knots(family, amplitude, values[component], std, level, fixed)
+            best = fit_curve(
+                family,
+                with_zero(place_knots(amplitude, count), fixed),
+                amplitude,
+                values[component],
+                std,
+                level,
+                fixed_first=fixed,
+                scale_known=stated,
+            )
+            # The error of the amplitude matters along the slope: known after a first fit.
+            slope = log_slope(best.curve, amplitude)
+        return best
+
+    return fit(0), fit(1)
+
+
+def _choose_knots(
+    family: CurveFamily,
+    amplitude: np.ndarray,
+    values: np.ndarray,
+    std: np.ndarray,
+    level: np.ndarray,
+    fixed: float | None,
+) -> int:
+    """The number of knots whose curve predicts left-out levels best."""
+    most = max(2, len(np.unique(amplitude)) // 2)
+    counts = [n for n in CANDIDATE_KNOTS if n <= most]
+    errors = [prediction_error(family, n, amplitude, values, std, level, fixed) for n in counts]
+    if not np.isfinite(min(errors)):
+        # One or two levels: nothing to leave out; a few knots, no more than a third of the points.
+        return max(n for n in counts if n <= max(2, min(6, len(amplitude) // 3)))
+    return counts[int(np.argmin(errors))]
+
+
+def _anchor_report(
+    free: tuple[CurveFit, CurveFit],
+    pinned: tuple[CurveFit, CurveFit],
+    amplitude: np.ndarray,
+    omega: float,
+    zeta: float,
+) -> Anchor:
+    zero, at = jnp.zeros(1), jnp.asarray(amplitude)
+    squared_at_zero = float(free[0].curve(zero)[0])
+    damping_at_zero = float(free[1].curve(zero)[0])
+
+    def ratios(pair: tuple[CurveFit, CurveFit]) -> tuple[np.ndarray, np.ndarray]:
+        frequency = np.sqrt(np.asarray(pair[0].curve(at)))
+        return frequency, np.asarray(pair[1].curve(at)) / (2 * frequency)
+
+    (f_free, z_free), (f_pinned, z_pinned) = ratios(free), ratios(pinned)
+
+    def largest(difference: np.ndarray) -> float:
+        return float(difference[np.argmax(np.abs(difference))])
+
+    frequency = np.sqrt(max(squared_at_zero, 0.0))
+    return Anchor(
+        frequency_gap=frequency - omega,
+        frequency_gap_std=float(free[0].std(zero)[0]) / (2 * omega),
+        damping_gap=damping_at_zero / (2 * omega) - zeta,
+        damping_gap_std=float(free[1].std(zero)[0]) / (2 * omega),
+        largest_frequency_shift=largest(f_pinned - f_free),
+        largest_damping_shift=largest(z_pinned - z_free),
+    )

@@ -1,0 +1,269 @@
+"""Curves of ω̃² and 2ζ̃ω̃ against amplitude, and their fit to scattered points.
+
+A curve is a family (piecewise linear as in the paper, or a shape-preserving cubic spline), knots
+and values at the knots. Families differ only in how they pass through the knots.
+"""
+
+from abc import abstractmethod
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import interpax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import PchipInterpolator
+
+from snrmjax.identify.least_squares import weighted_least_squares
+
+
+class AbstractCurve(eqx.Module):
+    """A function of amplitude through values at knots; continued linearly beyond them."""
+
+    kind: ClassVar[str]
+    knots: Float[Array, " knot"]  # amplitudes, increasing
+    values: Float[Array, " knot"]
+
+    @abstractmethod
+    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """The variable in which the curve is drawn through its knots."""
+
+    @abstractmethod
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """The curve between its first and its last knot."""
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Value at an amplitude; beyond the knots along the end slopes of the abscissa."""
+        x = self.abscissa(jnp.asarray(amplitude))
+        first, last = self.abscissa(self.knots[0]), self.abscissa(self.knots[-1])
+        inside = jnp.clip(x, first, last)
+        flat = inside.reshape(-1)
+        value = self.within(flat).reshape(x.shape)
+        if self.knots.shape[0] < 2:
+            return value
+        slopes = jax.vmap(jax.grad(lambda u: self.within(u[None])[0]))(jnp.stack([first, last]))
+        below = jnp.minimum(x - first, 0.0) * slopes[0]
+        return value + below + jnp.maximum(x - last, 0.0) * slopes[1]
+
+
+class PiecewiseLinear(AbstractCurve):
+    """Straight lines between the knots, in the amplitude itself: the paper's choice."""
+
+    kind: ClassVar[str] = "piecewise_linear"
+
+    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve.abscissa`."""
+        return amplitude
+
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """See `AbstractCurve.within`."""
+        if self.knots.shape[0] < 2:
+            return jnp.broadcast_to(self.values[0], abscissa.shape)
+        return interpax.interp1d(abscissa, self.knots, self.values, method="linear", extrap=True)
+
+
+class ShapePreservingSpline(AbstractCurve):
+    """A monotonicity-preserving cubic (PCHIP) in the squared amplitude.
+
+    The square makes the curve an even, smooth function of amplitude: ω̃² of a smooth restoring
+    force is linear in it to first order, at zero and when continued beyond the data.
+    """
+
+    kind: ClassVar[str] = "spline"
+
+    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve.abscissa`."""
+        return amplitude**2
+
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """See `AbstractCurve.within`."""
+        if self.knots.shape[0] < 2:
+            return jnp.broadcast_to(self.values[0], abscissa.shape)
+        knots = self.abscissa(self.knots)
+        method = "monotonic" if self.knots.shape[0] > 2 else "linear"
+        return interpax.interp1d(abscissa, knots, self.values, method=method, extrap=True)
+
+
+CURVES: dict[str, type[AbstractCurve]] = {
+    curve.kind: curve for curve in (PiecewiseLinear, ShapePreservingSpline)
+}
+"""Families of curves by name."""
+
+
+class CurveFit(NamedTuple):
+    """A curve fitted to points, with the uncertainty of its values at the knots."""
+
+    curve: AbstractCurve
+    covariance: Float[Array, "knot knot"]
+    noise_scale: float  # rms of the whitened residuals: 1 when the stated noise is right
+    level_std: float  # 1σ of what all points of one level share, unit of the values
+    criterion: float  # Bayesian information criterion, up to a constant
+
+    def std(self, amplitude: Float[Array, " point"]) -> Float[Array, " point"]:
+        """1σ of the curve at some amplitudes."""
+        slopes = _slopes(self.curve, amplitude)
+        return jnp.sqrt(jnp.einsum("pk,kl,pl->p", slopes, self.covariance, slopes))
+
+
+@eqx.filter_jit
+def _slopes(curve: AbstractCurve, amplitude: Array) -> Float[Array, "point knot"]:
+    """Derivatives of the curve with respect to its values."""
+
+    def at(values: Array) -> Array:
+        return eqx.tree_at(lambda c: c.values, curve, values)(amplitude)
+
+    return jax.jacfwd(at)(curve.values)
+
+
+def place_knots(
+    amplitude: Float[np.ndarray, " point"], n_knots: int
+) -> Float[np.ndarray, " knot"]:
+    """Knots at quantiles of the amplitudes, the smallest and the largest included.
+
+    Amplitudes closer together than 2 % of the range count as one, so that a test with
+    controlled response gets at most one knot for every level.
+    """
+    ordered = np.sort(np.asarray(amplitude))
+    spacing = 0.02 * (ordered[-1] - ordered[0])
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > spacing) + 1)
+    # Long groups are real spreads, not repetitions: they are cut at every 2 % of the range.
+    centres = np.concatenate(
+        [
+            np.linspace(g[0], g[-1], max(1, round((g[-1] - g[0]) / max(spacing, 1e-300))))
+            if g[-1] - g[0] > 2 * spacing
+            else [g.mean()]
+            for g in groups
+        ]
+    )
+    if centres.size > 1:
+        centres[0], centres[-1] = ordered[0], ordered[-1]
+    n = min(n_knots, centres.size)
+    pick = np.unique(np.round(np.linspace(0, centres.size - 1, n)).astype(int))
+    return centres[pick]
+
+
+def fit_curve(
+    kind: str,
+    knots: Float[np.ndarray, " knot"],
+    amplitude: Float[np.ndarray, " point"],
+    values: Float[np.ndarray, " point"],
+    std: Float[np.ndarray, " point"],
+    level: np.ndarray,
+    *,
+    fixed_first: float | None = None,
+    scale_known: bool = True,
+) -> CurveFit:
+    """Fit a curve to points by weighted least squares over its values at the knots.
+
+    Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `std` 1σ of the values,
+    or their relative sizes when the scale is not known; `level` groups points whose errors are
+    partly shared. `fixed_first` pins the value at the first knot.
+    Returns `CurveFit`, its covariance by `weighted_least_squares`.
+    Raises `ValueError` when there are fewer points than free knots.
+    """
+    n, k = len(values), len(knots) - (fixed_first is not None)
+    if n < k:
+        raise ValueError(f"{n} usable points cannot determine a curve of {k} knots.")
+    unit = float(np.max(np.abs(values)))
+    target, spread = np.asarray(values) / unit, np.asarray(std) / unit
+    members = np.asarray(level)[:, None] == np.unique(level)
+    at_knots = np.full(len(knots), float(np.mean(target)))
+    free = slice(0, None)
+    if fixed_first is not None:
+        at_knots[0], free = fixed_first / unit, slice(1, None)
+    # The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
+    for _ in range(12):
+        current, slopes = _linearised(kind, knots, at_knots, amplitude)
+        offset = target - current + slopes[:, free] @ at_knots[free]
+        result = weighted_least_squares(
+            slopes[:, free], offset, spread, members, scale_known=scale_known
+        )
+        moved = float(np.max(np.abs(result.values - at_knots[free])))
+        at_knots[free] = result.values
+        if moved < 1e-9 or kind == PiecewiseLinear.kind:
+            break
+    covariance = np.zeros((len(knots), len(knots)))
+    covariance[free, free] = result.covariance
+    return CurveFit(
+        curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * unit)),
+        covariance=jnp.asarray(covariance * unit**2),
+        noise_scale=result.noise_scale,
+        level_std=result.level_std * unit,
+        criterion=result.criterion,
+    )
+
+
+def prediction_error(
+    kind: str,
+    n_knots: int,
+    amplitude: Float[np.ndarray, " point"],
+    values: Float[np.ndarray, " point"],
+    std: Float[np.ndarray, " point"],
+    level: np.ndarray,
+    fixed_first: float | None,
+) -> float:
+    """Mean squared error, in units of std², of every level as the others predict it.
+
+    Points outside the amplitudes of the other levels are left out: they would be continued, not
+    interpolated. Infinity when no level can be left out.
+    """
+    scores = []
+    for one in np.unique(level):
+        kept, left = level != one, level == one
+        if kept.sum() < n_knots:
+            return np.inf
+        knots = with_zero(place_knots(amplitude[kept], n_knots), fixed_first)
+        left &= (amplitude >= knots[0]) & (amplitude <= knots[-1])
+        if not left.any():
+            continue
+        fit = fit_curve(
+            kind,
+            knots,
+            amplitude[kept],
+            values[kept],
+            std[kept],
+            level[kept],
+            fixed_first=fixed_first,
+        )
+        predicted, _ = _linearised(kind, knots, np.asarray(fit.curve.values), amplitude[left])
+        scores.append(np.mean(((values[left] - predicted) / std[left]) ** 2))
+    return float(np.mean(scores)) if scores else np.inf
+
+
+def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
+    """dg/d log a of a curve at amplitudes between its knots, to the accuracy weights need."""
+    knots, values = np.asarray(curve.knots), np.asarray(curve.values)
+    low = np.clip(amplitude * (1 - 1e-4), knots[0], knots[-1])
+    high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
+    change = [_linearised(curve.kind, knots, values, a)[0] for a in (low, high)]
+    return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
+
+
+def with_zero(
+    knots: Float[np.ndarray, " knot"], fixed_first: float | None
+) -> Float[np.ndarray, " knot"]:
+    """The knots, with one at zero amplitude in front when the curve is pinned there."""
+    return knots if fixed_first is None else np.concatenate([[0.0], knots])
+
+
+def _linearised(
+    kind: str, knots: np.ndarray, values: np.ndarray, amplitude: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A curve at some amplitudes and its derivatives with respect to its values, in NumPy.
+
+    The fit tries many knots and would compile for each; the curves themselves are JAX.
+    The spline's derivatives are central differences: they steer Gauss-Newton steps whose fixed
+    point does not depend on them.
+    """
+    n = len(knots)
+    if n == 1:
+        return np.full(len(amplitude), values[0]), np.ones((len(amplitude), 1))
+    if kind == PiecewiseLinear.kind or n == 2:
+        x, u = (amplitude, knots) if kind == PiecewiseLinear.kind else (amplitude**2, knots**2)
+        slopes = np.stack([np.interp(x, u, column) for column in np.eye(n)], axis=1)
+        return slopes @ values, slopes
+    step = 1e-7 * max(float(np.max(np.abs(values))), 1e-300)
+    columns = values[:, None] + step * np.concatenate([np.eye(n), -np.eye(n)], axis=1)
+    both = PchipInterpolator(knots**2, np.column_stack([values, columns]))(amplitude**2)
+    return both[:, 0], (both[:, 1 : n + 1] - both[:, n + 1 :]) / (2 * step)

@@ -1,0 +1,355 @@
+"""The inverse of the SNRM function: natural frequency and damping from one steady state.
+
+Every steady state gives two equations, |V_nl + V_lin + V_RB| = v and the phase of V_nl, for two
+unknowns, ω̃ and ζ̃. With φ the phase of the nonlinear mode's velocity relative to the force, the
+paper's Eq. (17) reads (ω̃² − Ω²) = 2ζ̃ω̃Ω tan φ, and is used multiplied by cos φ: regular at
+resonance (φ = 0) and at ±90° alike.
+"""
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Complex, Float, Int
+
+
+class PointStatus(IntEnum):
+    """What became of one inversion."""
+
+    OK = 0
+    TWO_ROOTS = 1  # two answers fit equally; the other one is in `alternative_…`
+    NEGATIVE_DAMPING = 2  # solved, but the phase says that the force takes energy out
+    NO_ROOT = 3  # no response of the mode fits amplitude and phase
+    NO_REAL_FREQUENCY = 4  # the measurement asks for a negative ω̃²
+    ZERO_FORCE = 5  # no force or no participation: nothing to divide by
+    NOT_FINITE = 6  # NaN or infinity in the measurement, or a zero response
+    NOT_CONVERGED = 7  # Newton's method did not reach its tolerance
+
+
+STATUS_MESSAGE: dict[PointStatus, str] = {
+    PointStatus.OK: "ok",
+    PointStatus.TWO_ROOTS: "two roots: the residual response exceeds the measured one",
+    PointStatus.NEGATIVE_DAMPING: "negative damping: phase beyond 90° of resonance",
+    PointStatus.NO_ROOT: "no root: amplitude and phase contradict the residual modes",
+    PointStatus.NO_REAL_FREQUENCY: "no real natural frequency",
+    PointStatus.ZERO_FORCE: "zero force or participation",
+    PointStatus.NOT_FINITE: "measurement is zero or not finite",
+    PointStatus.NOT_CONVERGED: "Newton's method did not converge",
+}
+
+
+class SnrmPoints(NamedTuple):
+    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none."""
+
+    natural_frequency: Float[Array, "*batch"]  # rad/s
+    damping_ratio: Float[Array, "*batch"]
+    alternative_natural_frequency: Float[Array, "*batch"]  # rad/s, NaN = there is no other root
+    alternative_damping_ratio: Float[Array, "*batch"]
+    status: Int[Array, "*batch"]  # `PointStatus`
+
+
+class TwoByTwo(lx.AbstractLinearSolver[Any]):
+    """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Array:
+        """See `lineax.AbstractLinearSolver.init`."""
+        if operator.in_size() != 2 or operator.out_size() != 2:
+            raise ValueError("`TwoByTwo` solves systems of two equations for two unknowns only.")
+        return operator.as_matrix()
+
+    def compute(
+        self, state: Array, vector: Array, options: dict[str, Any]
+    ) -> tuple[Array, lx.RESULTS, dict[str, Any]]:
+        """See `lineax.AbstractLinearSolver.compute`."""
+        (a, b), (c, d) = state
+        determinant = a * d - b * c
+        x = (d * vector[0] - b * vector[1]) / determinant
+        y = (a * vector[1] - c * vector[0]) / determinant
+        return jnp.stack([x, y]), lx.RESULTS.successful, {}
+
+    def transpose(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
+        """See `lineax.AbstractLinearSolver.transpose`."""
+        return state.T, {}
+
+    def conj(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
+        """See `lineax.AbstractLinearSolver.conj`."""
+        return state.conj(), {}
+
+    def assume_full_rank(self) -> bool:
+        """See `lineax.AbstractLinearSolver.assume_full_rank`."""
+        return True
+
+
+_NEWTON = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=TwoByTwo())
+_ADJOINT = optx.ImplicitAdjoint(linear_solver=TwoByTwo())
+
+
+def closed_form(
+    modal_constant: Float[Array, "*batch"],
+    frequency: Float[Array, "*batch"],
+    mode_velocity: Complex[Array, "*batch"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """ω̃ and ζ̃ from the velocity phasor V of the nonlinear mode alone, in closed form.
+
+    c = iΩA/V = ω̃² − Ω² + 2iζ̃ω̃Ω, so ω̃² = Ω² + Re c and ζ̃ = Im c/(2ω̃Ω).
+
+    Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s², `frequency` Ω in rad/s, `mode_velocity` in
+    m/s relative to the force. Returns rad/s and a ratio; NaN where ω̃² is not positive.
+    It is the start and the test of the Newton solve. Reference: Kwarta & Allen, Eq. (18).
+
+    >>> closed_form(jnp.array(6.0), jnp.array(500.0), jnp.array(0.6 + 0.0j))
+    (Array(500., dtype=float64), Array(0.01, dtype=float64))
+    """
+    return _from_polar(
+        modal_constant, frequency, jnp.abs(mode_velocity), *_direction(mode_velocity)
+    )
+
+
+def invert_phasor(
+    modal_constant: Float[Array, "*batch"],
+    frequency: Float[Array, "*batch"],
+    velocity: Complex[Array, "*batch"],
+    residual_velocity: Complex[Array, "*batch"],
+) -> SnrmPoints:
+    """ω̃ and ζ̃ of steady states measured in amplitude and phase at one sensor.
+
+    Solves Eqs. (12) and (17) for every member by Newton's method (optimistix, vmapped), started
+    from the closed form, in x = ω̃/Ω and ζ̃. The phase of the nonlinear mode is that of
+    V − V_lin − V_RB; the amplitude of this difference tells which of two roots is meant, and
+    the other one, which the amplitude |V| and the phase alone would allow too, is reported in
+    `alternative_…`.
+
+    Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s²; `frequency` Ω in rad/s; `velocity` V and
+    `residual_velocity` V_lin + V_RB in m/s, phasors relative to the force.
+    Returns `SnrmPoints`. Differentiable (implicitly, through the two equations).
+    Reference: Kwarta & Allen, Eqs. (12), (17), (18).
+    """
+    mode_velocity = velocity - residual_velocity
+    return _invert(
+        modal_constant,
+        frequency,
+        jnp.abs(velocity),
+        *_direction(mode_velocity),
+        residual_velocity,
+        jnp.abs(mode_velocity),
+    )
+
+
+def invert_one(
+    modal_constant: Float[Array, ""],
+    frequency: Float[Array, ""],
+    velocity: Complex[Array, ""],
+    residual_velocity: Complex[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """ω̃ and ζ̃ of a single steady state, bare: for derivatives by `jax.jacfwd` or `jax.grad`.
+
+    The same Newton solve as `invert_phasor`, whose arguments it takes, without statuses and
+    without the other root; NaN where there is no real ω̃.
+    """
+    mode_velocity = velocity - residual_velocity
+    natural, damping, _ = _newton(
+        modal_constant,
+        frequency,
+        jnp.abs(velocity),
+        *_direction(mode_velocity),
+        residual_velocity,
+        jnp.abs(mode_velocity),
+    )
+    return natural, damping
+
+
+def invert_amplitude_phase(
+    modal_constant: Float[Array, "*batch"],
+    frequency: Float[Array, "*batch"],
+    amplitude: Float[Array, "*batch"],
+    mode_phase: Float[Array, "*batch"],
+    residual_velocity: Complex[Array, "*batch"],
+) -> SnrmPoints:
+    """ω̃ and ζ̃ from the paper's triple: amplitude v, frequency Ω, phase of the nonlinear mode.
+
+    As `invert_phasor`, but |V_nl| is unknown: |r e^{iφ} + V_lin + V_RB| = v is a quadratic in r.
+    Where it has two positive roots, the larger response is returned with the status TWO_ROOTS
+    and the smaller in `alternative_…`.
+
+    Arguments: `amplitude` v = |V| in m/s, `mode_phase` φ in rad relative to the force (0 at
+    resonance; the paper's angle plus 90°). Others as `invert_phasor`.
+    Reference: Kwarta & Allen, Eqs. (12), (17), (18).
+
+    >>> a = jnp.array
+    >>> p = invert_amplitude_phase(a([6.0]), a([500.0]), a([0.6]), a([0.0]), a([0.0 + 0.0j]))
+    >>> p.natural_frequency, p.damping_ratio
+    (Array([500.], dtype=float64), Array([0.01], dtype=float64))
+    """
+    nan = jnp.full_like(amplitude, jnp.nan)
+    return _invert(
+        modal_constant,
+        frequency,
+        amplitude,
+        jnp.cos(mode_phase),
+        jnp.sin(mode_phase),
+        residual_velocity,
+        nan,
+    )
+
+
+def _direction(phasor: Complex[Array, "*batch"]) -> tuple[Array, Array]:
+    """Cosine and sine of the phase, without the loss of an arctangent."""
+    length = jnp.abs(phasor)
+    return phasor.real / length, phasor.imag / length
+
+
+def _from_polar(
+    modal_constant: Array, frequency: Array, length: Array, cosine: Array, sine: Array
+) -> tuple[Array, Array]:
+    ratio = frequency * modal_constant / length
+    squared = frequency**2 + ratio * sine
+    natural_frequency = jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
+    return natural_frequency, ratio * cosine / (2 * natural_frequency * frequency)
+
+
+def _equations(unknowns: Array, args: tuple) -> Array:
+    """Eq. (17) times cos φ, and Eq. (12) squared, both scaled to order one."""
+    x, damping = unknowns
+    cosine, sine, constant, w_real, w_imag, scale = args
+    real, imag = x * x - 1.0, 2.0 * damping * x
+    phase = (real * cosine - imag * sine) * scale
+    # |iA/(Ωv D) + W/v| = 1 with D = real + i imag, times |D|².
+    top_real = w_real * real - w_imag * imag
+    top_imag = constant + w_real * imag + w_imag * real
+    amplitude = top_real**2 + top_imag**2 - (real * real + imag * imag)
+    return jnp.stack([phase, amplitude * scale * scale])
+
+
+def _newton(
+    modal_constant: Array,
+    frequency: Array,
+    amplitude: Array,
+    cosine: Array,
+    sine: Array,
+    residual: Array,
+    length: Array,
+) -> tuple[Array, Array, Array]:
+    """One member: the Newton solve from the closed form at |V_nl| = `length`."""
+    omega, damping = _from_polar(modal_constant, frequency, length, cosine, sine)
+    start = jax.lax.stop_gradient(jnp.stack([omega / frequency, damping]))
+    scale = jax.lax.stop_gradient(jnp.abs(frequency * length / modal_constant))
+    args = (
+        cosine,
+        sine,
+        modal_constant / (frequency * amplitude),
+        residual.real / amplitude,
+        residual.imag / amplitude,
+        scale,
+    )
+    solution = optx.root_find(
+        _equations, _NEWTON, start, args, max_steps=16, adjoint=_ADJOINT, throw=False
+    )
+    good = solution.result == optx.RESULTS.successful
+    return solution.value[0] * frequency, solution.value[1], good
+
+
+@jax.jit
+def _invert(
+    modal_constant: Array,
+    frequency: Array,
+    amplitude: Array,
+    cosine: Array,
+    sine: Array,
+    residual: Array,
+    known_length: Array,
+) -> SnrmPoints:
+    shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (modal_constant, frequency, amplitude)))
+    flat = [
+        jnp.broadcast_to(a, shape).reshape(-1)
+        for a in (modal_constant, frequency, amplitude, cosine, sine, residual, known_length)
+    ]
+    return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(*flat))
+
+
+def _invert_flat(
+    modal_constant: Array,
+    frequency: Array,
+    amplitude: Array,
+    cosine: Array,
+    sine: Array,
+    residual: Array,
+    known_length: Array,
+) -> SnrmPoints:
+    # r² + 2br + d = 0 with b = Re(e^{−iφ} W), d = |W|² − v²; the root far from zero first.
+    half = cosine * residual.real + sine * residual.imag
+    product = (jnp.abs(residual) - amplitude) * (jnp.abs(residual) + amplitude)
+    discriminant = half * half - product
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    far = -(half + jnp.copysign(root, half))
+    near = product / jnp.where(far == 0, jnp.nan, far)
+    larger, smaller = jnp.fmax(far, near), jnp.fmin(far, near)
+    known = jnp.isfinite(known_length)
+    # With the phasor measured, r is known and the other root follows from the sum −2b.
+    length = jnp.where(known, known_length, larger)
+    other = jnp.where(known, -2.0 * half - known_length, smaller)
+    has_root = known | ((discriminant >= 0) & (length > 0))
+    has_other = (other > 0) & (jnp.abs(other - length) > 1e-12 * length)
+
+    finite = (
+        jnp.isfinite(modal_constant)
+        & jnp.isfinite(frequency)
+        & jnp.isfinite(amplitude)
+        & jnp.isfinite(cosine + sine)
+        & jnp.isfinite(jnp.abs(residual))
+        & (amplitude > 0)
+        & (frequency > 0)
+    )
+    forced = modal_constant != 0
+    solvable = finite & forced & has_root
+
+    def solve(r: Array, wanted: Array) -> tuple[Array, Array, Array, Array]:
+        # Members without a root are solved for a harmless stand-in and masked afterwards.
+        def safe(value: Array, stand_in: float) -> Array:
+            return jnp.where(wanted, value, stand_in)
+
+        r_safe, omega = safe(r, 1.0), safe(frequency, 1.0)
+        squared = omega**2 + omega * safe(modal_constant, 1.0) / r_safe * safe(sine, 0.0)
+        real = squared > 0
+        wanted = wanted & real
+        natural, damping, good = jax.vmap(_newton)(
+            safe(modal_constant, 1.0),
+            safe(frequency, 1.0),
+            safe(amplitude, 1.0),
+            safe(cosine, 1.0),
+            safe(sine, 0.0),
+            safe(residual, 0.0),
+            safe(r, 1.0),
+        )
+        answer = wanted & good
+        nan = jnp.nan
+        return jnp.where(answer, natural, nan), jnp.where(answer, damping, nan), real, good
+
+    natural, damping, real, good = solve(length, solvable)
+
+    def no_alternative(_: None) -> tuple[Array, Array]:
+        return jnp.full_like(natural, jnp.nan), jnp.full_like(natural, jnp.nan)
+
+    def alternative(_: None) -> tuple[Array, Array]:
+        return solve(other, solvable & has_other)[:2]
+
+    other_natural, other_damping = jax.lax.cond(
+        jnp.any(solvable & has_other), alternative, no_alternative, None
+    )
+    ambiguous = ~known & has_other & jnp.isfinite(other_natural)
+    status = jnp.select(
+        [~finite, ~forced, ~has_root, ~real, ~good, damping < 0, ambiguous],
+        [
+            int(PointStatus.NOT_FINITE),
+            int(PointStatus.ZERO_FORCE),
+            int(PointStatus.NO_ROOT),
+            int(PointStatus.NO_REAL_FREQUENCY),
+            int(PointStatus.NOT_CONVERGED),
+            int(PointStatus.NEGATIVE_DAMPING),
+            int(PointStatus.TWO_ROOTS),
+        ],
+        int(PointStatus.OK),
+    )
+    return SnrmPoints(natural, damping, other_natural, other_damping, status)
