@@ -1,1 +1,1 @@
-"""io"""
+"""Files: tables of steady states and of results, and models."""

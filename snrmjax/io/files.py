@@ -1,0 +1,102 @@
+"""Reading and writing whole files, and the words that messages about them share."""
+
+import difflib
+import os
+import uuid
+from collections.abc import Iterable
+from pathlib import Path
+
+FilePath = str | os.PathLike[str]
+
+
+def read_text(path: FilePath) -> str:
+    """The text of a UTF-8 file, without a byte-order mark and with its line ends as they are.
+
+    Returns the text. Raises `ValueError` when the file is missing, a folder, unreadable or not
+    text.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise ValueError(f"{os.fspath(path)} does not exist.") from error
+    except IsADirectoryError as error:
+        raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
+    except OSError as error:
+        raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+    if b"\0" in content:
+        raise ValueError(f"{file_name(path)} is not a UTF-8 text file (it has NUL bytes).")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{file_name(path)} is not a UTF-8 text file (byte {error.start + 1} breaks it)."
+        ) from error
+
+
+def write_atomically(path: FilePath, content: str | bytes) -> None:
+    """Write a whole file or nothing: to a temporary file beside it, which then takes its name.
+
+    Arguments: `content` as bytes, or as a text that is written in UTF-8 with its line ends as
+    they are. Raises `ValueError` when the folder does not exist or cannot be written.
+    """
+    target = Path(os.path.realpath(path))  # a link stays a link
+    temporary = target.with_name(f".{uuid.uuid4().hex}.tmp")
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, target)
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"{os.fspath(path)} cannot be written: its folder does not exist."
+        ) from error
+    except OSError as error:
+        raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
+    finally:
+        if temporary.exists():
+            temporary.unlink()
+
+
+def file_name(path: FilePath) -> str:
+    """The last part of a path, as messages name the file.
+
+    >>> file_name("measured/beam.csv")
+    'beam.csv'
+    """
+    name = Path(path).name
+    return name if name.isprintable() else ascii(name)
+
+
+def shown(value: object) -> str:
+    """A value as messages show it: on one line and not too long.
+
+    >>> shown("1,5"), shown("x" * 60)
+    ("'1,5'", "'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx...")
+    """
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return "a number too long to show"
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def near_miss(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """The known name that is most like a given one, upper or lower case, or nothing.
+
+    Arguments: `cutoff` is difflib's similarity, from 0 to 1, that the name must reach.
+
+    >>> near_miss("Freq_hz", ["level", "frequency_hz"])
+    'frequency_hz'
+    """
+    folded = {other.casefold(): other for other in known}
+    near = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=cutoff)
+    return folded[near[0]] if near else None
+
+
+def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """A near miss among the known names, ready to end a message, or nothing.
+
+    >>> suggestion("dampin_ratio", ["damping_ratio", "shape"])
+    ' (did you mean `damping_ratio`?)'
+    """
+    near = near_miss(name, known, cutoff)
+    return "" if near is None else f" (did you mean `{near}`?)"

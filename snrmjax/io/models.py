@@ -1,0 +1,338 @@
+"""Models: a structure in and out, as TOML."""
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import tomli_w
+
+from snrmjax.io.files import (
+    FilePath,
+    file_name,
+    near_miss,
+    read_text,
+    shown,
+    suggestion,
+    write_atomically,
+)
+from snrmjax.io.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.io.units import DEGREE, HERTZ, in_unit
+from snrmjax.model.effects import (
+    DECLARED_EFFECTS,
+    EFFECTS,
+    AbstractEffect,
+    effect_parameters,
+    make_effect,
+)
+from snrmjax.model.modes import LinearModes, linear_modes
+from snrmjax.model.potential import (
+    Monomial,
+    PolynomialPotential,
+    monomial_key,
+    parse_monomial,
+    polynomial_potential,
+)
+from snrmjax.model.structure import Structure, structure
+
+_MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
+_MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std")
+_RIGID_BODY_KEYS = ("shape", "participation")
+_MEASUREMENT_KEYS = ("level_gain_std", "level_phase_std_deg")
+_TOP_KEYS = (
+    "name",
+    "mode_of_interest",
+    "mode",
+    "rigid_body_mode",
+    "potential",
+    "effect",
+    "measurement",
+)
+
+
+class _Table(NamedTuple):
+    """A table of the file and its place as messages name it."""
+
+    entries: Mapping[str, object]
+    place: str
+
+    def refusal(self, key: str, expected: str, value: object) -> ValueError:
+        """The error for one value."""
+        return ValueError(f"`{key}` must be {expected}, but {self.place} has {shown(value)}.")
+
+    def check_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
+        """Refuse keys that are not known and the lack of required ones."""
+        required = tuple(required)
+        missing = [key for key in required if key not in self.entries]
+        known = (*required, *optional)
+        for key in self.entries:
+            if key not in known:
+                near = suggestion(key, missing) or suggestion(key, known)
+                raise ValueError(f"{self.place} has the unknown key {shown(key)}{near}.")
+        if missing:
+            raise ValueError(f"{self.place} lacks the key `{missing[0]}`.")
+
+    def number(self, key: str, *rules: Rule, default: float | None = None) -> float:
+        """A finite number that keeps its rules."""
+        if default is not None and key not in self.entries:
+            return default
+        value = self.entries[key]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.refusal(key, "a number", value)
+        if not abs(value) < float("inf") or (isinstance(value, int) and abs(value) > 10**300):
+            raise self.refusal(key, "a finite number", value)
+        for rule in rules:
+            if not rule.good(value):
+                raise self.refusal(key, rule.expected, value)
+        return float(value)
+
+    def table(self, key: str, place: str) -> "_Table":
+        """A table inside this one."""
+        value = self.entries.get(key, {})
+        if not isinstance(value, dict):
+            raise self.refusal(key, "a table", value)
+        return _Table(value, place)
+
+    def tables(self, key: str, file: str) -> list["_Table"]:
+        """A list of tables at the top of a file."""
+        value = self.entries.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+            found = f"[{key}]" if isinstance(value, dict) else shown(value)
+            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {found}.")
+        return [_Table(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]
+
+
+def read_model(path: FilePath) -> Structure:
+    """Read a structure from a TOML: its modes, potential, effects and shared errors.
+
+    Files are in Hz and degrees and count modes from one; the result is in rad/s and rad and
+    counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
+    model without a name takes the file's.
+
+    Returns the structure. Raises `ValueError` that names file, table, key, value and what was
+    expected; a near miss is suggested for an unknown name.
+    """
+    return _read(read_text(path), file_name(path), Path(path).stem)
+
+
+def _read(text: str, file: str, stem: str) -> Structure:
+    try:
+        entries = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file} is not valid TOML: {error}.") from error
+    except ValueError as error:  # Python's limit on the digits of an integer
+        raise ValueError(f"{file} has a number of too many digits.") from error
+    except RecursionError as error:
+        raise ValueError(f"{file} is not valid TOML: it nests too deeply.") from error
+    top = _Table(entries, file)
+    top.check_keys((), _TOP_KEYS)
+    name = entries.get("name", stem)
+    if not isinstance(name, str):
+        raise top.refusal("name", "a text", name)
+    modes = _modes(top, file)
+    measurement = top.table("measurement", f"[measurement] of {file}")
+    measurement.check_keys((), _MEASUREMENT_KEYS)
+    return structure(
+        modes,
+        _potential(top.table("potential", f"[potential] of {file}"), modes.n_modes),
+        effects=tuple(_effect(table) for table in top.tables("effect", file)),
+        level_gain_std=measurement.number("level_gain_std", NOT_NEGATIVE, default=0.0),
+        level_phase_std=measurement.number("level_phase_std_deg", NOT_NEGATIVE, default=0.0)
+        * DEGREE,
+        name=name,
+    )
+
+
+def _modes(top: _Table, file: str) -> LinearModes:
+    flexible, rigid = top.tables("mode", file), top.tables("rigid_body_mode", file)
+    if not flexible:
+        raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
+    of_interest = top.entries.get("mode_of_interest", 1)
+    if isinstance(of_interest, bool) or not isinstance(of_interest, int):
+        raise top.refusal("mode_of_interest", "a whole number", of_interest)
+    if not 1 <= of_interest <= len(flexible):
+        expected = f"from 1 to the number of modes ({len(flexible)})"
+        raise top.refusal("mode_of_interest", expected, of_interest)
+    for table in flexible:
+        table.check_keys(_MODE_KEYS, _MODE_STD_KEYS)
+    for table in rigid:
+        table.check_keys(_RIGID_BODY_KEYS)
+    shapes = [_shape(table) for table in (*flexible, *rigid)]
+    sensors = tuple(shapes[0])
+    for table, shape in zip((*flexible, *rigid), shapes, strict=True):
+        for sensor in sensors:
+            if sensor not in shape:
+                near = near_miss(sensor, set(shape) - set(sensors))
+                raise ValueError(
+                    f"the shape of {table.place} lacks the sensor {shown(sensor)}, which mode 1 "
+                    f"has{'' if near is None else f' (is it {shown(near)}?)'}."
+                )
+        for sensor in shape:
+            if sensor not in sensors:
+                raise ValueError(
+                    f"the shape of {table.place} has the sensor {shown(sensor)}, which mode 1 "
+                    "lacks."
+                )
+    if not any(shapes[of_interest - 1].values()):
+        raise ValueError(
+            f"{file} must have at least one mode with a shape, but the mode of interest "
+            f"({of_interest}) is zero at every sensor."
+        )
+    mode_shape = np.array([[shape[name] for shape in shapes] for name in sensors])
+    return linear_modes(
+        [table.number("frequency_hz", POSITIVE, IN_RANGE_HZ) * HERTZ for table in flexible],
+        [table.number("damping_ratio", BELOW_ONE) for table in flexible],
+        mode_shape[:, : len(flexible)],
+        [table.number("participation", NOT_ZERO) for table in flexible],
+        sensors=sensors,
+        mode_of_interest=of_interest - 1,
+        rigid_body_shape=mode_shape[:, len(flexible) :],
+        rigid_body_participation=np.array(
+            [table.number("participation", NOT_ZERO) for table in rigid]
+        ),
+        natural_frequency_std=[
+            table.number("frequency_std_hz", NOT_NEGATIVE, IN_RANGE_HZ, default=0.0) * HERTZ
+            for table in flexible
+        ],
+        damping_ratio_std=[
+            table.number("damping_ratio_std", NOT_NEGATIVE, default=0.0) for table in flexible
+        ],
+    )
+
+
+def _shape(mode: _Table) -> dict[str, float]:
+    """The shape of one mode: its value at each sensor."""
+    table = mode.table("shape", f"the shape of {mode.place}")
+    if not table.entries:
+        raise ValueError(f"the shape of {mode.place} must have at least one sensor.")
+    for sensor in table.entries:
+        if sensor != sensor.strip() or sensor == "" or not sensor.isprintable():
+            raise ValueError(
+                f"the name of a sensor must be a text without spaces around it, "
+                f"but {table.place} has {sensor!r}."
+            )
+    return {sensor: table.number(sensor) for sensor in table.entries}
+
+
+def _potential(table: _Table, n_modes: int) -> PolynomialPotential:
+    coefficients: dict[Monomial, float] = {}
+    spread: dict[Monomial, float] = {}
+    for key, value in table.entries.items():
+        try:
+            monomial = parse_monomial(key, n_modes)
+        except ValueError as error:
+            raise ValueError(f"{table.place} cannot be read: {error}") from error
+        if monomial in coefficients:
+            raise ValueError(
+                f"{table.place} has the monomial {key!r} twice (the order of the modes is free)."
+            )
+        if isinstance(value, dict):
+            entry = _Table(value, f"monomial {key!r} in {table.place}")
+            entry.check_keys(("coefficient",), ("std",))
+            coefficients[monomial] = entry.number("coefficient")
+            spread[monomial] = entry.number("std", NOT_NEGATIVE, default=0.0)
+        else:
+            coefficients[monomial] = table.number(key)
+    return polynomial_potential(coefficients, n_modes, coefficient_std=spread)
+
+
+def _effect(table: _Table) -> AbstractEffect:
+    if "kind" not in table.entries:
+        raise ValueError(f"{table.place} lacks the key `kind`.")
+    kind = table.entries["kind"]
+    if not isinstance(kind, str):
+        raise table.refusal("kind", "a text", kind)
+    if kind in EFFECTS:
+        names = effect_parameters(kind)
+        table = _Table(table.entries, f"{table.place} ({kind})")
+        table.check_keys(("kind", *names))
+        return make_effect(kind, {name: table.number(name) for name in names})
+    if kind in DECLARED_EFFECTS:
+        raise ValueError(
+            f"`kind` of {table.place} is {kind!r}, a name that this version reads but an effect "
+            "that it cannot simulate yet."
+        )
+    near = suggestion(kind, (*EFFECTS, *DECLARED_EFFECTS))
+    known = "" if near else f" (known are {', '.join(sorted(EFFECTS))})"
+    raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}{known}.")
+
+
+def write_model(path: FilePath, model: Structure) -> None:
+    """Write a structure as the TOML that `read_model` reads.
+
+    Numbers are written in full, so that reading gives them back exactly, angular frequencies and
+    phases to one rounding of the unit conversion. The file appears whole or not at all.
+
+    Raises `ValueError` when a file could not hold the model: the rules of the reader apply.
+    """
+    if model.modes.natural_frequency.ndim != 1:
+        raise ValueError("`model` must be one structure, but is a batch of them.")
+    text = tomli_w.dumps(_entries(jax.tree.map(np.asarray, model)))
+    _read(text, file_name(path), Path(path).stem)
+    write_atomically(path, text)
+
+
+def _entries(model: Structure) -> dict[str, object]:
+    modes = model.modes
+    flexible = []
+    for k in range(modes.n_modes):
+        entry: dict[str, object] = {
+            "frequency_hz": in_unit(float(modes.natural_frequency[k]), HERTZ),
+            "damping_ratio": float(modes.damping_ratio[k]),
+            "participation": float(modes.participation[k]),
+        }
+        if modes.natural_frequency_std[k] != 0:
+            entry["frequency_std_hz"] = in_unit(float(modes.natural_frequency_std[k]), HERTZ)
+        if modes.damping_ratio_std[k] != 0:
+            entry["damping_ratio_std"] = float(modes.damping_ratio_std[k])
+        entry["shape"] = _shape_entry(modes, modes.mode_shape[:, k])
+        flexible.append(entry)
+    rigid = [
+        {
+            "participation": float(modes.rigid_body_participation[k]),
+            "shape": _shape_entry(modes, modes.rigid_body_shape[:, k]),
+        }
+        for k in range(modes.rigid_body_participation.shape[0])
+    ]
+    potential: dict[str, object] = {}
+    for monomial, value, std in zip(
+        model.potential.monomials,
+        model.potential.coefficient.tolist(),
+        model.potential.coefficient_std.tolist(),
+        strict=True,
+    ):
+        potential[monomial_key(monomial)] = {"coefficient": value, "std": std} if std else value
+    measurement = {
+        "level_gain_std": _one("level_gain_std", model.level_gain_std),
+        "level_phase_std_deg": in_unit(_one("level_phase_std", model.level_phase_std), DEGREE),
+    }
+    parts: dict[str, object] = {
+        "name": model.name,
+        "mode_of_interest": modes.mode_of_interest + 1,
+        "mode": flexible,
+        "rigid_body_mode": rigid,
+        "potential": potential,
+        "effect": [_effect_entry(effect) for effect in model.effects],
+        "measurement": {key: value for key, value in measurement.items() if value != 0},
+    }
+    return {key: value for key, value in parts.items() if value not in ([], {})}
+
+
+def _shape_entry(modes: LinearModes, shape: object) -> dict[str, float]:
+    return dict(zip(modes.sensors, np.asarray(shape).tolist(), strict=True))
+
+
+def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
+    if effect.kind not in EFFECTS:
+        raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
+    names = effect_parameters(effect.kind)
+    return {"kind": effect.kind} | {name: _one(name, getattr(effect, name)) for name in names}
+
+
+def _one(name: str, value: object) -> float:
+    number = np.asarray(value, dtype=np.float64)
+    if number.ndim != 0:
+        raise ValueError(f"`{name}` must be one number, but has shape {number.shape}.")
+    return float(number)

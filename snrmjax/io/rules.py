@@ -1,0 +1,22 @@
+"""Rules that a number in a file must keep: what is expected, and whether a number is it."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+
+class Rule(NamedTuple):
+    """What a message says is expected, and the test for it."""
+
+    expected: str
+    good: Callable[[float], bool]
+
+
+POSITIVE = Rule("positive", lambda value: value > 0)
+NOT_NEGATIVE = Rule("zero or positive", lambda value: value >= 0)
+NOT_ZERO = Rule("a number other than zero", lambda value: value != 0)
+FRACTION = Rule("from 0 to 1", lambda value: 0 <= value <= 1)
+BELOW_ONE = Rule("from 0 to below 1", lambda value: 0 <= value < 1)
+WHOLE = Rule("a whole number", lambda value: value == int(value))
+SHORT = Rule("of at most 15 digits", lambda value: abs(value) < 1e15)
+# In rad/s it must still be a number.
+IN_RANGE_HZ = Rule("below 1e300 Hz", lambda value: value < 1e300)

@@ -1,0 +1,320 @@
+"""Tables: steady states in and out, and results out, as CSV."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral, Real
+from typing import NamedTuple, SupportsFloat
+
+import jax
+import numpy as np
+
+from snrmjax.io.columns import FORCES, OPTIONAL, REQUIRED, harmonic_columns, read_header
+from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
+from snrmjax.io.rows import Cells, split_rows
+from snrmjax.io.units import DEGREE, HERTZ, in_unit
+from snrmjax.measure.steady_states import SteadyStates, steady_states
+
+
+class TableReading(NamedTuple):
+    """Steady states as a file gave them, and notes about what the reader did not use."""
+
+    steady_states: SteadyStates
+    notes: tuple[str, ...]
+
+
+def read_steady_states(path: FilePath, *, sensors: tuple[str, ...] | None = None) -> TableReading:
+    """Read measured steady states from a CSV, one row a steady state and sensor.
+
+    Rows of the same level, frequency, force (or drive voltage) and test order are one state seen
+    by several sensors; a sensor that comes again starts a new state. Files are in Hz and degrees,
+    the result is in rad/s and rad. An empty field in an optional column is "not stated".
+
+    Arguments: `sensors` are the model's; without them the sensors are those of the table, in the
+    order in which they appear. Returns the steady states, at `sensors` in their order, and one
+    note for each thing in the file that was not used or not stated.
+    Raises `ValueError` that names file, row, column, value and what was expected.
+    """
+    return _read(read_text(path), file_name(path), sensors)
+
+
+def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> TableReading:
+    rows = split_rows(text, file)
+    header = read_header(rows[0].fields, file)
+    for row in rows[1:]:
+        if len(row.fields) != header.n_columns:
+            hint = (
+                " (numbers need a point as decimal sign and no thousands separators)"
+                if len(row.fields) > header.n_columns
+                else ""
+            )
+            raise ValueError(
+                f"each row must have {header.n_columns} fields as the header has, "
+                f"but row {row.number} of {file} has {len(row.fields)}{hint}."
+            )
+    if len(rows) == 1:
+        raise ValueError(f"{file} has a header, but no rows below it.")
+    cells = Cells(rows[1:], header, file)
+    return _assemble(cells, sensors)
+
+
+def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
+    header, file = cells.header, cells.file
+    notes = list(header.notes)
+    columns = {name: cells.numbers(name) for name in REQUIRED}
+    for name in FORCES:
+        if name in header.position:
+            columns[name] = cells.numbers(name)
+    for name in (*OPTIONAL, *header.harmonics):
+        if name in header.position:
+            columns[name] = cells.numbers(name, empty_allowed=True)
+            empty = np.flatnonzero(np.isnan(columns[name]))
+            if empty.size:
+                notes.append(
+                    f"`{name}` is not stated in {empty.size} of {len(cells.rows)} rows of {file} "
+                    f"(first in row {cells.rows[empty[0]].number})."
+                )
+    if "harmonic_std_m_s" in columns and not header.harmonic_order:
+        notes.append(f"`harmonic_std_m_s` of {file} is not used: the table has no harmonics.")
+    velocity = _phasors(columns["velocity_re_m_s"], columns["velocity_im_m_s"])
+    if not np.any(velocity):
+        raise ValueError(f"{file} has nothing but zero velocities.")
+
+    names, sensor = _sensors(cells, sensors)
+    force = columns["drive_v"] if "drive_v" in columns else columns["force_n"]
+    key_columns = [columns["level"], columns["frequency_hz"], force]
+    if "order" in columns:
+        key_columns.append(np.nan_to_num(columns["order"], nan=-1.0))
+    state = group_states(np.column_stack(key_columns).tolist(), sensor)
+    n_states = max(state) + 1
+    first_row = np.unique(state, return_index=True)[1]
+    at = (np.asarray(state), np.asarray(sensor))
+
+    def per_state(name: str) -> np.ndarray | None:
+        return columns[name][first_row] if name in columns else None
+
+    def per_sensor(values: np.ndarray, missing: complex = np.nan) -> np.ndarray:
+        array = np.full((n_states, len(names)), missing, dtype=values.dtype)
+        array[at] = values
+        return array
+
+    harmonics = np.full((n_states, len(names), len(header.harmonic_order)), complex(np.nan, np.nan))
+    for k, order in enumerate(header.harmonic_order):
+        harmonics[(*at, k)] = _harmonic(cells, columns, order)
+    not_stated = np.full(len(sensor), np.nan)
+    data = steady_states(
+        level=columns["level"][first_row].astype(np.int64),
+        frequency=columns["frequency_hz"][first_row] * HERTZ,
+        force=np.full(n_states, np.nan) if "drive_v" in columns else columns["force_n"][first_row],
+        velocity=per_sensor(velocity, 0.0),
+        sensors=names,
+        measured=per_sensor(np.ones(len(sensor), dtype=bool), False),
+        velocity_std=per_sensor(columns.get("velocity_std_m_s", not_stated)),
+        phase_std=per_sensor(columns.get("phase_std_deg", not_stated)) * DEGREE,
+        force_std=_force_std(cells, columns.get("force_std_n"), state),
+        drive=per_state("drive_v"),
+        order=per_state("order"),
+        harmonics=harmonics,
+        harmonic_std=per_sensor(columns.get("harmonic_std_m_s", not_stated)),
+        harmonic_order=header.harmonic_order,
+    )
+    return TableReading(data, tuple(notes))
+
+
+def _harmonic(cells: Cells, columns: Mapping[str, np.ndarray], order: int) -> np.ndarray:
+    """One harmonic of every row, NaN where it is not stated."""
+    names = harmonic_columns(order)
+    real = columns[names[0]]
+    if order == 0:
+        return _phasors(real, np.where(np.isnan(real), np.nan, 0.0))
+    imaginary = columns[names[1]]
+    half = np.flatnonzero(np.isnan(real) != np.isnan(imaginary))
+    if half.size:
+        column = names[0] if np.isnan(real[half[0]]) else names[1]
+        other = names[1] if column == names[0] else names[0]
+        raise cells.refusal(column, f"a number where `{other}` has one", int(half[0]))
+    return _phasors(real, imaginary)
+
+
+def _phasors(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:
+    phasors = np.empty(real.shape, dtype=np.complex128)
+    phasors.real, phasors.imag = real, imaginary
+    return phasors
+
+
+def _force_std(cells: Cells, values: np.ndarray | None, state: Sequence[int]) -> np.ndarray | None:
+    """The standard deviation of the force of every state, on which its rows must agree."""
+    if values is None:
+        return None
+    of_state = np.full(max(state) + 1, np.nan)
+    for row, (k, value) in enumerate(zip(state, values, strict=True)):
+        if np.isnan(of_state[k]):
+            of_state[k] = value
+        elif value != of_state[k] and not np.isnan(value):
+            expected = f"{of_state[k]:g} as in the other rows of this steady state"
+            raise cells.refusal("force_std_n", expected, row)
+    return of_state
+
+
+def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, ...], list[int]]:
+    """The sensors of the result, and the index of each row's."""
+    if "sensor" not in cells.header.position:
+        if sensors is not None and len(sensors) != 1:
+            listed = ", ".join(f"`{name}`" for name in sensors)
+            raise ValueError(
+                f"{cells.file} lacks the column `sensor`, which is required because the model "
+                f"has the sensors {listed}."
+            )
+        return sensors or ("sensor 1",), [0] * len(cells.rows)
+    texts = cells.texts("sensor")
+    names = tuple(dict.fromkeys(texts)) if sensors is None else sensors
+    index = {name: k for k, name in enumerate(names)}
+    for row, text in enumerate(texts):
+        if text == "":
+            raise cells.refusal("sensor", "the name of a sensor", row)
+        if text not in index:
+            listed = ", ".join(f"`{name}`" for name in names)
+            raise ValueError(
+                f"`sensor` must be one of the model's ({listed}), but row "
+                f"{cells.rows[row].number} of {cells.file} has {shown(text)}"
+                f"{suggestion(text, names)}."
+            )
+    return names, [index[text] for text in texts]
+
+
+def group_states(keys: Iterable[Sequence[float]], sensor: Iterable[int]) -> list[int]:
+    """The state of each row: rows with one key and different sensors share it.
+
+    The n-th row of a sensor with some key belongs to the n-th state with that key, so that the
+    rows may be sorted by state or by sensor.
+
+    Arguments: for each row its `keys` (level, frequency, force or drive, order) and `sensor`.
+    Returns state numbers from zero, in the order in which the states first appear.
+
+    >>> group_states([(1, 80.0), (1, 80.0), (1, 80.0), (1, 81.0)], [0, 1, 0, 0])
+    [0, 0, 1, 2]
+    """
+    states: dict[tuple[float, ...], list[int]] = {}
+    rows_seen: dict[tuple[tuple[float, ...], int], int] = {}
+    result = []
+    n_states = 0
+    for values, which in zip(keys, sensor, strict=True):
+        key = tuple(values)
+        occurrence = rows_seen.get((key, which), 0)
+        rows_seen[key, which] = occurrence + 1
+        known = states.setdefault(key, [])
+        if occurrence == len(known):
+            known.append(n_states)
+            n_states += 1
+        result.append(known[occurrence])
+    return result
+
+
+def write_steady_states(path: FilePath, data: SteadyStates) -> None:
+    """Write steady states as the CSV that `read_steady_states` reads, one row a state and sensor.
+
+    Numbers are written in full, so that reading gives them back exactly, angular frequencies and
+    phases to one rounding of the unit conversion. Columns that nobody stated are left out.
+
+    Arguments: `data` with either the forces or the drive voltages of all states.
+    Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
+    """
+    host: SteadyStates = jax.tree.map(np.asarray, data)
+    file = file_name(path)
+    if not np.all(np.any(host.measured, axis=1)):
+        raise ValueError("each steady state must be measured by a sensor, but one is by none.")
+    state, sensor = np.nonzero(host.measured)
+    columns: dict[str, list[str]] = {
+        "level": [str(int(value)) for value in host.level[state]],
+        "sensor": [host.sensors[k] for k in sensor],
+        "frequency_hz": _texts(in_unit(float(f), HERTZ) for f in host.frequency[state]),
+    }
+    has_force, has_drive = ~np.isnan(host.force), ~np.isnan(host.drive)
+    if np.all(has_force) and not np.any(has_drive):
+        columns["force_n"] = _texts(host.force[state])
+    elif np.all(has_drive) and not np.any(has_force):
+        columns["drive_v"] = _texts(host.drive[state])
+    else:
+        raise ValueError(
+            "steady states to be written must have either all forces or all drive voltages."
+        )
+    columns["velocity_re_m_s"] = _texts(host.velocity.real[state, sensor])
+    columns["velocity_im_m_s"] = _texts(host.velocity.imag[state, sensor])
+    optional: dict[str, np.ndarray | jax.Array] = {
+        "velocity_std_m_s": host.velocity_std[state, sensor],
+        "phase_std_deg": np.asarray(
+            [in_unit(float(value), DEGREE) for value in host.phase_std[state, sensor]]
+        ),
+        "force_std_n": host.force_std[state],
+        "order": host.order[state],
+        "harmonic_std_m_s": host.harmonic_std[state, sensor],
+    }
+    for name, values in optional.items():
+        if not np.all(np.isnan(values)):
+            columns[name] = _texts(values)
+    for k, order in enumerate(host.harmonic_order):
+        harmonic = np.asarray(host.harmonics[state, sensor, k])
+        if order == 0 and np.any(np.nan_to_num(harmonic.imag)):
+            raise ValueError("harmonic 0 is a mean and must be real, but has an imaginary part.")
+        for name, part in zip(harmonic_columns(order), ("real", "imag"), strict=False):
+            columns[name] = _texts(getattr(harmonic, part))
+    text = _table_text(columns)
+    back = _read(text, file, host.sensors).steady_states
+    if back.n_states != data.n_states or not np.array_equal(back.measured, host.measured):
+        raise ValueError(
+            f"{file} could not tell some steady states apart that have the same level, "
+            "frequency and force, but different sensors: give each its own `order`."
+        )
+    write_atomically(path, text)
+
+
+def _texts(values: Iterable[SupportsFloat]) -> list[str]:
+    """Numbers in full; an empty field where a number is not stated."""
+    return ["" if np.isnan(value) else repr(value) for value in map(float, values)]
+
+
+def write_table(
+    path: FilePath, columns: Mapping[str, Sequence[object] | np.ndarray | jax.Array]
+) -> None:
+    """Write results as a CSV: a header row, commas, `\\n` line ends, 12 significant digits.
+
+    The file appears whole or not at all. NaN is written as `nan`, a truth value as 0 or 1, an
+    integer and a text as they are.
+
+    Arguments: `columns` maps the name of each column to its values, all of one length.
+    Raises `ValueError` for columns of unequal length or values that are no number and no text,
+    and when the file cannot be written.
+    """
+    fields = {}
+    for name, values in columns.items():
+        if isinstance(values, str):
+            raise ValueError(f"the column `{name}` must be a sequence of values, not a text.")
+        items = values.tolist() if isinstance(values, np.ndarray | jax.Array) else values
+        if not isinstance(items, Sequence):
+            raise ValueError(f"the column `{name}` must be a vector, but is one value.")
+        fields[name] = [_field(name, value) for value in items]
+    write_atomically(path, _table_text(fields))
+
+
+def _field(name: str, value: object) -> str:
+    """A value as tables show it."""
+    item = value.item() if isinstance(value, np.generic | jax.Array) else value
+    if isinstance(item, str):
+        return item
+    if isinstance(item, Integral):
+        return str(int(item))
+    if isinstance(item, Real):
+        return format(float(item) + 0.0, ".12g")  # adding zero turns -0 into 0
+    raise ValueError(f"the column `{name}` must hold real numbers or texts, but has {shown(item)}.")
+
+
+def _table_text(columns: Mapping[str, Sequence[str]]) -> str:
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"`{name}` {length}" for name, length in lengths.items())
+        raise ValueError(f"all columns of a table must have one length, but have {listed}.")
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return buffer.getvalue()

@@ -1,0 +1,631 @@
+"""Models: round trips, what is accepted, what is refused and in which words."""
+
+import os
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from snrmjax.io.models import read_model, write_model
+from snrmjax.model.effects import (
+    DECLARED_EFFECTS,
+    EFFECTS,
+    AbstractEffect,
+    effect_parameters,
+    make_effect,
+)
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structure import Structure, structure
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+MODEL = """\
+name = "two modes"
+mode_of_interest = 1
+[[mode]]
+frequency_hz = 79.02
+damping_ratio = 0.05
+shape = { midspan = 11.8, tip = -3 }
+participation = 247.8
+frequency_std_hz = 0.02
+damping_ratio_std = 0.001
+[[mode]]
+frequency_hz = 427
+damping_ratio = 0
+shape = { tip = 0.0, midspan = -10.5 }
+participation = -108.5
+[[rigid_body_mode]]
+shape = { midspan = 1.0, tip = 2.0 }
+participation = 1.5
+[potential]
+"1111" = { coefficient = 3.4e12, std = 1e10 }
+112 = -2.5e6
+"2-2-2" = 0
+[[effect]]
+kind = "quadratic_damping"
+coefficient = 0.01
+[[effect]]
+kind = "gap_stiffness"
+gap = 1e-4
+stiffness = 1000
+[measurement]
+level_gain_std = 0.01
+level_phase_std_deg = 0.5
+"""
+
+MINIMAL = """\
+[[mode]]
+frequency_hz = 80
+damping_ratio = 0.01
+shape = { tip = 1 }
+participation = 2
+"""
+
+
+def read(tmp_path, content):
+    path = tmp_path / "model.toml"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_model(path)
+
+
+def same(one: Structure, other: Structure, *, rtol: float) -> bool:
+    """Equal in structure and names, and in numbers to `rtol`."""
+    a, tree_a = jax.tree.flatten(one)
+    b, tree_b = jax.tree.flatten(other)
+    return tree_a == tree_b and all(
+        x.shape == y.shape and np.allclose(x, y, rtol=rtol, atol=0.0)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+# ------------------------------------------------------------------------------ accepted
+
+
+def test_reads_everything(tmp_path):
+    model = read(tmp_path, MODEL)
+    expected = structure(
+        linear_modes(
+            np.array([79.02, 427.0]) * 2 * np.pi,
+            [0.05, 0.0],
+            [[11.8, -10.5], [-3.0, 0.0]],
+            [247.8, -108.5],
+            sensors=("midspan", "tip"),
+            rigid_body_shape=np.array([[1.0], [2.0]]),
+            rigid_body_participation=np.array([1.5]),
+            natural_frequency_std=np.array([0.02, 0.0]) * 2 * np.pi,
+            damping_ratio_std=[0.001, 0.0],
+        ),
+        polynomial_potential(
+            {"1111": 3.4e12, "112": -2.5e6, "222": 0.0}, 2, coefficient_std={"1111": 1e10}
+        ),
+        effects=(
+            make_effect("quadratic_damping", {"coefficient": 0.01}),
+            make_effect("gap_stiffness", {"stiffness": 1000.0, "gap": 1e-4}),
+        ),
+        level_gain_std=0.01,
+        level_phase_std=0.5 * (np.pi / 180.0),
+        name="two modes",
+    )
+    assert same(model, expected, rtol=0.0)
+
+
+def test_reads_the_least(tmp_path):
+    model = read(tmp_path, MINIMAL)
+    assert model.name == "model"  # the file's
+    assert model.modes.sensors == ("tip",)
+    assert model.modes.mode_of_interest == 0
+    assert model.potential.monomials == ()
+    assert model.effects == ()
+    assert model.modes.rigid_body_shape.shape == (1, 0)
+    assert float(model.level_gain_std) == 0.0
+
+
+def test_counts_modes_from_one_in_files(tmp_path):
+    model = read(tmp_path, MODEL.replace("mode_of_interest = 1", "mode_of_interest = 2"))
+    assert model.modes.mode_of_interest == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        MODEL.replace("\n", "\r\n"),
+        "\ufeff" + MODEL,
+        "# a comment\n" + MODEL + "\n\n",
+        MODEL.replace("[measurement]", "[measurement] # shared"),
+        MODEL.replace("mode_of_interest = 1\n", ""),
+        MODEL.replace("112 =", '"211" ='),
+        MODEL.replace("112 =", '"1-2-1" ='),
+        MODEL.replace("frequency_hz = 427", "frequency_hz = 4_27.0"),
+        MODEL.replace(
+            "{ coefficient = 3.4e12, std = 1e10 }", "{ std = 1e10, coefficient = 3.4e12 }"
+        ),
+        MODEL.replace("-2.5e6", "{ coefficient = -2.5e6 }"),
+        MODEL.replace("-2.5e6", "{ coefficient = -2.5e6, std = 0 }"),
+    ],
+)
+def test_accepts(tmp_path, content):
+    assert same(read(tmp_path, content), read(tmp_path, MODEL), rtol=0.0)
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_reads_every_effect(tmp_path, kind):
+    names = effect_parameters(kind)
+    lines = [f"{name} = {k + 1}.5" for k, name in enumerate(names)]
+    model = read(tmp_path, MINIMAL + f'[[effect]]\nkind = "{kind}"\n' + "\n".join(lines))
+    (effect,) = model.effects
+    assert isinstance(effect, EFFECTS[kind])
+    assert [float(getattr(effect, name)) for name in names] == [
+        k + 1.5 for k, _ in enumerate(names)
+    ]
+
+
+# ------------------------------------------------------------------------------ refused
+
+
+def swapped(old, new, content=MODEL):
+    assert old in content
+    return content.replace(old, new, 1)
+
+
+BAD = {
+    "empty": ("", ["model.toml", "at least one mode with a shape", "[[mode]]"]),
+    "no mode": ('name = "x"\n[potential]\n111 = 1\n', ["model.toml", "at least one mode"]),
+    "not TOML": ("level,frequency_hz\n1,2\n", ["model.toml", "not valid TOML", "line 1"]),
+    "open bracket": (MODEL + "[effect\n", ["model.toml", "not valid TOML", "line 32"]),
+    "decimal comma": (swapped("79.02", "79,02"), ["model.toml", "not valid TOML", "line 4"]),
+    "doubled key": (
+        swapped("damping_ratio = 0.05", "damping_ratio = 0.05\ndamping_ratio = 0.06"),
+        ["model.toml", "not valid TOML", "line 6"],
+    ),
+    "doubled table": (MODEL + "[measurement]\n", ["model.toml", "not valid TOML", "line 32"]),
+    "deep nesting": (
+        "x = " + "[" * 5000 + "]" * 5000,
+        ["model.toml", "not valid TOML", "nests too deeply"],
+    ),
+    "endless number": (swapped("79.02", "9" * 5000), ["model.toml", "too many digits"]),
+    "NUL bytes": (MODEL.encode() + b"\0", ["model.toml", "not a UTF-8 text"]),
+    "Latin-1": (b"# \xfc\n" + MODEL.encode(), ["model.toml", "not a UTF-8 text"]),
+    "unknown table": (
+        swapped("[potential]", "[potentials]"),
+        ["model.toml", "'potentials'", "did you mean `potential`"],
+    ),
+    "unknown list": (
+        MODEL.replace("[[effect]]", "[[effects]]"),
+        ["model.toml", "'effects'", "did you mean `effect`"],
+    ),
+    "unknown key at the top": (swapped("name", "title"), ["model.toml", "unknown key 'title'"]),
+    "unknown key of a mode": (
+        swapped("damping_ratio = 0.05", "dampin_ratio = 0.05"),
+        ["mode 1 of model.toml", "'dampin_ratio'", "did you mean `damping_ratio`"],
+    ),
+    "frequency in rad/s": (
+        swapped("frequency_hz = 427", "frequency_rad_s = 2683"),
+        ["mode 2 of model.toml", "'frequency_rad_s'", "did you mean `frequency_hz`"],
+    ),
+    "frequency without unit": (
+        swapped("frequency_hz = 427", "frequency = 427"),
+        ["mode 2 of model.toml", "'frequency'", "did you mean `frequency_hz`"],
+    ),
+    "std without unit": (
+        swapped("frequency_std_hz", "frequency_std"),
+        ["mode 1 of model.toml", "'frequency_std'", "did you mean `frequency_std_hz`"],
+    ),
+    "unknown key of a rigid-body mode": (
+        swapped("participation = 1.5", "participation = 1.5\nfrequency_hz = 1"),
+        ["rigid_body_mode 1 of model.toml", "'frequency_hz'"],
+    ),
+    "unknown key of the measurement": (
+        swapped("level_phase_std_deg", "level_phase_std"),
+        ["[measurement] of model.toml", "'level_phase_std'", "did you mean `level_phase_std_deg`"],
+    ),
+    "unknown key of a coefficient": (
+        swapped("std = 1e10", "sdt = 1e10"),
+        ["monomial '1111'", "[potential] of model.toml", "'sdt'", "did you mean `std`"],
+    ),
+    "missing frequency": (
+        swapped("frequency_hz = 79.02\n", ""),
+        ["mode 1 of model.toml lacks", "`frequency_hz`"],
+    ),
+    "missing damping": (
+        swapped("damping_ratio = 0\n", ""),
+        ["mode 2 of model.toml lacks", "`damping_ratio`"],
+    ),
+    "missing participation": (
+        swapped("participation = 247.8\n", ""),
+        ["mode 1 of model.toml lacks", "`participation`"],
+    ),
+    "missing shape": (
+        swapped("shape = { tip = 0.0, midspan = -10.5 }\n", ""),
+        ["mode 2 of model.toml lacks", "`shape`"],
+    ),
+    "missing rigid-body participation": (
+        swapped("participation = 1.5\n", ""),
+        ["rigid_body_mode 1 of model.toml lacks", "`participation`"],
+    ),
+    "missing coefficient": (
+        swapped("coefficient = 3.4e12, ", ""),
+        ["monomial '1111'", "model.toml lacks", "`coefficient`"],
+    ),
+    "negative frequency": (
+        swapped("79.02", "-3.2"),
+        ["`frequency_hz` must be positive, but mode 1 of model.toml has -3.2."],
+    ),
+    "zero frequency": (swapped("427", "0"), ["`frequency_hz`", "positive", "mode 2", "0"]),
+    "frequency too large": (swapped("427", "1.5e308"), ["`frequency_hz`", "mode 2", "1.5e+308"]),
+    "negative damping": (swapped("0.05", "-0.05"), ["`damping_ratio`", "mode 1", "-0.05"]),
+    "damping of one": (
+        swapped("0.05", "1.0"),
+        ["`damping_ratio`", "from 0 to below 1", "mode 1 of model.toml", "1.0"],
+    ),
+    "zero participation": (
+        swapped("-108.5", "0"),
+        ["`participation`", "other than zero", "mode 2 of model.toml", "0"],
+    ),
+    "zero rigid-body participation": (
+        swapped("participation = 1.5", "participation = 0.0"),
+        ["`participation`", "other than zero", "rigid_body_mode 1 of model.toml"],
+    ),
+    "negative std": (
+        swapped("frequency_std_hz = 0.02", "frequency_std_hz = -0.02"),
+        ["`frequency_std_hz`", "zero or positive", "mode 1 of model.toml", "-0.02"],
+    ),
+    "negative damping std": (
+        swapped("damping_ratio_std = 0.001", "damping_ratio_std = -1"),
+        ["`damping_ratio_std`", "mode 1 of model.toml", "-1"],
+    ),
+    "negative coefficient std": (
+        swapped("std = 1e10", "std = -1.0"),
+        ["`std`", "monomial '1111'", "model.toml", "-1.0"],
+    ),
+    "negative gain std": (
+        swapped("level_gain_std = 0.01", "level_gain_std = -0.01"),
+        ["`level_gain_std`", "[measurement] of model.toml", "-0.01"],
+    ),
+    "text as a number": (swapped("79.02", '"79.02"'), ["`frequency_hz`", "mode 1", "'79.02'"]),
+    "empty text as a number": (swapped("79.02", '""'), ["`frequency_hz`", "a number", "has ''."]),
+    "truth value as a number": (swapped("79.02", "true"), ["`frequency_hz`", "mode 1", "True"]),
+    "date as a number": (swapped("79.02", "2024-01-01"), ["`frequency_hz`", "mode 1", "date"]),
+    "list as a number": (swapped("79.02", "[79.02]"), ["`frequency_hz`", "mode 1", "[79.02]"]),
+    "nan": (swapped("79.02", "nan"), ["`frequency_hz`", "finite", "mode 1 of model.toml", "nan"]),
+    "infinity": (swapped("247.8", "-inf"), ["`participation`", "finite", "mode 1", "-inf"]),
+    "infinity in a shape": (
+        swapped("tip = -3", "tip = inf"),
+        ["`tip`", "finite", "shape of mode 1 of model.toml", "inf"],
+    ),
+    "huge integer": (swapped("79.02", "1" + "0" * 400), ["`frequency_hz`", "finite", "mode 1"]),
+    "unprintable integer": (
+        swapped("79.02", "0x" + "F" * 5000),
+        ["`frequency_hz`", "finite", "mode 1", "too long"],
+    ),
+    "shape as a number": (swapped("{ midspan = 11.8, tip = -3 }", "11.8"), ["`shape`", "table"]),
+    "empty shape": (
+        swapped("{ midspan = 11.8, tip = -3 }", "{}"),
+        ["shape of mode 1 of model.toml", "at least one sensor"],
+    ),
+    "text in a shape": (
+        swapped("tip = -3", 'tip = "x"'),
+        ["`tip`", "a number", "shape of mode 1 of model.toml", "'x'"],
+    ),
+    "a mode lacks a sensor": (
+        swapped("{ tip = 0.0, midspan = -10.5 }", "{ midspan = -10.5 }"),
+        ["mode 2 of model.toml", "lacks the sensor 'tip'"],
+    ),
+    "a mode misspells a sensor": (
+        swapped("{ tip = 0.0, midspan = -10.5 }", "{ tip = 0.0, mid_span = -10.5 }"),
+        ["mode 2 of model.toml", "lacks the sensor 'midspan'", "is it 'mid_span'"],
+    ),
+    "a mode has a further sensor": (
+        swapped("{ tip = 0.0, ", "{ root = 1, tip = 0.0, "),
+        ["mode 2 of model.toml", "the sensor 'root'", "mode 1 lacks"],
+    ),
+    "a rigid-body mode lacks a sensor": (
+        swapped("midspan = 1.0, ", ""),
+        ["rigid_body_mode 1 of model.toml", "lacks the sensor 'midspan'"],
+    ),
+    "sensor with spaces around": (
+        swapped("shape = { tip = 1 }", 'shape = { " tip" = 1 }', MINIMAL),
+        ["sensor", "shape of mode 1 of model.toml", "' tip'"],
+    ),
+    "sensor without a name": (
+        swapped("shape = { tip = 1 }", 'shape = { "" = 1 }', MINIMAL),
+        ["sensor", "shape of mode 1 of model.toml", "''"],
+    ),
+    "zero shape": (
+        swapped("tip = 1", "tip = 0", MINIMAL),
+        ["model.toml", "at least one mode with a shape", "zero at every sensor"],
+    ),
+    "mode of interest 0": (
+        swapped("mode_of_interest = 1", "mode_of_interest = 0"),
+        ["`mode_of_interest`", "from 1", "(2)", "model.toml", "0"],
+    ),
+    "mode of interest 3": (
+        swapped("mode_of_interest = 1", "mode_of_interest = 3"),
+        ["`mode_of_interest`", "(2)", "model.toml", "3"],
+    ),
+    "mode of interest 1.0": (
+        swapped("mode_of_interest = 1", "mode_of_interest = 1.0"),
+        ["`mode_of_interest`", "whole number", "model.toml", "1.0"],
+    ),
+    "mode of interest true": (
+        swapped("mode_of_interest = 1", "mode_of_interest = true"),
+        ["`mode_of_interest`", "whole number", "model.toml", "True"],
+    ),
+    "one pair of brackets": (
+        MINIMAL.replace("[[mode]]", "[mode]"),
+        ["`mode`", "[[mode]]", "model.toml has [mode]"],
+    ),
+    "effect in one pair of brackets": (
+        MINIMAL + '[effect]\nkind = "cubic_stiffness"\n',
+        ["`effect`", "[[effect]]", "model.toml has [effect]"],
+    ),
+    "mode as a number": ("mode = 1", ["`mode`", "[[mode]]", "model.toml has 1"]),
+    "modes as numbers": ("mode = [1, 2]", ["`mode`", "[[mode]]", "model.toml has [1, 2]"]),
+    "potential as a number": ("potential = 1\n" + MINIMAL, ["`potential`", "table", "model.toml"]),
+    "name as a number": (swapped('"two modes"', "5"), ["`name`", "a text", "model.toml has 5"]),
+    "monomial of a missing mode": (
+        swapped("112 =", "113 ="),
+        ["[potential] of model.toml", "'113'", "does not exist"],
+    ),
+    "monomial of mode 0": (swapped("112 =", "110 ="), ["[potential] of model.toml", "'110'"]),
+    "monomial in words": (swapped("112 =", "cubic ="), ["[potential] of model.toml", "'cubic'"]),
+    "monomial of degree 1": (swapped("112 =", "1 ="), ["[potential] of model.toml", "degree"]),
+    "monomial with a point": (swapped("112 =", "1.12 ="), ["[potential] of model.toml", "'1'"]),
+    "empty monomial": (swapped("112 =", '"" ='), ["[potential] of model.toml", "''"]),
+    "monomial in other digits": (swapped("112 =", '"١١" ='), ["[potential] of model.toml", "'١١'"]),
+    "monomial in two orders": (
+        swapped("112 = -2.5e6", "112 = -2.5e6\n121 = 1.0"),
+        ["[potential] of model.toml", "'121'", "twice"],
+    ),
+    "text as a coefficient": (
+        swapped("-2.5e6", '"-2.5e6"'),
+        ["`112`", "a number", "[potential] of model.toml", "'-2.5e6'"],
+    ),
+    "nan as a coefficient": (
+        swapped("3.4e12", "nan"),
+        ["`coefficient`", "finite", "monomial '1111' in [potential] of model.toml", "nan"],
+    ),
+    "unknown effect": (
+        swapped('"quadratic_damping"', '"quadratic_dampng"'),
+        ["effect 1 of model.toml", "'quadratic_dampng'", "did you mean `quadratic_damping`"],
+    ),
+    "near miss of a declared effect": (
+        swapped('"quadratic_damping"', '"frequency_drft"'),
+        ["effect 1 of model.toml", "'frequency_drft'", "did you mean `frequency_drift`"],
+    ),
+    "far from any effect": (
+        swapped('"quadratic_damping"', '"xyz"'),
+        ["effect 1 of model.toml", "'xyz'", "cubic_damping"],
+    ),
+    "effect without a kind": (
+        swapped('kind = "gap_stiffness"\n', ""),
+        ["effect 2 of model.toml", "`kind`"],
+    ),
+    "kind as a number": (
+        swapped('"gap_stiffness"', "3"),
+        ["`kind`", "a text", "effect 2 of model.toml", "3"],
+    ),
+    "unknown parameter": (
+        swapped("stiffness = 1000", "stifness = 1000"),
+        ["effect 2 of model.toml (gap_stiffness)", "'stifness'", "did you mean `stiffness`"],
+    ),
+    "missing parameter": (
+        swapped("stiffness = 1000\n", ""),
+        ["effect 2 of model.toml (gap_stiffness)", "lacks", "`stiffness`"],
+    ),
+    "text as a parameter": (
+        swapped("stiffness = 1000", 'stiffness = "stiff"'),
+        ["`stiffness`", "a number", "effect 2 of model.toml (gap_stiffness)", "'stiff'"],
+    ),
+    "infinite parameter": (
+        swapped("stiffness = 1000", "stiffness = inf"),
+        ["`stiffness`", "finite", "effect 2 of model.toml (gap_stiffness)", "inf"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refuses(tmp_path, case, check_message):
+    content, parts = BAD[case]
+    with pytest.raises(ValueError, match=re.escape(parts[0])) as error:
+        read(tmp_path, content)
+    check_message(error, parts)
+
+
+@pytest.mark.parametrize("kind", sorted(DECLARED_EFFECTS - set(EFFECTS)))
+def test_says_which_effects_it_cannot_simulate(tmp_path, kind, check_message):
+    with pytest.raises(ValueError, match="cannot simulate") as error:
+        read(tmp_path, MINIMAL + f'[[effect]]\nkind = "{kind}"\nforce = 0.01\n')
+    check_message(error, [f"'{kind}'", "effect 1 of model.toml"])
+
+
+def test_refuses_a_missing_file_and_a_folder(tmp_path, check_message):
+    with pytest.raises(ValueError, match="does not exist") as error:
+        read_model(tmp_path / "gone.toml")
+    check_message(error, ["gone.toml"])
+    with pytest.raises(ValueError, match="is a folder") as error:
+        read_model(tmp_path)
+    check_message(error, [tmp_path.name])
+
+
+@settings(max_examples=100, deadline=None)
+@given(content=st.one_of(st.text(), st.binary()))
+def test_reads_or_refuses_anything(tmp_path_factory, content):
+    path = tmp_path_factory.mktemp("any") / "model.toml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+    with pytest.raises(ValueError, match=r"model\.toml") as error:
+        read_model(path)
+    assert "\n" not in str(error.value)
+
+
+FRAGMENTS = ["", " ", "\n", '"', "=", "[", "]", "{", "-", "9", "e9", "nan", "true", "\0", "é", "'"]
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_reads_or_refuses_a_damaged_model(tmp_path_factory, data):
+    start = data.draw(st.integers(0, len(MODEL)))
+    length = data.draw(st.integers(0, 3))
+    content = MODEL[:start] + data.draw(st.sampled_from(FRAGMENTS)) + MODEL[start + length :]
+    path = tmp_path_factory.mktemp("damaged") / "model.toml"
+    path.write_bytes(content.encode())
+    try:
+        model = read_model(path)
+    except ValueError as error:
+        message = str(error)
+        assert "model.toml" in message
+        assert "\n" not in message
+    else:
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(model))
+
+
+# ------------------------------------------------------------------------------ round trips
+
+finite = st.floats(-1e200, 1e200)
+spread = st.one_of(st.just(0.0), st.floats(0.0, 1e200))
+
+
+@st.composite
+def models(draw):
+    n, n_rigid = draw(st.integers(1, 3)), draw(st.integers(0, 2))
+    sensors = ("mid span", 'the "tip"', "Fläche.3")[: draw(st.integers(1, 3))]
+
+    def array(of, *shape):
+        count = int(np.prod(shape))
+        return np.array(draw(st.lists(of, min_size=count, max_size=count))).reshape(shape)
+
+    j = draw(st.integers(0, n - 1))
+    shape = array(finite, len(sensors), n)
+    shape[0, j] = draw(st.floats(1e-3, 1e3))
+    not_zero = finite.filter(lambda value: value != 0)
+    monomials = draw(
+        st.sets(
+            st.lists(st.integers(0, n - 1), min_size=2, max_size=6).map(lambda m: tuple(sorted(m))),
+            max_size=4,
+        )
+    )
+    kinds = draw(st.lists(st.sampled_from(sorted(EFFECTS)), max_size=2))
+    return structure(
+        linear_modes(
+            array(st.floats(1e-200, 1e200), n),
+            array(st.floats(0, 1, exclude_max=True), n),
+            shape,
+            array(not_zero, n),
+            sensors=sensors,
+            mode_of_interest=j,
+            rigid_body_shape=array(finite, len(sensors), n_rigid),
+            rigid_body_participation=array(not_zero, n_rigid),
+            natural_frequency_std=array(st.floats(0, 1e6, allow_subnormal=False), n),
+            damping_ratio_std=array(spread, n),
+        ),
+        polynomial_potential(
+            {m: draw(finite) for m in sorted(monomials)},
+            n,
+            coefficient_std={m: draw(spread) for m in sorted(monomials)},
+        ),
+        effects=tuple(
+            make_effect(kind, {name: draw(finite) for name in effect_parameters(kind)})
+            for kind in kinds
+        ),
+        level_gain_std=draw(spread),
+        level_phase_std=draw(st.floats(0, 10, allow_subnormal=False)),
+        name=draw(st.text(st.characters(exclude_categories=["Cs"]), max_size=8)),
+    )
+
+
+@settings(max_examples=80, deadline=None)
+@given(model=models())
+def test_round_trip(tmp_path_factory, model):
+    path = tmp_path_factory.mktemp("round") / "model.toml"
+    write_model(path, model)
+    back = read_model(path)
+    # Through Hz or degrees: a quotient and a product, each correctly rounded.
+    assert same(back, model, rtol=2 * np.finfo(float).eps)
+    assert np.array_equal(back.modes.mode_shape, model.modes.mode_shape)
+    assert np.array_equal(back.potential.coefficient, model.potential.coefficient)
+    # What came from a file returns to the last bit.
+    content = path.read_bytes()
+    write_model(path, back)
+    assert path.read_bytes() == content
+
+
+def test_many_modes_make_longer_monomials(tmp_path):
+    n = 12
+    modes = linear_modes(np.arange(1.0, n + 1), np.zeros(n), np.ones((1, n)), np.ones(n))
+    potential = polynomial_potential({"1-1-12": 5.0, "123": 6.0}, n)
+    model = structure(modes, potential)
+    path = tmp_path / "model.toml"
+    write_model(path, model)
+    assert '"1-1-12"' in path.read_text() or "1-1-12 = 5.0" in path.read_text()
+    assert same(read_model(path), model, rtol=2 * np.finfo(float).eps)
+
+
+def test_numbers_of_a_file_stay_as_they_are(tmp_path):
+    path = tmp_path / "copy.toml"
+    write_model(path, read(tmp_path, MODEL))
+    text = path.read_text()
+    for line in ("frequency_hz = 79.02", "frequency_std_hz = 0.02", "level_phase_std_deg = 0.5"):
+        assert line in text.splitlines()
+    assert same(read_model(path), read(tmp_path, MODEL), rtol=0.0)
+    assert sorted(os.listdir(tmp_path)) == ["copy.toml", "model.toml"]
+
+
+class Unheard(AbstractEffect):
+    kind = "unheard_of"
+
+    def force(self, displacement, velocity):
+        return 0.0 * displacement
+
+
+def small(**changes):
+    arguments = {"mode_shape": [[1.0]], "participation": [1.0]} | changes
+    return linear_modes([500.0], [0.01], **arguments)
+
+
+BATCH = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), structure(small()))
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (structure(small(participation=[0.0])), "`participation` must be a number other than zero"),
+        (structure(small(mode_shape=[[0.0]])), "zero at every sensor"),
+        (structure(small(mode_shape=[[np.nan]])), "must be a finite number"),
+        (structure(small(sensors=(" a ",))), "without spaces around it"),
+        (structure(small(), level_gain_std=-1.0), "`level_gain_std` must be zero or positive"),
+        (structure(small(), level_phase_std=np.inf), "`level_phase_std_deg` must be a finite"),
+        (structure(small(), effects=(Unheard(),)), "'unheard_of'"),
+        (
+            structure(small(), effects=(EFFECTS["cubic_stiffness"](jnp.ones(3)),)),
+            "`coefficient` must be one number, but has shape (3,)",
+        ),
+        (BATCH, "one structure"),
+    ],
+)
+def test_does_not_write_what_could_not_be_read(tmp_path, model, message, check_message):
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        write_model(tmp_path / "model.toml", model)
+    check_message(error, [])
+    assert os.listdir(tmp_path) == []
+
+
+# ------------------------------------------------------------------------------ measured files
+
+
+@pytest.mark.parametrize(
+    ("folder", "sensor", "frequency_hz"),
+    [("brake_reuss_beam", "drive_point", 80.37), ("suspended_beam", "laser", 42.80)],
+)
+def test_reads_the_models_of_the_measured_structures(folder, sensor, frequency_hz):
+    path = SHARED / folder / "model.toml"
+    if not path.exists():
+        pytest.skip(f"the measured file {path} is not there (it is kept outside the repository)")
+    model = read_model(path)
+    assert model.modes.sensors == (sensor,)
+    assert float(model.modes.natural_frequency[0]) == frequency_hz * (2 * np.pi)
+    assert float(model.modes.natural_frequency_std[0]) > 0.0
