@@ -4,3 +4,90 @@ import jax
 
 # Before anything else is imported: arrays made earlier would be float32.
 jax.config.update("jax_enable_x64", True)
+
+# ruff: noqa: E402
+from snrmjax.identify.backbone import Backbone, BackboneFit, fit_backbone
+from snrmjax.identify.backbone_points import BackbonePoints, identify_points
+from snrmjax.identify.identification import Identification, identify_backbone
+from snrmjax.identify.points import (
+    PointStatus,
+    SnrmPoints,
+    closed_form,
+    invert_amplitude_phase,
+    invert_phasor,
+)
+from snrmjax.identify.prediction import (
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonance_by_fixed_point,
+    resonances,
+)
+from snrmjax.identify.snrm import nonlinear_mode_velocity, snrm_velocity
+from snrmjax.measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
+from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.model.averaging import averaged_force, averaged_response
+from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.effects import make_effect
+from snrmjax.model.modes import LinearModes, linear_modes, linear_response
+from snrmjax.model.potential import (
+    PolynomialPotential,
+    polynomial_potential,
+    potential_from_force_table,
+)
+from snrmjax.model.structure import Structure, equilibria, structure
+from snrmjax.simulate.continuation import CurveStatus, StepControl
+from snrmjax.simulate.forced_response import ResponseCurve, forced_response, solve_at_frequency
+from snrmjax.simulate.normal_modes import NormalModeBranch, nonlinear_normal_mode
+from snrmjax.simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
+
+__all__ = [
+    "Backbone",
+    "BackboneFit",
+    "BackbonePoints",
+    "CurveStatus",
+    "Identification",
+    "LinearModes",
+    "MeasurementErrors",
+    "NormalModeBranch",
+    "PointStatus",
+    "PolynomialPotential",
+    "PredictedResponse",
+    "Resonance",
+    "ResponseCurve",
+    "SnrmPoints",
+    "SteadyStates",
+    "StepControl",
+    "Structure",
+    "VirtualTest",
+    "appropriation_of",
+    "averaged_force",
+    "averaged_response",
+    "closed_form",
+    "curved_beam",
+    "equilibria",
+    "fit_backbone",
+    "flat_beam",
+    "forced_response",
+    "identify_backbone",
+    "identify_points",
+    "invert_amplitude_phase",
+    "invert_phasor",
+    "linear_modes",
+    "linear_response",
+    "make_effect",
+    "mode_indicator",
+    "nnm_appropriation",
+    "nonlinear_mode_velocity",
+    "nonlinear_normal_mode",
+    "phase_resonance_test",
+    "polynomial_potential",
+    "potential_from_force_table",
+    "predict_response",
+    "resonance_by_fixed_point",
+    "resonances",
+    "snrm_velocity",
+    "solve_at_frequency",
+    "steady_states",
+    "structure",
+]

@@ -9,19 +9,24 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.backbone_points import AmplitudeArgument, BackbonePoints
 from snrmjax.identify.curves import (
+    AS_STATED,
     AbstractCurve,
     CurveFit,
     fit_curve,
     log_slope,
     place_knots,
-    prediction_error,
-    with_zero,
+    predict_left_out,
 )
+from snrmjax.identify.least_squares import ErrorSizes
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
 
 CurveFamily = Literal["spline", "piecewise_linear"]
-CANDIDATE_KNOTS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
+MOST_KNOTS = 24
+SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-8, 4))
+
+OFF_RESONANCE = 4.0
+"""How much more a point 90° off resonance is mistrusted than one at it, when no noise is stated."""
 
 
 class Anchor(NamedTuple):
@@ -72,8 +77,8 @@ class Backbone(eqx.Module):
         self, amplitude: Float[Array, " point"]
     ) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
         """1σ of ω̃ (rad/s) and of ζ̃ at some amplitudes."""
-        squared = CurveFit(self.squared_frequency, self.squared_frequency_covariance, 1, 0, 0)
-        damping = CurveFit(self.modal_damping, self.modal_damping_covariance, 1, 0, 0)
+        squared = CurveFit(self.squared_frequency, self.squared_frequency_covariance)
+        damping = CurveFit(self.modal_damping, self.modal_damping_covariance)
         omega, zeta = self.natural_frequency(amplitude), self.damping_ratio(amplitude)
         omega_std = squared.std(amplitude) / (2 * omega)
         zeta_std = jnp.hypot(damping.std(amplitude) / (2 * omega), zeta * omega_std / omega)
@@ -106,10 +111,10 @@ def fit_backbone(
     and phase, whose size the scatter gives. What the points of a level share is estimated and
     enters the bands.
 
-    Arguments: `n_knots` of each curve, chosen by how well left-out levels are predicted when
-    not given; `anchor` pins both curves at the linear mode at zero amplitude and reports how far
-    this moves them. Returns `BackboneFit`. Raises `ValueError` when fewer than two points are
-    usable or `n_knots` exceeds their number.
+    Arguments: `n_knots` of each curve, by default up to 24, with a roughness penalty chosen
+    by how well left-out levels are predicted; `anchor` pins both curves at the linear mode at
+    zero amplitude and reports how far this moves them.
+    Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
     """
     use = np.asarray(points.usable & jnp.isfinite(points.amplitude))
@@ -130,8 +135,14 @@ def fit_backbone(
         pair = _fit_pair(
             points, use, relative, stated, family, n_knots, (omega**2, 2 * zeta * omega)
         )
-        report = _anchor_report(free, pair, np.asarray(points.amplitude)[use], omega, zeta)
-    squared, damping = pair
+        report = _anchor_report(
+            (free[0][0], free[1][0]),
+            (pair[0][0], pair[1][0]),
+            np.asarray(points.amplitude)[use],
+            omega,
+            zeta,
+        )
+    (squared, squared_sizes), (damping, damping_sizes) = pair
     amplitude = np.asarray(points.amplitude)[use]
     backbone = Backbone(
         squared_frequency=squared.curve,
@@ -147,9 +158,9 @@ def fit_backbone(
     middle = float(np.median(np.asarray(points.natural_frequency)[use]))
     return BackboneFit(
         backbone=backbone,
-        noise_scale=(squared.noise_scale, damping.noise_scale),
-        level_frequency_std=squared.level_std / (2 * middle),
-        level_damping_std=damping.level_std / (2 * middle),
+        noise_scale=(squared_sizes.noise_scale, damping_sizes.noise_scale),
+        level_frequency_std=squared_sizes.level_std / (2 * middle),
+        level_damping_std=damping_sizes.level_std / (2 * middle),
         noise_stated=stated,
         anchor=report,
     )
@@ -163,7 +174,7 @@ def _fit_pair(
     family: CurveFamily,
     n_knots: int | None,
     anchor: tuple[float, float] | None,
-) -> tuple[CurveFit, CurveFit]:
+) -> tuple[tuple[CurveFit, ErrorSizes], tuple[CurveFit, ErrorSizes]]:
     amplitude = np.asarray(points.amplitude)[use]
     level = np.asarray(points.level)[use]
     values = (
@@ -174,50 +185,54 @@ def _fit_pair(
     linear = np.asarray(points.linear_variance)[use]
     # Nothing stated: one relative error for amplitude and phase alike, none for the force.
     errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
+    # The method is exact at resonance and errs with the correction it makes from there.
+    sine = np.sin(np.angle(np.asarray(points.mode_velocity)[use]))
+    far = 1.0 if stated else np.sqrt(1.0 + (OFF_RESONANCE * sine) ** 2)
 
-    def fit(component: int) -> CurveFit:
+    def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
+        knots = place_knots(amplitude, n_knots or min(MOST_KNOTS, len(amplitude) // 2))
+        if fixed is not None:
+            knots = np.concatenate([[0.0], knots])
         slope = np.zeros(len(amplitude))
-        count = n_knots or min(5, len(np.unique(amplitude)))
         for first in (True, False):
             moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
             std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
-            std = np.maximum(std, 1e-12 * np.max(np.abs(values[component])))
-            if n_knots is None and not first:
-                count = _choose_knots(family, amplitude, values[component], std, level, fixed)
+            std = np.maximum(std * far, 1e-12 * np.max(np.abs(values[component])))
+            sample = (amplitude, values[component], std)
+            smoothing, sizes = 1e-4, AS_STATED
+            if not first:
+                weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
+                smoothing, sizes = _best_smoothing(family, knots, weights, *sample, level, fixed)
+            used = sizes._replace(noise_scale=1.0) if stated else sizes
             best = fit_curve(
-                family,
-                with_zero(place_knots(amplitude, count), fixed),
-                amplitude,
-                values[component],
-                std,
-                level,
-                fixed_first=fixed,
-                scale_known=stated,
+                family, knots, smoothing, *sample, level, fixed_first=fixed, sizes=used
             )
             # The error of the amplitude matters along the slope: known after a first fit.
             slope = log_slope(best.curve, amplitude)
-        return best
+        return best, sizes
 
     return fit(0), fit(1)
 
 
-def _choose_knots(
+def _best_smoothing(
     family: CurveFamily,
+    knots: np.ndarray,
+    weights: tuple[float, ...],
     amplitude: np.ndarray,
     values: np.ndarray,
     std: np.ndarray,
     level: np.ndarray,
     fixed: float | None,
-) -> int:
-    """The number of knots whose curve predicts left-out levels best."""
-    most = max(2, len(np.unique(amplitude)) // 2)
-    counts = [n for n in CANDIDATE_KNOTS if n <= most]
-    errors = [prediction_error(family, n, amplitude, values, std, level, fixed) for n in counts]
-    if not np.isfinite(min(errors)):
-        # One or two levels: nothing to leave out; a few knots, no more than a third of the points.
-        return max(n for n in counts if n <= max(2, min(6, len(amplitude) // 3)))
-    return counts[int(np.argmin(errors))]
+) -> tuple[float, ErrorSizes]:
+    """The weight of the roughness penalty that predicts left-out levels best, and their errors."""
+    if len(np.unique(level)) < 3:
+        # One or two levels: leave out every third point in turn instead.
+        level = np.argsort(np.argsort(amplitude)) % 3
+    sample = (amplitude, values, std, level, fixed)
+    tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
+    best = int(np.argmin([one.score for one in tried]))
+    return weights[best], tried[best].sizes
 
 
 def _anchor_report(

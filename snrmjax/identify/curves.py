@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import PchipInterpolator
 
-from snrmjax.identify.least_squares import weighted_least_squares
+from snrmjax.identify.least_squares import ErrorSizes, error_sizes, penalised_least_squares
 
 
 class AbstractCurve(eqx.Module):
@@ -90,15 +90,15 @@ CURVES: dict[str, type[AbstractCurve]] = {
 }
 """Families of curves by name."""
 
+AS_STATED = ErrorSizes(1.0, 0.0)
+"""Errors of the stated size, none of them shared."""
+
 
 class CurveFit(NamedTuple):
     """A curve fitted to points, with the uncertainty of its values at the knots."""
 
     curve: AbstractCurve
     covariance: Float[Array, "knot knot"]
-    noise_scale: float  # rms of the whitened residuals: 1 when the stated noise is right
-    level_std: float  # 1σ of what all points of one level share, unit of the values
-    criterion: float  # Bayesian information criterion, up to a constant
 
     def std(self, amplitude: Float[Array, " point"]) -> Float[Array, " point"]:
         """1σ of the curve at some amplitudes."""
@@ -116,119 +116,120 @@ def _slopes(curve: AbstractCurve, amplitude: Array) -> Float[Array, "point knot"
     return jax.jacfwd(at)(curve.values)
 
 
-def place_knots(
-    amplitude: Float[np.ndarray, " point"], n_knots: int
-) -> Float[np.ndarray, " knot"]:
+def place_knots(amplitude: Float[np.ndarray, " point"], n_knots: int) -> Float[np.ndarray, " knot"]:
     """Knots at quantiles of the amplitudes, the smallest and the largest included.
 
-    Amplitudes closer together than 2 % of the range count as one, so that a test with
-    controlled response gets at most one knot for every level.
+    Knots closer together than 5 % of their amplitude are thinned out: that is how well a test
+    holds a level, so that a test with controlled response gets one knot for every level.
     """
-    ordered = np.sort(np.asarray(amplitude))
-    spacing = 0.02 * (ordered[-1] - ordered[0])
-    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > spacing) + 1)
-    # Long groups are real spreads, not repetitions: they are cut at every 2 % of the range.
-    centres = np.concatenate(
-        [
-            np.linspace(g[0], g[-1], max(1, round((g[-1] - g[0]) / max(spacing, 1e-300))))
-            if g[-1] - g[0] > 2 * spacing
-            else [g.mean()]
-            for g in groups
-        ]
-    )
-    if centres.size > 1:
-        centres[0], centres[-1] = ordered[0], ordered[-1]
-    n = min(n_knots, centres.size)
-    pick = np.unique(np.round(np.linspace(0, centres.size - 1, n)).astype(int))
-    return centres[pick]
+    wanted = np.quantile(amplitude, np.linspace(0.0, 1.0, max(n_knots, 2)))
+    knots = [wanted[0]]
+    for knot in wanted[1:]:
+        if knot - knots[-1] >= 0.05 * knot:
+            knots.append(knot)
+    if len(knots) == 1 and wanted[-1] > wanted[0]:
+        knots.append(wanted[-1])
+    knots[-1] = wanted[-1] if len(knots) > 1 else knots[-1]
+    return np.asarray(knots)
 
 
 def fit_curve(
     kind: str,
     knots: Float[np.ndarray, " knot"],
+    smoothing: float,
     amplitude: Float[np.ndarray, " point"],
     values: Float[np.ndarray, " point"],
     std: Float[np.ndarray, " point"],
     level: np.ndarray,
     *,
     fixed_first: float | None = None,
-    scale_known: bool = True,
+    sizes: ErrorSizes = AS_STATED,
 ) -> CurveFit:
-    """Fit a curve to points by weighted least squares over its values at the knots.
+    """Fit a curve to points by penalised least squares over its values at the knots.
 
-    Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `std` 1σ of the values,
-    or their relative sizes when the scale is not known; `level` groups points whose errors are
-    partly shared. `fixed_first` pins the value at the first knot.
-    Returns `CurveFit`, its covariance by `weighted_least_squares`.
-    Raises `ValueError` when there are fewer points than free knots.
+    Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `smoothing` weighs the
+    second differences of the values against the points (relative to what a knot knows on
+    average); `std` 1σ of the values, or their relative sizes when the scale is not known;
+    `level` groups points whose errors are partly shared. `fixed_first` pins the value at the
+    first knot. `sizes` scale the two parts of the covariance.
+    Returns `CurveFit`.
     """
-    n, k = len(values), len(knots) - (fixed_first is not None)
-    if n < k:
-        raise ValueError(f"{n} usable points cannot determine a curve of {k} knots.")
     unit = float(np.max(np.abs(values)))
     target, spread = np.asarray(values) / unit, np.asarray(std) / unit
     members = np.asarray(level)[:, None] == np.unique(level)
-    at_knots = np.full(len(knots), float(np.mean(target)))
-    free = slice(0, None)
+    n = len(knots)
+    at_knots = np.full(n, float(np.mean(target)))
+    free = slice(0, n)
     if fixed_first is not None:
-        at_knots[0], free = fixed_first / unit, slice(1, None)
+        at_knots[0], free = fixed_first / unit, slice(1, n)
+    information = np.sum(1.0 / spread**2) / n
+    rough = np.sqrt(smoothing * information) * np.diff(np.eye(n), n=2, axis=0)
+    pinned = -rough[:, 0] * at_knots[0] if fixed_first is not None else np.zeros(len(rough))
     # The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
     for _ in range(12):
         current, slopes = _linearised(kind, knots, at_knots, amplitude)
         offset = target - current + slopes[:, free] @ at_knots[free]
-        result = weighted_least_squares(
-            slopes[:, free], offset, spread, members, scale_known=scale_known
+        result = penalised_least_squares(
+            slopes[:, free],
+            offset,
+            spread,
+            members,
+            rough[:, free],
+            pinned,
         )
         moved = float(np.max(np.abs(result.values - at_knots[free])))
         at_knots[free] = result.values
         if moved < 1e-9 or kind == PiecewiseLinear.kind:
             break
-    covariance = np.zeros((len(knots), len(knots)))
-    covariance[free, free] = result.covariance
+    covariance = np.zeros((n, n))
+    tau = sizes.level_std / unit
+    covariance[free, free] = (
+        sizes.noise_scale**2 * result.unshared_covariance + tau**2 * result.shared_covariance
+    )
     return CurveFit(
         curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * unit)),
         covariance=jnp.asarray(covariance * unit**2),
-        noise_scale=result.noise_scale,
-        level_std=result.level_std * unit,
-        criterion=result.criterion,
     )
 
 
-def prediction_error(
+class LeftOut(NamedTuple):
+    """How well levels are predicted by the others."""
+
+    score: float  # mean squared error in units of std², infinity when nothing was predicted
+    sizes: ErrorSizes
+
+
+def predict_left_out(
     kind: str,
-    n_knots: int,
+    knots: Float[np.ndarray, " knot"],
+    smoothing: float,
     amplitude: Float[np.ndarray, " point"],
     values: Float[np.ndarray, " point"],
     std: Float[np.ndarray, " point"],
     level: np.ndarray,
-    fixed_first: float | None,
-) -> float:
-    """Mean squared error, in units of std², of every level as the others predict it.
+    fixed_first: float | None = None,
+) -> LeftOut:
+    """Leave out every level in turn and predict it from a curve through the others.
 
-    Points outside the amplitudes of the other levels are left out: they would be continued, not
-    interpolated. Infinity when no level can be left out.
+    Points outside the amplitudes of the other levels are left aside: they would be continued,
+    not interpolated.
     """
-    scores = []
+    errors, spreads = [], []
     for one in np.unique(level):
         kept, left = level != one, level == one
-        if kept.sum() < n_knots:
-            return np.inf
-        knots = with_zero(place_knots(amplitude[kept], n_knots), fixed_first)
-        left &= (amplitude >= knots[0]) & (amplitude <= knots[-1])
+        left &= (amplitude >= amplitude[kept].min()) & (amplitude <= amplitude[kept].max())
         if not left.any():
             continue
-        fit = fit_curve(
-            kind,
-            knots,
-            amplitude[kept],
-            values[kept],
-            std[kept],
-            level[kept],
-            fixed_first=fixed_first,
-        )
+        sample = (amplitude[kept], values[kept], std[kept], level[kept])
+        fit = fit_curve(kind, knots, smoothing, *sample, fixed_first=fixed_first)
         predicted, _ = _linearised(kind, knots, np.asarray(fit.curve.values), amplitude[left])
-        scores.append(np.mean(((values[left] - predicted) / std[left]) ** 2))
-    return float(np.mean(scores)) if scores else np.inf
+        errors.append(values[left] - predicted)
+        spreads.append(std[left])
+    if not errors:
+        return LeftOut(np.inf, AS_STATED)
+    pairs = zip(errors, spreads, strict=True)
+    score = float(np.mean([np.mean((error / spread) ** 2) for error, spread in pairs]))
+    return LeftOut(score, error_sizes(errors, spreads))
 
 
 def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
@@ -238,13 +239,6 @@ def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> n
     high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
     change = [_linearised(curve.kind, knots, values, a)[0] for a in (low, high)]
     return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
-
-
-def with_zero(
-    knots: Float[np.ndarray, " knot"], fixed_first: float | None
-) -> Float[np.ndarray, " knot"]:
-    """The knots, with one at zero amplitude in front when the curve is pinned there."""
-    return knots if fixed_first is None else np.concatenate([[0.0], knots])
 
 
 def _linearised(

@@ -1,4 +1,4 @@
-"""Weighted least squares for points whose errors are partly shared by a whole level."""
+"""Penalised least squares for points whose errors are partly shared by a whole level."""
 
 from typing import NamedTuple
 
@@ -7,69 +7,69 @@ from jaxtyping import Bool, Float
 
 
 class LeastSquares(NamedTuple):
-    """Estimate, its covariance and the two sizes of error found."""
+    """Estimate and the two parts of its covariance."""
 
     values: Float[np.ndarray, " parameter"]
-    covariance: Float[np.ndarray, "parameter parameter"]
-    noise_scale: float  # s, what the stated standard deviations would have to be multiplied by
-    level_std: float  # τ, 1σ of the error that a level shares
-    criterion: float  # n log(rss/n) + k log n, or rss + k log n when the scale is known
+    unshared_covariance: Float[np.ndarray, "parameter parameter"]  # for errors std, independent
+    shared_covariance: Float[np.ndarray, "parameter parameter"]  # for an error 1 of each level
 
 
-def weighted_least_squares(
+def penalised_least_squares(
     design: Float[np.ndarray, "point parameter"],
     target: Float[np.ndarray, " point"],
     std: Float[np.ndarray, " point"],
     members: Bool[np.ndarray, "point level"],
-    *,
-    scale_known: bool,
+    penalty: Float[np.ndarray, "row parameter"],
+    penalty_target: Float[np.ndarray, " row"],
 ) -> LeastSquares:
-    """Fit target = design · values + error, with an honest covariance for shared errors.
+    """Fit target = design · values + error with a roughness penalty and an honest covariance.
 
-    The estimate weights points by 1/std² alone: errors shared by a level would otherwise push
-    all weight on the differences inside a level, where the method's own small systematic errors
-    sit. The covariance is the sandwich that belongs to cov(error) = s²·diag(std²) + τ²·(same
-    level). s and τ are the unbiased solution of two moments of the residuals, their weighted sum
-    of squares and that of their level sums. With `scale_known` s = 1 in the covariance, while
-    `noise_scale` still says what the residuals say.
+    Minimises Σ((target − design·values)/std)² + Σ(penalty·values − penalty_target)². Points are
+    weighted by 1/std² alone: errors shared by a level would otherwise push all weight on the
+    differences inside a level, where the method's own small systematic errors sit. The
+    covariance is the sandwich for cov(error) = s²·diag(std²) + τ²·(same level), returned as its
+    two parts for s = 1 and τ = 1.
 
     Reference: Liang & Zeger, Biometrika 73 (1986) 13, doi:10.1093/biomet/73.1.13 (working
     independence and sandwich covariance).
     """
-    n, k = design.shape
     x, y = design / std[:, None], target / std
     shared = members / std[:, None]
-    q, r = np.linalg.qr(x)
-    values = np.linalg.lstsq(r, q.T @ y, rcond=None)[0]
-    residual = y - x @ values
-    rss = float(residual @ residual)
-    dof = max(n - k, 1)
-    unshared = rss / dof
-    # Moments of P y, P = I − QQᵀ, under the covariance s² I + τ² UUᵀ.
-    gram = shared.T @ shared - (shared.T @ q) @ (q.T @ shared)
-    trace, square = float(np.trace(gram)), float(np.sum(gram**2))
-    sums = float(np.sum((shared.T @ residual) ** 2))
-    several = bool(np.max(members.sum(axis=0)) > 1) and members.shape[1] > 2
-    scale2, level2 = unshared, 0.0
-    if several and square > 0:
-        if scale_known:
-            level2 = max((sums - trace) / square, 0.0)
-        else:
-            determinant = dof * square - trace**2
-            if determinant > 1e-12 * dof * square:
-                level2 = max((dof * sums - trace * rss) / determinant, 0.0)
-                scale2 = max((square * rss - trace * sums) / determinant, 0.0)
-            if level2 == 0.0 or scale2 == 0.0:
-                scale2, level2 = unshared, 0.0
-    used = 1.0 if scale_known else scale2
-    bread = np.linalg.pinv(r)
-    projected = bread @ (q.T @ shared)
-    covariance = used * bread @ bread.T + level2 * projected @ projected.T
-    misfit = rss if scale_known else n * np.log(max(rss, 1e-300) / n)
+    bread = np.linalg.pinv(x.T @ x + penalty.T @ penalty, hermitian=True)
+    arms = bread @ (x.T @ shared)
     return LeastSquares(
-        values=values,
-        covariance=covariance,
-        noise_scale=float(np.sqrt(unshared)),
-        level_std=float(np.sqrt(level2)),
-        criterion=float(misfit + k * np.log(n)),
+        values=bread @ (x.T @ y + penalty.T @ penalty_target),
+        unshared_covariance=bread @ (x.T @ x) @ bread,
+        shared_covariance=arms @ arms.T,
     )
+
+
+class ErrorSizes(NamedTuple):
+    """Sizes of the two kinds of error that left-out levels show."""
+
+    noise_scale: float  # s, what the stated standard deviations would have to be multiplied by
+    level_std: float  # τ, 1σ of the error that a level shares, unit of the values
+
+
+def error_sizes(
+    errors: list[Float[np.ndarray, " point"]], std: list[Float[np.ndarray, " point"]]
+) -> ErrorSizes:
+    """How large the errors of points and of whole levels are, from predicting left-out levels.
+
+    Around its own mean the error of a level shows s. Its mean shows τ and the error of the
+    prediction from the other levels, taken as half as large in variance, which is what two
+    neighbours with errors of their own give: τ² = ⟨mean²⟩/1.5 − ⟨s²/Σ std⁻²⟩.
+
+    Arguments: errors and stated 1σ of every left-out level. τ is 0 for fewer than three levels.
+    """
+    within, count, means, floors = 0.0, 0, [], []
+    for error, spread in zip(errors, std, strict=True):
+        weight = 1.0 / spread**2
+        mean = float(np.sum(weight * error) / np.sum(weight))
+        within += float(np.sum(weight * (error - mean) ** 2))
+        count += len(error) - 1
+        means.append(mean**2)
+        floors.append(1.0 / float(np.sum(weight)))
+    squared = within / count if count > 0 else 0.0
+    level = np.mean(means) / 1.5 - squared * np.mean(floors) if len(means) > 2 else 0.0
+    return ErrorSizes(float(np.sqrt(squared)), float(np.sqrt(max(level, 0.0))))

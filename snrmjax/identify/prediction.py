@@ -210,9 +210,7 @@ def _picard(backbone: Backbone, force: Array, start: Array, max_steps: int) -> t
     return solution.value, good
 
 
-def _resonance(
-    backbone: Backbone, modes: LinearModes, force: float, amplitude: float
-) -> Resonance:
+def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: float) -> Resonance:
     at = jnp.asarray(amplitude)
     frequency, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
     velocity = _velocity(backbone, modes, force, frequency, frequency, damping)

@@ -104,9 +104,9 @@ def follow_curve(
     """Follow a curve of solutions of R(x, λ) = 0 from `start` until λ leaves [lower, upper].
 
     Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
-    corrected at its own λ, or across `start_across`; `direction` says which way to go. A step is halved when Newton's
-    method fails or the tangent turns by more than three times `control.angle`, otherwise it is
-    chosen so that the next turn comes near `control.angle`.
+    corrected at its own λ, or across `start_across`; `direction` says which way to go. A step is
+    halved when Newton's method fails or the tangent turns by more than three times
+    `control.angle`, otherwise it is chosen so that the next turn comes near `control.angle`.
     The last point of a curve that left the range lies on its end.
     """
     size = start.shape[0]

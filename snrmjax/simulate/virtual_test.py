@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.measure.indicators import nnm_appropriation
 from snrmjax.measure.steady_states import SteadyStates, steady_states
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.forced_response import ResponseCurve, forced_response, solve_at_frequency
@@ -54,8 +53,8 @@ def phase_resonance_test(
     At every level the frequency is stepped along the stable response, from both ends of the
     range; states whose appropriation indicator (Eq. 20, of the fundamental) lies inside
     `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over the
-    sides that a test can reach. Where a stable branch ends at a fold, the test jumps to the
-    other branch, which is noted in `jumps`; no state beyond it is reached from that side.
+    sides that a test can reach. Where a stable branch ends, the test jumps to the next one,
+    which is noted in `jumps`; states between the two are not reached.
 
     Arguments: `forces` in N, frequencies in rad/s, `errors` 1σ, drawn from `seed`;
     `keep_harmonics` are recorded beside the fundamental.
@@ -69,27 +68,20 @@ def phase_resonance_test(
     curves = forced_response(
         model, forces, from_frequency, to_frequency, harmonic_order=harmonic_order
     )
-    j = model.modes.mode_of_interest
     levels, frequency, force, starts = [], [], [], []
     jumps: list[tuple[int, float]] = []
-    for number, curve in enumerate(curves):
+    for curve in curves:
         level = 1 + list(forces).index(curve.force)
-        reached = _reachable(curve)
-        jumps += [(level, f) for f in _branch_ends(curve)]
-        own = velocity_phasors(
-            jnp.asarray(curve.coefficients),
-            jnp.asarray(curve.frequency),
-            jnp.sign(model.modes.participation[j]) * jnp.eye(model.n_modes)[j : j + 1],
-        )[:, 1:2, :]
-        indicator = np.asarray(nnm_appropriation(jnp.swapaxes(own, 1, 2), (1,)))
-        phase = np.angle(np.asarray(own)[:, 0, 0])
+        reached, ends = _swept(curve)
+        jumps += [(level, f) for f in ends]
+        phase = _mode_phase(model, curve)
+        indicator = np.cos(phase) ** 2  # Eq. (20) of the fundamental
         for wanted in _wanted_phases(phase, indicator, reached, low, high, points_per_level):
             nearest = int(np.argmin(np.where(reached, np.abs(phase - wanted), np.inf)))
             levels.append(level)
             force.append(curve.force)
             frequency.append(_frequency_at(curve, phase, nearest, wanted))
             starts.append(curve.coefficients[nearest])
-        del number
     if not levels:
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
@@ -113,26 +105,38 @@ def phase_resonance_test(
     return VirtualTest(recorded, tuple(jumps), tuple(curves))
 
 
-def _reachable(curve: ResponseCurve) -> np.ndarray:
-    """Points that stepping the frequency from either end reaches before the first fold."""
-    stable = curve.stable
-    if stable.all():
-        return stable
-    first, last = int(np.argmin(stable)), len(stable) - int(np.argmin(stable[::-1]))
-    reached = np.zeros(len(stable), dtype=bool)
-    reached[:first] = True
-    reached[last:] = True
-    return reached & stable
+def _mode_phase(model: Structure, curve: ResponseCurve) -> np.ndarray:
+    """Phase of the velocity fundamental of the mode of interest, 0 at phase resonance."""
+    j = model.modes.mode_of_interest
+    cosine, sine = curve.coefficients[:, 1, j], curve.coefficients[:, 2, j]
+    return np.angle(1j * (cosine - 1j * sine) * np.sign(float(model.modes.participation[j])))
 
 
-def _branch_ends(curve: ResponseCurve) -> list[float]:
-    """Frequencies of the folds at which a stepped test jumps."""
-    if curve.stable.all() or not len(curve.stable):
-        return []
-    first = int(np.argmin(curve.stable))
-    last = len(curve.stable) - int(np.argmin(curve.stable[::-1]))
-    ends = [k for k in (first - 1, last) if 0 <= k < len(curve.stable)]
-    return [float(curve.frequency[k]) for k in ends]
+def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
+    """Points that stepping the frequency up and down visits, and where it jumps.
+
+    A sweep follows a stable branch until it ends, then goes on with the next stable points of
+    the same curve at that frequency or, beyond a window of period doubling, the next frequency.
+    """
+    n = len(curve.frequency)
+    visited = np.zeros(n, dtype=bool)
+    jumps: list[float] = []
+    for direction in (1, -1):
+        order = np.arange(n)[::direction]
+        frequency, stable = direction * curve.frequency[order], curve.stable[order]
+        stable_points = np.flatnonzero(stable)
+        k = int(stable_points[0]) if stable_points.size else n
+        while k < n:
+            visited[order[k]] = True
+            if k + 1 < n and stable[k + 1] and frequency[k + 1] > frequency[k]:
+                k += 1
+                continue
+            beyond = np.flatnonzero(stable[k + 1 :] & (frequency[k + 1 :] >= frequency[k]))
+            if not beyond.size:
+                break
+            jumps.append(float(curve.frequency[order[k]]))
+            k += 1 + int(beyond[0])
+    return visited, jumps
 
 
 def _wanted_phases(
@@ -196,9 +200,11 @@ def _with_errors(
     )
     factor = shared[:, None] * own
     exact = velocity[:, 1]
-    harmonics = np.stack(
-        [velocity[:, h] * factor for h in keep_harmonics], axis=2
-    ) if keep_harmonics else None
+    harmonics = (
+        np.stack([velocity[:, h] * factor for h in keep_harmonics], axis=2)
+        if keep_harmonics
+        else None
+    )
     if harmonics is not None:
         parts = normal(keys[5], 2, *harmonics.shape) / np.sqrt(2)
         harmonics = harmonics + errors.harmonic * (parts[0] + 1j * parts[1])

@@ -1,0 +1,439 @@
+"""Force from drive voltage: the equivalent force of low-level responses and its line."""
+
+import dataclasses
+from collections.abc import Callable
+from enum import IntEnum
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
+
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.modes import LinearModes, linear_response
+
+
+class ForceStatus(IntEnum):
+    """How the search for the equivalent force of one level ended."""
+
+    SUCCESSFUL = 0
+    TOO_FEW = 1  # fewer measured numbers than unknowns, or they do not determine the unknowns
+    NOT_CONVERGED = 2
+    NEGATIVE = 3  # the best force is negative: a sensor or the force is wired the other way round
+
+
+FORCE_MESSAGE: dict[ForceStatus, str] = {
+    ForceStatus.SUCCESSFUL: "found",
+    ForceStatus.TOO_FEW: "too few states to find the unknowns; adjust fewer, or measure more",
+    ForceStatus.NOT_CONVERGED: (
+        "the linear response does not fit; check the modes, or adjust the damping or phase too"
+    ),
+    ForceStatus.NEGATIVE: (
+        "the best force is negative; turn the sign of the sensor or of its mode shape, or adjust "
+        "the phase"
+    ),
+}
+
+ADJUSTABLE = ("natural_frequency", "damping_ratio", "phase")
+
+
+class EquivalentForce(eqx.Module):
+    """Force with which the linear structure answers as measured, one entry a level.
+
+    NaN where `status` is not `ForceStatus.SUCCESSFUL`. `force_covariance` contains, besides the
+    random errors, the error that all levels share because `damping_ratio_std` of the mode of
+    interest scales every force; `force_std` is its diagonal's root.
+    """
+
+    level: Int[Array, " level"]
+    drive: Float[Array, " level"]  # V
+    force: Float[Array, " level"]  # N
+    force_covariance: Float[Array, "level level"]  # N²
+    natural_frequency: Float[Array, " level"]  # rad/s, of the mode of interest
+    natural_frequency_std: Float[Array, " level"]  # rad/s, 0 where not adjusted
+    damping_ratio: Float[Array, " level"]
+    damping_ratio_std: Float[Array, " level"]  # 0 where not adjusted
+    phase: Float[Array, " level"]  # rad, by which the measured velocities lead the model's
+    phase_std: Float[Array, " level"]  # rad, 0 where not adjusted
+    misfit: Float[Array, " level"]  # rms residual: in stated σ, or in m/s where none is stated
+    status: Int[Array, " level"]
+
+    @property
+    def force_std(self) -> Float[Array, " level"]:
+        """1σ of the forces in N."""
+        return jnp.sqrt(jnp.diagonal(self.force_covariance))
+
+
+def equivalent_force(
+    data: SteadyStates,
+    modes: LinearModes,
+    *,
+    adjust: tuple[str, ...] = ("natural_frequency",),
+) -> EquivalentForce:
+    """Force magnitude of every level, from its measured low-amplitude response.
+
+    Minimises Σ |V_meas − F e^{iψ} H(Ω; ω_j, ζ_j)|² over F > 0 and what `adjust` names, H the
+    linear response to a unit force; weighted along and across V_meas with `velocity_std` and
+    `phase_std` where every measured velocity states both, else with equal weights and the noise
+    taken from the residual. By Levenberg–Marquardt, started from a scan of ω_j.
+
+    Arguments: `data`, whose `level` groups the states of equal `drive` (V); `modes`, the linear
+    model; `adjust`, any of "natural_frequency" (ω_j), "damping_ratio" (ζ_j), both of the mode of
+    interest, and "phase" (ψ, common to the level).
+    Returns `EquivalentForce`, with a status per level: see `FORCE_MESSAGE` for what to try.
+    Raises `ValueError` for an unknown name in `adjust`, a sensor that the model lacks, or a level
+    whose drives differ.
+    Validity: levels so low that the response is linear; the force is what the given mode shapes,
+    participations and (unless adjusted) damping make of the velocity.
+    Reference: Kwarta & Allen, section 4.1 and Eq. (23).
+    """
+    unknown = [name for name in adjust if name not in ADJUSTABLE]
+    if unknown:
+        raise ValueError(f"`adjust` must name some of {ADJUSTABLE}, but names {unknown[0]!r}.")
+    missing = [name for name in data.sensors if name not in modes.sensors]
+    if missing:
+        raise ValueError(
+            f"`data` has sensor {missing[0]!r}, but `modes` has only {', '.join(modes.sensors)}."
+        )
+    rows = np.asarray([modes.sensors.index(name) for name in data.sensors])
+    seen = dataclasses.replace(
+        modes,
+        mode_shape=modes.mode_shape[rows],
+        rigid_body_shape=modes.rigid_body_shape[rows],
+        sensors=data.sensors,
+    )
+    levels = np.unique(np.asarray(data.level))
+    members = np.asarray(data.level)[None, :] == levels[:, None]
+    drive = np.array([_common_drive(data, level) for level in levels])
+    stated = data.measured & (data.velocity_std > 0) & (data.phase_std > 0)
+    use_stated = bool(jnp.all(stated == data.measured))
+    best, std, covariance, misfit, status = _fit_levels(
+        seen, data, jnp.asarray(members), use_stated, tuple(n in adjust for n in ADJUSTABLE)
+    )
+    return EquivalentForce(
+        level=jnp.asarray(levels),
+        drive=jnp.asarray(drive),
+        force=best[:, 0],
+        force_covariance=covariance,
+        natural_frequency=best[:, 1],
+        natural_frequency_std=std[:, 1],
+        damping_ratio=best[:, 2],
+        damping_ratio_std=std[:, 2],
+        phase=best[:, 3],
+        phase_std=std[:, 3],
+        misfit=misfit,
+        status=status,
+    )
+
+
+def _common_drive(data: SteadyStates, level: int) -> float:
+    drive = np.asarray(data.drive)[np.asarray(data.level) == level]
+    if np.any(drive != drive[0]) and not np.all(np.isnan(drive)):
+        different = drive[np.argmax(drive != drive[0])]
+        raise ValueError(
+            f"`drive` must be the same for all states of a level, but level {level} has "
+            f"{drive[0]:g} V and {different:g} V."
+        )
+    return float(drive[0])
+
+
+@eqx.filter_jit
+def _fit_levels(
+    modes: LinearModes,
+    data: SteadyStates,
+    members: Bool[Array, "level state"],
+    use_stated: bool,
+    adjusted: tuple[bool, bool, bool],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Force, ω_j, ζ_j and ψ of every level, their std, the force covariance, misfit and status."""
+    best, std, shared, misfit, status = jax.vmap(
+        lambda member: _fit_level(modes, data, member, use_stated, adjusted)
+    )(members)
+    good = status == int(ForceStatus.SUCCESSFUL)
+    covariance = jnp.diag(std[:, 0] ** 2) + shared @ shared.T
+    covariance = jnp.where(good[:, None] & good, covariance, jnp.nan)
+
+    def masked(value: Array) -> Array:
+        return jnp.where(good[:, None], value, jnp.nan)
+
+    return masked(best), masked(std), covariance, jnp.where(good, misfit, jnp.nan), status
+
+
+def _fit_level(
+    modes: LinearModes,
+    data: SteadyStates,
+    member: Bool[Array, " state"],
+    use_stated: bool,
+    adjusted: tuple[bool, bool, bool],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The physical unknowns are (F, ω_j, ζ_j, ψ); the solver's are scaled to order one."""
+    j = modes.mode_of_interest
+    used = member[:, None] & data.measured
+    measured = jnp.where(used, data.velocity, 0.0)
+    size = jnp.sqrt(jnp.sum(jnp.abs(measured) ** 2) / jnp.maximum(jnp.sum(used), 1))
+    size = jnp.where(size > 0, size, 1.0)
+    direction = jnp.where(used & (jnp.abs(measured) > 0), measured, 1.0)
+    direction = direction / jnp.abs(direction)
+    along = jnp.where(used, data.velocity_std, 1.0) if use_stated else size
+    across = jnp.where(used, data.phase_std * jnp.abs(measured), 1.0) if use_stated else size
+
+    def response(physical: Float[Array, " 4"]) -> Complex[Array, "state sensor"]:
+        adapted = dataclasses.replace(
+            modes,
+            natural_frequency=modes.natural_frequency.at[j].set(physical[1]),
+            damping_ratio=modes.damping_ratio.at[j].set(physical[2]),
+        )
+        unit = linear_response(adapted, data.frequency, jnp.ones_like(data.frequency))
+        return physical[0] * jnp.exp(1j * physical[3]) * unit
+
+    def deviation(physical: Float[Array, " 4"]) -> Float[Array, " number"]:
+        error = jnp.where(used, (response(physical) - measured) / direction, 0.0)
+        return jnp.concatenate([(error.real / along).ravel(), (error.imag / across).ravel()])
+
+    free = np.array([True, *adjusted])
+    start = _scanned_start(modes, data.frequency, measured, used, member, adjusted, response)
+    scale = jnp.array([start[0], start[1] * start[2], start[2], 1.0])
+    scale = jnp.where(scale == 0, 1.0, scale)
+
+    def physical_of(unknown: Float[Array, " unknown"]) -> Float[Array, " 4"]:
+        return start.at[free].add(scale[free] * unknown)
+
+    solution: optx.Solution = optx.least_squares(
+        lambda unknown, _: deviation(physical_of(unknown)),
+        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8),
+        jnp.zeros(int(free.sum())),
+        max_steps=128,
+        throw=False,
+    )
+    best = physical_of(solution.value)
+    sensitivity = jax.jacfwd(deviation)(best) * scale
+    orthogonal, upper = jnp.linalg.qr(sensitivity[:, free])
+    inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
+    singular = jnp.linalg.svd(upper, compute_uv=False)
+    freedom = 2 * jnp.sum(used) - upper.shape[0]
+    squares = jnp.sum(deviation(best) ** 2)
+    misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
+    spread = jnp.linalg.norm(inverse, axis=1) * (1.0 if use_stated else misfit)
+    std = jnp.zeros(4).at[free].set(jnp.abs(scale[free]) * spread)
+    # What the stated errors of ω_j and ζ_j, where they are held, do to the force of every level.
+    held = jnp.where(
+        jnp.asarray(free[1:3]),
+        0.0,
+        jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]]),
+    )
+    shift = -(inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0]
+    shared = shift * scale[0] * held / scale[1:3]
+    lowest, highest = _range(data.frequency, member)
+    found = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(best))
+    found &= (best[1] > 0.5 * lowest) & (best[1] < 2 * highest) & (best[2] >= 0)
+    status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
+    status = jnp.where(found, status, int(ForceStatus.NOT_CONVERGED))
+    determined = (freedom >= 0) & (singular[-1] > 1e-9 * singular[0])
+    status = jnp.where(determined, status, int(ForceStatus.TOO_FEW))
+    return best, std, shared, misfit * (1.0 if use_stated else size), status
+
+
+def _scanned_start(
+    modes: LinearModes,
+    frequency: Float[Array, " state"],
+    measured: Complex[Array, "state sensor"],
+    used: Bool[Array, "state sensor"],
+    member: Bool[Array, " state"],
+    adjusted: tuple[bool, bool, bool],
+    response: Callable[[Float[Array, " 4"]], Complex[Array, "state sensor"]],
+) -> Float[Array, " 4"]:
+    """Best of a scan over ω_j (and ζ_j), each with the force that fits it, which is linear."""
+    natural = modes.natural_frequency[modes.mode_of_interest]
+    damping = modes.damping_ratio[modes.mode_of_interest]
+    frequencies = natural[None]
+    if adjusted[0]:
+        scanned = jnp.linspace(*_range(frequency, member), 128)
+        frequencies = jnp.concatenate([frequencies, scanned])
+    ratios = damping[None]
+    if adjusted[1]:
+        ratios = jnp.maximum(damping, 1e-4) * jnp.array([1.0, 0.2, 0.5, 2.0, 5.0])
+
+    def candidate(pair: Float[Array, " 2"]) -> tuple[Float[Array, ""], Float[Array, " 4"]]:
+        unit = jnp.where(used, response(jnp.array([1.0, pair[0], pair[1], 0.0])), 0.0)
+        force = jnp.sum(jnp.conj(unit) * measured) / jnp.sum(jnp.abs(unit) ** 2)
+        turn = jnp.angle(force) if adjusted[2] else jnp.array(0.0)
+        magnitude = jnp.abs(force) if adjusted[2] else force.real
+        left = jnp.sum(jnp.abs(magnitude * jnp.exp(1j * turn) * unit - measured) ** 2)
+        return left, jnp.stack([magnitude, pair[0], pair[1], turn])
+
+    grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
+    misfits, starts = jax.vmap(candidate)(grid)
+    return starts[jnp.argmin(jnp.where(jnp.isfinite(misfits), misfits, jnp.inf))]
+
+
+def _range(
+    frequency: Float[Array, " state"], member: Bool[Array, " state"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    return (
+        jnp.min(jnp.where(member, frequency, jnp.inf)),
+        jnp.max(jnp.where(member, frequency, -jnp.inf)),
+    )
+
+
+class ForceCalibration(eqx.Module):
+    """The line F = gain · drive + offset, and how well it is known."""
+
+    gain: Float[Array, ""]  # N/V
+    offset: Float[Array, ""]  # N
+    covariance: Float[Array, "2 2"]  # of gain and offset; NaN = unknown
+    residual_std: Float[Array, ""]  # N, scatter about the line, NaN with two points
+    misfit: Float[Array, ""]  # the same in stated σ, NaN where none is stated
+
+    def force(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Force in N at a drive in V."""
+        return self.gain * drive + self.offset
+
+    def force_std(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """1σ in N of the line at a drive in V, without the scatter about it."""
+        row = self._row(drive)
+        return jnp.sqrt(jnp.einsum("...i,ij,...j->...", row, self.covariance, row))
+
+    def force_covariance(self, drive: Float[Array, " state"]) -> Float[Array, "state state"]:
+        """Covariance in N² of the forces at several drives, which share the line's error."""
+        row = self._row(drive)
+        return row @ self.covariance @ row.T
+
+    def _row(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+        return jnp.stack([jnp.asarray(drive), jnp.ones_like(drive)], axis=-1)
+
+
+def calibrate_force(
+    drive: Shaped[np.ndarray | Array, " level"],
+    force: Shaped[np.ndarray | Array, " level"],
+    force_std: Shaped[np.ndarray | Array, " level"] | None = None,
+    *,
+    force_covariance: Shaped[np.ndarray | Array, "level level"] | None = None,
+) -> ForceCalibration:
+    """Straight line F = gain · V + offset through the forces of several drive voltages.
+
+    Generalised least squares with the stated errors; without any, equal weights and the variance
+    from the scatter about the line, Σ(F − gain · V − offset)² / (n − 2).
+
+    Arguments: `drive` in V; `force` in N; `force_std` its 1σ in N, independent, or in its place
+    `force_covariance` in N², which may hold errors that all levels share.
+    Returns `ForceCalibration`; with two points and no stated errors its covariance is NaN.
+    Raises `ValueError` for fewer than two different drives, numbers that are not finite, standard
+    deviations that are not positive, or a covariance that is not positive definite.
+    Reference: Kwarta & Allen, section 4.1, Figs. 15c and 15d.
+
+    >>> line = calibrate_force([0.01, 0.02, 0.03], [1.9138e-4, 4.6678e-4, 7.3752e-4])
+    >>> line.gain.round(6), line.offset.round(8)
+    (Array(0.027307, dtype=float64), Array(-8.091e-05, dtype=float64))
+    """
+    volts, newtons = jnp.asarray(drive, dtype=float), jnp.asarray(force, dtype=float)
+    if volts.ndim != 1 or newtons.shape != volts.shape:
+        raise ValueError(
+            f"`drive` and `force` must be vectors of one length, but have shapes {volts.shape} "
+            f"and {newtons.shape}."
+        )
+    n = volts.size
+    if force_std is not None and force_covariance is not None:
+        raise ValueError("`force_std` and `force_covariance` are both given; give one.")
+    stated = force_std is not None or force_covariance is not None
+    root = jnp.eye(n)
+    if force_std is not None:
+        std = jnp.asarray(force_std, dtype=float)
+        _require_finite("force_std", std, (n,), positive=True)
+        root = jnp.diag(std)
+    elif force_covariance is not None:
+        given = jnp.asarray(force_covariance, dtype=float)
+        _require_finite("force_covariance", given, (n, n))
+        root = jnp.linalg.cholesky(given)
+        if not isinstance(root, jax.core.Tracer) and not np.all(np.isfinite(root)):
+            raise ValueError("`force_covariance` must be positive definite, but is not.")
+    _require_finite("drive", volts, (n,))
+    _require_finite("force", newtons, (n,))
+    if n < 2 or (not isinstance(volts, jax.core.Tracer) and np.unique(volts).size < 2):
+        raise ValueError(
+            f"`drive` must contain two different voltages at least, but is {np.asarray(volts)}."
+        )
+    return _line(volts, newtons, root, stated)
+
+
+@eqx.filter_jit
+def _line(
+    drive: Float[Array, " level"],
+    force: Float[Array, " level"],
+    root: Float[Array, "level level"],
+    stated: bool,
+) -> ForceCalibration:
+    scale = jnp.array([jnp.max(jnp.abs(drive)), 1.0])
+    design = jnp.stack([drive / scale[0], jnp.ones_like(drive)], axis=1)
+    whitened = jax.scipy.linalg.solve_triangular(
+        root, jnp.column_stack([design, force]), lower=True
+    )
+    orthogonal, upper = jnp.linalg.qr(whitened[:, :2])
+    line = jax.scipy.linalg.solve_triangular(upper, orthogonal.T @ whitened[:, 2])
+    inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(2)) / scale[:, None]
+    freedom = drive.size - 2
+    residual = jnp.stack([force - design @ line, whitened[:, 2] - whitened[:, :2] @ line])
+    scatter, misfit = (
+        jnp.sqrt(jnp.sum(residual**2, axis=1) / freedom) if freedom else jnp.full(2, jnp.nan)
+    )
+    return ForceCalibration(
+        gain=line[0] / scale[0],
+        offset=line[1],
+        covariance=(inverse @ inverse.T) * (1.0 if stated else scatter**2),
+        residual_std=scatter,
+        misfit=misfit if stated else jnp.array(jnp.nan),
+    )
+
+
+def _require_finite(
+    name: str, value: Array, shape: tuple[int, ...], *, positive: bool = False
+) -> None:
+    if value.shape != shape:
+        raise ValueError(f"`{name}` must have shape {shape}, but has {value.shape}.")
+    if isinstance(value, jax.core.Tracer):
+        return
+    array = np.asarray(value)
+    bad = ~np.isfinite(array) | (positive & (array <= 0))
+    if bad.any():
+        index = tuple(int(k) for k in np.argwhere(bad)[0])
+        expected = "finite and positive" if positive else "finite"
+        raise ValueError(f"`{name}` must be {expected}, but entry {index} is {array[index]:g}.")
+
+
+def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> SteadyStates:
+    """Steady states with `force` and `force_std` filled in from `drive`.
+
+    F = gain · drive + offset with its standard deviation, that of the line alone, where a drive is
+    given; a state without one keeps its force. Because all states share the line, their force
+    errors are correlated: `ForceCalibration.force_covariance` has the whole of it.
+
+    Arguments: `data`; `calibration`, in N and V. Returns `SteadyStates`; `drive` is kept.
+    Raises `ValueError` when no state has a drive, or when the line gives a force that is not
+    positive (NaN when traced): such a drive lies below the range that the line can be used in.
+    Reference: Kwarta & Allen, section 4.1.
+
+    >>> from snrmjax.measure.steady_states import steady_states
+    >>> line = calibrate_force([0.01, 0.02, 0.03], [1.0, 2.0, 3.0])
+    >>> data = steady_states([1], [500.0], [np.nan], [0.1 + 0j], drive=[0.05])
+    >>> apply_calibration(data, line).force.round(9)
+    Array([5.], dtype=float64)
+    """
+    driven = jnp.isfinite(data.drive)
+    force = calibration.force(data.drive)
+    unusable = driven & ~(force > 0)
+    if not isinstance(force, jax.core.Tracer) and not isinstance(driven, jax.core.Tracer):
+        if not np.any(driven):
+            raise ValueError("`data` must have a drive voltage for a state at least, but has none.")
+        if np.any(unusable):
+            row = int(np.argmax(unusable))
+            raise ValueError(
+                f"`data` has drive {data.drive[row]:g} V in state {row}, for which the line gives "
+                f"{force[row]:g} N; a force must be positive."
+            )
+    force = jnp.where(unusable, jnp.nan, force)
+    return dataclasses.replace(
+        data,
+        force=jnp.where(driven, force, data.force),
+        force_std=jnp.where(driven, calibration.force_std(data.drive), data.force_std),
+    )

@@ -1,0 +1,112 @@
+"""Indicators that say how close a measured steady state is to a (non)linear resonance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.measure.signals import require_orders
+from snrmjax.measure.steady_states import SteadyStates
+
+
+def nnm_appropriation(
+    velocity_amplitudes: Complex[Array, "*batch sensor harmonic"] | Complex[Array, " harmonic"],
+    orders: tuple[int, ...],
+) -> Float[Array, "*batch"]:
+    """Nonlinear normal mode appropriation indicator: 1 when the motion is at its resonance.
+
+    Δ = (1/N) Σ_k Re{X_k}ᵀRe{X_k} / X_kᴴX_k, where the X_k are displacements relative to a sine
+    force. With velocities relative to a cosine force X_k = V_k e^{−ikπ/2}/(ikΩ), so that the part
+    which counts is Re V_k for odd k and Im V_k for even k; the frequency cancels. For the
+    fundamental of one sensor Δ is cos² of the velocity phase.
+
+    Arguments: `velocity_amplitudes` in m/s (any unit), one column a harmonic of `orders`; a vector
+    is taken as one sensor. NaN means not measured: such entries are left out, and so is a harmonic
+    that is exactly zero at every sensor, and harmonic 0, which has no phase.
+    Returns a number from 0 to 1; NaN when no harmonic counts.
+    Raises `ValueError` when `orders` does not fit.
+    Validity: every harmonic weighs the same, however small it is; harmonics that are only noise
+    pull Δ towards one half.
+    Reference: Kwarta & Allen, Eq. (20).
+
+    >>> nnm_appropriation(jnp.array([1.0 + 1.0j, 0.01j]), (1, 2)).round(12)
+    Array(0.75, dtype=float64)
+    """
+    amplitudes = jnp.asarray(velocity_amplitudes)
+    if amplitudes.ndim == 1:
+        amplitudes = amplitudes[None]
+    if amplitudes.ndim == 0 or amplitudes.shape[-1] != len(orders):
+        raise ValueError(
+            f"`velocity_amplitudes` must end in an axis of {len(orders)} harmonics, as many as "
+            f"`orders` {orders} names, but has shape {jnp.shape(velocity_amplitudes)}."
+        )
+    require_orders("orders", orders)
+    order = np.asarray(orders, dtype=int)
+    aligned, total = _aligned_and_total(amplitudes, np.asarray(order % 2 == 1))
+    counts = (total > 0) & (order > 0)
+    ratio = jnp.where(counts, aligned / jnp.where(counts, total, 1.0), 0.0)
+    n_counted = jnp.sum(counts, axis=-1)
+    return jnp.where(n_counted > 0, jnp.sum(ratio, axis=-1) / jnp.maximum(n_counted, 1), jnp.nan)
+
+
+def mode_indicator(velocity: Complex[Array, "*batch sensor"]) -> Float[Array, "*batch"]:
+    """Mode indicator of a single-harmonic response: 1 when all sensors are at phase resonance.
+
+    Δ = Re{X}ᵀRe{X} / XᴴX with displacements relative to a sine force, which is
+    Σ(Re V)² / Σ|V|² with velocities relative to a cosine force.
+
+    Arguments: `velocity` in m/s (any unit), one entry a sensor; NaN entries are left out.
+    Returns a number from 0 to 1; NaN when every sensor is zero or NaN.
+    Reference: Kwarta & Allen, Eq. (21).
+
+    >>> mode_indicator(jnp.array([3.0 + 4.0j])).round(12)
+    Array(0.36, dtype=float64)
+    """
+    aligned, total = _aligned_and_total(jnp.atleast_1d(velocity)[..., None], np.array([True]))
+    counts = total[..., 0] > 0
+    return jnp.where(counts, aligned[..., 0] / jnp.where(counts, total[..., 0], 1.0), jnp.nan)
+
+
+def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[Array, " state"]:
+    """Appropriation indicator of every measured state, from all harmonics it was measured with.
+
+    Eq. (20) over the fundamental (`velocity`) and the stored `harmonics`, without harmonic 0.
+
+    Arguments: `data`; `significance`: a higher harmonic counts when its rms over the sensors is
+    at least that many times their stated `harmonic_std` (harmonics without one always count).
+    Returns one number per state; NaN for a state that no sensor measured.
+    Reference: Kwarta & Allen, Eq. (20).
+
+    >>> from snrmjax.measure.steady_states import steady_states
+    >>> data = steady_states([1, 1], [500.0, 510.0], [1.0, 1.0], [0.6 + 0.0j, 0.5 - 0.5j])
+    >>> appropriation_of(data).round(12)
+    Array([1. , 0.5], dtype=float64)
+    """
+    higher = [k for k, order in enumerate(data.harmonic_order) if order > 1]
+    harmonics = data.harmonics[..., np.asarray(higher, dtype=int)]
+    usable = data.measured[..., None] & jnp.isfinite(harmonics)
+    floor = jnp.nan_to_num(data.harmonic_std)[..., None]
+    energy = jnp.sum(jnp.where(usable, jnp.abs(harmonics) ** 2, 0.0), axis=1, keepdims=True)
+    noise = jnp.sum(jnp.where(usable, floor**2, 0.0), axis=1, keepdims=True)
+    usable &= energy >= significance**2 * noise
+    amplitudes = jnp.concatenate(
+        [
+            jnp.where(data.measured, data.velocity, jnp.nan)[..., None],
+            jnp.where(usable, harmonics, jnp.nan),
+        ],
+        axis=-1,
+    )
+    return nnm_appropriation(amplitudes, (1, *(data.harmonic_order[k] for k in higher)))
+
+
+def _aligned_and_total(
+    amplitudes: Complex[Array, "*batch sensor harmonic"], odd: np.ndarray
+) -> tuple[Float[Array, "*batch harmonic"], Float[Array, "*batch harmonic"]]:
+    """Sums over the sensors of the squared part at resonance and of the squared magnitude."""
+    measured = jnp.isfinite(amplitudes)
+    values = jnp.where(measured, amplitudes, 0.0)
+    # Scaled, so that the squares of tiny amplitudes do not vanish.
+    largest = jnp.max(jnp.abs(values), axis=-2, keepdims=True, initial=0.0)
+    values = values / jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1.0))
+    part = jnp.where(odd, values.real, values.imag)
+    return jnp.sum(part**2, axis=-2), jnp.sum(values.real**2 + values.imag**2, axis=-2)

@@ -1,0 +1,630 @@
+"""Harmonics of measured time records: their fit, their synthesis and what is read off them."""
+
+import dataclasses
+from enum import IntEnum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
+
+from snrmjax.measure.steady_states import SteadyStates, steady_states
+
+
+class FitStatus(IntEnum):
+    """How the harmonic fit of one record ended."""
+
+    SUCCESSFUL = 0
+    NOT_FINITE = 1  # a sample or the frequency is NaN or infinite, or the frequency not positive
+    RANK_DEFICIENT = 2  # the samples cannot tell the harmonics apart
+    FREQUENCY_NOT_FOUND = 3  # the refined frequency is not held by the record
+
+
+FIT_MESSAGE: dict[FitStatus, str] = {
+    FitStatus.SUCCESSFUL: "fitted",
+    FitStatus.NOT_FINITE: (
+        "a sample is not finite, or the frequency is not finite and positive; remove such samples"
+    ),
+    FitStatus.RANK_DEFICIENT: (
+        "the samples cannot tell the harmonics apart; record longer (a period or more), sample "
+        "faster than twice the highest harmonic, or fit fewer harmonics"
+    ),
+    FitStatus.FREQUENCY_NOT_FOUND: (
+        "the record does not hold a frequency near the given one (within 2/duration in Hz and a "
+        "quarter of it); start closer, or record longer if the tone is lost in noise"
+    ),
+}
+
+
+class HarmonicFit(eqx.Module):
+    """Harmonics of a record, x(t) = Re Σ X_k e^{ikΩ(t − reference_time)}, and their errors.
+
+    `harmonic_order` starts with 0, the (real) mean. The covariance is that of the real parts of
+    all harmonics followed by their imaginary parts; it is NaN when no degree of freedom is left.
+    Everything but `condition` is NaN where `status` is not `FitStatus.SUCCESSFUL`.
+    """
+
+    amplitude: Complex[Array, "*batch harmonic"]  # unit of the record, peak
+    covariance: Float[Array, "*batch parameter parameter"]  # unit of the record, squared
+    frequency: Float[Array, "*batch"]  # rad/s, as given or refined
+    frequency_std: Float[Array, "*batch"]  # rad/s, NaN when the frequency was given
+    noise_std: Float[Array, "*batch"]  # unit of the record, from the residual, per sample
+    residual_rms: Float[Array, "*batch"]  # unit of the record
+    condition: Float[Array, "*batch"]  # largest over smallest singular value of the fit
+    reference_time: Float[Array, "*batch"]  # s
+    status: Int[Array, "*batch"]
+    degrees_of_freedom: int = eqx.field(static=True)
+    harmonic_order: tuple[int, ...] = eqx.field(static=True)
+
+    def harmonic(self, order: int) -> Complex[Array, "*batch"]:
+        """Amplitude of one harmonic, in the unit of the record."""
+        return self.amplitude[..., self._index(order)]
+
+    @property
+    def real_std(self) -> Float[Array, "*batch harmonic"]:
+        """1σ of the real parts, in the unit of the record."""
+        return jnp.sqrt(self._variance[..., : len(self.harmonic_order)])
+
+    @property
+    def imag_std(self) -> Float[Array, "*batch harmonic"]:
+        """1σ of the imaginary parts, in the unit of the record."""
+        return jnp.sqrt(self._variance[..., len(self.harmonic_order) :])
+
+    @property
+    def complex_std(self) -> Float[Array, "*batch harmonic"]:
+        """Root mean square of the complex errors, in the unit of the record."""
+        return jnp.hypot(self.real_std, self.imag_std)
+
+    @property
+    def amplitude_std(self) -> Float[Array, "*batch harmonic"]:
+        """1σ of the magnitudes, in the unit of the record; valid well above the noise."""
+        unit = self.amplitude / jnp.abs(self.amplitude)
+        return self._std_along(unit.real, unit.imag)
+
+    @property
+    def phase_std(self) -> Float[Array, "*batch harmonic"]:
+        """1σ of the phases in rad; valid well above the noise."""
+        unit = self.amplitude / jnp.abs(self.amplitude)
+        return self._std_along(-unit.imag, unit.real) / jnp.abs(self.amplitude)
+
+    @property
+    def _variance(self) -> Float[Array, "*batch parameter"]:
+        return jnp.diagonal(self.covariance, axis1=-2, axis2=-1)
+
+    def _std_along(self, real: Array, imag: Array) -> Float[Array, "*batch harmonic"]:
+        n = len(self.harmonic_order)
+        mixed = jnp.diagonal(self.covariance[..., :n, n:], axis1=-2, axis2=-1)
+        variance = real**2 * self._variance[..., :n] + imag**2 * self._variance[..., n:]
+        return jnp.sqrt(jnp.maximum(variance + 2 * real * imag * mixed, 0.0))
+
+    def _index(self, order: int) -> int:
+        if order not in self.harmonic_order:
+            raise ValueError(f"`order` must be one of {self.harmonic_order}, but is {order}.")
+        return self.harmonic_order.index(order)
+
+
+def fit_harmonics(
+    time: Shaped[np.ndarray | Array, " sample"],
+    signal: Shaped[np.ndarray | Array, "*batch sample"],
+    frequency: float | Float[Array, "*batch"],
+    harmonic_order: tuple[int, ...],
+    *,
+    refine_frequency: bool = False,
+    reference_time: float | Float[Array, ""] = 0.0,
+    max_condition: float = 1e6,
+) -> HarmonicFit:
+    """Least-squares fit of a mean and of harmonics to time records.
+
+    Minimises Σ_n [x(t_n) − Re Σ_k X_k e^{ikΩ(t_n − t_ref)}]² by QR, in centred time; with
+    `refine_frequency` over Ω too, by Levenberg–Marquardt with the X_k eliminated. The stated
+    covariance is that of least squares, with the noise taken from the residual.
+
+    Arguments: `time` in s, in any order and spacing; `signal` in any unit, one row a record;
+    `frequency` Ω in rad/s, one or one per record; `harmonic_order`, the mean is always fitted
+    and listed first as order 0; `reference_time` in s, where the phases count from;
+    `max_condition`, above which the harmonics are taken as not separable.
+    Returns `HarmonicFit`; `status` is RANK_DEFICIENT for too short or too coarse records,
+    FREQUENCY_NOT_FOUND when the refined frequency is farther off than 4π/duration or a quarter,
+    or its standard deviation exceeds 1/duration, NOT_FINITE for NaN; `FIT_MESSAGE` says what to
+    try.
+    Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
+    Validity: the standard deviations assume independent errors of equal size from sample to
+    sample; correlated noise (filters, oversampling) makes the true ones larger.
+    Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).
+
+    >>> time = np.linspace(0.0, 1.3, 50)
+    >>> fit = fit_harmonics(time, 2.0 + 3.0 * np.cos(9.0 * time), 9.0, (1,))
+    >>> fit.harmonic_order, fit.amplitude.real.round(9)
+    ((0, 1), Array([2., 3.], dtype=float64))
+    """
+    times, records = jnp.asarray(time, dtype=float), jnp.asarray(signal, dtype=float)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(f"`time` must be a vector of samples, but has shape {times.shape}.")
+    if records.ndim == 0 or records.shape[-1] != times.size:
+        raise ValueError(
+            f"`signal` must end in an axis of {times.size} samples, as many as `time` has, "
+            f"but has shape {records.shape}."
+        )
+    orders = _orders_with_mean(harmonic_order)
+    omega = jnp.asarray(frequency, dtype=float)
+    batch = records.shape[:-1]
+    if omega.shape not in ((), batch):
+        raise ValueError(f"`frequency` must have shape () or {batch}, but has {omega.shape}.")
+    if not isinstance(omega, jax.core.Tracer) and not np.all(np.asarray(omega) > 0):
+        raise ValueError(f"`frequency` must be positive, but is {frequency}.")
+    fit = _fit_records(
+        times,
+        records.reshape(-1, times.size),
+        omega.reshape(-1) if omega.ndim else omega,
+        jnp.asarray(reference_time, dtype=float),
+        jnp.asarray(max_condition, dtype=float),
+        orders,
+        refine_frequency,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(batch + leaf.shape[1:]), fit)
+
+
+@eqx.filter_jit
+def _fit_records(
+    time: Float[Array, " sample"],
+    records: Float[Array, "record sample"],
+    frequency: Float[Array, " record"] | Float[Array, ""],
+    reference_time: Float[Array, ""],
+    max_condition: Float[Array, ""],
+    orders: tuple[int, ...],
+    refine: bool,
+) -> HarmonicFit:
+    def one(record: Float[Array, " sample"], omega: Float[Array, ""]) -> HarmonicFit:
+        return _fit_one(time, record, omega, reference_time, max_condition, orders, refine)
+
+    # One frequency for all: the factorisation is then shared by all records.
+    return jax.vmap(one, in_axes=(0, None if frequency.ndim == 0 else 0))(records, frequency)
+
+
+def _fit_one(
+    time: Float[Array, " sample"],
+    record: Float[Array, " sample"],
+    frequency: Float[Array, ""],
+    reference_time: Float[Array, ""],
+    max_condition: Float[Array, ""],
+    orders: tuple[int, ...],
+    refine: bool,
+) -> HarmonicFit:
+    centre = jnp.mean(time)
+    # Centred: the frequency is then least correlated with the phases, and Ωt keeps its digits.
+    centred = time - centre
+    duration = jnp.max(time) - jnp.min(time)
+    finite = jnp.all(jnp.isfinite(record)) & jnp.all(jnp.isfinite(time))
+    finite &= jnp.isfinite(frequency) & (frequency > 0)
+    values = jnp.where(finite, record, 0.0)
+    omega, converged = frequency, jnp.array(True)
+    if refine:
+        # Two lobes of the record, but never so far that a harmonic is taken for the fundamental.
+        reach = jnp.minimum(4 * jnp.pi / duration, frequency / 4)
+        omega, converged = _refined_frequency(centred, values, frequency, reach, orders)
+    design = _design(centred, omega, orders)
+    upper, coefficients = _least_squares(design, values)
+    residual = values - design @ coefficients
+    unknown, scale = coefficients, jnp.ones(coefficients.shape)
+    if refine:
+        slope = jax.jvp(lambda w: _design(centred, w, orders) @ coefficients, (omega,), (1.0,))[1]
+        size = jnp.sqrt(jnp.mean((design[:, 1:] @ coefficients[1:]) ** 2)) * duration
+        size = jnp.where(size > 0, size, 1.0)
+        upper, _ = _least_squares(jnp.column_stack([design, slope / size]), values)
+        unknown, scale = jnp.append(coefficients, omega), jnp.append(scale, 1.0 / size)
+    singular = jnp.linalg.svd(jax.lax.stop_gradient(upper), compute_uv=False)
+    condition = jnp.where(singular[-1] > 0, singular[0] / singular[-1], jnp.inf)
+    freedom = record.size - unknown.size
+    squares = jnp.sum(residual**2)
+    noise_variance = squares / freedom if freedom > 0 else jnp.array(jnp.nan)
+    root = scale[:, None] * jax.scipy.linalg.solve_triangular(upper, jnp.eye(unknown.size))
+    frequency_std = jnp.array(jnp.nan)
+    if refine:
+        frequency_std = jnp.sqrt(noise_variance) * jnp.linalg.norm(root[-1])
+        # Written so that an unknown (NaN) standard deviation passes.
+        converged &= ~(frequency_std * duration > 1.0)
+
+    def parts(unknown: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
+        final = unknown[-1] if refine else omega
+        return _parts_at(unknown, final * (reference_time - centre), orders)
+
+    turned = jax.jacfwd(parts)(unknown) @ root
+    real, imag = jnp.split(parts(unknown), 2)
+    status = jnp.where(converged, int(FitStatus.SUCCESSFUL), int(FitStatus.FREQUENCY_NOT_FOUND))
+    separable = (condition <= max_condition) & (freedom >= 0)
+    status = jnp.where(separable, status, int(FitStatus.RANK_DEFICIENT))
+    status = jnp.where(finite, status, int(FitStatus.NOT_FINITE))
+    good = status == int(FitStatus.SUCCESSFUL)
+
+    def masked(value: Array) -> Array:
+        return jnp.where(good, value, jnp.nan)
+
+    return HarmonicFit(
+        amplitude=masked(jax.lax.complex(real, imag)),
+        covariance=masked(noise_variance * (turned @ turned.T)),
+        frequency=masked(omega),
+        frequency_std=masked(frequency_std),
+        noise_std=masked(jnp.sqrt(noise_variance)),
+        residual_rms=masked(jnp.sqrt(squares / record.size)),
+        condition=condition,
+        reference_time=reference_time,
+        status=status,
+        degrees_of_freedom=freedom,
+        harmonic_order=orders,
+    )
+
+
+def _design(
+    time: Float[Array, " sample"], frequency: Float[Array, ""], orders: tuple[int, ...]
+) -> Float[Array, "sample unknown"]:
+    """Columns 1, cos kΩt and −sin kΩt, whose coefficients are the mean, Re X_k and Im X_k."""
+    turn = jnp.exp(1j * frequency * time)
+    powers = jnp.stack([turn**order for order in orders[1:]], axis=1)
+    return jnp.concatenate([jnp.ones((time.size, 1)), powers.real, -powers.imag], axis=1)
+
+
+def _least_squares(
+    design: Float[Array, "sample unknown"], values: Float[Array, " sample"]
+) -> tuple[Float[Array, "unknown unknown"], Float[Array, " unknown"]]:
+    """Triangular factor and coefficients; with too few samples the factor is singular."""
+    missing = max(design.shape[1] - design.shape[0], 0)
+    orthogonal, upper = jnp.linalg.qr(jnp.pad(design, ((0, missing), (0, 0))))
+    projected = orthogonal.T @ jnp.pad(values, (0, missing))
+    return upper, jax.scipy.linalg.solve_triangular(upper, projected)
+
+
+def _refined_frequency(
+    time: Float[Array, " sample"],
+    values: Float[Array, " sample"],
+    frequency: Float[Array, ""],
+    reach: Float[Array, ""],
+    orders: tuple[int, ...],
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Frequency within `reach` that leaves the smallest residual, and whether it was found."""
+    size = jnp.linalg.norm(values - jnp.mean(values))
+    scaled = values / jnp.where(size > 0, size, 1.0)
+
+    def residual(shift: Float[Array, ""], _: None) -> Float[Array, " sample"]:
+        # Normal equations: the residual feels an error of the amplitudes in second order only.
+        design = _design(time, frequency + shift * reach, orders)
+        return scaled - design @ jnp.linalg.solve(design.T @ design, design.T @ scaled)
+
+    # The misfit has side lobes 2π/duration apart: start from the lowest of a scan.
+    shifts = jnp.linspace(-1.5, 1.5, 25)
+    misfits = jax.lax.map(lambda shift: jnp.sum(residual(shift, None) ** 2), shifts)
+    solution: optx.Solution = optx.least_squares(
+        residual,
+        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-9),
+        shifts[jnp.nanargmin(misfits)],
+        max_steps=64,
+        throw=False,
+    )
+    found = (solution.result == optx.RESULTS.successful) & (jnp.abs(solution.value) < 1)
+    return frequency + solution.value * reach, jnp.asarray(found)
+
+
+def _parts_at(
+    unknown: Float[Array, " unknown"], angle: Float[Array, ""], orders: tuple[int, ...]
+) -> Float[Array, " parameter"]:
+    """Real, then imaginary parts of the phasors, counted from `angle` of the fundamental on."""
+    n = len(orders)
+    real = unknown[:n]
+    imag = jnp.concatenate([jnp.zeros(1), unknown[n : 2 * n - 1]])
+    turn = angle * jnp.asarray(orders, dtype=float)
+    cosine, sine = jnp.cos(turn), jnp.sin(turn)
+    return jnp.concatenate([real * cosine - imag * sine, real * sine + imag * cosine])
+
+
+def phasor_relative_to_force(
+    response: Complex[Array, "*batch harmonic"],
+    force: Complex[Array, "*batch"],
+    orders: tuple[int, ...],
+) -> Complex[Array, "*batch harmonic"]:
+    """Move the origin of time so that the fundamental of the force is real and positive.
+
+    X_k e^{−ik arg F₁}: harmonic k turns k times as far as the fundamental.
+
+    Arguments: `response` in any unit, one column a harmonic of `orders`; `force` the phasor F₁ of
+    the force fundamental on the same time axis, in N. Returns the unit of `response`; NaN where
+    the force is zero. Raises `ValueError` when `orders` does not fit.
+    Reference: Kwarta & Allen, section 3.1, below Eq. (20).
+
+    >>> phasor_relative_to_force(jnp.array([1j, 1.0 + 0j]), jnp.array(2j), (1, 2)).real.round(12)
+    Array([ 1., -1.], dtype=float64)
+    """
+    amplitudes = _with_orders("response", response, orders)
+    forces = jnp.asarray(force)
+    phase = jnp.where(jnp.abs(forces) > 0, jnp.angle(forces), jnp.nan)
+    return amplitudes * jnp.exp(-1j * phase[..., None] * jnp.asarray(orders, dtype=float))
+
+
+def synthesise(
+    amplitudes: Complex[Array, "*batch harmonic"],
+    orders: tuple[int, ...],
+    frequency: float | Float[Array, ""],
+    time: Float[Array, " sample"],
+) -> Float[Array, "*batch sample"]:
+    """Signal of given harmonics, x(t) = Re Σ_k X_k e^{ikΩt}.
+
+    Arguments: `amplitudes` in any unit, one column a harmonic of `orders`; `frequency` Ω in rad/s;
+    `time` in s. Returns the unit of `amplitudes`. Raises `ValueError` when `orders` does not fit.
+
+    >>> synthesise(jnp.array([2.0, 1j]), (0, 1), 1.0, jnp.array([0.0, jnp.pi / 2])).round(12)
+    Array([2., 1.], dtype=float64)
+    """
+    values = _with_orders("amplitudes", amplitudes, orders)
+    angle = jnp.outer(jnp.asarray(orders, dtype=float), frequency * jnp.asarray(time))
+    return values.real @ jnp.cos(angle) - values.imag @ jnp.sin(angle)
+
+
+def peak_amplitude(
+    amplitudes: Complex[Array, "*batch harmonic"], orders: tuple[int, ...]
+) -> Float[Array, "*batch"]:
+    """Largest magnitude of a signal over one period, max_t |Re Σ_k X_k e^{ikΩt}|.
+
+    The largest of 32 samples per period of the highest harmonic, refined by Newton's method.
+
+    Arguments: `amplitudes` in any unit, one column a harmonic of `orders` (order 0 counts when it
+    is listed). Returns the unit of `amplitudes`. Raises `ValueError` when `orders` does not fit.
+    Validity: differentiable, twice, except where two peaks are equally high; there the gradient
+    is that of one of them.
+
+    >>> peak_amplitude(jnp.array([3.0 + 4.0j]), (1,)).round(12)
+    Array(5., dtype=float64)
+    """
+    values = _with_orders("amplitudes", amplitudes, orders)
+    order = jnp.asarray(orders, dtype=float)
+    n_samples = 32 * max(1, *orders)
+    spacing = 2 * jnp.pi / n_samples
+
+    def derivative(amplitude: Array, angle: Array, power: int) -> Array:
+        turned = amplitude * (1j * order) ** power * jnp.exp(1j * angle[..., None] * order)
+        return jnp.sum(turned.real, axis=-1)
+
+    def newton_step(amplitude: Array, angle: Array) -> Array:
+        curvature = derivative(amplitude, angle, 2)
+        flat = curvature == 0
+        step = derivative(amplitude, angle, 1) / jnp.where(flat, 1.0, curvature)
+        return jnp.where(flat, 0.0, jnp.clip(step, -spacing, spacing))
+
+    fixed = jax.lax.stop_gradient(values)
+    samples = synthesise(fixed, orders, 1.0, spacing * jnp.arange(n_samples))
+    start = spacing * jnp.argmax(jnp.abs(samples), axis=-1)
+    angle = start
+    for _ in range(6):
+        angle = jnp.clip(angle - newton_step(fixed, angle), start - spacing, start + spacing)
+    # Where the curve is too flat for Newton's method, the sample is the better peak.
+    found, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
+    angle = jnp.where(jnp.abs(found) >= jnp.abs(sampled), angle, start)
+    sign = jnp.where(sampled < 0, -1.0, 1.0)
+    # One more step, now differentiated: it carries how the peak moves into second derivatives.
+    return sign * derivative(values, angle - newton_step(values, angle), 0)
+
+
+class ForceVelocityLoop(NamedTuple):
+    """One closed period of force against velocity, and the power that flows in."""
+
+    phase: Float[Array, " point"]  # Ωt in rad, 0…2π
+    force: Float[Array, "*batch point"]  # N
+    velocity: Float[Array, "*batch point"]  # m/s
+    mean_power: Float[Array, "*batch"]  # W
+
+
+def force_velocity_loop(
+    force: float | Float[Array, "*batch"],
+    velocity_amplitudes: Complex[Array, "*batch harmonic"],
+    orders: tuple[int, ...],
+    n_points: int = 201,
+) -> ForceVelocityLoop:
+    """Lissajous figure of a force F cos Ωt and a velocity: a line at the phase resonance.
+
+    The mean power is P = ½ F Re V₁, the area of the force-displacement loop over the period.
+
+    Arguments: `force` F in N; `velocity_amplitudes` in m/s relative to the force, one column a
+    harmonic of `orders`, which must contain 1; `n_points`, the last repeats the first.
+    Returns `ForceVelocityLoop`. Raises `ValueError` when `orders` does not fit.
+    Reference: Kwarta & Allen, Fig. 2 and Eq. (5b).
+
+    >>> force_velocity_loop(2.0, jnp.array([0.5 + 0.1j]), (1,)).mean_power
+    Array(0.5, dtype=float64)
+    """
+    values = _with_orders("velocity_amplitudes", velocity_amplitudes, orders)
+    if 1 not in orders:
+        raise ValueError(f"`orders` must contain the fundamental, 1, but is {orders}.")
+    peak = jnp.asarray(force, dtype=float)
+    phase = jnp.linspace(0.0, 2 * jnp.pi, n_points)
+    return ForceVelocityLoop(
+        phase=phase,
+        force=peak[..., None] * jnp.cos(phase),
+        velocity=synthesise(values, orders, 1.0, phase),
+        mean_power=0.5 * peak * values[..., orders.index(1)].real,
+    )
+
+
+class RecordFit(eqx.Module):
+    """Harmonics of the force record and of the velocity records of one steady state.
+
+    The phases of both fits count from the mean time of the records, where a wrong clock turns
+    them least; the properties below count from the force fundamental.
+    """
+
+    force: HarmonicFit  # N
+    velocity: HarmonicFit  # m/s, one row a sensor
+
+    @property
+    def force_harmonics(self) -> Complex[Array, " harmonic"]:
+        """All harmonics of the force in N, relative to its fundamental (order 0 first)."""
+        fit = self.force
+        return phasor_relative_to_force(fit.amplitude, fit.harmonic(1), fit.harmonic_order)
+
+    @property
+    def velocity_harmonics(self) -> Complex[Array, "sensor harmonic"]:
+        """All harmonics of the velocities in m/s, relative to the force (order 0 first)."""
+        fit = self.velocity
+        return phasor_relative_to_force(fit.amplitude, self.force.harmonic(1), fit.harmonic_order)
+
+    @property
+    def force_distortion(self) -> Float[Array, ""]:
+        """Root sum square of the force's higher harmonics over its fundamental."""
+        higher = np.flatnonzero(np.asarray(self.force.harmonic_order) > 1)
+        return jnp.linalg.norm(self.force.amplitude[higher]) / jnp.abs(self.force.harmonic(1))
+
+
+def fit_records(
+    time: Shaped[np.ndarray | Array, " sample"],
+    force_record: Shaped[np.ndarray | Array, " sample"],
+    velocity_records: Shaped[np.ndarray | Array, "sensor sample"],
+    frequency: float | Float[Array, ""],
+    harmonic_order: tuple[int, ...],
+    *,
+    refine_frequency: bool = False,
+) -> RecordFit:
+    """Fit the harmonics of a force and of several velocities recorded together.
+
+    With `refine_frequency` every record is asked for the frequency and the answers are averaged
+    with the inverse of their variances; all records are then fitted with that frequency.
+
+    Arguments: `time` in s; `force_record` in N; `velocity_records` in m/s, one row a sensor (a
+    vector is one sensor); `frequency` in rad/s; `harmonic_order` must contain 1; the others as in
+    `fit_harmonics`. Returns `RecordFit`, with a status for each record as in `fit_harmonics`.
+    Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
+    Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).
+    """
+    times, force = jnp.asarray(time, dtype=float), jnp.asarray(force_record, dtype=float)
+    velocity = jnp.atleast_2d(jnp.asarray(velocity_records, dtype=float))
+    for name, record in (("force_record", force), ("velocity_records", velocity[0])):
+        if record.shape != times.shape:
+            raise ValueError(
+                f"`{name}` must have samples of shape {times.shape}, as `time` has, "
+                f"but has {record.shape}."
+            )
+    if 1 not in harmonic_order:
+        raise ValueError(
+            f"`harmonic_order` must contain the fundamental, 1, but is {harmonic_order}."
+        )
+    records, mean_time = jnp.concatenate([force[None], velocity]), jnp.mean(times)
+
+    def fitted(omega: float | Array, refine: bool) -> HarmonicFit:
+        return fit_harmonics(
+            times,
+            records,
+            omega,
+            harmonic_order,
+            refine_frequency=refine,
+            reference_time=mean_time,
+        )
+
+    fit = fitted(frequency, refine_frequency)
+    if refine_frequency:
+        good = fit.status == int(FitStatus.SUCCESSFUL)
+        # Rounding is the floor: without it a record free of noise would weigh infinitely.
+        variance = fit.frequency_std**2 + (1e-14 * fit.frequency) ** 2
+        weight = jnp.where(good, 1.0 / variance, 0.0)
+        mean = jnp.sum(jnp.where(good, weight * fit.frequency, 0.0)) / jnp.sum(weight)
+        found = jnp.any(good)
+        shared = fitted(jnp.where(found, mean, frequency), False)
+        failed = dataclasses.replace(fit, degrees_of_freedom=shared.degrees_of_freedom)
+        fit = jax.tree.map(lambda new, old: jnp.where(found, new, old), shared, failed)
+        std = jnp.where(found, 1.0 / jnp.sqrt(jnp.sum(weight)), jnp.nan)
+        fit = dataclasses.replace(fit, frequency_std=jnp.broadcast_to(std, good.shape))
+    return RecordFit(
+        jax.tree.map(lambda leaf: leaf[0], fit), jax.tree.map(lambda leaf: leaf[1:], fit)
+    )
+
+
+def steady_state_from_records(
+    time: Shaped[np.ndarray | Array, " sample"],
+    force_record: Shaped[np.ndarray | Array, " sample"],
+    velocity_records: Shaped[np.ndarray | Array, "sensor sample"],
+    frequency: float,
+    *,
+    level: int = 1,
+    harmonic_order: tuple[int, ...] = (1, 2, 3),
+    sensors: tuple[str, ...] | None = None,
+    refine_frequency: bool = False,
+) -> SteadyStates:
+    """One measured steady state, with its harmonics and standard deviations, from time records.
+
+    Arguments: as in `fit_records`, with the `level` the state belongs to and names of the
+    sensors; harmonic 0 is kept when `harmonic_order` lists it.
+    Returns `SteadyStates` with one state. `phase_std` contains the phase error of the force;
+    `harmonic_std` is the rms over the harmonics. A sensor whose fit failed has `measured` False.
+    Raises `ValueError` when the force or every velocity cannot be fitted, with the reason.
+    Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).
+
+    >>> time = np.linspace(0.0, 1.0, 200)
+    >>> force, velocity = np.cos(60 * time + 0.3), 0.2 * np.cos(60 * time + 0.4)
+    >>> data = steady_state_from_records(time, force, velocity, 60.0)
+    >>> data.force.round(9), jnp.angle(data.velocity).round(9)
+    (Array([1.], dtype=float64), Array([[0.1]], dtype=float64))
+    """
+    fit = fit_records(
+        time,
+        force_record,
+        velocity_records,
+        frequency,
+        harmonic_order,
+        refine_frequency=refine_frequency,
+    )
+    measured = np.asarray(fit.velocity.status == int(FitStatus.SUCCESSFUL))
+    for name, good, status in (
+        ("force_record", bool(fit.force.status == int(FitStatus.SUCCESSFUL)), fit.force.status),
+        ("velocity_records", bool(measured.any()), fit.velocity.status[0]),
+    ):
+        if not good:
+            raise ValueError(f"`{name}` cannot be fitted: {FIT_MESSAGE[FitStatus(int(status))]}.")
+    higher = tuple(order for order in harmonic_order if order != 1)
+    columns = np.asarray([fit.velocity.harmonic_order.index(order) for order in higher], dtype=int)
+    amplitudes = fit.velocity_harmonics
+    first = fit.velocity.harmonic_order.index(1)
+    complex_std = fit.velocity.complex_std[:, columns]
+    phase_std = jnp.hypot(fit.velocity.phase_std[:, first], fit.force.phase_std[first])
+    return steady_states(
+        np.array([level]),
+        np.asarray(fit.force.frequency)[None],
+        np.abs(np.asarray(fit.force.harmonic(1)))[None],
+        np.where(measured, amplitudes[:, first], 0.0)[None],
+        sensors=sensors or tuple(f"sensor {k + 1}" for k in range(measured.size)),
+        measured=measured[None],
+        velocity_std=np.asarray(fit.velocity.amplitude_std[:, first])[None],
+        phase_std=np.asarray(phase_std)[None],
+        force_std=np.asarray(fit.force.amplitude_std[first])[None],
+        harmonics=np.asarray(amplitudes[:, columns])[None] if higher else None,
+        harmonic_std=np.asarray(jnp.sqrt(jnp.mean(complex_std**2, axis=-1)))[None]
+        if higher
+        else None,
+        harmonic_order=higher,
+    )
+
+
+def _with_orders(
+    name: str, amplitudes: Complex[Array, "*batch harmonic"], orders: tuple[int, ...]
+) -> Complex[Array, "*batch harmonic"]:
+    values = jnp.asarray(amplitudes, dtype=complex)
+    if values.ndim == 0 or values.shape[-1] != len(orders) or not orders:
+        raise ValueError(
+            f"`{name}` must end in an axis of {len(orders)} harmonics, as many as `orders` "
+            f"{orders} names (one at least), but has shape {values.shape}."
+        )
+    require_orders("orders", orders)
+    return values
+
+
+def require_orders(name: str, orders: tuple[int, ...]) -> None:
+    """Refuse harmonic orders that are doubled, negative or not whole, with a `ValueError`."""
+    whole = all(isinstance(order, int | np.integer) and order >= 0 for order in orders)
+    if not whole or len(set(orders)) != len(orders):
+        raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {orders}.")
+
+
+def _orders_with_mean(harmonic_order: tuple[int, ...]) -> tuple[int, ...]:
+    require_orders("harmonic_order", harmonic_order)
+    positive = tuple(int(order) for order in harmonic_order if order > 0)
+    if not positive:
+        raise ValueError(
+            f"`harmonic_order` must contain a harmonic above 0, but is {harmonic_order}."
+        )
+    return (0, *positive)
