@@ -83,7 +83,7 @@ class TwoByTwo(lx.AbstractLinearSolver[Any]):
         return True
 
 
-_NEWTON = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=TwoByTwo())
+_NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=TwoByTwo())
 _ADJOINT = optx.ImplicitAdjoint(linear_solver=TwoByTwo())
 
 
@@ -244,10 +244,10 @@ def _newton(
         residual.imag / amplitude,
         scale,
     )
-    solution = optx.root_find(
+    solution: optx.Solution = optx.root_find(
         _equations, _NEWTON, start, args, max_steps=16, adjoint=_ADJOINT, throw=False
     )
-    good = solution.result == optx.RESULTS.successful
+    good = jnp.asarray(solution.result == optx.RESULTS.successful)
     return solution.value[0] * frequency, solution.value[1], good
 
 

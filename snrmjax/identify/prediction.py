@@ -57,7 +57,7 @@ def resonances(backbone: Backbone, modes: LinearModes, force: float) -> list[Res
     """
     _require_force(force)
     amplitude = _scan(backbone)
-    excess = np.asarray(_resonance_excess(backbone, amplitude, force))
+    excess = np.asarray(_resonance_excess(backbone, jnp.asarray(amplitude), jnp.asarray(force)))
     at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
     found = []
     for k in at:
@@ -117,11 +117,11 @@ def predict_response(
     """
     _require_force(force)
     scan = _scan(backbone)
-    load = abs(float(backbone.modal_constant)) * force
+    load = jnp.abs(backbone.modal_constant) * force
     inside = np.asarray(_branches(backbone, jnp.asarray(scan), load)[2]) >= 0
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     starts = [scan[0]] if inside[0] else []
-    ends = []
+    ends: list[float] = []
     for k in edges:
         low, high = scan[k], scan[k + 1]
         for _ in range(60):
@@ -177,7 +177,7 @@ def _newton_resonance(
     def equation(share: Array, _: None) -> Array:
         return _resonance_excess(backbone, share * high, force) / load
 
-    solution = optx.root_find(
+    solution: optx.Solution = optx.root_find(
         equation,
         optx.Newton(rtol=1e-12, atol=1e-12),
         jnp.asarray(start / high),
@@ -199,7 +199,7 @@ def _picard(backbone: Backbone, force: Array, start: Array, max_steps: int) -> t
             return velocity
         return velocity / backbone.natural_frequency(amplitude)
 
-    solution = optx.fixed_point(
+    solution: optx.Solution = optx.fixed_point(
         update,
         optx.FixedPointIteration(rtol=1e-10, atol=1e-14),
         start,
@@ -256,7 +256,7 @@ def _branches(backbone: Backbone, amplitude: Array, load: Array) -> tuple[Array,
     return middle - root, middle + root, margin
 
 
-def _margin(backbone: Backbone, amplitude: float, load: float) -> float:
+def _margin(backbone: Backbone, amplitude: float, load: Array) -> float:
     return float(_branches(backbone, jnp.asarray(amplitude), load)[2])
 
 
@@ -286,7 +286,7 @@ def _one_curve(
     *,
     closed: bool,
 ) -> PredictedResponse:
-    load = abs(float(backbone.modal_constant)) * force
+    load = jnp.abs(backbone.modal_constant) * force
     # Points crowd where both sides meet: there the frequency changes with a square root.
     angle = np.linspace(0.0, 1.0, points_per_side)
     share = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)

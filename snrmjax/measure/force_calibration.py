@@ -109,8 +109,9 @@ def equivalent_force(
     drive = np.array([_common_drive(data, level) for level in levels])
     stated = data.measured & (data.velocity_std > 0) & (data.phase_std > 0)
     use_stated = bool(jnp.all(stated == data.measured))
+    adjusted = ("natural_frequency" in adjust, "damping_ratio" in adjust, "phase" in adjust)
     best, std, covariance, misfit, status = _fit_levels(
-        seen, data, jnp.asarray(members), use_stated, tuple(n in adjust for n in ADJUSTABLE)
+        seen, data, jnp.asarray(members), use_stated, adjusted
     )
     return EquivalentForce(
         level=jnp.asarray(levels),

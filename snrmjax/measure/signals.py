@@ -290,14 +290,15 @@ def _refined_frequency(
     def residual(shift: Float[Array, ""], _: None) -> Float[Array, " sample"]:
         # Normal equations: the residual feels an error of the amplitudes in second order only.
         design = _design(time, frequency + shift * reach, orders)
-        return scaled - design @ jnp.linalg.solve(design.T @ design, design.T @ scaled)
+        factor = jax.scipy.linalg.cho_factor(design.T @ design)
+        return scaled - design @ jax.scipy.linalg.cho_solve(factor, design.T @ scaled)
 
     # The misfit has side lobes 2π/duration apart: start from the lowest of a scan.
     shifts = jnp.linspace(-1.5, 1.5, 25)
     misfits = jax.lax.map(lambda shift: jnp.sum(residual(shift, None) ** 2), shifts)
     solution: optx.Solution = optx.least_squares(
         residual,
-        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-9),
+        optx.GaussNewton(rtol=1e-8, atol=1e-9),
         shifts[jnp.nanargmin(misfits)],
         max_steps=64,
         throw=False,

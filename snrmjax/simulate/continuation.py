@@ -66,8 +66,7 @@ def correct(
     tangent (along `direction`), the iterations used and whether the last step was below
     `tolerance`.
     """
-    size = start.shape[0] - 1
-    last = jnp.zeros(size + 1).at[-1].set(1.0)
+    last = jnp.zeros(start.shape[0]).at[-1].set(1.0)
 
     def body(state: tuple) -> tuple:
         point, _, count, _, _ = state
@@ -141,7 +140,7 @@ def follow_curve(
         def to_end(_: None) -> tuple[Array, Array, Array]:
             share = (end - here[-1]) / (new[-1] - here[-1])
             on_end = (here + share * (new - here)).at[-1].set(end)
-            last, last_tangent, _, ok = correct(
+            last, last_tangent, _count, ok = correct(
                 linearised, on_end, at_lambda, control.tolerance, 5 * control.iterations
             )
             sign = jnp.where(last_tangent @ tangent < 0, -1.0, 1.0)
@@ -207,7 +206,7 @@ def locate_event(
     f_low, *_ = trial(low)
     f_high, *_ = trial(high)
 
-    def body(_: int, state: tuple) -> tuple:
+    def body(_step: int, state: tuple) -> tuple:
         low, high, f_low, f_high, side = state
         share = (low * f_high - high * f_low) / (f_high - f_low)
         share = jnp.where(jnp.isfinite(share), share, 0.5 * (low + high))

@@ -85,13 +85,13 @@ def forced_response(
         balance = harmonic_balance(
             model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
         )
-        ends = (from_frequency, to_frequency)
-        upward = _follow(balance, *ends, steps, max_points, downward=False)
+        ends = jnp.asarray([from_frequency, to_frequency])
+        upward = _follow(balance, ends, steps, max_points, downward=False)
         if int(upward.status) == CurveStatus.UPPER_END:
             curves.append(_assemble(balance, upward, float(force), steps))
             continue
         # Below a strong softening the lower end has several solutions; the upper end has one.
-        downward = _follow(balance, *ends, steps, max_points, downward=True)
+        downward = _follow(balance, ends, steps, max_points, downward=True)
         if int(downward.status) == CurveStatus.LOWER_END:
             curves.append(_assemble(balance, _reversed(downward), float(force), steps))
             continue
@@ -134,22 +134,21 @@ def _solve_batch(model: Structure, force: Array, frequency: Array, start: Array)
 @eqx.filter_jit
 def _follow(
     balance: HarmonicBalance,
-    from_frequency: Array,
-    to_frequency: Array,
+    ends: Array,
     steps: StepControl,
     max_points: int,
     downward: bool,
 ) -> Curve:
     model, order = balance.model, balance.harmonic_order
-    begin = jnp.where(downward, to_frequency, from_frequency)
+    begin = jnp.where(downward, ends[1], ends[0])
     start = balance.point(linear_coefficients(model, balance.force, begin, order), begin)
     direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
     return follow_curve(
         balance.linearised,
         start,
         direction,
-        from_frequency / balance.frequency_scale,
-        to_frequency / balance.frequency_scale,
+        ends[0] / balance.frequency_scale,
+        ends[1] / balance.frequency_scale,
         jnp.array(jnp.inf),
         steps,
         max_points,

@@ -70,8 +70,8 @@ class HarmonicBalance(eqx.Module):
         stiffness = modes.natural_frequency**2
         damping = 2 * modes.damping_ratio * modes.natural_frequency
         h2 = squared_orders(self.harmonic_order, cosine_only=self.cosine_only)[:, None]
-        samples = basis.synthesis @ x
-        rate = omega * (basis.synthesis @ basis.derivative) @ x
+        samples = jnp.asarray(basis.synthesis) @ x
+        rate = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
         slope = basis.derivative @ x
         load = jnp.zeros((size, n)).at[1].set(self.force * modes.participation)
         balance = (
@@ -85,7 +85,7 @@ class HarmonicBalance(eqx.Module):
         if not with_jacobian:
             return residual, jnp.zeros((0,))
         tangent = model.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
-        blocks = (basis.product @ tangent).reshape(size, size, n, n)
+        blocks = (jnp.asarray(basis.product) @ tangent).reshape(size, size, n, n)
         linear = (
             jnp.diag(jnp.ones(size))[:, :, None] * stiffness
             - jnp.diag(h2[:, 0])[:, :, None] * omega**2
@@ -111,8 +111,8 @@ class HarmonicBalance(eqx.Module):
 
 def harmonic_balance(
     model: Structure,
-    force: Float[Array, ""],
-    displacement_scale: Float[Array, ""],
+    force: Float[Array, ""] | float,
+    displacement_scale: Float[Array, ""] | float,
     *,
     harmonic_order: int,
     n_samples: int | None = None,

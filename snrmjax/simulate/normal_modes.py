@@ -66,16 +66,15 @@ def nonlinear_normal_mode(
     upward = to_frequency > omega
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
-    curve = _follow(balance, lower, upper, jnp.asarray(limit), steps, max_points)
+    ends = jnp.asarray([lower, upper, limit])
+    curve = _follow(balance, ends, steps, max_points)
     return _assemble(balance, curve)
 
 
 @eqx.filter_jit
 def _follow(
     balance: HarmonicBalance,
-    lower: Array,
-    upper: Array,
-    limit: Array,
+    ends: Array,
     steps: StepControl,
     max_points: int,
 ) -> Curve:
@@ -89,9 +88,9 @@ def _follow(
         balance.linearised,
         linear + 1e-3 * direction,
         direction,
-        lower / balance.frequency_scale,
-        upper / balance.frequency_scale,
-        limit,
+        ends[0] / balance.frequency_scale,
+        ends[1] / balance.frequency_scale,
+        ends[2],
         steps,
         max_points,
         start_across=direction,

@@ -1,0 +1,274 @@
+"""The commands: demo, simulate, nnm, identify."""
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import platformdirs
+import typer
+from rich.console import Console
+
+import snrmjax as sj
+from snrmjax import story
+from snrmjax.io import results
+from snrmjax.io.models import read_model, write_model
+from snrmjax.io.tables import read_steady_states, write_steady_states
+from snrmjax.io.units import HERTZ
+from snrmjax.plot import save_figure
+from snrmjax.report import write_report
+
+app = typer.Typer(
+    name="snrmjax",
+    help="Backbones and damping of nonlinear normal modes from near-resonant steady states.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+_console = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class Amplitude(StrEnum):
+    """At which amplitude an identified frequency and damping belong."""
+
+    displacement = "displacement"
+    velocity = "velocity"
+
+
+class Measure(StrEnum):
+    """Which amplitude of the measured motion enters the equations."""
+
+    fundamental = "fundamental"
+    peak = "peak"
+
+
+class Family(StrEnum):
+    """How a curve passes through its knots."""
+
+    spline = "spline"
+    piecewise_linear = "piecewise_linear"
+
+
+ModelFile = Annotated[Path, typer.Argument(help="Model of the structure (TOML).", metavar="MODEL")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made when missing.")]
+Harmonics = Annotated[int, typer.Option(help="Number of harmonics.", min=1, max=99)]
+
+
+@app.command()
+def demo(out: Out) -> None:
+    """Run the whole chain on the built-in flat beam: simulate, test, identify, predict.
+
+    Writes the model, the simulated responses, the normal mode, a virtual measurement with noise,
+    what `identify` makes of it, figures and report.html.
+    """
+    with _staged(out) as folder:
+        model = sj.flat_beam()
+        write_model(folder / "model.toml", model)
+        forces = sj.model.beams.FLAT_BEAM_FORCES
+        _say("simulating the forced responses of the flat beam")
+        curves = sj.forced_response(model, forces, 60 * HERTZ, 110 * HERTZ)
+        results.write_response(folder / "response.csv", model, curves)
+        _say("following its first nonlinear normal mode")
+        branch = sj.nonlinear_normal_mode(model, 105 * HERTZ)
+        results.write_normal_mode(folder / "nnm.csv", model, branch)
+        _say("testing it near resonance, with noise")
+        test = sj.phase_resonance_test(
+            model,
+            np.linspace(1.0e-3, 1.45e-2, 12).tolist(),
+            60 * HERTZ,
+            110 * HERTZ,
+            errors=sj.MeasurementErrors(amplitude=0.005, phase=np.radians(0.3), force=0.002),
+            seed=1,
+            keep_harmonics=(3, 5),
+        )
+        data = test.steady_states
+        write_steady_states(folder / "steady_states.csv", data)
+        _say("identifying backbone and damping, predicting responses")
+        telling = story.identification(data, model, forces, truth=branch, responses=curves)
+        _write_identification(folder, telling, "demo", {"model": model.name}, ())
+    _say(f"done: open {out / 'report.html'}")
+
+
+@app.command()
+def simulate(
+    model: ModelFile,
+    force: Annotated[list[float], typer.Option(help="Force amplitude in N; repeat for more.")],
+    from_hz: Annotated[float, typer.Option(help="Lowest frequency in Hz.")],
+    to_hz: Annotated[float, typer.Option(help="Highest frequency in Hz.")],
+    out: Out,
+    harmonics: Harmonics = 9,
+) -> None:
+    """Simulate forced responses by harmonic balance, unstable parts included.
+
+    Writes response.csv and response.png.
+    """
+    with _staged(out) as folder:
+        structure = read_model(model)
+        _report_equilibria(structure)
+        curves = []
+        for number, one in enumerate(force):
+            _say(f"force {one:g} N ({number + 1} of {len(force)})")
+            curves += sj.forced_response(
+                structure, [one], from_hz * HERTZ, to_hz * HERTZ, harmonic_order=harmonics
+            )
+        for curve in curves:
+            if curve.status != sj.CurveStatus.UPPER_END:
+                _warn(f"force {curve.force:g} N: {story.CURVE_MESSAGE[curve.status]}.")
+        if not any(len(curve.frequency) for curve in curves):
+            raise ValueError("no response was found in this range; start farther from resonance.")
+        results.write_response(folder / "response.csv", structure, curves)
+        save_figure(story.response_figure(structure, curves), folder / "response.png")
+
+
+@app.command()
+def nnm(
+    model: ModelFile,
+    to_hz: Annotated[float, typer.Option(help="Follow the mode to this frequency in Hz.")],
+    out: Out,
+    harmonics: Harmonics = 9,
+) -> None:
+    """Follow the nonlinear normal mode of interest from its linear frequency.
+
+    Writes nnm.csv and nnm.png.
+    """
+    with _staged(out) as folder:
+        structure = read_model(model)
+        _report_equilibria(structure)
+        branch = sj.nonlinear_normal_mode(structure, to_hz * HERTZ, harmonic_order=harmonics)
+        if branch.status not in (sj.CurveStatus.UPPER_END, sj.CurveStatus.LOWER_END):
+            _warn(f"the mode {story.CURVE_MESSAGE[branch.status]}.")
+        results.write_normal_mode(folder / "nnm.csv", structure, branch)
+        save_figure(story.normal_mode_figure(structure, branch), folder / "nnm.png")
+
+
+@app.command()
+def identify(
+    data: Annotated[Path, typer.Argument(help="Measured steady states (CSV).", metavar="DATA")],
+    model: Annotated[Path, typer.Option(help="Linear model of the structure (TOML).")],
+    out: Out,
+    predict_force: Annotated[
+        list[float] | None,
+        typer.Option(help="Predict the response to this force in N; repeat for more."),
+    ] = None,
+    amplitude: Annotated[
+        Amplitude,
+        typer.Option(help="Backbone against displacement (right for stiffness) or velocity."),
+    ] = Amplitude.displacement,
+    measure: Annotated[
+        Measure, typer.Option(help="Identify with the fundamental or with the peak amplitude.")
+    ] = Measure.fundamental,
+    curve: Annotated[Family, typer.Option(help="Family of the curves.")] = Family.spline,
+    knots: Annotated[
+        int | None, typer.Option(help="Number of knots; chosen by prediction if not given.", min=2)
+    ] = None,
+    anchor: Annotated[
+        bool, typer.Option("--anchor", help="Pin the curves at the linear mode at zero amplitude.")
+    ] = False,
+) -> None:
+    """Identify backbone and damping from measured steady states, and predict responses.
+
+    Writes points.csv, backbone.csv, summary.json, figures and report.html; with --predict-force
+    also prediction.csv.
+    """
+    with _staged(out) as folder:
+        structure = read_model(model)
+        reading = read_steady_states(data, sensors=structure.modes.sensors)
+        for note in reading.notes:
+            _warn(note)
+        telling = story.identification(
+            reading.steady_states,
+            structure,
+            predict_force or [],
+            amplitude=amplitude.value,
+            measure=measure.value,
+            family=curve.value,
+            n_knots=knots,
+            anchor=anchor,
+        )
+        for note in telling.identification.notes:
+            _warn(note)
+        described = {"data": data.name, "model": structure.name}
+        _write_identification(folder, telling, data.stem, described, reading.notes)
+
+
+def main() -> None:
+    """Run the commands; wrong input ends with exit code 2 and one sentence."""
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("snrmjax")
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    try:
+        app()
+    except ValueError as error:
+        _console.print(f"error: {error}", style="red", markup=False)
+        sys.exit(2)
+
+
+def _write_identification(
+    folder: Path,
+    telling: story.Identified,
+    title: str,
+    described: dict[str, str],
+    reader_notes: tuple[str, ...],
+) -> None:
+    identification = telling.identification
+    results.write_points(folder / "points.csv", identification)
+    results.write_backbone(folder / "backbone.csv", identification)
+    if telling.predictions:
+        responses = [r for prediction in telling.predictions for r in prediction.responses]
+        results.write_prediction(folder / "prediction.csv", responses)
+    pairs = [(p.force, p.resonances) for p in telling.predictions]
+    summary = {"program": "snrmjax", "version": version("snrmjax"), **described}
+    summary |= results.summarise(identification, pairs)
+    summary["notes"] = [*reader_notes, *telling.notes]
+    results.write_summary(folder / "summary.json", summary)
+    figures = story.figures(telling)
+    for name, figure in figures.items():
+        save_figure(figure, folder / f"{name}.png")
+    write_report(folder / "report.html", story.report(telling, title, summary, figures))
+
+
+def _report_equilibria(structure: sj.Structure) -> None:
+    for note in story.equilibria_notes(structure):
+        _warn(note)
+
+
+@contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """A folder to write into whose files move to `out` together, or not at all."""
+    out = Path(os.path.abspath(out))
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"--out {out} is a file, but a folder is expected.")
+    made = [p for p in (out, *out.parents) if not p.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=".snrmjax-", dir=out))
+    except OSError as error:
+        raise ValueError(f"--out {out} cannot be written: {error.strerror}.") from error
+    done = False
+    try:
+        yield staging
+        for file in sorted(staging.iterdir()):
+            os.replace(file, out / file.name)
+        done = True
+    finally:
+        shutil.rmtree(staging)
+        if not done:
+            for folder in made:
+                folder.rmdir()
+
+
+def _say(message: str) -> None:
+    _console.print(message, markup=False)
+
+
+def _warn(message: str) -> None:
+    _console.print(f"note: {message}", style="yellow", markup=False)
