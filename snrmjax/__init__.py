@@ -25,7 +25,7 @@ from snrmjax.identify.prediction import (
 )
 from snrmjax.identify.snrm import nonlinear_mode_velocity, snrm_velocity
 from snrmjax.measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.steady_states import SteadyStates, join_steady_states, steady_states
 from snrmjax.model.averaging import averaged_force, averaged_response
 from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
@@ -73,6 +73,7 @@ __all__ = [
     "identify_points",
     "invert_amplitude_phase",
     "invert_phasor",
+    "join_steady_states",
     "linear_modes",
     "linear_response",
     "make_effect",

@@ -22,7 +22,7 @@ from snrmjax.identify.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
 
 CurveFamily = Literal["spline", "piecewise_linear"]
-MOST_KNOTS = 24
+MOST_KNOTS = 60
 SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-8, 4))
 
 OFF_RESONANCE = 4.0
@@ -111,7 +111,7 @@ def fit_backbone(
     and phase, whose size the scatter gives. What the points of a level share is estimated and
     enters the bands.
 
-    Arguments: `n_knots` of each curve, by default up to 24, with a roughness penalty chosen
+    Arguments: `n_knots` of each curve, by default up to 60, with a roughness penalty chosen
     by how well left-out levels are predicted; `anchor` pins both curves at the linear mode at
     zero amplitude and reports how far this moves them.
     Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
@@ -191,7 +191,7 @@ def _fit_pair(
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
-        knots = place_knots(amplitude, n_knots or min(MOST_KNOTS, len(amplitude) // 2))
+        knots = place_knots(amplitude, level, n_knots or min(MOST_KNOTS, len(amplitude) // 2))
         if fixed is not None:
             knots = np.concatenate([[0.0], knots])
         slope = np.zeros(len(amplitude))

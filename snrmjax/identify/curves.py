@@ -116,21 +116,31 @@ def _slopes(curve: AbstractCurve, amplitude: Array) -> Float[Array, "point knot"
     return jax.jacfwd(at)(curve.values)
 
 
-def place_knots(amplitude: Float[np.ndarray, " point"], n_knots: int) -> Float[np.ndarray, " knot"]:
-    """Knots at quantiles of the amplitudes, the smallest and the largest included.
+def place_knots(
+    amplitude: Float[np.ndarray, " point"], level: np.ndarray, n_knots: int
+) -> Float[np.ndarray, " knot"]:
+    """At most `n_knots` amplitudes, spread as the points are, from the smallest to the largest.
 
-    Knots closer together than 5 % of their amplitude are thinned out: that is how well a test
-    holds a level, so that a test with controlled response gets one knot for every level.
+    A level that was held at one amplitude (within 15 % from end to end) gets one knot: what
+    varies inside it is not amplitude. Otherwise knots are at least 3 % apart.
     """
-    wanted = np.quantile(amplitude, np.linspace(0.0, 1.0, max(n_knots, 2)))
-    knots = [wanted[0]]
-    for knot in wanted[1:]:
-        if knot - knots[-1] >= 0.05 * knot:
-            knots.append(knot)
-    if len(knots) == 1 and wanted[-1] > wanted[0]:
-        knots.append(wanted[-1])
-    knots[-1] = wanted[-1] if len(knots) > 1 else knots[-1]
-    return np.asarray(knots)
+    candidates = []
+    for one in np.unique(level):
+        inside = amplitude[level == one]
+        held = len(inside) > 1 and inside.max() < 1.15 * inside.min()
+        candidates += [float(np.median(inside))] if held else inside.tolist()
+    ordered = np.sort(candidates)
+    apart = [ordered[0]]
+    for value in ordered[1:]:
+        if value >= 1.03 * apart[-1]:
+            apart.append(value)
+    pick = np.linspace(0, len(apart) - 1, min(max(n_knots, 2), len(apart)))
+    knots = np.asarray(apart)[np.unique(np.round(pick).astype(int))]
+    lowest, highest = amplitude.min(), amplitude.max()
+    if len(knots) == 1:
+        return np.array([lowest, highest]) if highest > lowest else knots
+    knots[0], knots[-1] = lowest, highest
+    return knots
 
 
 def fit_curve(
@@ -195,7 +205,7 @@ def fit_curve(
 class LeftOut(NamedTuple):
     """How well levels are predicted by the others."""
 
-    score: float  # mean squared error in units of std², infinity when nothing was predicted
+    score: float  # geometric mean over levels of error²/std², infinity when nothing was predicted
     sizes: ErrorSizes
 
 
@@ -228,7 +238,9 @@ def predict_left_out(
     if not errors:
         return LeftOut(np.inf, AS_STATED)
     pairs = zip(errors, spreads, strict=True)
-    score = float(np.mean([np.mean((error / spread) ** 2) for error, spread in pairs]))
+    squares = [np.mean((error / spread) ** 2) for error, spread in pairs]
+    # The geometric mean: a few levels that no curve predicts must not decide for all.
+    score = float(np.exp(np.mean(np.log(np.maximum(squares, 1e-30)))))
     return LeftOut(score, error_sizes(errors, spreads))
 
 

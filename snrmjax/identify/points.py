@@ -84,6 +84,8 @@ class TwoByTwo(lx.AbstractLinearSolver[Any]):
 
 
 _NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=TwoByTwo())
+_STEPS = 8  # from the closed form one step is enough, two where the two roots nearly meet
+_CHUNK = 1 << 14  # members that are solved at a time on a CPU: they stay in its cache
 _ADJOINT = optx.ImplicitAdjoint(linear_solver=TwoByTwo())
 
 
@@ -117,7 +119,7 @@ def invert_phasor(
     """ω̃ and ζ̃ of steady states measured in amplitude and phase at one sensor.
 
     Solves Eqs. (12) and (17) for every member by Newton's method (optimistix, vmapped), started
-    from the closed form, in x = ω̃/Ω and ζ̃. The phase of the nonlinear mode is that of
+    from the closed form, in (ω̃² − Ω²)/Ω² and 2ζ̃ω̃/Ω. The phase of the nonlinear mode is that of
     V − V_lin − V_RB; the amplitude of this difference tells which of two roots is meant, and
     the other one, which the amplitude |V| and the phase alone would allow too, is reported in
     `alternative_…`.
@@ -183,7 +185,7 @@ def invert_amplitude_phase(
     >>> p.natural_frequency, p.damping_ratio
     (Array([500.], dtype=float64), Array([0.01], dtype=float64))
     """
-    nan = jnp.full_like(amplitude, jnp.nan)
+    nan = jnp.full(jnp.shape(amplitude), jnp.nan)
     return _invert(
         modal_constant,
         frequency,
@@ -211,16 +213,15 @@ def _from_polar(
 
 
 def _equations(unknowns: Array, args: tuple) -> Array:
-    """Eq. (17) times cos φ, and Eq. (12) squared, both scaled to order one."""
-    x, damping = unknowns
-    cosine, sine, constant, w_real, w_imag, scale = args
-    real, imag = x * x - 1.0, 2.0 * damping * x
-    phase = (real * cosine - imag * sine) * scale
-    # |iA/(Ωv D) + W/v| = 1 with D = real + i imag, times |D|².
+    """Eq. (17) times cos φ, and Eq. (12) squared, both scaled so that no term exceeds one."""
+    real, imag = unknowns
+    cosine, sine, constant, w_real, w_imag, amplitude = args
+    phase = real * cosine - imag * sine
+    # |iA/(ΩD) + W| = v with D = (real + i imag), times |D|².
     top_real = w_real * real - w_imag * imag
     top_imag = constant + w_real * imag + w_imag * real
-    amplitude = top_real**2 + top_imag**2 - (real * real + imag * imag)
-    return jnp.stack([phase, amplitude * scale * scale])
+    balance = top_real**2 + top_imag**2 - amplitude**2 * (real * real + imag * imag)
+    return jnp.stack([phase, balance])
 
 
 def _newton(
@@ -233,22 +234,28 @@ def _newton(
     length: Array,
 ) -> tuple[Array, Array, Array]:
     """One member: the Newton solve from the closed form at |V_nl| = `length`."""
-    omega, damping = _from_polar(modal_constant, frequency, length, cosine, sine)
-    start = jax.lax.stop_gradient(jnp.stack([omega / frequency, damping]))
-    scale = jax.lax.stop_gradient(jnp.abs(frequency * length / modal_constant))
+    # The unknown is D = scale·((x² − 1) + 2iζ̃x), x = ω̃/Ω, of length one at the closed form: x
+    # itself would resolve a lightly damped resonance no finer than rounding of Ω allows.
+    # Units belong to the scaling, not to the equations: no derivative goes through them.
+    fixed = jax.lax.stop_gradient
+    start = fixed(jnp.sign(modal_constant) * jnp.stack([sine, cosine]))
+    unit = fixed(1.0 / (length + jnp.abs(residual)))
+    scale = fixed(jnp.abs(frequency * length / modal_constant))
     args = (
         cosine,
         sine,
-        modal_constant / (frequency * amplitude),
-        residual.real / amplitude,
-        residual.imag / amplitude,
-        scale,
+        modal_constant * unit * scale / frequency,
+        residual.real * unit,
+        residual.imag * unit,
+        amplitude * unit,
     )
     solution: optx.Solution = optx.root_find(
-        _equations, _NEWTON, start, args, max_steps=16, adjoint=_ADJOINT, throw=False
+        _equations, _NEWTON, start, args, max_steps=_STEPS, adjoint=_ADJOINT, throw=False
     )
     good = jnp.asarray(solution.result == optx.RESULTS.successful)
-    return solution.value[0] * frequency, solution.value[1], good
+    squared = 1.0 + solution.value[0] / scale
+    x = jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
+    return x * frequency, solution.value[1] / (2.0 * scale * x), good
 
 
 @jax.jit
@@ -261,12 +268,16 @@ def _invert(
     residual: Array,
     known_length: Array,
 ) -> SnrmPoints:
-    shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (modal_constant, frequency, amplitude)))
-    flat = [
-        jnp.broadcast_to(a, shape).reshape(-1)
-        for a in (modal_constant, frequency, amplitude, cosine, sine, residual, known_length)
-    ]
-    return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(*flat))
+    given = (modal_constant, frequency, amplitude, cosine, sine, residual, known_length)
+    shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in given))
+    flat = [jnp.broadcast_to(a, shape).reshape(-1) for a in given]
+    n = flat[0].shape[0]
+    if n <= _CHUNK or jax.default_backend() != "cpu":
+        return jax.tree.map(lambda a: a.reshape(shape), _invert_flat(*flat))
+    # A member that needs more steps then delays its own chunk only.
+    padded = [jnp.pad(a, (0, -n % _CHUNK)).reshape(-1, _CHUNK) for a in flat]
+    answers = jax.lax.map(lambda rows: _invert_flat(*rows), padded)
+    return jax.tree.map(lambda a: a.reshape(-1)[:n].reshape(shape), answers)
 
 
 def _invert_flat(

@@ -421,7 +421,9 @@ def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> Stea
     Array([5.], dtype=float64)
     """
     driven = jnp.isfinite(data.drive)
-    force = calibration.force(data.drive)
+    # Without NaN inside: it would pass `where` in a gradient.
+    drive = jnp.where(driven, data.drive, 0.0)
+    force = calibration.force(drive)
     unusable = driven & ~(force > 0)
     if not isinstance(force, jax.core.Tracer) and not isinstance(driven, jax.core.Tracer):
         if not np.any(driven):
@@ -436,5 +438,5 @@ def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> Stea
     return dataclasses.replace(
         data,
         force=jnp.where(driven, force, data.force),
-        force_std=jnp.where(driven, calibration.force_std(data.drive), data.force_std),
+        force_std=jnp.where(driven, calibration.force_std(drive), data.force_std),
     )

@@ -119,8 +119,8 @@ def fit_harmonics(
     """Least-squares fit of a mean and of harmonics to time records.
 
     Minimises Σ_n [x(t_n) − Re Σ_k X_k e^{ikΩ(t_n − t_ref)}]² by QR, in centred time; with
-    `refine_frequency` over Ω too, by Levenberg–Marquardt with the X_k eliminated. The stated
-    covariance is that of least squares, with the noise taken from the residual.
+    `refine_frequency` over Ω too, by a scan and Gauss–Newton steps with the X_k eliminated. The
+    stated covariance is that of least squares, with the noise taken from the residual.
 
     Arguments: `time` in s, in any order and spacing; `signal` in any unit, one row a record;
     `frequency` Ω in rad/s, one or one per record; `harmonic_order`, the mean is always fitted
@@ -128,8 +128,8 @@ def fit_harmonics(
     `max_condition`, above which the harmonics are taken as not separable.
     Returns `HarmonicFit`; `status` is RANK_DEFICIENT for too short or too coarse records,
     FREQUENCY_NOT_FOUND when the refined frequency is farther off than 4π/duration or a quarter,
-    or its standard deviation exceeds 1/duration, NOT_FINITE for NaN; `FIT_MESSAGE` says what to
-    try.
+    or the tone stands out by less than five standard deviations, NOT_FINITE for NaN;
+    `FIT_MESSAGE` says what to try.
     Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
     Validity: the standard deviations assume independent errors of equal size from sample to
     sample; correlated noise (filters, oversampling) makes the true ones larger.
@@ -149,29 +149,16 @@ def fit_harmonics(
             f"but has shape {records.shape}."
         )
     orders = _orders_with_mean(harmonic_order)
-    omega = jnp.asarray(frequency, dtype=float)
-    batch = records.shape[:-1]
-    if omega.shape not in ((), batch):
-        raise ValueError(f"`frequency` must have shape () or {batch}, but has {omega.shape}.")
-    if not isinstance(omega, jax.core.Tracer) and not np.all(np.asarray(omega) > 0):
-        raise ValueError(f"`frequency` must be positive, but is {frequency}.")
-    fit = _fit_records(
-        times,
-        records.reshape(-1, times.size),
-        omega.reshape(-1) if omega.ndim else omega,
-        jnp.asarray(reference_time, dtype=float),
-        jnp.asarray(max_condition, dtype=float),
-        orders,
-        refine_frequency,
-    )
-    return jax.tree.map(lambda leaf: leaf.reshape(batch + leaf.shape[1:]), fit)
+    omega = _checked_frequency(frequency, records.shape[:-1])
+    reference, limit = (jnp.asarray(x, dtype=float) for x in (reference_time, max_condition))
+    return _fit_batch(times, records, omega, reference, limit, orders, refine_frequency)
 
 
 @eqx.filter_jit
-def _fit_records(
+def _fit_batch(
     time: Float[Array, " sample"],
-    records: Float[Array, "record sample"],
-    frequency: Float[Array, " record"] | Float[Array, ""],
+    records: Float[Array, "*batch sample"],
+    frequency: Float[Array, "*batch"],
     reference_time: Float[Array, ""],
     max_condition: Float[Array, ""],
     orders: tuple[int, ...],
@@ -181,7 +168,11 @@ def _fit_records(
         return _fit_one(time, record, omega, reference_time, max_condition, orders, refine)
 
     # One frequency for all: the factorisation is then shared by all records.
-    return jax.vmap(one, in_axes=(0, None if frequency.ndim == 0 else 0))(records, frequency)
+    each = None if frequency.ndim == 0 else 0
+    fit = jax.vmap(one, in_axes=(0, each))(
+        records.reshape(-1, time.size), frequency if each is None else frequency.reshape(-1)
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(records.shape[:-1] + leaf.shape[1:]), fit)
 
 
 def _fit_one(
@@ -224,8 +215,10 @@ def _fit_one(
     frequency_std = jnp.array(jnp.nan)
     if refine:
         frequency_std = jnp.sqrt(noise_variance) * jnp.linalg.norm(root[-1])
-        # Written so that an unknown (NaN) standard deviation passes.
-        converged &= ~(frequency_std * duration > 1.0)
+        # Five standard deviations of a tone, and what noise puts into every harmonic. Written so
+        # that an unknown (NaN) noise passes.
+        explained = jnp.sum((values - jnp.mean(values)) ** 2) - squares
+        converged &= ~(explained < noise_variance * (25.0 + 4.0 * (len(orders) - 1)))
 
     def parts(unknown: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
         final = unknown[-1] if refine else omega
@@ -287,19 +280,22 @@ def _refined_frequency(
     size = jnp.linalg.norm(values - jnp.mean(values))
     scaled = values / jnp.where(size > 0, size, 1.0)
 
-    def residual(shift: Float[Array, ""], _: None) -> Float[Array, " sample"]:
+    def residual(shift: Float[Array, ""], record: tuple[Array, ...]) -> Float[Array, " sample"]:
         # Normal equations: the residual feels an error of the amplitudes in second order only.
-        design = _design(time, frequency + shift * reach, orders)
-        factor = jax.scipy.linalg.cho_factor(design.T @ design)
-        return scaled - design @ jax.scipy.linalg.cho_solve(factor, design.T @ scaled)
+        samples, centre, width = record
+        design = _design(time, centre + shift * width, orders)
+        return samples - design @ jnp.linalg.solve(design.T @ design, design.T @ samples)
 
     # The misfit has side lobes 2π/duration apart: start from the lowest of a scan.
+    record = (scaled, frequency, reach)
+    fixed = jax.lax.stop_gradient(record)
     shifts = jnp.linspace(-1.5, 1.5, 25)
-    misfits = jax.lax.map(lambda shift: jnp.sum(residual(shift, None) ** 2), shifts)
+    misfits = jax.lax.map(lambda shift: jnp.sum(residual(shift, fixed) ** 2), shifts)
     solution: optx.Solution = optx.least_squares(
         residual,
         optx.GaussNewton(rtol=1e-8, atol=1e-9),
         shifts[jnp.nanargmin(misfits)],
+        args=record,
         max_steps=64,
         throw=False,
     )
@@ -376,14 +372,20 @@ def peak_amplitude(
     >>> peak_amplitude(jnp.array([3.0 + 4.0j]), (1,)).round(12)
     Array(5., dtype=float64)
     """
-    values = _with_orders("amplitudes", amplitudes, orders)
+    return _peak(_with_orders("amplitudes", amplitudes, orders), orders)
+
+
+@eqx.filter_jit
+def _peak(
+    values: Complex[Array, "*batch harmonic"], orders: tuple[int, ...]
+) -> Float[Array, "*batch"]:
     order = jnp.asarray(orders, dtype=float)
     n_samples = 32 * max(1, *orders)
     spacing = 2 * jnp.pi / n_samples
 
     def derivative(amplitude: Array, angle: Array, power: int) -> Array:
         turned = amplitude * (1j * order) ** power * jnp.exp(1j * angle[..., None] * order)
-        return jnp.sum(turned.real, axis=-1)
+        return jnp.sum(turned, axis=-1).real
 
     def newton_step(amplitude: Array, angle: Array) -> Array:
         curvature = derivative(amplitude, angle, 2)
@@ -394,9 +396,12 @@ def peak_amplitude(
     fixed = jax.lax.stop_gradient(values)
     samples = synthesise(fixed, orders, 1.0, spacing * jnp.arange(n_samples))
     start = spacing * jnp.argmax(jnp.abs(samples), axis=-1)
-    angle = start
-    for _ in range(6):
-        angle = jnp.clip(angle - newton_step(fixed, angle), start - spacing, start + spacing)
+    angle = jax.lax.fori_loop(
+        0,
+        6,
+        lambda _, a: jnp.clip(a - newton_step(fixed, a), start - spacing, start + spacing),
+        start,
+    )
     # Where the curve is too flat for Newton's method, the sample is the better peak.
     found, sampled = derivative(fixed, angle, 0), derivative(fixed, start, 0)
     angle = jnp.where(jnp.abs(found) >= jnp.abs(sampled), angle, start)
@@ -506,31 +511,37 @@ def fit_records(
         raise ValueError(
             f"`harmonic_order` must contain the fundamental, 1, but is {harmonic_order}."
         )
-    records, mean_time = jnp.concatenate([force[None], velocity]), jnp.mean(times)
+    records = jnp.concatenate([force[None], velocity])
+    omega = _checked_frequency(frequency, ())
+    orders = _orders_with_mean(harmonic_order)
+    return _fit_together(times, records, omega, orders, refine_frequency)
 
-    def fitted(omega: float | Array, refine: bool) -> HarmonicFit:
-        return fit_harmonics(
-            times,
-            records,
-            omega,
-            harmonic_order,
-            refine_frequency=refine,
-            reference_time=mean_time,
-        )
 
-    fit = fitted(frequency, refine_frequency)
-    if refine_frequency:
-        good = fit.status == int(FitStatus.SUCCESSFUL)
-        # Rounding is the floor: without it a record free of noise would weigh infinitely.
-        variance = fit.frequency_std**2 + (1e-14 * fit.frequency) ** 2
-        weight = jnp.where(good, 1.0 / variance, 0.0)
-        mean = jnp.sum(jnp.where(good, weight * fit.frequency, 0.0)) / jnp.sum(weight)
+@eqx.filter_jit
+def _fit_together(
+    time: Float[Array, " sample"],
+    records: Float[Array, "record sample"],
+    frequency: Float[Array, ""],
+    orders: tuple[int, ...],
+    refine: bool,
+) -> RecordFit:
+    reference = jnp.mean(time)
+    std, found = jnp.array(jnp.nan), jnp.array(True)
+    if refine:
+        alone = fit_harmonics(time, records, frequency, orders, refine_frequency=True)
+        good = alone.status == int(FitStatus.SUCCESSFUL)
         found = jnp.any(good)
-        shared = fitted(jnp.where(found, mean, frequency), False)
-        failed = dataclasses.replace(fit, degrees_of_freedom=shared.degrees_of_freedom)
-        fit = jax.tree.map(lambda new, old: jnp.where(found, new, old), shared, failed)
-        std = jnp.where(found, 1.0 / jnp.sqrt(jnp.sum(weight)), jnp.nan)
-        fit = dataclasses.replace(fit, frequency_std=jnp.broadcast_to(std, good.shape))
+        # Rounding is the floor: without it a record free of noise would weigh infinitely.
+        variance = alone.frequency_std**2 + (1e-14 * alone.frequency) ** 2
+        weight = jnp.where(good, 1.0 / variance, 0.0)
+        mean = jnp.sum(jnp.where(good, weight * alone.frequency, 0.0)) / jnp.sum(weight)
+        frequency = jnp.where(found, mean, frequency)
+        std = 1.0 / jnp.sqrt(jnp.sum(weight))
+    fit = fit_harmonics(time, records, frequency, orders, reference_time=reference)
+    if refine:
+        lost = dataclasses.replace(alone, degrees_of_freedom=fit.degrees_of_freedom)
+        fit = jax.tree.map(lambda new, old: jnp.where(found, new, old), fit, lost)
+        fit = dataclasses.replace(fit, frequency_std=jnp.where(found, std, alone.frequency_std))
     return RecordFit(
         jax.tree.map(lambda leaf: leaf[0], fit), jax.tree.map(lambda leaf: leaf[1:], fit)
     )
@@ -570,35 +581,44 @@ def steady_state_from_records(
         harmonic_order,
         refine_frequency=refine_frequency,
     )
-    measured = np.asarray(fit.velocity.status == int(FitStatus.SUCCESSFUL))
+    measured = np.asarray(fit.velocity.status) == FitStatus.SUCCESSFUL
     for name, good, status in (
-        ("force_record", bool(fit.force.status == int(FitStatus.SUCCESSFUL)), fit.force.status),
-        ("velocity_records", bool(measured.any()), fit.velocity.status[0]),
+        ("force_record", fit.force.status == FitStatus.SUCCESSFUL, fit.force.status),
+        ("velocity_records", measured.any(), fit.velocity.status[0]),
     ):
         if not good:
             raise ValueError(f"`{name}` cannot be fitted: {FIT_MESSAGE[FitStatus(int(status))]}.")
     higher = tuple(order for order in harmonic_order if order != 1)
-    columns = np.asarray([fit.velocity.harmonic_order.index(order) for order in higher], dtype=int)
-    amplitudes = fit.velocity_harmonics
-    first = fit.velocity.harmonic_order.index(1)
-    complex_std = fit.velocity.complex_std[:, columns]
-    phase_std = jnp.hypot(fit.velocity.phase_std[:, first], fit.force.phase_std[first])
+    state = {name: np.asarray(value)[None] for name, value in _state_of(fit, higher).items()}
     return steady_states(
         np.array([level]),
-        np.asarray(fit.force.frequency)[None],
-        np.abs(np.asarray(fit.force.harmonic(1)))[None],
-        np.where(measured, amplitudes[:, first], 0.0)[None],
         sensors=sensors or tuple(f"sensor {k + 1}" for k in range(measured.size)),
         measured=measured[None],
-        velocity_std=np.asarray(fit.velocity.amplitude_std[:, first])[None],
-        phase_std=np.asarray(phase_std)[None],
-        force_std=np.asarray(fit.force.amplitude_std[first])[None],
-        harmonics=np.asarray(amplitudes[:, columns])[None] if higher else None,
-        harmonic_std=np.asarray(jnp.sqrt(jnp.mean(complex_std**2, axis=-1)))[None]
-        if higher
-        else None,
         harmonic_order=higher,
+        **state,
     )
+
+
+@eqx.filter_jit
+def _state_of(fit: RecordFit, higher: tuple[int, ...]) -> dict[str, Array]:
+    """What a steady state needs, by the names of the arguments of `steady_states`."""
+    orders = fit.velocity.harmonic_order
+    first = orders.index(1)
+    stored = np.asarray([orders.index(order) for order in higher], dtype=int)
+    amplitudes = fit.velocity_harmonics
+    good = fit.velocity.status == int(FitStatus.SUCCESSFUL)
+    noisy = [k for k in stored if orders[k] > 1] or list(stored)  # the mean has half an error
+    floor = jnp.mean(fit.velocity.complex_std[:, np.asarray(noisy, dtype=int)] ** 2, axis=-1)
+    return {
+        "frequency": fit.force.frequency,
+        "force": jnp.abs(fit.force.harmonic(1)),
+        "force_std": fit.force.amplitude_std[first],
+        "velocity": jnp.where(good, amplitudes[:, first], 0.0),
+        "velocity_std": fit.velocity.amplitude_std[:, first],
+        "phase_std": jnp.hypot(fit.velocity.phase_std[:, first], fit.force.phase_std[first]),
+        "harmonics": amplitudes[:, stored],
+        "harmonic_std": jnp.sqrt(floor),
+    }
 
 
 def _with_orders(
@@ -619,6 +639,18 @@ def require_orders(name: str, orders: tuple[int, ...]) -> None:
     whole = all(isinstance(order, int | np.integer) and order >= 0 for order in orders)
     if not whole or len(set(orders)) != len(orders):
         raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {orders}.")
+
+
+def _checked_frequency(
+    frequency: float | Float[Array, "*batch"], batch: tuple[int, ...]
+) -> Float[Array, "*batch"]:
+    omega = jnp.asarray(frequency, dtype=float)
+    if omega.shape not in ((), batch):
+        shapes = " or ".join(str(shape) for shape in dict.fromkeys(((), batch)))
+        raise ValueError(f"`frequency` must have shape {shapes}, but has {omega.shape}.")
+    if not isinstance(omega, jax.core.Tracer) and not np.all(np.asarray(omega) > 0):
+        raise ValueError(f"`frequency` must be positive, but is {frequency}.")
+    return omega
 
 
 def _orders_with_mean(harmonic_order: tuple[int, ...]) -> tuple[int, ...]:

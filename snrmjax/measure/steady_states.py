@@ -1,6 +1,7 @@
 """A table of measured steady states: the input of every identification."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
@@ -34,6 +35,10 @@ class SteadyStates(eqx.Module):
     def n_states(self) -> int:
         """Number of steady states."""
         return self.frequency.shape[0]
+
+    def renumbered(self, offset: int) -> "SteadyStates":
+        """The same states with `offset` added to their levels, before joining tests."""
+        return eqx.tree_at(lambda data: data.level, self, self.level + offset)
 
 
 def steady_states(
@@ -111,3 +116,24 @@ def steady_states(
         harmonic_order=tuple(harmonic_order),
         sensors=tuple(sensors),
     )
+
+
+def join_steady_states(*parts: SteadyStates) -> SteadyStates:
+    """All states of several tests of the same structure, in order.
+
+    Levels are kept as they are: give different tests different levels beforehand, since a level
+    stands for what its states share. Raises `ValueError` when sensors or recorded harmonics
+    differ.
+
+    >>> one = steady_states([1], [500.0], [1.0], [0.6 + 0.0j])
+    >>> join_steady_states(one, one).n_states
+    2
+    """
+    for part in parts[1:]:
+        if part.sensors != parts[0].sensors or part.harmonic_order != parts[0].harmonic_order:
+            raise ValueError(
+                "tests can be joined when they have the same sensors and harmonics, but one has "
+                f"{list(part.sensors)} and {list(part.harmonic_order)}, the first "
+                f"{list(parts[0].sensors)} and {list(parts[0].harmonic_order)}."
+            )
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)

@@ -1,7 +1,7 @@
 """The two numerical beams of the method paper, as reduced-order models.
 
 Reference: Kwarta & Allen, Tabs. 2, 4 and A.1. The potential of the flat beam holds the means of
-the redundant entries of Tab. A.1 (relative spread at most 4.3e-4) with its labels put right:
+the redundant entries of Tab. A.1 (relative spread at most 4.9e-4) with its labels put right:
 row β_ij multiplies q_i² q_j, and the last four rows are 123, 124, 134 and 234. Participations are
 those of a uniform force on every free node.
 """

@@ -59,6 +59,8 @@ def linear_modes(
     """
     frequency = _vector("natural_frequency", natural_frequency)
     n_modes = frequency.size
+    if n_modes == 0:
+        raise ValueError("`natural_frequency` must have at least one mode, but is empty.")
     damping = _vector("damping_ratio", damping_ratio, n_modes)
     shape = np.asarray(mode_shape, dtype=np.float64)
     if shape.ndim != 2 or shape.shape[1] != n_modes or shape.shape[0] == 0:
@@ -115,6 +117,7 @@ def linear_modes(
 
 def _vector(name: str, value: object, size: int | None = None) -> np.ndarray:
     vector = np.asarray(value, dtype=np.float64)
+    _require(name, vector.reshape(-1), np.isfinite(vector.reshape(-1)), "finite")
     if vector.ndim != 1 or (size is not None and vector.size != size):
         wanted = "a vector" if size is None else f"a vector of {size}"
         raise ValueError(f"`{name}` must be {wanted}, but has shape {vector.shape}.")

@@ -1,6 +1,7 @@
 """Polynomial restoring forces as the gradient of one potential."""
 
 import itertools
+import operator
 from collections.abc import Mapping
 from functools import lru_cache
 
@@ -63,19 +64,14 @@ def polynomial_potential(
     mode numbers counted from one ("1112" is q₁³q₂; with modes above 9, "1-1-12") or a tuple of
     indices counted from zero. `coefficient_std` gives 1σ for some of them.
     Raises `ValueError` for a monomial of degree below 2, of modes that do not exist, or given
-    twice in two orders.
+    twice in two orders, and for a coefficient that is not finite.
 
     >>> duffing = polynomial_potential({"1111": 0.25}, 1)
     >>> duffing.force(jnp.array([2.0]))
     Array([8.], dtype=float64)
     """
-    values: dict[Monomial, float] = {}
-    for key, value in coefficients.items():
-        monomial = parse_monomial(key, n_modes)
-        if monomial in values:
-            raise ValueError(f"monomial {key!r} is given twice (the order of modes is free).")
-        values[monomial] = float(value)
-    spread = {parse_monomial(k, n_modes): float(v) for k, v in (coefficient_std or {}).items()}
+    values = _by_monomial(coefficients, n_modes)
+    spread = _by_monomial(coefficient_std or {}, n_modes)
     unknown = set(spread) - set(values)
     if unknown:
         raise ValueError(f"`coefficient_std` names {sorted(unknown)}, which have no coefficient.")
@@ -88,6 +84,20 @@ def polynomial_potential(
     )
 
 
+def _by_monomial(
+    numbers: Mapping[str, float] | Mapping[Monomial, float], n_modes: int
+) -> dict[Monomial, float]:
+    values: dict[Monomial, float] = {}
+    for key, value in numbers.items():
+        monomial = parse_monomial(key, n_modes)
+        if monomial in values:
+            raise ValueError(f"monomial {key!r} is given twice (the order of modes is free).")
+        if not np.isfinite(value):
+            raise ValueError(f"the number of monomial {key!r} must be finite, but is {value}.")
+        values[monomial] = float(value)
+    return values
+
+
 def parse_monomial(key: str | Monomial, n_modes: int) -> Monomial:
     """The sorted, zero-based modes of a monomial written "1112", "1-1-12" or (0, 0, 0, 1)."""
     if isinstance(key, str):
@@ -96,7 +106,7 @@ def parse_monomial(key: str | Monomial, n_modes: int) -> Monomial:
             raise ValueError(f'monomial {key!r} must be mode numbers, such as "112" for q1^2 q2.')
         indices = [int(part) - 1 for part in parts]
     else:
-        indices = [int(index) for index in key]
+        indices = [operator.index(index) for index in key]
     if len(indices) < 2:
         raise ValueError(f"monomial {key!r} must have degree 2 or more.")
     if not all(0 <= index < n_modes for index in indices):
@@ -123,6 +133,8 @@ def potential_from_force_table(
     maps each potential monomial whose estimates disagree to their relative spread,
     (max − min)/max|estimate|; an estimate missing from the table counts as 0.
 
+    Raises `ValueError` for a monomial given twice, of degree below 2 or of modes that do not
+    exist, and for a row that is not one finite number for every mode.
     Reference: DESIGN of this package; reduced-order models from static load cases rarely come
     out exactly symmetric.
 
@@ -133,7 +145,15 @@ def potential_from_force_table(
     """
     table: dict[Monomial, np.ndarray] = {}
     for key, row in force_coefficients.items():
-        table[tuple(sorted(key))] = np.asarray(row, dtype=np.float64)
+        monomial, numbers = parse_monomial(key, n_modes), np.asarray(row, dtype=np.float64)
+        if monomial in table:
+            raise ValueError(f"force monomial {key!r} is given twice (the order is free).")
+        if numbers.shape != (n_modes,) or not np.all(np.isfinite(numbers)):
+            raise ValueError(
+                f"force monomial {key!r} must have a finite coefficient for each of the {n_modes} "
+                f"modes, but has {numbers}."
+            )
+        table[monomial] = numbers
     monomials = {tuple(sorted((*key, mode))) for key in table for mode in range(n_modes)}
     coefficients: dict[Monomial, float] = {}
     spread: dict[str, float] = {}

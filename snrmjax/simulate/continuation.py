@@ -107,7 +107,10 @@ def follow_curve(
     halved when Newton's method fails or the tangent turns by more than three times
     `control.angle`, otherwise it is chosen so that the next turn comes near `control.angle`.
     The last point of a curve that left the range lies on its end.
+    Raises `ValueError` when `max_points` is below 2.
     """
+    if max_points < 2:
+        raise ValueError(f"`max_points` must be 2 or more, but is {max_points}.")
     size = start.shape[0]
     at_lambda = jnp.zeros(size).at[-1].set(1.0)
     first, tangent, _, found = correct(

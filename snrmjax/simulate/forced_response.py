@@ -70,11 +70,12 @@ def forced_response(
     from the lower end does not reach the upper one, it is followed from the upper end instead,
     and when that does not reach the lower end either, both parts are returned, a part without a
     start being empty. Isolated branches and second wells are not searched for.
-    Raises `ValueError` for a force that is not positive and for an empty frequency range.
+    Raises `ValueError` for a force that is not positive and for an empty or endless frequency
+    range.
     """
-    if not 0 < from_frequency < to_frequency:
+    if not 0 < from_frequency < to_frequency < np.inf:
         raise ValueError(
-            "`from_frequency` must be positive and below `to_frequency`, but they are "
+            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
             f"{from_frequency:g} and {to_frequency:g} rad/s."
         )
     curves = []
@@ -121,7 +122,9 @@ def _solve_batch(model: Structure, force: Array, frequency: Array, start: Array)
     harmonic_order = (start.shape[1] - 1) // 2
 
     def one(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
-        scale = jnp.maximum(jnp.max(jnp.abs(start)), 1e-300)
+        # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
+        static = force * model.modes.participation / model.modes.natural_frequency**2
+        scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
         balance = harmonic_balance(model, force, scale, harmonic_order=harmonic_order)
         guess = balance.point(start, frequency)
         fixed = jnp.zeros_like(guess).at[-1].set(1.0)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.model.averaging import averaged_force
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.harmonics import alias_free_samples, harmonic_basis, squared_orders
 
@@ -122,10 +123,16 @@ def harmonic_balance(
 
     `n_samples` defaults to the alias-free number for a polynomial potential and to at least
     128 when there are effects, whose forces are not polynomial.
-    Raises `ValueError` when `harmonic_order` is below 1.
+    Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to tell the
+    harmonics apart.
     """
     if harmonic_order < 1:
         raise ValueError(f"`harmonic_order` must be 1 or more, but is {harmonic_order}.")
+    if n_samples is not None and n_samples <= 2 * harmonic_order:
+        raise ValueError(
+            f"`n_samples` must be above {2 * harmonic_order}, twice the harmonic order, "
+            f"but is {n_samples}."
+        )
     if n_samples is None:
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
         if model.effects:
@@ -160,19 +167,27 @@ def linear_coefficients(
 def resonance_displacement(model: Structure, force: float) -> float:
     """Rough displacement (kg^1/2 m) of the mode of interest at resonance: a scale, no result.
 
-    Solves 2ζω₀ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, by bisection.
+    Solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, and with the
+    averages of the effects. The damping counts as at least that of ζ = 5e-5, and the scale is
+    at least the static displacement of every mode, so that no motion is small beside it.
     """
     modes, j = model.modes, model.modes.mode_of_interest
     omega = float(modes.natural_frequency[j])
-    damping = max(2 * float(modes.damping_ratio[j]) * omega, 1e-9 * omega)
+    least_damping = 1e-4 * omega
+    damping = 2 * float(modes.damping_ratio[j]) * omega
     load = abs(force * float(modes.participation[j]))
     own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
     quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
-    low, high = 0.0, load / (damping * omega)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if damping * np.sqrt(omega**2 + quartic * middle**2) * middle < load:
-            low = middle
-        else:
-            high = middle
-    return high
+    static = np.max(np.abs(force * np.asarray(modes.participation / modes.natural_frequency**2)))
+    if load == 0:
+        return float(static)
+    amplitude = load / (max(damping, least_damping) * omega) * np.logspace(-9, 0, 361)
+    stiffness, viscous = omega**2 + quartic * amplitude**2, np.full(amplitude.shape, damping)
+    for effect in model.effects:
+        average = averaged_force(
+            effect.force, jnp.asarray(amplitude), jnp.asarray(omega), n_samples=128
+        )
+        stiffness = stiffness + np.maximum(average.stiffness, 0.0)
+        viscous = viscous + np.asarray(average.damping)
+    needed = np.maximum(viscous, least_damping) * np.sqrt(stiffness) * amplitude
+    return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))

@@ -105,7 +105,7 @@ def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
     full = _with_sines(coefficients)
     velocity = velocity_phasors(full, frequency, model.modes.mode_shape)
     at_rest = jnp.sum(coefficients, axis=1)  # q(0), where the velocity vanishes
-    energy = 0.5 * (at_rest**2 @ model.modes.natural_frequency**2) + model.potential.energy(at_rest)
+    energy = model.potential_energy(at_rest)
     return NormalModeBranch(
         frequency=np.asarray(frequency),
         coefficients=np.asarray(coefficients),
@@ -121,5 +121,6 @@ def _with_sines(
 ) -> Float[Array, "point coefficient mode"]:
     """Mean and cosines with zero sines in between."""
     pairs = jnp.stack([cosines[:, 1:], jnp.zeros_like(cosines[:, 1:])], axis=2)
-    flat = pairs.reshape(cosines.shape[0], -1, cosines.shape[2])
+    n_points, n_coefficients, n_modes = cosines.shape
+    flat = pairs.reshape(n_points, 2 * (n_coefficients - 1), n_modes)
     return jnp.concatenate([cosines[:, :1], flat], axis=1)

@@ -150,23 +150,23 @@ class TestFit:
     @pytest.mark.parametrize(
         "time",
         [
-            uneven_times(0.05, 200),  # too short
-            np.arange(200) * 2 * np.pi / OMEGA / 4,  # four samples a period: 3 looks like 1
+            uneven_times(0.05, 150),  # too short
+            np.arange(150) * 2 * np.pi / OMEGA / 4,  # four samples a period: 3 looks like 1
+            np.zeros(150),
             uneven_times(3.0, 6),  # fewer samples than unknowns
-            np.zeros(50),
         ],
-        ids=["short", "aliased", "few", "one instant"],
+        ids=["short", "aliased", "one instant", "few"],
     )
-    @pytest.mark.parametrize("refine", [False, True])
-    def test_inseparable_harmonics_are_refused(self, time, refine):
-        fit = fit_harmonics(time, signal(time), OMEGA, ORDERS, refine_frequency=refine)
-        assert fit.status == FitStatus.RANK_DEFICIENT
-        assert fit.condition > 1e6
-        for value in (fit.amplitude, fit.covariance, fit.residual_rms, fit.noise_std):
-            assert np.isnan(value).all()
+    def test_inseparable_harmonics_are_refused(self, time):
+        for refine in (False, True):
+            fit = fit_harmonics(time, signal(time), OMEGA, ORDERS, refine_frequency=refine)
+            assert fit.status == FitStatus.RANK_DEFICIENT
+            assert fit.condition > 1e6
+            for value in (fit.amplitude, fit.covariance, fit.residual_rms, fit.noise_std):
+                assert np.isnan(value).all()
 
     def test_a_bad_record_leaves_the_others_alone(self):
-        time = uneven_times(3.0, 80)
+        time = uneven_times(3.0, 120)
         records = np.stack([signal(time)] * 3)
         records[1, 7] = np.nan
         for refine in (False, True):
@@ -209,28 +209,27 @@ class TestFit:
         compiled(2.0 * signal(time))
         assert len(traces) == 1
 
-    def test_gradients_against_finite_differences(self):
-        time = uneven_times(2.3, 60)
-        values = signal(time) + 0.1 * np.random.default_rng(7).standard_normal(60)
+    @pytest.mark.parametrize("refine", [False, True])
+    def test_gradients_against_finite_differences(self, refine):
+        time = uneven_times(2.3, 150)
+        values = signal(time) + 0.1 * np.random.default_rng(7).standard_normal(150)
 
-        def quantity(y, omega, refine):
+        def quantity(y, omega):
             fit = fit_harmonics(time, y, omega, ORDERS, refine_frequency=refine)
             return jnp.abs(fit.amplitude[1]) + fit.amplitude[3].imag + 1e-3 * fit.frequency
 
-        direction = np.random.default_rng(8).standard_normal(60)
+        direction = np.random.default_rng(8).standard_normal(150)
+        slopes = jax.grad(quantity, argnums=(0, 1))(values, OMEGA)
         step = 1e-4
-        for refine in (False, True):
-            slope = jax.jvp(lambda y: quantity(y, OMEGA, refine), (values,), (direction,))[1]
-            gradient = jax.grad(lambda y: quantity(y, OMEGA, refine))(values)
-            ahead = quantity(values + step * direction, OMEGA, refine)
-            behind = quantity(values - step * direction, OMEGA, refine)
-            # Central differences: step² truncation, and 1e-9 solver error over the step.
-            np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-4)
-            np.testing.assert_allclose(gradient @ direction, slope, rtol=1e-7)
-        slope = jax.grad(lambda w: quantity(values, w, False))(OMEGA)
-        step = 1e-3
-        ahead, behind = (quantity(values, OMEGA + s, False) for s in (step, -step))
-        np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-6)  # truncation
+        ahead, behind = (quantity(values + s * direction, OMEGA) for s in (step, -step))
+        # Central differences: step² truncation, and the solver's 1e-9 over the step.
+        np.testing.assert_allclose(
+            slopes[0] @ direction, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-5
+        )
+        step = 1e-2
+        ahead, behind = (quantity(values, OMEGA + s) for s in (step, -step))
+        # A refined frequency does not depend on where the search starts.
+        np.testing.assert_allclose(slopes[1], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-6)
 
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -239,7 +238,7 @@ class TestFit:
             ({"signal": np.zeros(4)}, r"`signal` must end in an axis of 50 samples"),
             ({"frequency": -3.0}, r"`frequency` must be positive, but is -3.0"),
             ({"frequency": np.nan}, r"`frequency` must be positive"),
-            ({"frequency": np.ones(3)}, r"`frequency` must have shape \(\) or \(\)"),
+            ({"frequency": np.ones(3)}, r"`frequency` must have shape \(\), but has \(3,\)"),
             ({"harmonic_order": (1, 1)}, r"`harmonic_order` must be distinct whole numbers"),
             ({"harmonic_order": (1, -2)}, r"`harmonic_order` must be distinct whole numbers"),
             ({"harmonic_order": (1.5,)}, r"`harmonic_order` must be distinct whole numbers"),
@@ -259,47 +258,51 @@ class TestFit:
 
 
 class TestRefinedFrequency:
+    time = uneven_times(9.0, 150)
+    duration = time.max() - time.min()
+
     def test_agrees_with_scipy(self):
-        time = uneven_times(6.3, 150)
-        values = signal(time) + 0.05 * np.random.default_rng(9).standard_normal(150)
+        values = signal(self.time) + 0.05 * np.random.default_rng(9).standard_normal(150)
 
-        def model(t, mean, a1, a3, b1, b3, omega):
-            return signal(t, [mean, a1 + 1j * b1, 0.0, a3 + 1j * b3], omega)
+        def model(t, *x):
+            return signal(t, [x[0], x[1] + 1j * x[4], x[2] + 1j * x[5], x[3] + 1j * x[6]], x[7])
 
-        start = [0.3, 1.0, 0.0, -0.4, -0.08, OMEGA]
-        best, pcov = scipy.optimize.curve_fit(model, time, values, p0=start, xtol=1e-14)
-        fit = fit_harmonics(time, values, 1.01 * OMEGA, (1, 3), refine_frequency=True)
-        # Both stop when their steps are below 1e-8 of a lobe; scipy differentiates numerically.
-        np.testing.assert_allclose(fit.frequency, best[5], rtol=1e-8)
-        np.testing.assert_allclose(fit.frequency_std, np.sqrt(pcov[5, 5]), rtol=1e-5)
-        np.testing.assert_allclose(fit.amplitude[1:].real, best[1:3], atol=1e-6)
-        keep = [0, 1, 2, 4, 5]
-        np.testing.assert_allclose(
-            fit.covariance[np.ix_(keep, keep)], pcov[:5, :5], atol=1e-5 * pcov[:5, :5].max()
+        start = [0.3, 1.0, 0.0, 0.0, -0.4, 0.0, -0.08, OMEGA]
+        best, pcov = scipy.optimize.curve_fit(
+            model, self.time, values, p0=start, xtol=1e-14, ftol=1e-14, gtol=1e-14
         )
-        assert fit.degrees_of_freedom == 150 - 6
+        fit = fit_harmonics(self.time, values, 1.01 * OMEGA, ORDERS, refine_frequency=True)
+        # The solver's tolerance, 1e-8 of 4π/duration; scipy differentiates numerically (1e-8).
+        np.testing.assert_allclose(fit.frequency, best[7], rtol=1e-8)
+        np.testing.assert_allclose(fit.frequency_std, np.sqrt(pcov[7, 7]), rtol=1e-5)
+        np.testing.assert_allclose(fit.amplitude.real, best[:4], atol=1e-6)
+        np.testing.assert_allclose(fit.amplitude.imag[1:], best[4:7], atol=1e-6)
+        keep = [0, 1, 2, 3, 5, 6, 7]
+        np.testing.assert_allclose(
+            fit.covariance[np.ix_(keep, keep)], pcov[:7, :7], atol=1e-5 * pcov[:7, :7].max()
+        )
+        assert fit.degrees_of_freedom == 150 - 8
 
     @pytest.mark.parametrize("lobes", [-1.2, -0.5, -0.01, 0.3, 0.9, 1.2])
     def test_finds_the_tone_from_a_lobe_away(self, lobes):
-        time = uneven_times(9.0, 150)
-        duration = time.max() - time.min()
-        given_frequency = OMEGA + 2 * np.pi * lobes / duration
-        fit = fit_harmonics(time, signal(time), given_frequency, ORDERS, refine_frequency=True)
+        near = OMEGA + 2 * np.pi * lobes / self.duration
+        fit = fit_harmonics(self.time, signal(self.time), near, ORDERS, refine_frequency=True)
         assert fit.status == FitStatus.SUCCESSFUL
-        # The solver's tolerance, 1e-9 of 4π/duration, and convergence faster than linear.
-        np.testing.assert_allclose(fit.frequency, OMEGA, rtol=1e-9)
+        # The solver's tolerance, 1e-8 of 4π/duration = 0.2 Ω.
+        np.testing.assert_allclose(fit.frequency, OMEGA, rtol=2e-9)
 
     def test_says_when_there_is_no_tone(self):
-        time = uneven_times(20.0, 300)
-        duration = time.max() - time.min()
-        far = OMEGA + 2 * np.pi * 2.6 / duration
-        rng = np.random.default_rng(10)
-        records = np.stack([signal(time), rng.standard_normal(300), np.zeros(300)])
-        fit = fit_harmonics(time, records, far, (1,), refine_frequency=True)
-        expected = [FitStatus.FREQUENCY_NOT_FOUND] * 2 + [FitStatus.RANK_DEFICIENT]
-        assert fit.status.tolist() == expected
-        assert np.isnan(fit.frequency).all()
-        assert np.isnan(fit.amplitude).all()
+        far = OMEGA + 2 * np.pi * 2.6 / self.duration
+        noise = np.random.default_rng(10).standard_normal(150)
+        for values, expected in (
+            (signal(self.time), FitStatus.FREQUENCY_NOT_FOUND),
+            (noise, FitStatus.FREQUENCY_NOT_FOUND),
+            (np.zeros(150), FitStatus.RANK_DEFICIENT),
+        ):
+            fit = fit_harmonics(self.time, values, far, ORDERS, refine_frequency=True)
+            assert fit.status == expected
+            assert np.isnan(fit.frequency)
+            assert np.isnan(fit.amplitude).all()
 
     def test_stated_standard_deviations_cover(self):
         # The record starts three durations after the reference: the clock's error turns the phase.
@@ -319,9 +322,9 @@ class TestRefinedFrequency:
         np.testing.assert_allclose(z_spread(amplitude_z), 1.0, rtol=0.1)
         # Where the phase counts from the middle of the record, it is much better known.
         middle = fit_harmonics(
-            time, records[0], OMEGA, (1, 3), refine_frequency=True, reference_time=time.mean()
+            time, records, 1.002 * OMEGA, (1, 3), refine_frequency=True, reference_time=time.mean()
         )
-        assert middle.phase_std[1] < 0.2 * fit.phase_std[0, 1]
+        assert middle.phase_std[0, 1] < 0.2 * fit.phase_std[0, 1]
 
 
 class TestPhasors:
@@ -381,7 +384,9 @@ def brute_peak(amplitudes, orders):
     """Largest magnitude by scipy, bracketed by a fine grid."""
 
     def negative(angle):
-        return -abs(sum((x * np.exp(1j * k * angle)).real for k, x in zip(orders, amplitudes)))
+        return -abs(
+            sum((x * np.exp(1j * k * angle)).real for k, x in zip(orders, amplitudes, strict=True))
+        )
 
     grid = np.linspace(0, 2 * np.pi, 4001)
     best = grid[np.argmin([negative(angle) for angle in grid])]
@@ -452,7 +457,10 @@ class TestLoop:
         loop = force_velocity_loop(force, velocity, ORDERS, 1001)
         # Displacement over one period by its own integral; the area of the loop, over the period.
         displacement = [v / (1j * k * OMEGA) for k, v in zip(ORDERS, velocity, strict=True)]
-        x = sum((d * np.exp(1j * k * loop.phase)).real for k, d in zip(ORDERS, displacement))
+        x = sum(
+            (d * np.exp(1j * k * loop.phase)).real
+            for k, d in zip(ORDERS, displacement, strict=True)
+        )
         area = 0.5 * np.sum((loop.force[1:] + loop.force[:-1]) * np.diff(x))
         # The trapezoidal rule on a periodic curve, step 2π/1000: error of order (2π/1000)².
         np.testing.assert_allclose(area * OMEGA / (2 * np.pi), loop.mean_power, rtol=1e-4)
@@ -542,32 +550,36 @@ class TestRecords:
     def test_stated_standard_deviations_cover(self):
         n = 400
         force, velocity = noisy_records(self.time, np.random.default_rng(12), n)
-        fits = jax.vmap(
-            lambda f, v: fit_records(self.time, f, v, 1.002 * OMEGA, ORDERS, refine_frequency=True)
-        )(force, velocity)
-        assert not fits.velocity.status.any()
-        frequency_z = (fits.force.frequency - OMEGA) / fits.force.frequency_std
-        # 400 scores: 3.5 % sampling error; with sensor 2 weak, the shared clock is the others'.
-        np.testing.assert_allclose(z_spread(frequency_z), 1.0, rtol=0.1)
         states = [
             steady_state_from_records(self.time, f, v, OMEGA)
-            for f, v in zip(force[:100], velocity[:100], strict=True)
+            for f, v in zip(force, velocity, strict=True)
         ]
-        velocities = np.concatenate([s.velocity for s in states])
+
+        def gathered(name):
+            return np.concatenate([getattr(state, name) for state in states])
+
         exact = self.relative(VELOCITY)
-        scores = {
-            "force": np.array([(s.force[0] - 2.0) / s.force_std[0] for s in states]),
-            "velocity": (np.abs(velocities) - np.abs(exact[:, 1]))
-            / np.concatenate([s.velocity_std for s in states]),
-            "phase": np.angle(velocities / exact[:, 1])
-            / np.concatenate([s.phase_std for s in states]),
-            "harmonics": np.sqrt(2)
-            * (np.concatenate([s.harmonics for s in states]) - exact[:, 2:]).real
-            / np.concatenate([s.harmonic_std for s in states])[..., None],
-        }
-        for score in scores.values():
-            # 100 states: the spread scatters by 7 %, hence 20 %.
-            np.testing.assert_allclose(z_spread(score), 1.0, rtol=0.2)
+        velocity_error = gathered("velocity") / exact[:, 1]
+        harmonic_error = np.sqrt(2) * (gathered("harmonics") - exact[:, 2:])
+        for score in (
+            (gathered("force") - 2.0) / gathered("force_std"),
+            (np.abs(velocity_error) - 1) * np.abs(exact[:, 1]) / gathered("velocity_std"),
+            np.angle(velocity_error) / gathered("phase_std"),
+            harmonic_error.real / gathered("harmonic_std")[..., None],
+            harmonic_error.imag / gathered("harmonic_std")[..., None],
+        ):
+            # 400 scores scatter by 3.5 %; the largest of the 15 spreads here stays below 10 %.
+            np.testing.assert_allclose(z_spread(score), 1.0, rtol=0.1)
+
+    def test_shared_frequency_covers(self):
+        force, velocity = noisy_records(self.time, np.random.default_rng(16), 200)
+        fits = [
+            fit_records(self.time, f, v, 1.002 * OMEGA, ORDERS, refine_frequency=True).force
+            for f, v in zip(force, velocity, strict=True)
+        ]
+        scores = [float((fit.frequency - OMEGA) / fit.frequency_std) for fit in fits]
+        # 200 scores scatter by 5 %.
+        np.testing.assert_allclose(z_spread(scores), 1.0, rtol=0.15)
 
     def test_shared_frequency_is_better_than_its_parts(self):
         force, velocity = noisy_records(self.time, np.random.default_rng(13), 1)
@@ -607,7 +619,8 @@ class TestRecords:
             steady_state_from_records(self.time, force, np.nan * velocity, OMEGA)
         with pytest.raises(ValueError, match=r"record longer"):
             steady_state_from_records(1e-3 * self.time, force, velocity, OMEGA)
-        fit = fit_records(self.time, force, velocity, 1.6 * OMEGA, (1,), refine_frequency=True)
+        noise = np.random.default_rng(17).standard_normal((3, 120))
+        fit = fit_records(self.time, noise[0], noise[1:], OMEGA, ORDERS, refine_frequency=True)
         assert fit.force.status == FitStatus.FREQUENCY_NOT_FOUND
         assert np.isnan(fit.force.frequency_std)
         assert np.isnan(fit.velocity.amplitude).all()

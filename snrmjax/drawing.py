@@ -1,0 +1,165 @@
+"""The marks, colours, panels and legends that all figures share.
+
+Everything is set on the figures themselves: matplotlib's settings stay as they are.
+"""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, MultipleLocator
+
+MEASURED, IDENTIFIED, SIMULATED, EXCLUDED = "#0072B2", "#D55E00", "black", "0.55"
+SERIES = (IDENTIFIED, MEASURED, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Colours that colour-blind readers can tell apart (Okabe & Ito)."""
+
+CROWD = 120
+"""From this number of points on they are drawn small."""
+
+Style = dict[str, Any]
+DOT: Style = {"linestyle": "none", "marker": "o", "markersize": 5.5, "color": MEASURED}
+DOT |= {"markeredgecolor": "white", "markeredgewidth": 0.5}
+STAR: Style = {**DOT, "marker": "*", "markersize": 11.0, "color": IDENTIFIED}
+CROSS: Style = {**DOT, "marker": "x", "markeredgecolor": EXCLUDED, "markeredgewidth": 1.5}
+HOLLOW: Style = {**DOT, "color": "white", "markeredgecolor": "black", "markersize": 7.0}
+HOLLOW |= {"markeredgewidth": 1.2, "zorder": 5, "clip_on": False}
+FILL: Style = {"alpha": 0.22, "linewidth": 0}
+
+
+class Unit(NamedTuple):
+    """A unit by its name and its size in the SI unit."""
+
+    size: float
+    name: str
+
+
+def unit_for(values: Any, base: str) -> Unit:
+    """The unit in which values read well, with a prefix when they are small.
+
+    >>> unit_for([0.02, 0.05], "m/s")
+    Unit(size=0.001, name='mm/s')
+    """
+    largest = np.nanmax(np.abs(np.asarray(values)), initial=0.0)
+    for size, prefix in ((1.0, ""), (1e-3, "m")):
+        if largest >= 0.1 * size or largest == 0:
+            return Unit(size, prefix + base)
+    return Unit(1e-6, "µ" + base)
+
+
+def with_unit(value: float, base: str) -> str:
+    """A value to four digits with its unit.
+
+    >>> with_unit(2.669e-3, "N")
+    '2.669 mN'
+    """
+    unit = unit_for(value, base)
+    return f"{value / unit.size:.4g} {unit.name}"
+
+
+def plain(text: str) -> str:
+    """A user's text as a label: no mathematics in it, and not hidden from legends."""
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    """A figure, width and height in inches, and its panels as an array of rows."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.tick_params(labelsize=10.5)
+        axes.grid(color="0.9", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+    return figure, grid
+
+
+def name_axes(axes: Axes, title: str, x: str, y: str) -> None:
+    """Title and axis labels."""
+    axes.set_title(title, loc="left", fontsize=11.5)
+    axes.set_xlabel(x, fontsize=11.5)
+    axes.set_ylabel(y, fontsize=11.5)
+
+
+def limits(values: Iterable[float]) -> tuple[float, float]:
+    """Ends of an axis on which all finite values lie, with a margin."""
+    finite = np.asarray([float(value) for value in values if np.isfinite(value)])
+    margin = 0.06 * max(np.ptp(finite), 1e-3 * np.max(np.abs(finite)))
+    return finite.min() - margin, finite.max() + margin
+
+
+def phase_axis(axes: Axes) -> None:
+    """A vertical axis of phases in degrees: from -100 to 100 at least, ticks every 45."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, -100.0), max(high, 100.0))
+    axes.yaxis.set_major_locator(MultipleLocator(45.0))
+
+
+def marks(axes: Axes, x: Any, y: Any, style: Style, name: str | None = None) -> None:
+    """Markers, if there are any; without a point nothing enters the legend."""
+    if np.size(x):
+        axes.plot(x, y, **style, label=name)
+
+
+def stars(axes: Axes, x: Any, y: Any, name: str | None = None, **bars: Any) -> None:
+    """Identified points with their error bars, small and without edges when they are many."""
+    crowded = {"markersize": 5.0, "markeredgewidth": 0.0} if len(x) > CROWD else {}
+    axes.errorbar(x, y, **bars, fmt="none", ecolor=IDENTIFIED, elinewidth=0.9, alpha=0.4)
+    marks(axes, x, y, {**STAR, **crowded, "zorder": 3}, name)
+
+
+def response_line(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    stable: np.ndarray,
+    name: str,
+    colour: Any,
+    width: float,
+    beyond: np.ndarray | None = None,
+) -> None:
+    """A response curve in pieces: unstable ones dashed and thin, ones `beyond` the data pale."""
+    axes.plot([], [], color=colour, linewidth=width, label=name)  # for the legend
+    pale = np.zeros(len(x), dtype=bool) if beyond is None else beyond
+    starts = [0, *(np.flatnonzero(np.diff(2 * pale.astype(int) + stable)) + 1)]
+    for start, stop in zip(starts, [*starts[1:], len(x) - 1], strict=True):
+        piece = slice(start, stop + 1)  # up to the next piece's first point: no gaps
+        axes.plot(
+            x[piece],
+            y[piece],
+            "-" if stable[start] else "--",
+            color=colour,
+            linewidth=width * (1.0 if stable[start] else 0.6),
+            alpha=0.4 if pale[start] else 1.0,
+        )
+
+
+def explain_lines(figure: Figure) -> None:
+    """Name dashed and pale lines in the legend to come, if there are any."""
+    lines = [line for axes in figure.axes for line in axes.lines]
+    style: Style = {"color": "0.3", "linewidth": 1.1}
+    if any(line.get_linestyle() == "--" for line in lines):
+        figure.axes[-1].plot([], [], "--", **style, label="unstable")
+    if any((line.get_alpha() or 1.0) < 1.0 for line in lines):
+        figure.axes[-1].plot([], [], **style, alpha=0.4, label="beyond the data")
+
+
+def legend(figure: Figure) -> None:
+    """One legend below all panels, each name once, to be read row by row."""
+    found: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(name, handle)
+    columns = max(1, min(len(found), int(figure.get_figwidth() / 1.9)))
+    order = [k for first in range(columns) for k in range(first, len(found), columns)]
+    names = [list(found)[k] for k in order]
+    figure.legend(
+        [found[name] for name in names],
+        names,
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=10.5,
+        frameon=False,
+    )

@@ -1,0 +1,150 @@
+"""The arrows of the house: who imports whom, and what no numerical module may touch."""
+
+import ast
+import itertools
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "snrmjax"
+
+# What each room may import beside itself. Whatever is not here stands on the roof.
+ROOMS = {
+    "model": set(),
+    "measure": {"model"},
+    "simulate": {"model", "measure"},
+    "identify": {"model", "measure", "simulate"},
+    "diagnose": {"model", "measure", "simulate", "identify"},
+    "sweep": {"model", "measure", "simulate", "identify", "diagnose"},
+    "io": {"model", "measure"},
+}
+NUMERICAL = set(ROOMS) - {"io"}
+# The top of the package gives names to users; rooms name the module they mean.
+PUBLIC = "the package itself"
+
+DRAWING_AND_COMMANDS = {"matplotlib", "typer", "rich", "jinja2", "click"}
+FILE_FORMATS = {
+    *("csv", "json", "pickle", "tomllib", "tomli_w", "yaml", "zipfile", "sqlite3"),
+    *("h5py", "h5netcdf", "netCDF4", "xarray", "pandas", "openpyxl", "pyuff", "pymatreader"),
+    *("scipy.io", "platformdirs"),
+}
+LONGEST = 450
+
+
+def imported_modules(tree, module, *, is_package):
+    """(line, full dotted name) of everything a module imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = module.split(".")
+            up = node.level - is_package if node.level else 0
+            base = parts[: len(parts) - up] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{stem}.{alias.name}") for alias in node.names)
+
+
+def room_of(module):
+    """The room a dotted name of the package is in: its first part after the package's name."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else PUBLIC
+
+
+def begins(name, prefixes):
+    """Whether a dotted name is one of the prefixes or inside it."""
+    return any(name == prefix or name.startswith(prefix + ".") for prefix in prefixes)
+
+
+def violations(module, source, *, rooms, is_package=False):
+    """What one module does against the house; `rooms` are the names at the package's top."""
+    tree, room = ast.parse(source), room_of(module)
+    found = []
+    for line, name in imported_modules(tree, module, is_package=is_package):
+        where = f"{module}:{line}"
+        if begins(name, {"snrmjax"}):
+            # `from snrmjax import flat_beam` names no room: it takes a public name from the top.
+            target = room_of(name) if room_of(name) in rooms else PUBLIC
+            if room in ROOMS and target != room and target not in ROOMS[room]:
+                found.append(f"{where}: {room} imports {name}")
+        elif room in NUMERICAL and begins(name, DRAWING_AND_COMMANDS | FILE_FORMATS):
+            found.append(f"{where}: the numerical room {room} imports {name}")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assert):
+            found.append(f"{module}:{node.lineno}: an assert statement")
+        if isinstance(node, ast.ExceptHandler) and node.type is None:
+            found.append(f"{module}:{node.lineno}: a bare except")
+    length = len(source.splitlines())
+    if length > LONGEST:
+        found.append(f"{module}: {length} lines, more than {LONGEST}")
+    return found
+
+
+def package_modules():
+    """(dotted name, file, whether it is a package) of all of snrmjax."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = ("snrmjax", *path.relative_to(PACKAGE).with_suffix("").parts)
+        is_package = parts[-1] == "__init__"
+        yield ".".join(parts[:-1] if is_package else parts), path, is_package
+
+
+MODULES = list(package_modules())
+TOP = {room_of(module) for module, _, _ in MODULES} - {PUBLIC}
+
+
+@pytest.mark.parametrize(
+    ("module", "path", "is_package"), MODULES, ids=[module for module, _, _ in MODULES]
+)
+def test_every_module_keeps_the_house(module, path, is_package):
+    source = path.read_text(encoding="utf-8")
+    assert violations(module, source, rooms=TOP, is_package=is_package) == []
+
+
+def test_the_rooms_are_there_and_all_files_are_seen():
+    assert {"model", "measure", "simulate", "identify", "io"} <= TOP
+    assert len(MODULES) == len(list(PACKAGE.rglob("*.py"))) > 30
+    for room, below in ROOMS.items():  # downwards only: nobody is below itself
+        assert room not in set(itertools.chain(below, *(ROOMS[b] for b in below)))
+
+
+BROKEN = {
+    "snrmjax.model.modes": [
+        ("from snrmjax.measure.steady_states import SteadyStates", "model imports"),
+        ("import snrmjax.simulate.harmonics", "model imports snrmjax.simulate.harmonics"),
+        ("from ..io import tables", "model imports snrmjax.io.tables"),
+        ("from .. import plot", "model imports snrmjax.plot"),
+        ("def late():\n    from snrmjax.cli import main", "model imports snrmjax.cli.main"),
+        ("from snrmjax import flat_beam", "model imports snrmjax.flat_beam"),
+        ("import snrmjax", "model imports snrmjax"),
+        ("import matplotlib.pyplot as plt", "numerical room model imports matplotlib.pyplot"),
+        ("from scipy.io import loadmat", "numerical room model imports scipy.io.loadmat"),
+        ("from scipy import io", "numerical room model imports scipy.io"),
+        ("import tomllib, math", "numerical room model imports tomllib"),
+        ("assert True", "an assert statement"),
+        ("try:\n    pass\nexcept:\n    pass", "a bare except"),
+        ("\n" * (LONGEST + 1), "more than 450"),
+    ],
+    "snrmjax.measure.signals": [("from snrmjax.simulate import harmonics", "measure imports")],
+    "snrmjax.simulate": [("from .identify import points", "")],  # inside the room: allowed
+    "snrmjax.simulate.virtual_test": [("from snrmjax.identify.snrm import f", "simulate imports")],
+    "snrmjax.identify.points": [("from snrmjax.diagnose import name", "identify imports")],
+    "snrmjax.io.tables": [
+        ("from snrmjax.identify.snrm import snrm_velocity", "io imports"),
+        ("import csv, tomllib", ""),  # files are its business
+        ("from snrmjax.report import write", "io imports"),
+    ],
+    "snrmjax.cli": [("import typer\nfrom snrmjax.identify import snrm", "")],  # the roof may
+}
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [(module, source, text) for module, cases in BROKEN.items() for source, text in cases],
+)
+def test_the_check_sees_a_violation(module, source, complaint):
+    rooms = TOP | {"plot", "report", "cli", "diagnose", "sweep"}
+    found = violations(module, source, rooms=rooms, is_package=module.count(".") == 1)
+    if not complaint:
+        assert found == []
+    else:
+        assert len(found) == 1
+        assert complaint in found[0]
