@@ -45,7 +45,7 @@ def curved_test() -> sj.SteadyStates:
     """
     windows = [
         (np.linspace(5e-6, 1.8e-4, 16), off_resonance(3, 28)),
-        (np.linspace(1.85e-4, 2.2e-4, 24), off_resonance(0.1, 4)),
+        (np.linspace(1.85e-4, 2.2e-4, 24), off_resonance(0.1, 3)),
         (np.linspace(2.25e-4, 3.0e-4, 9), off_resonance(0.5, 8)),
         (np.geomspace(3.3e-4, 2e-3, 12), off_resonance(3, 28)),
     ]

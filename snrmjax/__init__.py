@@ -23,7 +23,7 @@ from snrmjax.identify.prediction import (
     resonance_by_fixed_point,
     resonances,
 )
-from snrmjax.identify.snrm import nonlinear_mode_velocity, snrm_velocity
+from snrmjax.identify.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from snrmjax.measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
 from snrmjax.measure.steady_states import SteadyStates, join_steady_states, steady_states
 from snrmjax.model.averaging import averaged_force, averaged_response
@@ -38,6 +38,7 @@ from snrmjax.model.potential import (
 from snrmjax.model.structure import Structure, equilibria, structure
 from snrmjax.simulate.continuation import CurveStatus, StepControl
 from snrmjax.simulate.forced_response import ResponseCurve, forced_response, solve_at_frequency
+from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.normal_modes import NormalModeBranch, nonlinear_normal_mode
 from snrmjax.simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
 
@@ -85,10 +86,12 @@ __all__ = [
     "polynomial_potential",
     "potential_from_force_table",
     "predict_response",
+    "reference_sensor",
     "resonance_by_fixed_point",
     "resonances",
     "snrm_velocity",
     "solve_at_frequency",
     "steady_states",
     "structure",
+    "velocity_phasors",
 ]

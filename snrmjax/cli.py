@@ -18,13 +18,21 @@ import typer
 from rich.console import Console
 
 import snrmjax as sj
-from snrmjax import story
 from snrmjax.io import results
 from snrmjax.io.models import read_model, write_model
 from snrmjax.io.tables import read_steady_states, write_steady_states
 from snrmjax.io.units import HERTZ
-from snrmjax.plot import save_figure
+from snrmjax.model.beams import FLAT_BEAM_FORCES
+from snrmjax.plot import normal_mode_figure, save_figure, simulated_response_figure
+from snrmjax.presentation import (
+    Presentation,
+    equilibria_notes,
+    identification_figures,
+    present_identification,
+    presentation_report,
+)
 from snrmjax.report import write_report
+from snrmjax.simulate.continuation import STATUS_MESSAGE
 
 app = typer.Typer(
     name="snrmjax",
@@ -73,9 +81,8 @@ def demo(out: Out) -> None:
     with _staged(out) as folder:
         model = sj.flat_beam()
         write_model(folder / "model.toml", model)
-        forces = sj.model.beams.FLAT_BEAM_FORCES
         _say("simulating the forced responses of the flat beam")
-        curves = sj.forced_response(model, forces, 60 * HERTZ, 110 * HERTZ)
+        curves = sj.forced_response(model, FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
         results.write_response(folder / "response.csv", model, curves)
         _say("following its first nonlinear normal mode")
         branch = sj.nonlinear_normal_mode(model, 105 * HERTZ)
@@ -93,8 +100,10 @@ def demo(out: Out) -> None:
         data = test.steady_states
         write_steady_states(folder / "steady_states.csv", data)
         _say("identifying backbone and damping, predicting responses")
-        telling = story.identification(data, model, forces, truth=branch, responses=curves)
-        _write_identification(folder, telling, "demo", {"model": model.name}, ())
+        told = present_identification(data, model, FLAT_BEAM_FORCES, truth=branch, simulated=curves)
+        done = {"data": "a virtual test with seeded noise", "model": model.name}
+        _write_identification(folder, told, "The chain on the flat beam", done, ())
+        save_figure(simulated_response_figure(curves), folder / "response.png")
     _say(f"done: open {out / 'report.html'}")
 
 
@@ -122,11 +131,13 @@ def simulate(
             )
         for curve in curves:
             if curve.status != sj.CurveStatus.UPPER_END:
-                _warn(f"force {curve.force:g} N: {story.CURVE_MESSAGE[curve.status]}.")
+                _warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
         if not any(len(curve.frequency) for curve in curves):
             raise ValueError("no response was found in this range; start farther from resonance.")
         results.write_response(folder / "response.csv", structure, curves)
-        save_figure(story.response_figure(structure, curves), folder / "response.png")
+        save_figure(
+            simulated_response_figure(curves, sensor=_sensor(structure)), folder / "response.png"
+        )
 
 
 @app.command()
@@ -145,9 +156,9 @@ def nnm(
         _report_equilibria(structure)
         branch = sj.nonlinear_normal_mode(structure, to_hz * HERTZ, harmonic_order=harmonics)
         if branch.status not in (sj.CurveStatus.UPPER_END, sj.CurveStatus.LOWER_END):
-            _warn(f"the mode {story.CURVE_MESSAGE[branch.status]}.")
+            _warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
         results.write_normal_mode(folder / "nnm.csv", structure, branch)
-        save_figure(story.normal_mode_figure(structure, branch), folder / "nnm.png")
+        save_figure(normal_mode_figure(branch, sensor=_sensor(structure)), folder / "nnm.png")
 
 
 @app.command()
@@ -184,7 +195,7 @@ def identify(
         reading = read_steady_states(data, sensors=structure.modes.sensors)
         for note in reading.notes:
             _warn(note)
-        telling = story.identification(
+        told = present_identification(
             reading.steady_states,
             structure,
             predict_force or [],
@@ -194,10 +205,15 @@ def identify(
             n_knots=knots,
             anchor=anchor,
         )
-        for note in telling.identification.notes:
+        for note in told.notes:
             _warn(note)
-        described = {"data": data.name, "model": structure.name}
-        _write_identification(folder, telling, data.stem, described, reading.notes)
+        done = {
+            "data": data.name,
+            "model": f"{structure.name} ({model.name})",
+            "amplitude": f"{amplitude.value}, {measure.value}",
+            "curves": curve.value + (", anchored at the linear mode" if anchor else ""),
+        }
+        _write_identification(folder, told, data.stem.replace("_", " "), done, reading.notes)
 
 
 def main() -> None:
@@ -213,31 +229,32 @@ def main() -> None:
 
 
 def _write_identification(
-    folder: Path,
-    telling: story.Identified,
-    title: str,
-    described: dict[str, str],
-    reader_notes: tuple[str, ...],
+    folder: Path, told: Presentation, title: str, done: dict[str, str], notes: tuple[str, ...]
 ) -> None:
-    identification = telling.identification
+    identification = told.identification
     results.write_points(folder / "points.csv", identification)
     results.write_backbone(folder / "backbone.csv", identification)
-    if telling.predictions:
-        responses = [r for prediction in telling.predictions for r in prediction.responses]
+    if told.predictions:
+        responses = [response for one in told.predictions for response in one.responses]
         results.write_prediction(folder / "prediction.csv", responses)
-    pairs = [(p.force, p.resonances) for p in telling.predictions]
-    summary = {"program": "snrmjax", "version": version("snrmjax"), **described}
+    pairs = [(one.force, one.resonances) for one in told.predictions]
+    summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     summary |= results.summarise(identification, pairs)
-    summary["notes"] = [*reader_notes, *telling.notes]
+    summary |= {"notes": [*notes, *told.notes]}
     results.write_summary(folder / "summary.json", summary)
-    figures = story.figures(telling)
+    figures = identification_figures(told)
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png")
-    write_report(folder / "report.html", story.report(telling, title, summary, figures))
+    report = presentation_report(told, title, done, notes, figures)
+    write_report(folder / "report.html", report)
+
+
+def _sensor(structure: sj.Structure) -> str:
+    return structure.modes.sensors[sj.reference_sensor(structure.modes)]
 
 
 def _report_equilibria(structure: sj.Structure) -> None:
-    for note in story.equilibria_notes(structure):
+    for note in equilibria_notes(structure):
         _warn(note)
 
 

@@ -3,7 +3,6 @@
 Everything is set on the figures themselves: matplotlib's settings stay as they are.
 """
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,11 +82,29 @@ def name_axes(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_ylabel(y, fontsize=11.5)
 
 
-def limits(values: Iterable[float]) -> tuple[float, float]:
-    """Ends of an axis on which all finite values lie, with a margin."""
-    finite = np.asarray([float(value) for value in values if np.isfinite(value)])
-    margin = 0.06 * max(np.ptp(finite), 1e-3 * np.max(np.abs(finite)))
-    return finite.min() - margin, finite.max() + margin
+def fit_axis(axes: Axes, direction: str, points: Any, others: Any = (), bars: Any = (0.0,)) -> None:
+    """Limits of an axis that show all `others` and all points but far outliers, which are counted.
+
+    Arguments: `direction` "x" or "y"; `bars` the error bars of the points, of which a typical one
+    fits on the axis unless it is longer than the rest. A point is far out when it lies outside
+    the middle nine tenths of the points by more than their width. NaN is left out.
+    """
+    value, shown = np.asarray(points, dtype=float), np.asarray(others, dtype=float)
+    value, shown = value[np.isfinite(value)], shown[np.isfinite(shown)]
+    low, high = np.quantile(value, [0.05, 0.95]) if value.size else (-np.inf, np.inf)
+    near = np.abs(value - 0.5 * (low + high)) <= 1.5 * (high - low)
+    shown = np.concatenate([shown, value[near] if near.any() else value])
+    if not shown.size:
+        return
+    width = max(np.ptp(shown), 1e-3 * np.max(np.abs(shown)))
+    margin = 0.06 * width + min(float(np.median(np.nan_to_num(np.asarray(bars)))), 0.5 * width)
+    ends = shown.min() - margin, shown.max() + margin
+    axes.set(**{f"{direction}lim": ends})
+    outside = int(np.sum((value < ends[0]) | (value > ends[1])))
+    if outside:
+        note = f"{outside} point{'s' if outside > 1 else ''} off the {direction} axis"
+        place = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": 9.5}
+        axes.text(0.99, 0.99 if direction == "y" else 0.93, note, color="0.3", **place)
 
 
 def phase_axis(axes: Axes) -> None:

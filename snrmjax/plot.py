@@ -9,8 +9,10 @@ import io
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
@@ -25,8 +27,8 @@ from snrmjax.drawing import (
     SIMULATED,
     STAR,
     explain_lines,
+    fit_axis,
     legend,
-    limits,
     marks,
     name_axes,
     panels,
@@ -56,6 +58,19 @@ BAND = 1.96
 _CURVE_POINTS = 300
 
 
+class BackboneSamples(NamedTuple):
+    """A backbone at some amplitudes, in the units of the figures; errors are 95 %."""
+
+    velocity: np.ndarray  # m/s
+    frequency: np.ndarray  # Hz
+    frequency_error: np.ndarray  # Hz
+    damping: np.ndarray  # % of critical
+    damping_error: np.ndarray
+    modal_damping: np.ndarray  # 1/s
+    modal_damping_error: np.ndarray
+    beyond: np.ndarray  # whether the amplitude exceeds the measured ones
+
+
 class DampingSeries(NamedTuple):
     """The modal damping of one structure, or by one method: points, a curve, or both."""
 
@@ -81,6 +96,41 @@ def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
     return buffer.getvalue()
 
 
+def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
+    """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
+    start = jnp.minimum(backbone.smallest, backbone.squared_frequency.knots[0])
+    amplitude = jnp.linspace(start, reach * backbone.largest, _CURVE_POINTS)
+    return BackboneSamples(*(np.asarray(one) for one in _sampled(backbone, amplitude)))
+
+
+@eqx.filter_jit
+def _sampled(backbone: Backbone, amplitude: Array) -> tuple[Array, ...]:
+    modal_damping = CurveFit(backbone.modal_damping, backbone.modal_damping_covariance)
+    std, damping_std = backbone.std(amplitude)
+    return (
+        backbone.velocity(amplitude),
+        backbone.natural_frequency(amplitude) / HERTZ,
+        BAND * std / HERTZ,
+        100 * backbone.damping_ratio(amplitude),
+        100 * BAND * damping_std,
+        modal_damping.curve(amplitude),
+        BAND * modal_damping.std(amplitude),
+        amplitude > backbone.largest,
+    )
+
+
+def velocity_of(
+    curve: PredictedResponse | ResponseCurve | NormalModeBranch, sensor: str
+) -> np.ndarray:
+    """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
+
+    A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.
+    """
+    if isinstance(curve, PredictedResponse):
+        return curve.velocity
+    return curve.velocity[:, 1, _sensor_index(curve.sensors, sensor)]
+
+
 def backbone_figure(
     points: BackbonePoints,
     backbone: Backbone,
@@ -101,16 +151,15 @@ def backbone_figure(
     Reference: Kwarta & Allen, Figs. 7 and 10.
     """
     use = np.asarray(points.usable)
-    natural, damping = np.asarray(points.natural_frequency) / HERTZ, 100 * points.damping_ratio
+    omega = np.asarray(points.frequency) / HERTZ
+    natural = np.asarray(points.natural_frequency) / HERTZ
+    damping = 100 * np.asarray(points.damping_ratio)
     measured, own = np.abs(np.asarray(points.velocity)), np.asarray(points.backbone_velocity)
     unit = unit_for([*measured[use], *own[use]], "m/s")
-    measured, own, omega = measured / unit.size, own / unit.size, points.frequency / HERTZ
-    top = 1.06 * np.max([*measured[use], *own[use], 0.0])
-    amplitude = jnp.linspace(backbone.smallest, backbone.largest, _CURVE_POINTS)
-    velocity = np.asarray(backbone.velocity(amplitude)) / unit.size
-    curve = np.asarray(backbone.natural_frequency(amplitude)) / HERTZ
-    curve_damping = 100 * np.asarray(backbone.damping_ratio(amplitude))
-    std, damping_std = (np.asarray(one) for one in backbone.std(amplitude))
+    measured, own = measured / unit.size, own / unit.size
+    top = 1.06 * np.max([*measured[use], *own[use]])
+    curve = sample_backbone(backbone)
+    velocity = curve.velocity / unit.size
 
     figure, ((speeds, phases, dampings),) = panels(13.0, 4.7, 1, 3)
     for axes, y in ((speeds, measured), (phases, _phase(points.mode_velocity, backbone))):
@@ -122,30 +171,30 @@ def backbone_figure(
     stars(speeds, natural[use], own[use], "identified, 95 % bars", xerr=bars)
     stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
     stars(dampings, own[use], damping[use], yerr=damping_bars)
-    speeds.plot(curve, velocity, color=IDENTIFIED, zorder=4, label="identified curve")
-    dampings.plot(velocity, curve_damping, color=IDENTIFIED, zorder=4)
-    sides = [curve + sign * BAND * std / HERTZ for sign in (-1, 1)]
+    speeds.plot(curve.frequency, velocity, color=IDENTIFIED, zorder=4, label="identified curve")
+    dampings.plot(velocity, curve.damping, color=IDENTIFIED, zorder=4)
+    sides = curve.frequency - curve.frequency_error, curve.frequency + curve.frequency_error
     speeds.fill_betweenx(velocity, *sides, color=IDENTIFIED, **FILL, label="95 % band")
-    sides = [curve_damping + sign * 100 * BAND * damping_std for sign in (-1, 1)]
+    sides = curve.damping - curve.damping_error, curve.damping + curve.damping_error
     dampings.fill_between(velocity, *sides, color=IDENTIFIED, **FILL)
-    seen, seen_damping = [*omega, *natural[use], *curve], [*damping[use], *curve_damping]
-    short = damping_bars < np.ptp(damping[use])
-    seen_damping += [*(damping[use] + damping_bars)[short], *(damping[use] - damping_bars)[short]]
+    seen, seen_damping = [*omega, *curve.frequency], [*curve.damping]
     if truth is not None:
-        true_velocity = np.abs(_velocity_of(truth, backbone.sensor)) / unit.size
+        true_velocity = np.abs(velocity_of(truth, backbone.sensor)) / unit.size
         inside = np.where(true_velocity <= top, truth.frequency / HERTZ, np.nan)
         speeds.plot(inside, true_velocity, "--", color=SIMULATED, zorder=4, label="true mode")
         seen += [*inside]
     if modes is not None:
         j = modes.mode_of_interest
-        linear = modes.natural_frequency[j] / HERTZ, 100 * modes.damping_ratio[j]
+        linear = float(modes.natural_frequency[j]) / HERTZ, 100 * float(modes.damping_ratio[j])
         diamond = {**HOLLOW, "marker": "D"}
         marks(speeds, linear[0], 0.0, diamond, "linear mode")
         marks(dampings, 0.0, linear[1], diamond)
         seen, seen_damping = [*seen, linear[0]], [*seen_damping, linear[1]]
     phases.sharex(speeds)
-    speeds.set(ylim=(0.0, top), xlim=limits(seen))
-    dampings.set(xlim=(0.0, top), ylim=limits(seen_damping))
+    speeds.set_ylim(0.0, top)
+    dampings.set_xlim(0.0, top)
+    fit_axis(speeds, "x", natural[use], seen, bars)
+    fit_axis(dampings, "y", damping[use], seen_damping, damping_bars)
     phase_axis(phases)
     at, level = plain(backbone.sensor), f"Velocity amplitude ({unit.name})"
     name_axes(speeds, f"(a) amplitude at {at}", "Frequency (Hz)", level)
@@ -184,18 +233,17 @@ def response_figure(
         raise ValueError("there is no response to show: `predicted` and `simulated` are empty.")
     spans = [frequency_range] if frequency_range else [_span(c, sensor) for c in predicted or exact]
     low, high = min(s[0] for s in spans) / HERTZ, max(s[1] for s in spans) / HERTZ
-    amplitude = jnp.linspace(backbone.smallest, CONTINUED * backbone.largest, _CURVE_POINTS)
-    spine = np.asarray(backbone.natural_frequency(amplitude)) / HERTZ
-    along, far = np.asarray(backbone.velocity(amplitude)), np.asarray(amplitude > backbone.largest)
+    spine = sample_backbone(backbone, reach=CONTINUED)
     figure, rows = panels(10.5, 0.8 + 3.1 * len(forces), len(forces), 2)
     for force, (speeds, phases) in zip(forces, rows, strict=True):
         omega, states = _measured_at(measured, sensor, force, force_tolerance)
         curves = [c for c in every if c.force == force]
-        velocities = [_velocity_of(curve, sensor) for curve in curves]
+        velocities = [velocity_of(curve, sensor) for curve in curves]
         largest = np.nanmax(np.abs(np.concatenate([*velocities, states])))
         unit = unit_for(largest, "m/s")
-        for part, style in ((~far, {"label": "backbone"}), (far, {"alpha": 0.4})):
-            speeds.plot(spine[part], along[part] / unit.size, ":", color=IDENTIFIED, **style)
+        for part, style in ((~spine.beyond, {"label": "backbone"}), (spine.beyond, {"alpha": 0.4})):
+            x, y = spine.frequency[part], spine.velocity[part] / unit.size
+            speeds.plot(x, y, ":", color=IDENTIFIED, **style)
         phases.axhline(0.0, color="0.6", linewidth=1.0, zorder=1)
         for curve, v in zip(curves, velocities, strict=True):
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, _phase(v, backbone))):
@@ -240,12 +288,12 @@ def simulated_response_figure(
     forces = sorted({c.force for c in drawn})
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
     colours = dict(zip(forces, shades, strict=True))
-    unit = unit_for(np.concatenate([_velocity_of(c, name) for c in drawn]), "m/s")
+    unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
     figure, ((speeds,), (phases,)) = panels(9.0, 7.5, 2, 1)
     markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
     for event in (None, *markers):
         for curve in drawn:
-            v, x = _velocity_of(curve, name), curve.frequency / HERTZ
+            v, x = velocity_of(curve, name), curve.frequency / HERTZ
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
                 if event is None:
                     label, colour = with_unit(curve.force, "N"), colours[curve.force]
@@ -280,7 +328,7 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     if not len(branch.frequency):
         raise ValueError("there is no normal mode to show: the branch has no point.")
     name = sensor or branch.sensors[0]
-    fundamental = np.abs(_velocity_of(branch, name))
+    fundamental = np.abs(velocity_of(branch, name))
     signal = branch.velocity[:, 1:, branch.sensors.index(name)]
     peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
     unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
@@ -320,23 +368,26 @@ def force_velocity_figure(
             f"`states` must be rows measured at {name!r} under a known force, of which there are "
             f"{len(good)}, but {f'has {wrong[0]}' if wrong else 'is empty'}."
         )
-    rows = jnp.asarray(states)
-    phasors = jnp.concatenate([data.velocity[:, r, None], data.harmonics[:, r]], axis=1)[rows]
-    phasors = jnp.where(jnp.isfinite(phasors), phasors, 0.0)
-    loops = force_velocity_loop(data.force[rows], phasors, (1, *data.harmonic_order))
-    indicator = appropriation_of(data)
+    phasors = np.concatenate([data.velocity[:, r, None], data.harmonics[:, r]], axis=1)
+    phasors = np.where(np.isfinite(phasors), phasors, 0.0)[list(states)]
+    forces = np.asarray(data.force)[list(states)]
+    loops = force_velocity_loop(
+        jnp.asarray(forces), jnp.asarray(phasors), (1, *data.harmonic_order)
+    )
+    frequency, indicator = np.asarray(data.frequency) / HERTZ, np.asarray(appropriation_of(data))
     columns = min(3, len(states))
     height = -(-len(states) // columns)
     figure, grid = panels(3.9 * columns, 0.3 + 3.7 * height, height, columns)
-    force_unit, unit = unit_for(loops.force, "N"), unit_for(loops.velocity, "m/s")
-    for axes, k, force, velocity, phasor in zip(
-        grid.flat, states, loops.force, loops.velocity, phasors[:, 0], strict=False
-    ):
-        force, in_phase = force / force_unit.size, phasor.real * np.cos(loops.phase) / unit.size
-        axes.plot(force, in_phase, "--", color=SIMULATED, linewidth=1.1)
-        axes.plot(force, velocity / unit.size, color=MEASURED)
-        title = f"level {data.level[k]}, {data.frequency[k] / HERTZ:.4g} Hz\n"
-        title += f"phase {jnp.angle(phasor) / DEGREE:+.0f}°, indicator {indicator[k]:.2f}"
+    for number, (axes, k) in enumerate(zip(grid.flat, states, strict=False)):
+        force, velocity = np.asarray(loops.force[number]), np.asarray(loops.velocity[number])
+        force_unit, unit = unit_for(force, "N"), unit_for(velocity, "m/s")
+        ends, phasor = np.array([-1.0, 1.0]), phasors[number, 0]
+        in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
+        axes.plot(*in_phase, "--", color=SIMULATED, linewidth=1.1)
+        axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED)
+        turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
+        title = f"level {int(data.level[k])}, {frequency[k]:.4g} Hz\n"
+        title += f"phase {turn}, indicator {indicator[k]:.2f}"
         name_axes(axes, title, f"Force ({force_unit.name})", f"Velocity ({unit.name})")
     for axes in grid.flat[len(states) :]:
         axes.remove()
@@ -355,30 +406,38 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
     shown = [s for s in series if s.points is not None or s.backbone is not None]
     if not shown:
         raise ValueError("there is no damping to show: no series has points or a backbone.")
-    ends = [s.points.backbone_velocity[s.points.usable] for s in shown if s.points is not None]
-    ends += [b.velocity(b.largest)[None] for s in shown if (b := s.backbone) is not None]
-    unit = unit_for(jnp.concatenate(ends), "m/s")
     figure, ((axes,),) = panels(7.5, 5.2, 1, 1)
-    for number, (name, points, backbone) in enumerate(shown):
-        colour, text = SERIES[number % len(SERIES)], plain(name)
-        if points is not None:
-            use = np.asarray(points.usable)
-            x, y = points.backbone_velocity[use] / unit.size, points.modal_damping[use]
+    curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in shown]
+    largest = [c.velocity for c in curves if c] + [_usable(s.points)[0] for s in shown if s.points]
+    unit = unit_for(np.concatenate(largest), "m/s")
+    dots: list[float] = []
+    lines: list[float] = [] if linear is None else [linear]
+    for number, (one, curve) in enumerate(zip(shown, curves, strict=True)):
+        colour, name = SERIES[number % len(SERIES)], plain(one.label)
+        if one.points is not None:
+            velocity, damping = _usable(one.points)
             style = {**DOT, "color": colour, "alpha": 0.7}
-            marks(axes, x, y, style, text if backbone is None else None)
-        if backbone is not None:
-            amplitude = jnp.linspace(backbone.smallest, backbone.largest, _CURVE_POINTS)
-            fit = CurveFit(backbone.modal_damping, backbone.modal_damping_covariance)
-            x, y = backbone.velocity(amplitude) / unit.size, fit.curve(amplitude)
-            error = BAND * fit.std(amplitude)
-            axes.fill_between(x, y - error, y + error, color=colour, **FILL)
-            axes.plot(x, y, color=colour, label=text)
+            marks(axes, velocity / unit.size, damping, style, None if curve else name)
+            dots += [*damping]
+        if curve is not None:
+            velocity, damping = curve.velocity / unit.size, curve.modal_damping
+            sides = damping - curve.modal_damping_error, damping + curve.modal_damping_error
+            axes.fill_between(velocity, *sides, color=colour, **FILL)
+            axes.plot(velocity, damping, color=colour, label=name)
+            lines += [*damping]
     if linear is not None:
         axes.axhline(linear, color=SIMULATED, linestyle=":", label="linear mode")
     axes.set_xlim(left=0.0)
+    fit_axis(axes, "y", dots, lines)
     name_axes(axes, "", f"Velocity amplitude ({unit.name})", "Modal damping 2ζω (1/s)")
     legend(figure)
     return figure
+
+
+def _usable(points: BackbonePoints) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity on the backbone (m/s) and modal damping (1/s) of the points that curves use."""
+    use = np.asarray(points.usable)
+    return np.asarray(points.backbone_velocity)[use], np.asarray(points.modal_damping)[use]
 
 
 def _phase(velocity: Any, backbone: Backbone) -> np.ndarray:
@@ -392,17 +451,8 @@ def _sensor_index(sensors: tuple[str, ...], name: str) -> int:
     return sensors.index(name)
 
 
-def _velocity_of(
-    curve: PredictedResponse | ResponseCurve | NormalModeBranch, sensor: str
-) -> np.ndarray:
-    """The phasor of the velocity fundamental at a sensor."""
-    if isinstance(curve, PredictedResponse):
-        return curve.velocity
-    return curve.velocity[:, 1, _sensor_index(curve.sensors, sensor)]
-
-
 def _span(curve: PredictedResponse | ResponseCurve, sensor: str) -> tuple[float, float]:
-    amplitude = np.abs(_velocity_of(curve, sensor))
+    amplitude = np.abs(velocity_of(curve, sensor))
     inside = curve.frequency[amplitude >= 0.25 * amplitude.max()]
     margin = 0.1 * np.ptp(inside)
     return inside.min() - margin, inside.max() + margin

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax import plot
 from snrmjax.identify.identification import Identification, identify_backbone
 from snrmjax.identify.prediction import (
     CONTINUED,
@@ -16,6 +17,7 @@ from snrmjax.identify.prediction import (
 )
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure, equilibria
+from snrmjax.report import Report, ReportFigure, Section, identification_report
 from snrmjax.simulate.forced_response import ResponseCurve
 from snrmjax.simulate.normal_modes import NormalModeBranch
 
@@ -82,8 +84,100 @@ def equilibria_notes(model: Structure) -> list[str]:
         return []
     shape = np.asarray(model.modes.mode_shape)
     listed = ", ".join(
-        f"{'stable' if e.stable else 'unstable'} at q = {np.array2string(e.displacement, precision=3)}"
+        f"{'stable' if e.stable else 'unstable'} at q = "
+        f"{np.array2string(e.displacement, precision=3)}"
         f" ({model.modes.sensors[0]} {1e3 * (shape @ e.displacement)[0]:.3g} mm)"
         for e in others
     )
     return [f"the model has {len(others)} further equilibria: {listed}. Curves start from rest."]
+
+
+def identification_figures(told: Presentation) -> dict[str, Figure]:
+    """Figures of an identification by the names of their files."""
+    points, backbone = told.identification.points, told.identification.fit.backbone
+    modes = told.model.modes
+    figures = {
+        "backbone": plot.backbone_figure(points, backbone, truth=told.truth, modes=modes),
+        "modal_damping": plot.modal_damping_figure(
+            [plot.DampingSeries("identified", points=points, backbone=backbone)],
+            linear=_linear_modal_damping(told.model),
+        ),
+        "loops": plot.force_velocity_figure(told.data, _typical_states(told), sensor=points.sensor),
+    }
+    if told.predictions:
+        figures["prediction"] = plot.response_figure(
+            backbone,
+            [response for one in told.predictions for response in one.responses],
+            [resonance for one in told.predictions for resonance in one.resonances],
+            simulated=told.simulated,
+            measured=told.data,
+        )
+    if told.truth is not None:
+        figures["nnm"] = plot.normal_mode_figure(told.truth, sensor=points.sensor)
+    return figures
+
+
+def _linear_modal_damping(model: Structure) -> float:
+    j = model.modes.mode_of_interest
+    return 2 * float(model.modes.damping_ratio[j] * model.modes.natural_frequency[j])
+
+
+def _typical_states(told: Presentation) -> list[int]:
+    """Three states of the largest level: nearest to resonance, farthest and one between."""
+    points = told.identification.points
+    phase = np.abs(np.angle(np.asarray(points.mode_velocity)))
+    amplitude = np.where(np.asarray(points.usable), np.asarray(points.amplitude), -np.inf)
+    level = np.asarray(points.level)[int(np.argmax(amplitude))]
+    rows = np.flatnonzero((np.asarray(points.level) == level) & np.isfinite(amplitude))
+    ordered = rows[np.argsort(phase[rows])]
+    return sorted({int(ordered[0]), int(ordered[len(ordered) // 2]), int(ordered[-1])})
+
+
+LOOPS_CAPTION = (
+    "Force against velocity over one period, nearest to resonance first: a straight line at phase "
+    "resonance, the wider the farther from it."
+)
+DAMPING_CAPTION = (
+    "Modal damping 2ζω against amplitude. Linear damping gives a constant near the dotted line, "
+    "whatever the stiffness does; harmonics of the motion add a few per cent."
+)
+MODE_CAPTION = (
+    "The nonlinear normal mode of the model, followed by harmonic balance: velocity against "
+    "frequency, and frequency against energy."
+)
+
+
+def presentation_report(
+    told: Presentation,
+    title: str,
+    done: dict[str, str],
+    notes: Sequence[str],
+    figures: dict[str, Figure],
+) -> Report:
+    """The report of an identification; `notes` are those of the reader, before its own."""
+    further = [
+        Section(
+            "What was measured, and its damping",
+            (),
+            [
+                ReportFigure(figures["loops"], LOOPS_CAPTION),
+                ReportFigure(figures["modal_damping"], DAMPING_CAPTION),
+            ],
+        )
+    ]
+    if "nnm" in figures:
+        shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
+        further.append(Section("The nonlinear normal mode", (), shown))
+    return identification_report(
+        told.identification,
+        told.model.modes,
+        title=title,
+        done=done,
+        notes=[*notes, *told.notes],
+        predicted=[response for one in told.predictions for response in one.responses],
+        resonances=[resonance for one in told.predictions for resonance in one.resonances],
+        simulated=told.simulated,
+        truth=told.truth,
+        measured=told.data,
+        further=further,
+    )

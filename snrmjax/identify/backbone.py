@@ -23,7 +23,7 @@ from snrmjax.model.modes import LinearModes
 
 CurveFamily = Literal["spline", "piecewise_linear"]
 MOST_KNOTS = 60
-SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-8, 4))
+SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-12, 3))
 
 OFF_RESONANCE = 4.0
 """How much more a point 90° off resonance is mistrusted than one at it, when no noise is stated."""
@@ -200,7 +200,7 @@ def _fit_pair(
             std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
             std = np.maximum(std * far, 1e-12 * np.max(np.abs(values[component])))
             sample = (amplitude, values[component], std)
-            smoothing, sizes = 1e-4, AS_STATED
+            smoothing, sizes = 1e-6, AS_STATED
             if not first:
                 weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
                 smoothing, sizes = _best_smoothing(family, knots, weights, *sample, level, fixed)
@@ -231,8 +231,10 @@ def _best_smoothing(
         level = np.argsort(np.argsort(amplitude)) % 3
     sample = (amplitude, values, std, level, fixed)
     tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
-    best = int(np.argmin([one.score for one in tried]))
-    return weights[best], tried[best].sizes
+    best = min(tried, key=lambda one: one.score)
+    # Of all weights that are not clearly worse than the best one, the smoothest.
+    chosen = max(k for k, one in enumerate(tried) if one.score <= best.score + best.score_std)
+    return weights[chosen], tried[chosen].sizes
 
 
 def _anchor_report(

@@ -121,12 +121,14 @@ def _identify(
     velocity, relative_std = data.velocity, _relative_std(data)
     if measure == "peak":
         velocity = velocity * _peak_ratio(data)
-    projected, filtered_std, filter_residual = _modal_filter(data, modes, r, velocity, relative_std)
+    combined, share, filtered_std, filter_residual = _modal_filter(
+        data, modes, r, velocity, relative_std
+    )
     inputs = jnp.stack(
-        [jnp.log(data.force), jnp.log(jnp.abs(projected)), jnp.angle(projected)], axis=1
+        [jnp.log(data.force), jnp.log(jnp.abs(combined)), jnp.angle(combined)], axis=1
     )
     solved, mode_velocity, argument, sensitivity, linear_variance = _solve(
-        modes, r, amplitude, data.frequency, inputs
+        modes, r, amplitude, data.frequency, inputs, share
     )
     natural, damping = solved.natural_frequency, solved.damping_ratio
     covariance = jnp.einsum("soi,si,spi->sop", sensitivity, filtered_std**2, sensitivity)
@@ -139,7 +141,7 @@ def _identify(
         level=data.level,
         frequency=data.frequency,
         force=data.force,
-        velocity=projected,
+        velocity=mode_velocity + residual_velocity(modes, data.frequency, data.force)[:, r],
         mode_velocity=mode_velocity,
         appropriation=appropriation_of(data),
         natural_frequency=natural,
@@ -209,11 +211,12 @@ def _modal_filter(
     r: int,
     velocity: Complex[Array, "state sensor"],
     relative_std: Float[Array, "state sensor input"],
-) -> tuple[Array, Array, Array]:
-    """The velocity at the reference sensor that all sensors agree on best.
+) -> tuple[Array, Array, Array, Array]:
+    """The combination of the sensors' velocities that sees the mode of interest best.
 
     Least squares of Φ_s η = V_s − V_res,s over the sensors, weighted with their stated errors
-    when all have them. Returns Φ_r η + V_res,r, its relative errors and the relative residual.
+    when all have them, is Φ_r η = Σ_s share_s (V_s − V_res,s). Returns Σ share_s V_s, the shares,
+    the relative errors of the sum and the relative residual of the least squares.
     """
     shape = modes.mode_shape[:, modes.mode_of_interest]
     measured = data.measured & jnp.isfinite(jnp.abs(velocity))
@@ -222,22 +225,21 @@ def _modal_filter(
     absolute = relative_std[..., 1] * jnp.abs(velocity)
     known = jnp.all(jnp.where(measured, absolute > 0, True), axis=1, keepdims=True)
     weight = jnp.where(measured, jnp.where(known, 1 / absolute**2, 1.0), 0.0)
-    weight = jnp.where(measured, weight, 0.0)
-    norm = jnp.sum(weight * shape**2, axis=1)
-    modal = jnp.sum(weight * shape * own, axis=1) / jnp.where(norm > 0, norm, jnp.nan)
-    misfit = jnp.where(measured, own - shape * modal[:, None], 0.0)
+    norm = jnp.sum(weight * shape**2, axis=1, keepdims=True)
+    share = weight * shape * shape[r] / jnp.where(norm > 0, norm, jnp.nan)
+    modal = jnp.sum(share * own, axis=1, keepdims=True) / shape[r]
+    misfit = jnp.where(measured, own - shape * modal, 0.0)
     size = jnp.sqrt(jnp.sum(weight * jnp.abs(own) ** 2, axis=1))
     relative_misfit = jnp.sqrt(jnp.sum(weight * jnp.abs(misfit) ** 2, axis=1)) / size
+    combined = jnp.sum(share * jnp.where(measured, velocity, 0.0), axis=1)
+
     # Errors of the sensors are independent; amplitude and phase errors lie along and across V.
-    share = jnp.where(measured, weight * shape, 0.0) / norm[:, None] * shape[r]
-    total = shape[r] * modal + residual[:, r]
+    def error(component: int) -> Array:
+        each = jnp.where(measured, share * relative_std[..., component] * jnp.abs(velocity), 0.0)
+        return jnp.sqrt(jnp.sum(each**2, axis=1)) / jnp.abs(combined)
 
-    def combined(component: int) -> Array:
-        error = jnp.where(measured, share * relative_std[..., component] * jnp.abs(velocity), 0.0)
-        return jnp.sqrt(jnp.sum(error**2, axis=1)) / jnp.abs(total)
-
-    force_std = relative_std[:, 0, 0]
-    return total, jnp.stack([force_std, combined(1), combined(2)], axis=1), relative_misfit
+    std = jnp.stack([relative_std[:, 0, 0], error(1), error(2)], axis=1)
+    return combined, share, std, relative_misfit
 
 
 def _solve(
@@ -246,6 +248,7 @@ def _solve(
     amplitude: AmplitudeArgument,
     frequency: Array,
     inputs: Float[Array, "state input"],
+    share: Float[Array, "state sensor"],
 ) -> tuple[SnrmPoints, Array, Array, Array, Array]:
     """Points, mode's velocity, amplitude, derivatives, the linear modes' share of the variance."""
     j = modes.mode_of_interest
@@ -260,27 +263,40 @@ def _solve(
         )
         return eqx.tree_at(lambda m: (m.natural_frequency, m.damping_ratio), modes, changed)
 
-    def measured(inputs: Array, parameters: Array, frequency: Array) -> tuple:
-        """Modal constant, velocity and residual velocity at the reference sensor."""
+    def measured(inputs: Array, parameters: Array, frequency: Array, share: Array) -> tuple:
+        """Modal constant at the reference sensor, velocity and residual of the sensors' sum."""
         force = jnp.exp(inputs[..., 0])
         velocity = jnp.exp(inputs[..., 1]) * jnp.exp(1j * inputs[..., 2])
-        residual = residual_velocity(with_parameters(parameters), frequency, force)[..., r]
+        everywhere = residual_velocity(with_parameters(parameters), frequency, force)
+        residual = jnp.sum(share * everywhere, axis=-1)
         return modes.mode_shape[r, j] * modes.participation[j] * force, velocity, residual
 
     def argument_of(own: Array, frequency: Array) -> Array:
         return jnp.abs(own) / frequency if amplitude == "displacement" else jnp.abs(own)
 
-    def outputs(inputs: Array, parameters: Array, frequency: Array) -> Array:
-        constant, velocity, residual = measured(inputs, parameters, frequency)
+    def outputs(
+        inputs: Array, parameters: Array, frequency: Array, share: Array, solved: Array
+    ) -> Array:
+        constant, velocity, residual = measured(inputs, parameters, frequency, share)
+        # A singular system would stop the whole batch: unsolved states get a harmless one.
+        constant, frequency, velocity, residual = (
+            jnp.where(solved, value, stand_in)
+            for value, stand_in in zip(
+                (constant, frequency, velocity, residual), (1.0, 1.0, 1.0, 0.0), strict=True
+            )
+        )
         natural, damping = invert_one(constant, frequency, velocity, residual)
         argument = argument_of(velocity - residual, frequency)
         return jnp.stack([natural**2, 2 * damping * natural, jnp.log(argument)])
 
-    slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0))
-    by_input, by_parameter = slopes(inputs, parameters, frequency)
+    constant, velocity, residual = measured(inputs, parameters, frequency, share)
+    points = invert_phasor(constant, frequency, velocity, residual)
+    solved = jnp.isfinite(points.natural_frequency)
+    slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))
+    by_input, by_parameter = slopes(inputs, parameters, frequency, share, solved)
     spread = jnp.concatenate([modes.natural_frequency_std[keep], modes.damping_ratio_std[keep]])
     variance = jnp.sum((by_parameter * spread) ** 2, axis=-1)
-    constant, velocity, residual = measured(inputs, parameters, frequency)
-    points = invert_phasor(constant, frequency, velocity, residual)
+    by_input = jnp.where(solved[:, None, None], by_input, jnp.nan)
+    variance = jnp.where(solved[:, None], variance, jnp.nan)
     own = velocity - residual
     return points, own, argument_of(own, frequency), by_input, variance

@@ -25,8 +25,9 @@ class AbstractCurve(eqx.Module):
     knots: Float[Array, " knot"]  # amplitudes, increasing
     values: Float[Array, " knot"]
 
+    @staticmethod
     @abstractmethod
-    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """The variable in which the curve is drawn through its knots."""
 
     @abstractmethod
@@ -52,7 +53,8 @@ class PiecewiseLinear(AbstractCurve):
 
     kind: ClassVar[str] = "piecewise_linear"
 
-    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    @staticmethod
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractCurve.abscissa`."""
         return amplitude
 
@@ -72,7 +74,8 @@ class ShapePreservingSpline(AbstractCurve):
 
     kind: ClassVar[str] = "spline"
 
-    def abscissa(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    @staticmethod
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractCurve.abscissa`."""
         return amplitude**2
 
@@ -124,7 +127,7 @@ def place_knots(
     A level that was held at one amplitude (within 15 % from end to end) gets one knot: what
     varies inside it is not amplitude. Otherwise knots are at least 3 % apart.
     """
-    candidates = []
+    candidates: list[float] = []
     for one in np.unique(level):
         inside = amplitude[level == one]
         held = len(inside) > 1 and inside.max() < 1.15 * inside.min()
@@ -158,7 +161,7 @@ def fit_curve(
     """Fit a curve to points by penalised least squares over its values at the knots.
 
     Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `smoothing` weighs the
-    second differences of the values against the points (relative to what a knot knows on
+    bending of the curve in its abscissa against the points (relative to what a knot knows on
     average); `std` 1σ of the values, or their relative sizes when the scale is not known;
     `level` groups points whose errors are partly shared. `fixed_first` pins the value at the
     first knot. `sizes` scale the two parts of the covariance.
@@ -173,7 +176,7 @@ def fit_curve(
     if fixed_first is not None:
         at_knots[0], free = fixed_first / unit, slice(1, n)
     information = np.sum(1.0 / spread**2) / n
-    rough = np.sqrt(smoothing * information) * np.diff(np.eye(n), n=2, axis=0)
+    rough = np.sqrt(smoothing * information) * _bending(np.asarray(CURVES[kind].abscissa(knots)))
     pinned = -rough[:, 0] * at_knots[0] if fixed_first is not None else np.zeros(len(rough))
     # The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
     for _ in range(12):
@@ -205,7 +208,8 @@ def fit_curve(
 class LeftOut(NamedTuple):
     """How well levels are predicted by the others."""
 
-    score: float  # geometric mean over levels of error²/std², infinity when nothing was predicted
+    score: float  # error²/std², mean of the better three quarters of the levels; infinity = none
+    score_std: float  # 1σ of the score, from its scatter over the levels
     sizes: ErrorSizes
 
 
@@ -236,12 +240,13 @@ def predict_left_out(
         errors.append(values[left] - predicted)
         spreads.append(std[left])
     if not errors:
-        return LeftOut(np.inf, AS_STATED)
+        return LeftOut(np.inf, np.inf, AS_STATED)
     pairs = zip(errors, spreads, strict=True)
-    squares = [np.mean((error / spread) ** 2) for error, spread in pairs]
-    # The geometric mean: a few levels that no curve predicts must not decide for all.
-    score = float(np.exp(np.mean(np.log(np.maximum(squares, 1e-30)))))
-    return LeftOut(score, error_sizes(errors, spreads))
+    squares = np.sort([np.mean((error / spread) ** 2) for error, spread in pairs])
+    # A few levels that no curve predicts, at a sharp bend, must not decide for all.
+    squares = squares[: -(-3 * len(squares) // 4)]
+    score, score_std = float(np.mean(squares)), float(np.std(squares) / np.sqrt(len(squares)))
+    return LeftOut(score, score_std, error_sizes(errors, spreads))
 
 
 def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
@@ -251,6 +256,18 @@ def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> n
     high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
     change = [_linearised(curve.kind, knots, values, a)[0] for a in (low, high)]
     return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
+
+
+def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
+    """Rows whose squares add up to about ∫(d²g/du²)² du of values at knots, u from 0 to 1."""
+    u = (abscissa - abscissa[0]) / max(abscissa[-1] - abscissa[0], 1e-300)
+    n = len(u)
+    rows = np.zeros((max(n - 2, 0), n))
+    for k in range(n - 2):
+        left, right = u[k + 1] - u[k], u[k + 2] - u[k + 1]
+        mean = 0.5 * (left + right)
+        rows[k, k : k + 3] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) / np.sqrt(mean)
+    return rows
 
 
 def _linearised(

@@ -102,8 +102,9 @@ def closed_form(
     m/s relative to the force. Returns rad/s and a ratio; NaN where ω̃² is not positive.
     It is the start and the test of the Newton solve. Reference: Kwarta & Allen, Eq. (18).
 
-    >>> closed_form(jnp.array(6.0), jnp.array(500.0), jnp.array(0.6 + 0.0j))
-    (Array(500., dtype=float64), Array(0.01, dtype=float64))
+    >>> omega, zeta = closed_form(jnp.array(6.0), jnp.array(500.0), jnp.array(0.6 + 0.0j))
+    >>> float(omega), float(zeta)
+    (500.0, 0.01)
     """
     return _from_polar(
         modal_constant, frequency, jnp.abs(mode_velocity), *_direction(mode_velocity)

@@ -155,9 +155,8 @@ def _require_force(force: float) -> None:
 
 
 def _scan(backbone: Backbone) -> Float[np.ndarray, " point"]:
-    """Amplitudes from nearly zero to the end of the continued curve."""
-    largest = CONTINUED * float(backbone.largest)
-    return largest * np.linspace(0.0, 1.0, _SCAN + 1)[1:]
+    """Amplitudes from zero to the end of the continued curve."""
+    return CONTINUED * float(backbone.largest) * np.linspace(0.0, 1.0, _SCAN + 1)
 
 
 @eqx.filter_jit
@@ -294,12 +293,14 @@ def _one_curve(
     below, above, _ = (np.asarray(a) for a in _branches(backbone, jnp.asarray(amplitude), load))
     both = np.concatenate([amplitude, amplitude[::-1]])
     squared = np.concatenate([below, above[::-1]])
+    # Points without a real frequency are dropped at the end: every force has the same shapes,
+    # and the functions below are compiled once.
     keep = squared > 0
-    both, frequency = both[keep], np.sqrt(squared[keep])
+    frequency = np.sqrt(np.where(keep, squared, 1.0))
     at, omega = jnp.asarray(both), jnp.asarray(frequency)
     natural, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
     velocity = np.asarray(_velocity(backbone, modes, force, omega, natural, damping))
-    return PredictedResponse(
+    curve = PredictedResponse(
         force=force,
         frequency=frequency,
         velocity=velocity,
@@ -309,6 +310,7 @@ def _one_curve(
         continued=both > float(backbone.largest) * (1 + 1e-9),
         isolated=closed,
     )
+    return _subset(curve, keep)
 
 
 def _subset(curve: PredictedResponse, keep: np.ndarray) -> PredictedResponse:

@@ -1,7 +1,6 @@
 """Force from drive voltage: the equivalent force of low-level responses and its line."""
 
 import dataclasses
-from collections.abc import Callable
 from enum import IntEnum
 
 import equinox as eqx
@@ -19,16 +18,17 @@ class ForceStatus(IntEnum):
     """How the search for the equivalent force of one level ended."""
 
     SUCCESSFUL = 0
-    TOO_FEW = 1  # fewer measured numbers than unknowns, or they do not determine the unknowns
-    NOT_CONVERGED = 2
+    TOO_FEW = 1  # fewer measured numbers than unknowns
+    NOT_CONVERGED = 2  # no fit, or the measured numbers do not determine the unknowns
     NEGATIVE = 3  # the best force is negative: a sensor or the force is wired the other way round
 
 
 FORCE_MESSAGE: dict[ForceStatus, str] = {
     ForceStatus.SUCCESSFUL: "found",
-    ForceStatus.TOO_FEW: "too few states to find the unknowns; adjust fewer, or measure more",
+    ForceStatus.TOO_FEW: "fewer measured numbers than unknowns; adjust less, or measure more",
     ForceStatus.NOT_CONVERGED: (
-        "the linear response does not fit; check the modes, or adjust the damping or phase too"
+        "the linear response does not fit, or the states do not determine what is adjusted; check "
+        "the modes and the band, or adjust something else"
     ),
     ForceStatus.NEGATIVE: (
         "the best force is negative; turn the sign of the sensor or of its mode shape, or adjust "
@@ -77,7 +77,8 @@ def equivalent_force(
     Minimises Σ |V_meas − F e^{iψ} H(Ω; ω_j, ζ_j)|² over F > 0 and what `adjust` names, H the
     linear response to a unit force; weighted along and across V_meas with `velocity_std` and
     `phase_std` where every measured velocity states both, else with equal weights and the noise
-    taken from the residual. By Levenberg–Marquardt, started from a scan of ω_j.
+    taken from the residual. By a scan and Levenberg–Marquardt over ω_j and ζ_j, with F and ψ
+    eliminated. Stated errors too small for the misfit are enlarged by it.
 
     Arguments: `data`, whose `level` groups the states of equal `drive` (V); `modes`, the linear
     model; `adjust`, any of "natural_frequency" (ω_j), "damping_ratio" (ζ_j), both of the mode of
@@ -108,7 +109,7 @@ def equivalent_force(
     members = np.asarray(data.level)[None, :] == levels[:, None]
     drive = np.array([_common_drive(data, level) for level in levels])
     stated = data.measured & (data.velocity_std > 0) & (data.phase_std > 0)
-    use_stated = bool(jnp.all(stated == data.measured))
+    use_stated = jnp.all(stated == data.measured)
     adjusted = ("natural_frequency" in adjust, "damping_ratio" in adjust, "phase" in adjust)
     best, std, covariance, misfit, status = _fit_levels(
         seen, data, jnp.asarray(members), use_stated, adjusted
@@ -145,7 +146,7 @@ def _fit_levels(
     modes: LinearModes,
     data: SteadyStates,
     members: Bool[Array, "level state"],
-    use_stated: bool,
+    use_stated: Bool[Array, ""],
     adjusted: tuple[bool, bool, bool],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Force, ω_j, ζ_j and ψ of every level, their std, the force covariance, misfit and status."""
@@ -166,116 +167,102 @@ def _fit_level(
     modes: LinearModes,
     data: SteadyStates,
     member: Bool[Array, " state"],
-    use_stated: bool,
+    use_stated: Bool[Array, ""],
     adjusted: tuple[bool, bool, bool],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The physical unknowns are (F, ω_j, ζ_j, ψ); the solver's are scaled to order one."""
+    """The unknowns are (F, ω_j, ζ_j, ψ); F and ψ are linear, so that only ω_j and ζ_j iterate."""
     j = modes.mode_of_interest
+    natural, damping = modes.natural_frequency[j], modes.damping_ratio[j]
     used = member[:, None] & data.measured
+    n_used = jnp.sum(used)
     measured = jnp.where(used, data.velocity, 0.0)
-    size = jnp.sqrt(jnp.sum(jnp.abs(measured) ** 2) / jnp.maximum(jnp.sum(used), 1))
+    size = jnp.sqrt(jnp.sum(jnp.abs(measured) ** 2) / jnp.maximum(n_used, 1))
     size = jnp.where(size > 0, size, 1.0)
-    direction = jnp.where(used & (jnp.abs(measured) > 0), measured, 1.0)
+    direction = jnp.where(jnp.abs(measured) > 0, measured, 1.0)
     direction = direction / jnp.abs(direction)
-    along = jnp.where(used, data.velocity_std, 1.0) if use_stated else size
-    across = jnp.where(used, data.phase_std * jnp.abs(measured), 1.0) if use_stated else size
+    weigh = used & use_stated
+    along = jnp.where(weigh, data.velocity_std, size)
+    across = jnp.where(weigh, data.phase_std * jnp.abs(measured), size)
 
-    def response(physical: Float[Array, " 4"]) -> Complex[Array, "state sensor"]:
+    def weighted(velocity: Complex[Array, "state sensor"]) -> Float[Array, " number"]:
+        turned = jnp.where(used, velocity / direction, 0.0)
+        return jnp.concatenate([(turned.real / along).ravel(), (turned.imag / across).ravel()])
+
+    def unit_response(mode: Float[Array, " 2"]) -> Complex[Array, "state sensor"]:
         adapted = dataclasses.replace(
             modes,
-            natural_frequency=modes.natural_frequency.at[j].set(physical[1]),
-            damping_ratio=modes.damping_ratio.at[j].set(physical[2]),
+            natural_frequency=modes.natural_frequency.at[j].set(mode[0]),
+            damping_ratio=modes.damping_ratio.at[j].set(mode[1]),
         )
-        unit = linear_response(adapted, data.frequency, jnp.ones_like(data.frequency))
-        return physical[0] * jnp.exp(1j * physical[3]) * unit
+        return linear_response(adapted, data.frequency, jnp.ones_like(data.frequency))
 
-    def deviation(physical: Float[Array, " 4"]) -> Float[Array, " number"]:
-        error = jnp.where(used, (response(physical) - measured) / direction, 0.0)
-        return jnp.concatenate([(error.real / along).ravel(), (error.imag / across).ravel()])
+    def deviation(unknown: Float[Array, " 4"]) -> Float[Array, " number"]:
+        force = unknown[0] * jnp.exp(1j * unknown[3])
+        return weighted(force * unit_response(unknown[1:3]) - measured)
 
-    free = np.array([True, *adjusted])
-    start = _scanned_start(modes, data.frequency, measured, used, member, adjusted, response)
-    scale = jnp.array([start[0], start[1] * start[2], start[2], 1.0])
-    scale = jnp.where(scale == 0, 1.0, scale)
+    def with_best_force(mode: Float[Array, " 2"]) -> Float[Array, " 4"]:
+        unit, target = unit_response(mode), weighted(measured)
+        real = weighted(unit)
+        if not adjusted[2]:
+            return jnp.stack([real @ target / (real @ real), *mode, 0.0])
+        imag = weighted(1j * unit)
+        common = real @ imag / (real @ real)
+        b = (imag - common * real) @ target / ((imag - common * real) @ imag)
+        a = real @ (target - b * imag) / (real @ real)
+        return jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
 
-    def physical_of(unknown: Float[Array, " unknown"]) -> Float[Array, " 4"]:
-        return start.at[free].add(scale[free] * unknown)
+    frequencies, ratios = natural[None], damping[None]
+    lowest = jnp.min(jnp.where(member, data.frequency, jnp.inf))
+    highest = jnp.max(jnp.where(member, data.frequency, -jnp.inf))
+    if adjusted[0]:
+        frequencies = jnp.append(jnp.linspace(lowest, highest, 128), natural)
+    if adjusted[1]:
+        ratios = jnp.maximum(damping, 1e-4) * 2.0 ** jnp.arange(-3.0, 4.0)
+    grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
+    misfits = jax.lax.map(lambda mode: jnp.sum(deviation(with_best_force(mode)) ** 2), grid)
+    start = grid[jnp.nanargmin(misfits)]
+    iterated = np.flatnonzero(adjusted[:2])
 
-    solution: optx.Solution = optx.least_squares(
-        lambda unknown, _: deviation(physical_of(unknown)),
-        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8),
-        jnp.zeros(int(free.sum())),
-        max_steps=128,
-        throw=False,
-    )
-    best = physical_of(solution.value)
+    def mode_of(step: Float[Array, " iterated"]) -> Float[Array, " 2"]:
+        full = jnp.zeros(2).at[iterated].set(step)
+        return start * jnp.stack([1 + start[1] * full[0], jnp.exp(full[1])])
+
+    mode, found = start, jnp.all(jnp.isfinite(measured))
+    if iterated.size:
+        solution: optx.Solution = optx.least_squares(
+            lambda step, _: deviation(with_best_force(mode_of(step))),
+            optx.LevenbergMarquardt(rtol=1e-6, atol=1e-7),
+            jnp.zeros(iterated.size),
+            max_steps=128,
+            throw=False,
+        )
+        mode = mode_of(solution.value)
+        found &= jnp.asarray(solution.result == optx.RESULTS.successful)
+    best = with_best_force(mode)
+    scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
     sensitivity = jax.jacfwd(deviation)(best) * scale
+    free = np.array([True, *adjusted])
     orthogonal, upper = jnp.linalg.qr(sensitivity[:, free])
-    inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
     singular = jnp.linalg.svd(upper, compute_uv=False)
-    freedom = 2 * jnp.sum(used) - upper.shape[0]
+    inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
+    freedom = 2 * n_used - upper.shape[0]
     squares = jnp.sum(deviation(best) ** 2)
     misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
-    spread = jnp.linalg.norm(inverse, axis=1) * (1.0 if use_stated else misfit)
+    # Stated errors that do not explain the misfit are too small for the model: enlarge them.
+    at_least_one = jnp.maximum(1.0, jnp.nan_to_num(misfit, nan=1.0))
+    enlarged = jnp.where(use_stated, at_least_one, misfit)
+    spread = jnp.linalg.norm(inverse, axis=1) * enlarged
     std = jnp.zeros(4).at[free].set(jnp.abs(scale[free]) * spread)
     # What the stated errors of ω_j and ζ_j, where they are held, do to the force of every level.
-    held = jnp.where(
-        jnp.asarray(free[1:3]),
-        0.0,
-        jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]]),
-    )
-    shift = -(inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0]
-    shared = shift * scale[0] * held / scale[1:3]
-    lowest, highest = _range(data.frequency, member)
-    found = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(best))
-    found &= (best[1] > 0.5 * lowest) & (best[1] < 2 * highest) & (best[2] >= 0)
+    held = jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]])
+    held = jnp.where(jnp.asarray(adjusted[:2]), 0.0, held) / scale[1:3]
+    shared = -scale[0] * (inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0] * held
+    found &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
     status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
-    status = jnp.where(found, status, int(ForceStatus.NOT_CONVERGED))
-    determined = (freedom >= 0) & (singular[-1] > 1e-9 * singular[0])
-    status = jnp.where(determined, status, int(ForceStatus.TOO_FEW))
-    return best, std, shared, misfit * (1.0 if use_stated else size), status
-
-
-def _scanned_start(
-    modes: LinearModes,
-    frequency: Float[Array, " state"],
-    measured: Complex[Array, "state sensor"],
-    used: Bool[Array, "state sensor"],
-    member: Bool[Array, " state"],
-    adjusted: tuple[bool, bool, bool],
-    response: Callable[[Float[Array, " 4"]], Complex[Array, "state sensor"]],
-) -> Float[Array, " 4"]:
-    """Best of a scan over ω_j (and ζ_j), each with the force that fits it, which is linear."""
-    natural = modes.natural_frequency[modes.mode_of_interest]
-    damping = modes.damping_ratio[modes.mode_of_interest]
-    frequencies = natural[None]
-    if adjusted[0]:
-        scanned = jnp.linspace(*_range(frequency, member), 128)
-        frequencies = jnp.concatenate([frequencies, scanned])
-    ratios = damping[None]
-    if adjusted[1]:
-        ratios = jnp.maximum(damping, 1e-4) * jnp.array([1.0, 0.2, 0.5, 2.0, 5.0])
-
-    def candidate(pair: Float[Array, " 2"]) -> tuple[Float[Array, ""], Float[Array, " 4"]]:
-        unit = jnp.where(used, response(jnp.array([1.0, pair[0], pair[1], 0.0])), 0.0)
-        force = jnp.sum(jnp.conj(unit) * measured) / jnp.sum(jnp.abs(unit) ** 2)
-        turn = jnp.angle(force) if adjusted[2] else jnp.array(0.0)
-        magnitude = jnp.abs(force) if adjusted[2] else force.real
-        left = jnp.sum(jnp.abs(magnitude * jnp.exp(1j * turn) * unit - measured) ** 2)
-        return left, jnp.stack([magnitude, pair[0], pair[1], turn])
-
-    grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
-    misfits, starts = jax.vmap(candidate)(grid)
-    return starts[jnp.argmin(jnp.where(jnp.isfinite(misfits), misfits, jnp.inf))]
-
-
-def _range(
-    frequency: Float[Array, " state"], member: Bool[Array, " state"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    return (
-        jnp.min(jnp.where(member, frequency, jnp.inf)),
-        jnp.max(jnp.where(member, frequency, -jnp.inf)),
-    )
+    determined = singular[-1] > 1e-9 * singular[0]
+    status = jnp.where(found & determined, status, int(ForceStatus.NOT_CONVERGED))
+    status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
+    return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status
 
 
 class ForceCalibration(eqx.Module):

@@ -66,17 +66,18 @@ class HarmonicFit(eqx.Module):
     @property
     def real_std(self) -> Float[Array, "*batch harmonic"]:
         """1σ of the real parts, in the unit of the record."""
-        return jnp.sqrt(self._variance[..., : len(self.harmonic_order)])
+        return _root(self._variance[..., : len(self.harmonic_order)])
 
     @property
     def imag_std(self) -> Float[Array, "*batch harmonic"]:
         """1σ of the imaginary parts, in the unit of the record."""
-        return jnp.sqrt(self._variance[..., len(self.harmonic_order) :])
+        return _root(self._variance[..., len(self.harmonic_order) :])
 
     @property
     def complex_std(self) -> Float[Array, "*batch harmonic"]:
         """Root mean square of the complex errors, in the unit of the record."""
-        return jnp.hypot(self.real_std, self.imag_std)
+        n = len(self.harmonic_order)
+        return _root(self._variance[..., :n] + self._variance[..., n:])
 
     @property
     def amplitude_std(self) -> Float[Array, "*batch harmonic"]:
@@ -98,12 +99,18 @@ class HarmonicFit(eqx.Module):
         n = len(self.harmonic_order)
         mixed = jnp.diagonal(self.covariance[..., :n, n:], axis1=-2, axis2=-1)
         variance = real**2 * self._variance[..., :n] + imag**2 * self._variance[..., n:]
-        return jnp.sqrt(jnp.maximum(variance + 2 * real * imag * mixed, 0.0))
+        return _root(jnp.maximum(variance + 2 * real * imag * mixed, 0.0))
 
     def _index(self, order: int) -> int:
         if order not in self.harmonic_order:
             raise ValueError(f"`order` must be one of {self.harmonic_order}, but is {order}.")
         return self.harmonic_order.index(order)
+
+
+def _root(variance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Square root with a finite (zero) slope at zero: the mean has no imaginary error."""
+    known = variance != 0
+    return jnp.where(known, jnp.sqrt(jnp.where(known, variance, 1.0)), 0.0)
 
 
 def fit_harmonics(
@@ -214,7 +221,7 @@ def _fit_one(
     root = scale[:, None] * jax.scipy.linalg.solve_triangular(upper, jnp.eye(unknown.size))
     frequency_std = jnp.array(jnp.nan)
     if refine:
-        frequency_std = jnp.sqrt(noise_variance) * jnp.linalg.norm(root[-1])
+        frequency_std = _root(noise_variance) * jnp.linalg.norm(root[-1])
         # Five standard deviations of a tone, and what noise puts into every harmonic. Written so
         # that an unknown (NaN) noise passes.
         explained = jnp.sum((values - jnp.mean(values)) ** 2) - squares
@@ -240,8 +247,8 @@ def _fit_one(
         covariance=masked(noise_variance * (turned @ turned.T)),
         frequency=masked(omega),
         frequency_std=masked(frequency_std),
-        noise_std=masked(jnp.sqrt(noise_variance)),
-        residual_rms=masked(jnp.sqrt(squares / record.size)),
+        noise_std=masked(_root(noise_variance)),
+        residual_rms=masked(_root(squares / record.size)),
         condition=condition,
         reference_time=reference_time,
         status=status,
@@ -259,6 +266,7 @@ def _design(
     return jnp.concatenate([jnp.ones((time.size, 1)), powers.real, -powers.imag], axis=1)
 
 
+@jax.custom_jvp
 def _least_squares(
     design: Float[Array, "sample unknown"], values: Float[Array, " sample"]
 ) -> tuple[Float[Array, "unknown unknown"], Float[Array, " unknown"]]:
@@ -267,6 +275,23 @@ def _least_squares(
     orthogonal, upper = jnp.linalg.qr(jnp.pad(design, ((0, missing), (0, 0))))
     projected = orthogonal.T @ jnp.pad(values, (0, missing))
     return upper, jax.scipy.linalg.solve_triangular(upper, projected)
+
+
+@_least_squares.defjvp
+def _least_squares_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """By the normal equations: XLA's derivative of many QR factorisations can hang on a CPU."""
+    (design, values), (design_dot, values_dot) = primals, tangents
+    upper, coefficients = _least_squares(design, values)
+    gram_dot = design_dot.T @ design + design.T @ design_dot
+    half = jax.scipy.linalg.solve_triangular(upper, gram_dot, trans="T")
+    both = jax.scipy.linalg.solve_triangular(upper, half.T, trans="T")
+    upper_dot = (jnp.triu(both) - 0.5 * jnp.diag(jnp.diag(both))) @ upper
+    right = design_dot.T @ (values - design @ coefficients)
+    right += design.T @ (values_dot - design_dot @ coefficients)
+    half = jax.scipy.linalg.solve_triangular(upper, right, trans="T")
+    return (upper, coefficients), (upper_dot, jax.scipy.linalg.solve_triangular(upper, half))
 
 
 def _refined_frequency(

@@ -145,42 +145,53 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
         candidates = np.unique(roots.real[real])[:, None]
         tolerance = 1e-12 * scale
     else:
-        candidates, tolerance = _equilibria_by_newton(model, squared, n_starts, seed)
+        candidates, tolerance = _equilibria_by_newton(model, n_starts, seed)
     found: list[Equilibrium] = []
     for q in sorted(candidates, key=lambda row: float(np.linalg.norm(row))):
         if any(np.linalg.norm(q - e.displacement) <= tolerance for e in found):
             continue
-        point = jnp.asarray(q)[None]
-        rest = jnp.zeros_like(point)
-        tangent = np.diag(squared) + np.asarray(model.tangent_stiffness(point, rest))[0]
-        energy = float(model.potential_energy(point)[0])
-        found.append(Equilibrium(q, energy, bool(np.all(np.linalg.eigvalsh(tangent) > 0))))
+        energy, tangent = _energy_and_tangent(model, jnp.asarray(q))
+        stable = bool(np.all(np.linalg.eigvalsh(np.asarray(tangent)) > 0))
+        found.append(Equilibrium(q, float(energy), stable))
     return found
 
 
-def _equilibria_by_newton(
-    model: Structure, squared: np.ndarray, n_starts: int, seed: int
-) -> tuple[np.ndarray, float]:
+def _equilibria_by_newton(model: Structure, n_starts: int, seed: int) -> tuple[np.ndarray, float]:
     """Newton's method from random starts at the amplitudes where the potential matters."""
     n = model.n_modes
     scale = displacement_scale(model)
     radius = 10.0 ** jax.random.uniform(jax.random.key(seed), (n_starts, 1), minval=-2, maxval=1)
     direction = jax.random.normal(jax.random.key(seed + 1), (n_starts, n))
     starts = jnp.concatenate([jnp.zeros((1, n)), radius * direction * scale])
+    ends, residual = (np.asarray(part) for part in _newton(model, starts))
+    good = np.all(np.isfinite(ends), axis=1) & (residual < 1e-9 * np.max(scale))
+    return ends[good], 1e-6 * float(np.max(scale))
+
+
+@eqx.filter_jit
+def _newton(
+    model: Structure, starts: Float[Array, "start mode"]
+) -> tuple[Float[Array, "start mode"], Float[Array, " start"]]:
+    """Ends of Newton's method for ω²q + f(q, 0) = 0, and what is left of the force over ω²."""
+    squared = model.modes.natural_frequency**2
 
     def balance(q: Array) -> Array:
-        rest = jnp.zeros((1, n))
-        return jnp.asarray(squared) * q + model.nonlinear_force(q[None], rest)[0]
+        return squared * q + model.nonlinear_force(q[None], jnp.zeros((1, q.size)))[0]
 
     def step(_: int, q: Array) -> Array:
-        rest = jnp.zeros((1, n))
-        tangent = jnp.diag(squared) + model.tangent_stiffness(q[None], rest)[0]
-        return q - jnp.linalg.solve(tangent, balance(q))
+        return q - jnp.linalg.solve(_energy_and_tangent(model, q)[1], balance(q))
 
     ends = jax.vmap(lambda q: jax.lax.fori_loop(0, 60, step, q))(starts)
-    residual = jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / squared))(ends)
-    good = np.asarray(jnp.all(jnp.isfinite(ends), axis=1) & (residual < 1e-9 * jnp.max(scale)))
-    return np.asarray(ends)[good], 1e-6 * float(np.max(scale))
+    return ends, jax.vmap(lambda q: jnp.max(jnp.abs(balance(q)) / squared))(ends)
+
+
+@eqx.filter_jit
+def _energy_and_tangent(
+    model: Structure, q: Float[Array, " mode"]
+) -> tuple[Float[Array, ""], Float[Array, "mode mode"]]:
+    """Potential energy and tangent stiffness, the linear part included, at rest."""
+    tangent = model.tangent_stiffness(q[None], jnp.zeros((1, q.size)))[0]
+    return model.potential_energy(q), jnp.diag(model.modes.natural_frequency**2) + tangent
 
 
 def displacement_scale(model: Structure) -> np.ndarray:

@@ -121,7 +121,7 @@ def follow_curve(
         5 * control.iterations,
     )
     tangent = tangent * jnp.where(tangent @ direction < 0, -1.0, 1.0)
-    points = jnp.full((max_points, size), jnp.nan).at[0].set(first)
+    points = jnp.full((max_points, size), jnp.nan).at[0].set(jnp.where(found, first, jnp.nan))
     tangents = jnp.full((max_points, size), jnp.nan).at[0].set(tangent)
     running = jnp.array(-1)
     status = jnp.where(found, running, int(CurveStatus.NO_START))
@@ -192,7 +192,8 @@ def locate_event(
     """The point between two neighbours where `test(point, tangent)` changes sign.
 
     Illinois' variant of the secant method in the arclength, each trial corrected across the
-    tangent. Returns the point, its tangent and whether the sign change was resolved.
+    tangent. Returns the point, its tangent and whether the sign change was resolved between the
+    neighbours, or beside them by less than the tangents of a curve are late.
     """
     length = tangent @ (there - here)
 
@@ -224,4 +225,5 @@ def locate_event(
     low, high, f_low, f_high, _ = jax.lax.fori_loop(0, 16, body, state)
     share = jnp.where(jnp.abs(f_low) < jnp.abs(f_high), low, high)
     _, point, direction, ok = trial(share)
-    return point, direction, ok & (f_low * f_high <= 0)
+    inside = jnp.abs(share - 0.5) < 0.51
+    return point, direction, ok & inside & (f_low * f_high <= 0)

@@ -87,12 +87,12 @@ def forced_response(
             model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
         )
         ends = jnp.asarray([from_frequency, to_frequency])
-        upward = _follow(balance, ends, steps, max_points, downward=False)
+        upward = _follow(balance, ends, steps, max_points, jnp.array(False))
         if int(upward.status) == CurveStatus.UPPER_END:
             curves.append(_assemble(balance, upward, float(force), steps))
             continue
         # Below a strong softening the lower end has several solutions; the upper end has one.
-        downward = _follow(balance, ends, steps, max_points, downward=True)
+        downward = _follow(balance, ends, steps, max_points, jnp.array(True))
         if int(downward.status) == CurveStatus.LOWER_END:
             curves.append(_assemble(balance, _reversed(downward), float(force), steps))
             continue
@@ -140,7 +140,7 @@ def _follow(
     ends: Array,
     steps: StepControl,
     max_points: int,
-    downward: bool,
+    downward: Bool[Array, ""],
 ) -> Curve:
     model, order = balance.model, balance.harmonic_order
     begin = jnp.where(downward, ends[1], ends[0])

@@ -52,36 +52,47 @@ def phase_resonance_test(
 
     At every level the frequency is stepped along the stable response, from both ends of the
     range; states whose appropriation indicator (Eq. 20, of the fundamental) lies inside
-    `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over the
-    sides that a test can reach. Where a stable branch ends, the test jumps to the next one,
+    `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over what a
+    test can reach of both sides. Where a stable branch ends, the test jumps to the next one,
     which is noted in `jumps`; states between the two are not reached.
 
     Arguments: `forces` in N, frequencies in rad/s, `errors` 1σ, drawn from `seed`;
     `keep_harmonics` are recorded beside the fundamental.
     Returns a `VirtualTest`; its steady states carry the stated standard deviations.
-    Raises `ValueError` for an empty range of the indicator.
+    Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
+    into, and for harmonics or errors that make no sense.
     Reference: Kwarta & Allen, sections 1.2 and 3.1.
     """
     low, high = appropriation
     if not 0 <= low < high <= 1:
         raise ValueError(f"`appropriation` must be a range inside 0…1, but is {appropriation}.")
+    if points_per_level < 1:
+        raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
+    if not all(2 <= h <= harmonic_order for h in keep_harmonics):
+        raise ValueError(
+            f"`keep_harmonics` must lie between 2 and `harmonic_order` = {harmonic_order}, "
+            f"but is {keep_harmonics}."
+        )
+    for name, value in errors._asdict().items():
+        if not 0 <= value < np.inf:
+            raise ValueError(f"the error `{name}` must be zero or positive, but is {value}.")
+    smallest, largest = np.arccos(np.sqrt([high, low])).tolist()  # Eq. (20): cos² of the phase
     curves = forced_response(
         model, forces, from_frequency, to_frequency, harmonic_order=harmonic_order
     )
-    levels, frequency, force, starts = [], [], [], []
+    levels, frequency, force, starts, phases = [], [], [], [], []
     jumps: list[tuple[int, float]] = []
     for curve in curves:
         level = 1 + list(forces).index(curve.force)
         reached, ends = _swept(curve)
         jumps += [(level, f) for f in ends]
-        phase = _mode_phase(model, curve)
-        indicator = np.cos(phase) ** 2  # Eq. (20) of the fundamental
-        for wanted in _wanted_phases(phase, indicator, reached, low, high, points_per_level):
-            nearest = int(np.argmin(np.where(reached, np.abs(phase - wanted), np.inf)))
+        phase = _mode_phase(model, curve.coefficients)
+        for k, share in _spread_in_phase(phase, reached, smallest, largest, points_per_level):
             levels.append(level)
             force.append(curve.force)
-            frequency.append(_frequency_at(curve, phase, nearest, wanted))
-            starts.append(curve.coefficients[nearest])
+            frequency.append(_between(curve.frequency, k, share))
+            starts.append(_between(curve.coefficients, k, share))
+            phases.append(_between(phase, k, share))
     if not levels:
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
@@ -90,7 +101,9 @@ def phase_resonance_test(
     exact, converged = solve_at_frequency(
         model, jnp.asarray(force), jnp.asarray(frequency), jnp.asarray(np.stack(starts))
     )
-    keep = np.asarray(converged)
+    # Beside a fold, Newton's method at fixed frequency may leave for the other branch.
+    found = _mode_phase(model, np.asarray(exact))
+    keep = np.asarray(converged) & (np.abs(found - np.array(phases)) < 0.05)
     velocity = velocity_phasors(exact, jnp.asarray(frequency), model.modes.mode_shape)
     recorded = _with_errors(
         np.asarray(levels)[keep],
@@ -105,10 +118,10 @@ def phase_resonance_test(
     return VirtualTest(recorded, tuple(jumps), tuple(curves))
 
 
-def _mode_phase(model: Structure, curve: ResponseCurve) -> np.ndarray:
+def _mode_phase(model: Structure, coefficients: np.ndarray) -> np.ndarray:
     """Phase of the velocity fundamental of the mode of interest, 0 at phase resonance."""
     j = model.modes.mode_of_interest
-    cosine, sine = curve.coefficients[:, 1, j], curve.coefficients[:, 2, j]
+    cosine, sine = coefficients[:, 1, j], coefficients[:, 2, j]
     return np.angle(1j * (cosine - 1j * sine) * np.sign(float(model.modes.participation[j])))
 
 
@@ -120,10 +133,12 @@ def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
     """
     n = len(curve.frequency)
     visited = np.zeros(n, dtype=bool)
+    stays = curve.stable.copy()
+    stays[curve.at_events("fold")] = False  # there a multiplier is 1, give or take a rounding
     jumps: list[float] = []
     for direction in (1, -1):
         order = np.arange(n)[::direction]
-        frequency, stable = direction * curve.frequency[order], curve.stable[order]
+        frequency, stable = direction * curve.frequency[order], stays[order]
         stable_points = np.flatnonzero(stable)
         k = int(stable_points[0]) if stable_points.size else n
         while k < n:
@@ -139,39 +154,38 @@ def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
     return visited, jumps
 
 
-def _wanted_phases(
-    phase: np.ndarray,
-    indicator: np.ndarray,
-    reached: np.ndarray,
-    low: float,
-    high: float,
-    count: int,
-) -> np.ndarray:
-    """Phases to record at, evenly spread over the reachable ones inside the indicator's range."""
-    good = reached & (indicator >= low) & (indicator <= high) & (np.abs(phase) < np.pi / 2)
-    sides = [phase[good & (phase > 0)], phase[good & (phase < 0)]]
-    sides = [side for side in sides if side.size]
-    if not sides:
-        return np.zeros(0)
-    shares = np.array_split(np.arange(count), len(sides))
-    return np.concatenate(
-        [
-            np.linspace(side.min(), side.max(), len(share)) if len(share) > 1 else [side.mean()]
-            for side, share in zip(sides, shares, strict=True)
-            if len(share)
-        ]
-    )
+def _spread_in_phase(
+    phase: np.ndarray, reached: np.ndarray, smallest: float, largest: float, count: int
+) -> list[tuple[int, float]]:
+    """Places (point, share of the way to the next) on a curve with |phase| inside a range.
+
+    `count` of them, shared among the sides of resonance and spread evenly in phase over what is
+    reached of a side, so that none lies in a gap between two branches.
+    """
+    pair = np.flatnonzero(reached[:-1] & reached[1:] & (np.abs(np.diff(phase)) < 1.0))
+    sides = []
+    for sign in (1, -1):
+        begin, end = (np.clip(sign * phase[pair + k], smallest, largest) for k in (0, 1))
+        used = begin != end
+        if used.any():
+            sides.append((pair[used], sign * begin[used], sign * end[used]))
+    places: list[tuple[int, float]] = []
+    for k, (here, begin, end) in enumerate(sides):
+        n = len(np.array_split(np.arange(count), len(sides))[k])
+        along = np.concatenate([[0.0], np.cumsum(np.abs(end - begin))])
+        wanted = along[-1] * (np.arange(n) + 0.5) / n  # the middles of equal parts
+        index = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, here.size - 1)
+        target = begin[index] + np.sign(end - begin)[index] * (wanted - along[index])
+        first, last = phase[here[index]], phase[here[index] + 1]
+        places += zip(
+            here[index].tolist(), ((target - first) / (last - first)).tolist(), strict=True
+        )
+    return places
 
 
-def _frequency_at(curve: ResponseCurve, phase: np.ndarray, nearest: int, wanted: float) -> float:
-    """Frequency at a phase, interpolated between the nearest point and its better neighbour."""
-    neighbours = [k for k in (nearest - 1, nearest + 1) if 0 <= k < len(phase)]
-    across = [k for k in neighbours if (phase[k] - wanted) * (phase[nearest] - wanted) < 0]
-    if not across:
-        return float(curve.frequency[nearest])
-    k = across[0]
-    share = (wanted - phase[nearest]) / (phase[k] - phase[nearest])
-    return float(curve.frequency[nearest] + share * (curve.frequency[k] - curve.frequency[nearest]))
+def _between(values: np.ndarray, point: int, share: float) -> np.ndarray:
+    """Linear interpolation between a point of a curve and the next."""
+    return values[point] + share * (values[point + 1] - values[point])
 
 
 def _with_errors(

@@ -78,6 +78,18 @@ def arrays(points: SnrmPoints):
     return SnrmPoints(*(np.asarray(field) for field in points))
 
 
+def few_of(function, *arguments):
+    """Up to 64 members, filled up to 64: one compilation serves all the small tests."""
+    columns = np.broadcast_arrays(*arguments)
+    shape = columns[0].shape
+    dtypes = [float] * (len(columns) - 1) + [complex]
+    if function is invert_phasor:
+        dtypes[2] = complex
+    full = [np.resize(a.ravel(), 64).astype(d) for a, d in zip(columns, dtypes, strict=True)]
+    points = function(*full)
+    return SnrmPoints(*(np.asarray(f)[: columns[0].size].reshape(shape) for f in points))
+
+
 def eq_12(natural, damping, constant, frequency, amplitude, residual):
     """Relative error of |V_nl + V_lin + V_RB| = v, Eqs. (10b) and (12), the paper's phase."""
     own = constant * frequency / (natural**2 - frequency**2 + 2j * damping * natural * frequency)
@@ -227,8 +239,6 @@ class TestRandomMeasurements:
         # 1e-6 keeps clear of rounding at these limits.
         clear = np.abs(chord) > 1e-6 * amplitude**2
         assert (found == expected)[clear].all()
-        for status in expected[clear]:
-            assert status in STATUS
         kinds, counts = np.unique(points.status, return_counts=True)
         assert (counts > 100).all()
         assert {*kinds} >= {
@@ -267,7 +277,7 @@ class TestEdges:
         offset = np.array([-1e-9, -1e-12, -1e-15, 0.0, 1e-15, 1e-12, 1e-9])
         centre = math.radians(paper_degrees + 90) + (np.pi if constant < 0 else 0.0)
         phase, omega, v = centre + offset, 500.0, 0.06
-        points = arrays(invert_amplitude_phase(constant, omega, v, phase, np.zeros(7, complex)))
+        points = few_of(invert_amplitude_phase, constant, omega, v, phase, 0.0)
         size = constant * omega / v
         squared = omega**2 + size * np.array([math.sin(p) for p in phase])
         imaginary = size * np.array([math.cos(p) for p in phase])
@@ -283,7 +293,7 @@ class TestEdges:
 
     @pytest.mark.parametrize("turn", [1, 1j, -1j])
     def test_phasors_exactly_along_an_axis(self, turn):
-        point = invert_phasor(6.0, 500.0, 0.06 * turn, 0j)
+        point = few_of(invert_phasor, 6.0, 500.0, 0.06 * turn, 0.0)
         assert int(point.status) == STATUS.OK
         squared = 500.0**2 + 6.0 * 500.0 / 0.06 * complex(turn).imag
         np.testing.assert_allclose(point.natural_frequency, np.sqrt(squared), rtol=4 * EPS)
@@ -292,13 +302,13 @@ class TestEdges:
 
     def test_light_damping_near_resonance(self):
         # Unit-sized ω̃/Ω resolves half-widths of 1e-7 to 9 digits: nothing to give up for.
-        phase = np.radians(np.linspace(-80, 80, 1001))
+        phase = np.radians(np.linspace(-80, 80, 64))
         for damping in (1e-4, 1e-5, 1e-6, 1e-7):
             offset = damping * np.tan(phase)
             frequency = 500.0 / (offset + np.sqrt(offset**2 + 1))
             c = 500.0**2 - frequency**2 + 2j * damping * 500.0 * frequency
             velocity = 6j * frequency / c
-            points = arrays(invert_phasor(6.0, frequency, velocity, np.zeros(1001, complex)))
+            points = few_of(invert_phasor, 6.0, frequency, velocity, 0.0)
             assert (points.status == STATUS.OK).all()
             # ω² − Ω² of the truth is known to ε·ω², that is to ε/(2ζ) of the half-width.
             np.testing.assert_allclose(points.damping_ratio, damping, rtol=8 * EPS / damping)
@@ -306,13 +316,13 @@ class TestEdges:
 
     def test_a_residual_larger_than_the_response_has_two_roots(self):
         # v = 1, V_res = −2 at φ = 0: |r − 2| = 1 has r = 3 and r = 1; ζ̃ = A/(2Ωr) there.
-        points = invert_amplitude_phase(6.0, 500.0, 1.0, 0.0, -2.0 + 0j)
+        points = few_of(invert_amplitude_phase, 6.0, 500.0, 1.0, 0.0, -2.0)
         assert int(points.status) == STATUS.TWO_ROOTS
         np.testing.assert_allclose(points.damping_ratio, 6 / 3000, rtol=1e-14)
         np.testing.assert_allclose(points.alternative_damping_ratio, 6 / 1000, rtol=1e-14)
         for velocity, own, other in ((1.0, 3, 1), (-1.0, 1, 3)):
             # The phasor says which root is meant; the other one is still shown.
-            point = invert_phasor(6.0, 500.0, velocity + 0j, -2.0 + 0j)
+            point = few_of(invert_phasor, 6.0, 500.0, velocity, -2.0)
             assert int(point.status) == STATUS.OK
             np.testing.assert_allclose(point.damping_ratio, 6 / (1000 * own), rtol=1e-14)
             np.testing.assert_allclose(
@@ -321,17 +331,18 @@ class TestEdges:
 
     def test_where_the_two_roots_meet_nothing_wrong_is_returned(self):
         # V at right angles to V_nl: |V| does not change with |V_nl| to first order.
-        for tilt in (0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3):
-            velocity, residual = 1.0 + 0j, 1.0 - (0.5j + 0.5 * tilt)
-            point = invert_phasor(6.0, 500.0, velocity, residual)
-            if int(point.status) == STATUS.NOT_CONVERGED:
-                assert np.isnan(point.natural_frequency)
-                assert np.isnan(point.damping_ratio)
-                continue
-            own = velocity - residual
-            truth = 6j * 500.0 / own
-            # A root of multiplicity two is known to the square root of rounding.
-            np.testing.assert_allclose(point.natural_frequency**2 - 500.0**2, truth.real, rtol=1e-7)
+        tilt = np.array([0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-4, 1e-3])
+        velocity, residual = 1.0, 1.0 - (0.5j + 0.5 * tilt)
+        points = few_of(invert_phasor, 6.0, 500.0, velocity, residual)
+        refused = points.status == STATUS.NOT_CONVERGED
+        assert np.isnan(points.natural_frequency[refused]).all()
+        assert np.isnan(points.damping_ratio[refused]).all()
+        assert refused[0]
+        assert (points.status[-2:] == STATUS.OK).all()
+        truth = 6j * 500.0 / (velocity - residual)
+        found = points.natural_frequency**2 - 500.0**2
+        # A root of multiplicity two is known to the square root of rounding.
+        np.testing.assert_allclose(found[~refused], truth.real[~refused], rtol=1e-7)
 
     @pytest.mark.parametrize(
         ("arguments", "status"),
@@ -348,13 +359,13 @@ class TestEdges:
         ],
     )
     def test_every_failure_has_its_status(self, arguments, status):
-        point = invert_amplitude_phase(*arguments)
+        point = few_of(invert_amplitude_phase, *arguments)
         assert int(point.status) == status
         assert status in STATUS_MESSAGE
         solved = status == STATUS.NEGATIVE_DAMPING
         for value in point[:2]:
-            assert bool(jnp.isfinite(value)) == solved
-        assert all(bool(jnp.isnan(value)) for value in point[2:4])
+            assert np.isfinite(value) == solved
+        assert np.isnan(point[2:4]).all()
         if solved:
             assert point.damping_ratio < 0
 
@@ -368,7 +379,7 @@ class TestEdges:
             for k in range(5)
             for value in (complex_bad if k == 4 else bad)
         ]
-        points = arrays(invert_amplitude_phase(*(np.array(c) for c in zip(*rows, strict=True))))
+        points = few_of(invert_amplitude_phase, *(np.array(c) for c in zip(*rows, strict=True)))
         assert (points.status == STATUS.NOT_FINITE).all()
         assert np.isnan(np.stack(points[:4])).all()
         rows = [
@@ -378,7 +389,7 @@ class TestEdges:
         ]
         rows.append([6.0, 500.0, 0.0j, 0.1j])  # no velocity
         rows.append([6.0, 500.0, 0.1j, 0.1j])  # nothing left for the mode
-        points = arrays(invert_phasor(*(np.array(c) for c in zip(*rows, strict=True))))
+        points = few_of(invert_phasor, *(np.array(c) for c in zip(*rows, strict=True)))
         assert (points.status == STATUS.NOT_FINITE).all()
         assert np.isnan(np.stack(points[:4])).all()
 
@@ -389,36 +400,22 @@ class TestEdges:
 
 class TestShapes:
     def test_scalars_and_broadcasting(self):
-        frequency = np.array([490.0, 500.0, 510.0])
-        plain = arrays(invert_phasor(np.full(3, 6.0), frequency, np.full(3, 0.5j), np.zeros(3)))
-        for points in (
-            invert_phasor(6.0, frequency, 0.5j, 0j),
-            invert_phasor(6, jnp.asarray(frequency), 0.5j, 0),
-            invert_amplitude_phase(6.0, frequency, 0.5, np.pi / 2, 0.0),
+        rows = np.array([[6.0], [5.0]]), np.array([490.0, 500.0, 510.0])
+        residual, phase = np.array([[0.0], [0.1j]]), np.array([-0.1, 0.0, 0.1])
+        # Any of the arguments may be the batch, the residual and the phase as well.
+        for function, arguments in (
+            (invert_phasor, (*rows, 0.5 + 0.1j, 0j)),
+            (invert_phasor, (6.0, 500.0, 0.6 + 0.1j * phase, residual)),
+            (invert_amplitude_phase, (6.0, 500.0, 0.6, phase, residual)),
         ):
-            # π/2 is not exact and turns the damping by 6e-17.
-            np.testing.assert_allclose(points.natural_frequency, plain.natural_frequency, 4 * EPS)
-            np.testing.assert_allclose(points.damping_ratio, plain.damping_ratio, atol=EPS)
-        one = invert_phasor(6.0, 500.0, 0.6 + 0.1j, 0.1j)
-        assert one.natural_frequency.shape == one.status.shape == ()
-        matrix = invert_phasor(
-            np.array([[6.0], [5.0]]), frequency, np.full((1, 3), 0.6 + 0.1j), 0.1j
-        )
-        assert matrix.damping_ratio.shape == (2, 3)
-        np.testing.assert_allclose(matrix.natural_frequency[0, 1], one.natural_frequency, 4 * EPS)
-
-    def test_the_residual_and_the_phase_may_be_the_batch(self):
-        residual = np.array([0.0, 0.1j, 0.2])
-        points = invert_phasor(6.0, 500.0, 0.6 + 0.1j, residual)
-        for k, one in enumerate(residual):
-            alone = invert_phasor(6.0, 500.0, 0.6 + 0.1j, complex(one))
-            np.testing.assert_allclose(points.damping_ratio[k], alone.damping_ratio, 4 * EPS)
-        phase = np.array([-0.1, 0.0, 0.1])
-        points = invert_amplitude_phase(6.0, 500.0, 0.6, phase, 0j)
-        np.testing.assert_allclose(points.damping_ratio[1], 0.01, rtol=4 * EPS)
-        assert points.damping_ratio.shape == (3,)
-
-    def test_whole_numbers_are_numbers(self):
+            points = arrays(function(*arguments))
+            assert {field.shape for field in points} == {(2, 3)}
+            for found, expected in zip(points, few_of(function, *arguments), strict=True):
+                # The compiler may contract operations in one of them.
+                np.testing.assert_allclose(found, expected, rtol=1e-13)
+        one = invert_phasor(6.0, 500.0, 0.6 + 0j, 0j)
+        assert {field.shape for field in one} == {()}
+        np.testing.assert_allclose(one.damping_ratio, 0.01, rtol=4 * EPS)
         whole = invert_amplitude_phase(6, 500, 1, 0, 0)
         assert int(whole.status) == STATUS.OK
         np.testing.assert_allclose(whole.damping_ratio, 0.006, rtol=4 * EPS)
@@ -445,7 +442,7 @@ class TestShapes:
             traces.append(1)
             return invert_amplitude_phase(*args)
 
-        results = [counted(*few), counted(*few), jax.vmap(invert_amplitude_phase)(*few)]
+        results = [counted(*few), counted(*few), jax.jit(jax.vmap(invert_amplitude_phase))(*few)]
         assert len(traces) == 1
         for points in results:
             np.testing.assert_array_equal(points.status, plain.status)
@@ -453,9 +450,6 @@ class TestShapes:
                 # Another order of operations: rounding, amplified where ζ̃ is far from the
                 # phase's axis as in the truth above.
                 np.testing.assert_allclose(found, expected, rtol=1e-9)
-        matrix = arrays(invert_amplitude_phase(*(a.reshape(8, 8) for a in few)))
-        for found, expected in zip(matrix, plain, strict=True):
-            np.testing.assert_array_equal(found.ravel(), expected)
 
     def test_one_member_is_the_batch(self, measured):
         few = [jnp.asarray(a[:64]) for a in measured.phasors()]
@@ -586,13 +580,13 @@ class TestDerivatives:
         residual = np.array([abs(residual_of(theta)) for theta in CASES])
         assert residual[-1] > CASES[-1, 2] > residual[0]
         for k, theta in enumerate(CASES):
-            truth = fourth_order(answer, theta, 1e-4 * np.abs(theta))
+            truth = fourth_order(answer, theta, 1e-5 * np.abs(theta))
             scaled = truth * np.abs(theta)  # per relative change of the input
             size = np.abs(scaled).max(axis=1, keepdims=True)
             for found in (forward[k], reverse[k]):
                 error = np.abs(found * np.abs(theta) - scaled)
-                # The differences err by (1e-4/ζ)⁴ < 1e-9 and by rounding, 1e-12 of the largest.
-                assert (error <= 1e-6 * np.abs(scaled) + 1e-11 * size).all()
+                # The differences err by (1e-5/ζ)⁴ and by rounding, 1e-16/1e-5 of the values.
+                assert (error <= 1e-6 * np.abs(scaled) + 1e-10 * size).all()
             # The linear properties of the mode itself are no input.
             own = [5, 8]
             assert [NAMES[i] for i in own] == ["natural_frequency", "damping_ratio"]

@@ -1,0 +1,193 @@
+"""Averages over a cycle against the closed formulas of the field, and the paper's Eq. (9b)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from snrmjax.model.averaging import averaged_force, averaged_response
+from snrmjax.model.effects import make_effect
+
+AMPLITUDE = np.array([0.3, 0.5, 0.9, 4.0])
+FREQUENCY = np.array([2.0, 3.0, 0.7, 5.0])
+SAMPLES = 1024
+# The trapezoidal rule is exact for polynomials; a kink costs about h²/12 times the jump of the
+# slope over the average itself, a jump (which lies midway between samples) h²/24.
+EXACT = 1e-12
+KINK = (2 * np.pi / SAMPLES) ** 2
+
+
+def engaged(amplitude, gap=0.4):
+    """1 − (2/π)(asin a + a√(1−a²)), a = gap/Q: the share of a spring beyond ±gap."""
+    a = np.minimum(gap / amplitude, 1.0)
+    return 1 - 2 / np.pi * (np.arcsin(a) + a * np.sqrt(1 - a**2))
+
+
+def of_kind(kind, **parameters):
+    return make_effect(kind, parameters).force
+
+
+# name: force, Δ(ω̃²)(Q, Ω), Δ(2ζ̃ω̃)(Q, Ω), tolerance. The formulas are those of DIAGNOSIS.md.
+FORMULAS = {
+    "linear stiffness": (lambda q, v: 1.7 * q, lambda Q, W: 1.7, lambda Q, W: 0.0, EXACT),
+    # DESIGN.md item 4: the paper's (9b) gives −ζΩ here, its Eq. (8) needs the coefficient itself.
+    "linear damping": (lambda q, v: 0.3 * v, lambda Q, W: 0.0, lambda Q, W: 0.3, EXACT),
+    "mass": (lambda q, v: 0.0 * q + 1.0, lambda Q, W: 0.0, lambda Q, W: 0.0, EXACT),
+    "cubic": (
+        of_kind("cubic_stiffness", coefficient=1.3),
+        lambda Q, W: 0.75 * 1.3 * Q**2,
+        lambda Q, W: 0.0,
+        EXACT,
+    ),
+    "quadratic": (
+        of_kind("quadratic_stiffness", coefficient=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 0.0,
+        EXACT,
+    ),
+    "quintic": (
+        of_kind("quintic_stiffness", coefficient=1.3),
+        lambda Q, W: 0.625 * 1.3 * Q**4,
+        lambda Q, W: 0.0,
+        EXACT,
+    ),
+    "bilinear": (
+        of_kind("bilinear_stiffness", stiffness=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 0.0,
+        EXACT,
+    ),
+    "gap": (
+        of_kind("gap_stiffness", stiffness=1.3, gap=0.4),
+        lambda Q, W: 1.3 * engaged(Q),
+        lambda Q, W: 0.0,
+        KINK,
+    ),
+    "stop": (
+        of_kind("one_sided_stop", stiffness=1.3, gap=0.4),
+        lambda Q, W: 0.65 * engaged(Q),
+        lambda Q, W: 0.0,
+        KINK,
+    ),
+    "quadratic damping": (
+        of_kind("quadratic_damping", coefficient=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 8 * 1.3 * W * Q / (3 * np.pi),
+        KINK,
+    ),
+    "cubic damping": (
+        of_kind("cubic_damping", coefficient=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 0.75 * 1.3 * W**2 * Q**2,
+        EXACT,
+    ),
+    "van der Pol": (
+        of_kind("van_der_pol_damping", coefficient=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 1.3 * Q**2 / 4,
+        EXACT,
+    ),
+    "preload": (
+        of_kind("static_preload", constant_force=1.3),
+        lambda Q, W: 0.0,
+        lambda Q, W: 0.0,
+        EXACT,
+    ),
+    "Coulomb": (
+        lambda q, v: 1.3 * jnp.sign(v),
+        lambda Q, W: 0.0,
+        lambda Q, W: 4 * 1.3 / (np.pi * Q * W),
+        KINK,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_averages_follow_the_closed_formulas(name):
+    force, stiffness, damping, tolerance = FORMULAS[name]
+    average = averaged_force(
+        force, jnp.asarray(AMPLITUDE), jnp.asarray(FREQUENCY), n_samples=SAMPLES
+    )
+    # Relative to the force at the turning points: where the answer is 0, it cancels from there.
+    largest = max(abs(float(force(jnp.array(4.0), jnp.array(20.0)))), 1.0)
+    wanted = np.broadcast_to(stiffness(AMPLITUDE, FREQUENCY), AMPLITUDE.shape)
+    np.testing.assert_allclose(average.stiffness, wanted, rtol=tolerance, atol=EXACT * largest)
+    wanted = np.broadcast_to(damping(AMPLITUDE, FREQUENCY), AMPLITUDE.shape)
+    np.testing.assert_allclose(average.damping, wanted, rtol=tolerance, atol=EXACT * largest)
+
+
+def test_averages_of_a_law_without_a_formula_against_adaptive_quadrature():
+    amplitude, omega = 0.8, 2.5
+
+    def law(q, v):  # stiffness and damping mixed, not odd
+        return np.tanh(3 * q + 0.2 * v) + 0.1 * np.exp(q) * v
+
+    def integrand(beta, weight):
+        return law(amplitude * np.cos(beta), -amplitude * omega * np.sin(beta)) * weight(beta)
+
+    cosine = quad(integrand, 0, 2 * np.pi, args=(np.cos,), epsabs=1e-12, limit=200)[0]
+    sine = quad(integrand, 0, 2 * np.pi, args=(np.sin,), epsabs=1e-12, limit=200)[0]
+    average = averaged_force(
+        lambda q, v: jnp.tanh(3 * q + 0.2 * v) + 0.1 * jnp.exp(q) * v,
+        jnp.array(amplitude),
+        jnp.array(omega),
+    )
+    # Analytic law: exponential convergence, so only quadrature's own 1e-11 remains.
+    assert float(average.stiffness) == pytest.approx(cosine / (np.pi * amplitude), abs=1e-10)
+    assert float(average.damping) == pytest.approx(-sine / (np.pi * amplitude * omega), abs=1e-10)
+
+
+def test_a_kink_converges_with_the_square_of_the_step():
+    force = of_kind("gap_stiffness", stiffness=1.0, gap=0.4)
+    errors = [
+        abs(
+            float(averaged_force(force, jnp.array(0.9), jnp.array(1.0), n_samples=n).stiffness)
+            - engaged(0.9)
+        )
+        for n in (64, 1024)
+    ]
+    # 16 times the samples: a factor of 256 up to where the kink lies between two samples (a
+    # factor of about 12 either way); first-order convergence would leave 16.
+    assert errors[1] < errors[0] / 20
+
+
+def test_response_of_a_linear_mode_is_its_dynamic_stiffness():
+    w, zeta, omega, amplitude = 500.0, 0.02, 470.0, 1e-3
+    force = averaged_response(
+        jnp.array(w),
+        jnp.array(zeta),
+        lambda q, v: 0.0 * q,
+        jnp.array(amplitude),
+        jnp.array(omega),
+    )
+    wanted = amplitude * (w**2 - omega**2 + 2j * zeta * w * omega)
+    assert complex(force) == pytest.approx(wanted, rel=1e-13)
+
+
+def test_damping_as_a_force_equals_damping_as_a_ratio():
+    w, omega, amplitude = jnp.array(500.0), jnp.array([470.0, 510.0]), jnp.array([1e-3, 2e-3])
+    nothing = averaged_response(w, jnp.array(0.02), lambda q, v: 0.0 * v, amplitude, omega)
+    as_force = averaged_response(
+        w, jnp.array(0.0), lambda q, v: 2 * 0.02 * 500.0 * v, amplitude, omega
+    )
+    np.testing.assert_allclose(as_force, nothing, rtol=1e-12)  # rounding of 1024 terms
+
+
+def test_jit_vmap_and_gradient():
+    effect = make_effect("cubic_stiffness", {"coefficient": 1.3})
+    traces = []
+
+    @jax.jit
+    def compiled(amplitude, frequency):
+        traces.append(1)
+        return jax.vmap(lambda a, f: averaged_force(effect.force, a, f))(amplitude, frequency)
+
+    amplitude, frequency = jnp.asarray(AMPLITUDE), jnp.asarray(FREQUENCY)
+    np.testing.assert_allclose(
+        compiled(amplitude, frequency).stiffness, 0.75 * 1.3 * AMPLITUDE**2, rtol=EXACT
+    )
+    compiled(2 * amplitude, frequency)
+    assert len(traces) == 1
+    slope = jax.grad(lambda a: averaged_force(effect.force, a, jnp.array(2.0)).stiffness)
+    assert float(slope(jnp.array(0.5))) == pytest.approx(1.5 * 1.3 * 0.5, rel=EXACT)

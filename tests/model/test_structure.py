@@ -1,0 +1,213 @@
+"""Structures: forces and tangents against differences, and equilibria against exact ones."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.model.beams import flat_beam
+from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structure import displacement_scale, equilibria, structure
+
+ALL_EFFECTS = {
+    "cubic_stiffness": {"coefficient": 1.3},
+    "quadratic_stiffness": {"coefficient": -0.7},
+    "quintic_stiffness": {"coefficient": 2.0},
+    "bilinear_stiffness": {"stiffness": 0.8},
+    "gap_stiffness": {"stiffness": 3.0, "gap": 0.4},
+    "one_sided_stop": {"stiffness": 2.0, "gap": 0.3},
+    "quadratic_damping": {"coefficient": 0.6},
+    "cubic_damping": {"coefficient": 0.5},
+    "van_der_pol_damping": {"coefficient": 0.9},
+    "static_preload": {"constant_force": -1.1},
+}
+
+
+def modes_of(*frequency, mode_of_interest=0):
+    n = len(frequency)
+    return linear_modes(
+        list(frequency), [0.01] * n, np.ones((1, n)), [1.0] * n, mode_of_interest=mode_of_interest
+    )
+
+
+def single(frequency=2.0, potential=None, **effects):
+    made = tuple(make_effect(kind, parameters) for kind, parameters in effects.items())
+    return structure(
+        modes_of(frequency), polynomial_potential(potential or {}, 1), effects=made, name="one"
+    )
+
+
+# ------------------------------------------------------------------------- forces and tangents
+
+
+def with_all_effects():
+    """Two coupled modes; every effect acts on the second, which is of interest."""
+    assert set(ALL_EFFECTS) == set(EFFECTS)
+    return structure(
+        modes_of(2.0, 5.0, mode_of_interest=1),
+        polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2),
+        effects=tuple(make_effect(k, p) for k, p in ALL_EFFECTS.items()),
+    )
+
+
+def test_effects_add_to_the_mode_of_interest_alone():
+    model = with_all_effects()
+    q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
+    v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
+    force = np.asarray(model.nonlinear_force(q, v))
+    # ∂V/∂q by hand.
+    x, y = np.asarray(q).T
+    by_hand = np.stack([1.5 * x**2 + 1.4 * x * y**2, 1.4 * x**2 * y - 0.6 * y**2], axis=1)
+    added = force - by_hand
+    np.testing.assert_allclose(added[:, 0], 0.0, atol=1e-15)  # rounding
+    wanted = [
+        sum(float(e.force(q[k, 1], v[k, 1])) for e in model.effects) for k in range(len(force))
+    ]
+    np.testing.assert_allclose(added[:, 1], wanted, rtol=1e-13)
+
+
+def test_tangents_against_central_differences():
+    model = with_all_effects()
+    # Away from the kinks of gap (0.4), stop (0.3) and the zeros of |q| and |q̇|.
+    q = jnp.array([[0.3, -0.8], [1.1, 0.7], [-0.4, 0.1]])
+    v = jnp.array([[2.0, 0.4], [-0.3, -1.2], [0.1, 0.9]])
+    step = 1e-5
+    stiffness = np.asarray(model.tangent_stiffness(q, v))
+    damping = np.asarray(model.tangent_damping(q, v))
+    # h²/6·|f'''| ≤ 1e-10/6·120 and rounding 10·1e-16/1e-5.
+    for mode in range(2):
+        shift = step * jnp.eye(2)[mode]
+        slope = (model.nonlinear_force(q + shift, v) - model.nonlinear_force(q - shift, v)) / (
+            2 * step
+        )
+        np.testing.assert_allclose(stiffness[:, :, mode], slope, rtol=0, atol=3e-9)
+        slope = (model.nonlinear_force(q, v + shift) - model.nonlinear_force(q, v - shift)) / (
+            2 * step
+        )
+        wanted = np.zeros((3, 2)) if mode == 0 else np.stack([np.zeros(3), damping], axis=1)
+        np.testing.assert_allclose(slope, wanted, rtol=0, atol=3e-9)
+
+
+def test_potential_energy_is_the_work_of_the_forces():
+    model = with_all_effects()
+    q = np.array([0.9, -0.8])
+    # Work along the straight line from rest by the trapezoidal rule with 20001 samples, whose
+    # error at the kinks is below 1e-8; Gauss's 64 points leave about 1e-4 of a kinked force.
+    share = np.linspace(0, 1, 20001)[:, None]
+    path = share * q
+    forces = eqx.filter_jit(type(model).nonlinear_force)
+    force = np.asarray(forces(model, jnp.asarray(path), jnp.zeros(path.shape)))
+    force = force + np.asarray(model.modes.natural_frequency) ** 2 * path
+    work = np.trapezoid(force @ q, share[:, 0])
+    energy = eqx.filter_jit(type(model).potential_energy)(model, jnp.asarray([q, 0 * q]))
+    assert float(energy[0]) == pytest.approx(work, rel=1e-4)
+    assert float(energy[1]) == 0.0
+    smooth = single(potential={"111": 1.0}, cubic_stiffness={"coefficient": 4.0})
+    q = jnp.array([[0.5], [-2.0]])
+    wanted = 0.5 * 4 * q**2 + q**3 + q**4
+    np.testing.assert_allclose(smooth.potential_energy(q), wanted[:, 0], rtol=1e-13)
+
+
+# ----------------------------------------------------------------------------------- equilibria
+
+
+def test_equilibria_of_one_mode_are_the_roots_of_its_force():
+    # ω²q − 5q³ + q⁵ = 0 with ω² = 4: q² = 1 or 4.
+    model = single(potential={"1111": -5 / 4, "111111": 1 / 6})
+    found = equilibria(model)
+    np.testing.assert_allclose(
+        sorted(float(e.displacement[0]) for e in found), [-2, -1, 0, 1, 2], atol=1e-12
+    )
+    distance = [abs(float(e.displacement[0])) for e in found]
+    assert distance == sorted(distance)
+    assert {round(float(e.displacement[0])): e.stable for e in found} == {
+        0: True,
+        1: False,
+        -1: False,
+        2: True,
+        -2: True,
+    }
+    # V = 2q² − (5/4)q⁴ + q⁶/6.
+    assert found[-1].energy == pytest.approx(8 - 20 + 64 / 6, abs=1e-11)
+
+
+def test_equilibria_of_two_modes_are_found_by_search():
+    # Each mode like the one above with its own scale: 5 × 5 equilibria on a grid, exactly.
+    scale = 3.0
+    model = structure(
+        modes_of(2.0, 2.0),
+        polynomial_potential(
+            {
+                "1111": -5 / 4,
+                "111111": 1 / 6,
+                "2222": -5 / 4 / scale**2,
+                "222222": 1 / 6 / scale**4,
+            },
+            2,
+        ),
+    )
+    found = equilibria(model)
+    places = {tuple(np.rint(e.displacement / [1, scale]).astype(int)) for e in found}
+    assert places == {(a, b) for a in range(-2, 3) for b in range(-2, 3)}
+    assert len(found) == 25
+    for e in found:
+        exact = np.rint(e.displacement / [1, scale]) * [1, scale]
+        np.testing.assert_allclose(e.displacement, exact, atol=1e-8)  # Newton's own tolerance
+        assert e.stable == all(abs(k) != 1 for k in np.rint(e.displacement / [1, scale]))
+
+
+def test_flat_beam_has_one_equilibrium():
+    only = equilibria(flat_beam())
+    assert len(only) == 1
+    np.testing.assert_allclose(only[0].displacement, 0.0, atol=1e-12)
+    assert only[0].stable
+
+
+def test_equilibria_with_effects():
+    # A constant force on a linear spring: q = −f/ω², energy −f²/2ω² with the work of the force.
+    (only,) = equilibria(single(static_preload={"constant_force": 0.6}))
+    assert only.displacement[0] == pytest.approx(-0.15, rel=1e-9)
+    assert only.energy == pytest.approx(-0.5 * 0.6**2 / 4, rel=1e-9)
+    # ω²q + aq² = 0: q = −ω²/a is a saddle, with energy ω²q²/2 + aq³/3 = ω⁶/6a².
+    rest, saddle = equilibria(single(quadratic_stiffness={"coefficient": 2.0}))
+    assert rest.displacement[0] == pytest.approx(0.0, abs=1e-12)
+    assert saddle.displacement[0] == pytest.approx(-2.0, rel=1e-9)
+    assert not saddle.stable
+    assert saddle.energy == pytest.approx(4.0**3 / (6 * 2.0**2), rel=1e-9)
+
+
+# --------------------------------------------------------------------------------------- scales
+
+
+def test_displacement_scale_is_where_the_nonlinearity_matters():
+    # ω²q = 4c q³ at q = ω/√(4c).
+    model = structure(modes_of(2.0, 6.0), polynomial_potential({"1111": 25.0, "1122": 9.0}, 2))
+    np.testing.assert_allclose(displacement_scale(model), [0.2, 0.2], rtol=1e-13)
+    np.testing.assert_allclose(displacement_scale(single()), [1e-3])  # linear: any will do
+    # Effects: where the static force changes by a tenth of the linear one; the grid is 6 % wide.
+    for effect, wanted in (
+        ({"cubic_stiffness": {"coefficient": 100.0}}, np.sqrt(0.1 * 4 / 100)),
+        ({"gap_stiffness": {"stiffness": 40.0, "gap": 0.3}}, 0.3 * 40 / (40 - 0.4)),
+        ({"one_sided_stop": {"stiffness": 40.0, "gap": 0.3}}, 0.3 * 40 / (40 - 0.4)),
+        ({"static_preload": {"constant_force": 5.0}}, 1e-3),
+        ({"bilinear_stiffness": {"stiffness": 5.0}}, 1e-3),
+        ({"cubic_damping": {"coefficient": 5.0}}, 1e-3),
+    ):
+        assert displacement_scale(single(**effect))[0] == pytest.approx(wanted, rel=0.06)
+
+
+def test_a_structure_of_mismatched_parts_is_refused():
+    with pytest.raises(ValueError, match="`potential` is for 2 modes, but `modes` has 1"):
+        structure(modes_of(2.0), polynomial_potential({"12": 1.0}, 2))
+
+
+def test_what_is_not_said_is_linear_and_exact():
+    model = structure(modes_of(2.0, 3.0))
+    q = jnp.ones((4, 2))
+    assert not np.any(model.nonlinear_force(q, q))
+    assert model.tangent_stiffness(q, q).shape == (4, 2, 2)
+    assert model.tangent_damping(q, q).shape == (4,)
+    assert (float(model.level_gain_std), float(model.level_phase_std)) == (0.0, 0.0)
+    assert (model.n_modes, model.name, model.effects) == (2, "structure", ())

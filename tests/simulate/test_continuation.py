@@ -1,0 +1,239 @@
+"""Continuation on curves whose points, folds and ends are known exactly."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.simulate.continuation import (
+    STATUS_MESSAGE,
+    CurveStatus,
+    StepControl,
+    correct,
+    follow_curve,
+    locate_event,
+)
+
+STEPS = StepControl()
+UPWARD = jnp.array([0.0, 1.0])
+
+
+def s_curve(point):
+    """λ = x³ − x: folds at x = ±1/√3, λ = ∓2/(3√3)."""
+    x, lam = point
+    return jnp.array([x**3 - x - lam]), jnp.array([[3 * x**2 - 1, -1.0]])
+
+
+def circle(point):
+    """x² + λ² = 1."""
+    return jnp.array([point @ point - 1.0]), 2 * point[None]
+
+
+def pole(point):
+    """x (1 − λ) = 1: grows without bound below λ = 1."""
+    x, lam = point
+    return jnp.array([x * (1 - lam) - 1]), jnp.array([[1 - lam, -x]])
+
+
+def broken(point):
+    """x = λ, which turns into NaN beyond λ = 0.5."""
+    x, lam = point
+    bad = jnp.where(lam > 0.5, jnp.nan, 0.0)
+    return jnp.array([x - lam + bad]), jnp.array([[1.0, -1.0]])
+
+
+def nothing(point):
+    """x² + 1 = 0: no solution."""
+    x, _ = point
+    return jnp.array([x**2 + 1]), jnp.array([[2 * x, 0.0]])
+
+
+def followed(
+    problem,
+    start,
+    *,
+    direction=UPWARD,
+    ends=(-2.0, 2.0),
+    limit=np.inf,
+    steps=STEPS,
+    max_points=800,
+    across=None,
+):
+    def run(start, ends, limit):
+        return follow_curve(
+            problem,
+            start,
+            jnp.asarray(direction),
+            ends[0],
+            ends[1],
+            limit,
+            steps,
+            max_points,
+            None if across is None else jnp.asarray(across),
+        )
+
+    curve = jax.jit(run)(jnp.asarray(start), jnp.asarray(ends), jnp.asarray(limit))
+    n = int(curve.n_points)
+    assert np.all(np.isfinite(curve.points[:n]))
+    assert np.all(np.isfinite(curve.tangents[:n]))
+    assert np.all(np.isnan(curve.points[n:]))  # nothing plausible behind the last point
+    return np.asarray(curve.points)[:n], np.asarray(curve.tangents)[:n], CurveStatus(curve.status)
+
+
+@pytest.fixture(scope="module")
+def s_points():
+    return followed(s_curve, [-1.0, -2.0])
+
+
+def test_points_lie_on_the_curve_and_tangents_along_it(s_points):
+    points, tangents, status = s_points
+    assert status == CurveStatus.UPPER_END
+    x, lam = points.T
+    # Newton stops at a step below 1e-8, so the next error is its square times the curvature.
+    np.testing.assert_allclose(x**3 - x, lam, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(tangents, axis=1), 1.0, rtol=1e-14)
+    # One Newton step older than the point: it is late by up to the root of 1e-8 times 6.
+    exact = np.stack([np.ones_like(x), 3 * x**2 - 1], axis=1)
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    np.testing.assert_allclose(tangents, exact, atol=1e-3)
+
+
+def test_ends_lie_on_the_ends_of_the_range(s_points):
+    points, _, _ = s_points
+    assert points[0, 1] == -2.0
+    assert points[-1, 1] == 2.0
+    # The real roots of x³ − x ∓ 2 = 0.
+    root = max(np.roots([1, 0, -1, -2]), key=lambda r: r.real).real
+    assert points[-1, 0] == pytest.approx(root, abs=1e-12)
+    assert points[0, 0] == pytest.approx(-root, abs=1e-12)
+    assert np.all(np.abs(points[1:-1, 1]) < 2.0)
+
+
+def test_steps_keep_to_their_limits(s_points):
+    points, tangents, _ = s_points
+    turn = np.arccos(np.clip(np.sum(tangents[1:] * tangents[:-1], axis=1), -1, 1))
+    assert turn.max() < 3 * STEPS.angle
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    # A step is measured along the tangent; the chord is longer by at most 1/cos(turn).
+    assert length.max() <= STEPS.largest / np.cos(3 * STEPS.angle)
+    assert np.median(length) > 0.5 * STEPS.largest  # and the steps do grow to the largest
+    # In order along the curve, both folds passed.
+    assert np.all(np.diff(points[:, 0]) > 0)
+    assert np.sum(np.diff(np.sign(np.diff(points[:, 1]))) != 0) == 2
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_folds_are_located(s_points, sign):
+    points, tangents, _ = s_points
+    fold = sign / np.sqrt(3)
+    k = int(np.searchsorted(points[:, 0], fold)) - 1
+    locate = jax.jit(
+        lambda here, tangent, there: locate_event(
+            s_curve, lambda _, t: t[-1], here, tangent, there, STEPS
+        )
+    )
+    found, tangent, resolved = locate(points[k], tangents[k], points[k + 1])
+    assert bool(resolved)
+    # Newton to 1e-11; the tangent's share along λ is then 6x·δx/(3x²−1…) of that order.
+    np.testing.assert_allclose(found, [fold, fold**3 - fold], atol=1e-10)
+    assert abs(float(tangent[-1])) < 1e-10
+    # An event that is not there is not resolved.
+    *_, resolved = locate(points[k + 5], tangents[k + 5], points[k + 6])
+    assert not bool(resolved)
+
+
+def test_a_coarse_curve_and_a_fine_one_agree(s_points):
+    fine, _, status = followed(
+        s_curve,
+        [-1.0, -2.0],
+        steps=StepControl(first=1e-3, largest=4e-3, angle=0.008),
+        max_points=4000,
+    )
+    assert status == CurveStatus.UPPER_END
+    assert len(fine) > 8 * len(s_points[0])
+    lam = np.interp(s_points[0][:, 0], fine[:, 0], fine[:, 1])
+    # Linear interpolation: h²/8·λ'' = (4e-3)²/8·9.
+    np.testing.assert_allclose(s_points[0][:, 1], lam, atol=2e-5)
+
+
+# ---------------------------------------------------------------------------------- every status
+
+
+def test_a_closed_curve_ends_at_the_point_limit():
+    points, _, status = followed(circle, [-0.8, -0.6], max_points=300)
+    assert status == CurveStatus.POINT_LIMIT
+    assert len(points) == 300
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
+    angle = np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
+    assert np.all(np.diff(angle) < 0)  # from (−0.8, −0.6) up in λ: clockwise, and never back
+    assert abs(angle[-1] - angle[0]) > 2 * np.pi
+
+
+def test_a_curve_that_turns_back_ends_at_the_lower_end():
+    points, _, status = followed(circle, [-0.8, -0.6], ends=(-0.6, 2.0))
+    assert status == CurveStatus.LOWER_END
+    np.testing.assert_allclose(points[0], [-0.8, -0.6], atol=1e-12)
+    np.testing.assert_allclose(points[-1], [0.8, -0.6], atol=1e-12)
+
+
+def test_a_curve_that_grows_ends_at_the_amplitude_limit():
+    points, _, status = followed(pole, [1.0, 0.0], limit=5.0)
+    assert status == CurveStatus.AMPLITUDE_LIMIT
+    assert 5.0 < points[-1, 0] < 5.0 + 2 * STEPS.largest
+    assert np.all(points[:-1, 0] <= 5.0)
+    np.testing.assert_allclose(points[:, 0] * (1 - points[:, 1]), 1.0, atol=1e-12)
+
+
+def test_an_equation_that_fails_ends_with_too_small_a_step():
+    points, _, status = followed(broken, [0.0, 0.0])
+    assert status == CurveStatus.STEP_TOO_SMALL
+    np.testing.assert_allclose(points[:, 0], points[:, 1], atol=1e-12)
+    assert points[-1, 1] <= 0.5
+    assert points[-1, 1] == pytest.approx(0.5, abs=2 * STEPS.smallest)
+
+
+def test_an_equation_without_solution_has_no_start():
+    points, _, status = followed(nothing, [0.3, 0.0])
+    assert status == CurveStatus.NO_START
+    assert points.shape == (0, 2)
+
+
+def test_a_start_may_be_corrected_at_fixed_amplitude():
+    points, tangents, _ = followed(
+        circle, [0.3, 0.9], direction=[1.0, 0.0], across=[1.0, 0.0], max_points=20
+    )
+    assert points[0, 0] == pytest.approx(0.3, abs=1e-12)
+    assert points[0, 1] == pytest.approx(np.sqrt(1 - 0.09), abs=1e-12)
+    assert tangents[0, 0] > 0
+
+
+def test_every_status_has_a_message():
+    assert set(STATUS_MESSAGE) == set(CurveStatus)
+    assert all(len(message) > 10 for message in STATUS_MESSAGE.values())
+
+
+@pytest.mark.parametrize("max_points", [-1, 0, 1])
+def test_a_curve_has_two_points(max_points):
+    with pytest.raises(ValueError, match=f"`max_points` must be 2 or more, but is {max_points}"):
+        followed(circle, [-0.8, -0.6], max_points=max_points)
+
+
+# ----------------------------------------------------------------------------------- correction
+
+
+def test_correction_stays_in_its_plane_and_says_when_it_fails():
+    start, across = jnp.array([-0.7, 0.9]), jnp.array([0.6, 0.8])
+    point, tangent, count, converged = correct(circle, start, across, 1e-8, 20)
+    assert bool(converged)
+    assert 2 <= int(count) <= 8
+    assert float(point @ point) == pytest.approx(1.0, abs=1e-14)
+    assert float(across @ (point - start)) == pytest.approx(0.0, abs=1e-14)
+    assert float(tangent @ point) == pytest.approx(0.0, abs=1e-7)
+    assert float(tangent @ across) > 0
+    *_, converged = correct(circle, start, across, 1e-8, 2)  # too few iterations
+    assert not bool(converged)
+    # The line 0.6x + 0.8λ = 1.06 passes the circle by.
+    *_, converged = correct(circle, jnp.array([0.9, 0.65]), across, 1e-8, 40)
+    assert not bool(converged)
+    *_, converged = correct(broken, jnp.array([0.6, 0.6]), across, 1e-8, 20)
+    assert not bool(converged)

@@ -1,0 +1,221 @@
+"""The balance: its Jacobian, exact residuals of known motions, and its scales."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from snrmjax.model.beams import flat_beam
+from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structure import structure
+from snrmjax.simulate.harmonic_balance import (
+    harmonic_balance,
+    linear_coefficients,
+    resonance_displacement,
+)
+from snrmjax.simulate.harmonics import velocity_phasors
+
+MODERATE = {
+    "cubic_stiffness": {"coefficient": 1.3},
+    "quadratic_stiffness": {"coefficient": -0.7},
+    "quintic_stiffness": {"coefficient": 2.0},
+    "bilinear_stiffness": {"stiffness": 0.8},
+    "gap_stiffness": {"stiffness": 3.0, "gap": 0.4},
+    "one_sided_stop": {"stiffness": 2.0, "gap": 0.3},
+    "quadratic_damping": {"coefficient": 0.6},
+    "cubic_damping": {"coefficient": 0.5},
+    "van_der_pol_damping": {"coefficient": 0.9},
+    "static_preload": {"constant_force": -1.1},
+}
+
+
+def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.5):
+    modes = linear_modes([omega], [ratio], [[1.0]], [participation])
+    return structure(modes, polynomial_potential(potential or {}, 1), effects=effects)
+
+
+def two_modes_with_all_effects():
+    assert set(MODERATE) == set(EFFECTS)
+    modes = linear_modes([2.0, 5.0], [0.03, 0.01], [[1.0, 2.0]], [1.5, -0.5], mode_of_interest=1)
+    return structure(
+        modes,
+        polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2),
+        effects=tuple(make_effect(k, p) for k, p in MODERATE.items()),
+    )
+
+
+CASES = {
+    "flat beam": (flat_beam, 1e-5, {"harmonic_order": 4}),
+    "flat beam, normal mode": (flat_beam, 1e-5, {"harmonic_order": 5, "cosine_only": True}),
+    "all effects": (two_modes_with_all_effects, 1.0, {"harmonic_order": 3}),
+    "all effects, at rest": (
+        two_modes_with_all_effects,
+        1.0,
+        {"harmonic_order": 3, "cosine_only": True},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_jacobian_against_differences_and_automatic_differentiation(name):
+    model, scale, options = CASES[name]
+    balance = harmonic_balance(model(), 1e-2, scale, **options)
+    point = 0.5 * np.random.default_rng(2).normal(size=balance.size + 1)
+    point[-1] = 1.1
+    point = jnp.asarray(point)
+    linearised = eqx.filter_jit(type(balance).linearised)
+    slow = eqx.filter_jit(type(balance).residual)
+    residual, jacobian = linearised(balance, point)
+    assert jacobian.shape == (balance.size, balance.size + 1)
+    size = float(jnp.abs(jacobian).max())
+    np.testing.assert_allclose(residual, slow(balance, point), rtol=0, atol=1e-13 * size)
+    automatic = eqx.filter_jit(lambda b, p: jax.jacfwd(b.residual)(p))(balance, point)
+    # The same sums in another order.
+    np.testing.assert_allclose(jacobian, automatic, rtol=0, atol=1e-12 * size)
+    step = 1e-5
+    columns = [
+        (slow(balance, point + step * e) - slow(balance, point - step * e)) / (2 * step)
+        for e in jnp.eye(balance.size + 1)
+    ]
+    # h²/6·R''' ≤ 1e-10 of the largest entry and rounding 1e-16/1e-5 of the residual's terms; a
+    # sample that crosses a kink within the step (of 128: none here) would cost more.
+    np.testing.assert_allclose(jacobian, np.stack(columns, axis=1), rtol=0, atol=1e-8 * size)
+
+
+def test_residual_by_vmap_agrees_and_traces_once():
+    balance = harmonic_balance(one_mode({"1111": 0.3}), 1.0, 1.0, harmonic_order=3)
+    points = jnp.asarray(np.random.default_rng(0).normal(size=(4, balance.size + 1)))
+    traces = []
+
+    @jax.jit
+    def residuals(points):
+        traces.append(1)
+        return jax.vmap(balance.residual)(points)
+
+    wanted = [balance.residual(point) for point in points]
+    np.testing.assert_allclose(residuals(points), wanted, rtol=0, atol=1e-13)
+    residuals(2 * points)
+    assert len(traces) == 1
+
+
+def test_linear_structure_is_solved_by_its_linear_response():
+    modes = linear_modes(
+        [2.0, 5.0], [0.03, 0.01], [[1.0, 2.0], [0.5, -1.0]], [1.5, -0.5], mode_of_interest=1
+    )
+    model, force, omega = structure(modes), jnp.array(0.7), jnp.array(2.3)
+    exact = linear_coefficients(model, force, omega, 3)
+    balance = harmonic_balance(model, force, 0.2, harmonic_order=3)
+    residual = balance.residual(balance.point(exact, omega))
+    np.testing.assert_allclose(residual, 0.0, atol=1e-15)  # rounding of terms of order one
+    velocity = velocity_phasors(exact, omega, modes.mode_shape)
+    np.testing.assert_allclose(velocity[1], linear_response(modes, omega, force), rtol=1e-13)
+    assert not np.any(velocity[2:])
+    # and by nothing else: the residual of another motion is its error through the stiffness.
+    off = balance.residual(balance.point(1.001 * exact, omega))
+    assert float(jnp.abs(off).max()) > 1e-4
+
+
+# Motions q = A cos Ωt + B and the forces they need, worked out by hand: the residual is
+# (left side − load)/(ω_ref² · scale), coefficients (mean, c1, s1, c2, s2, c3, s3).
+A, OMEGA, W, ZETA, LOAD = 0.8, 1.7, 2.0, 0.05, 1.5 * 0.9
+LINEAR = np.array([0, (W**2 - OMEGA**2) * A - LOAD, -2 * ZETA * W * OMEGA * A, 0, 0, 0, 0])
+KNOWN = {
+    "cubic": ({"1111": 0.3}, (), 1.2 * A**3 * np.array([0, 0.75, 0, 0, 0, 0.25, 0])),
+    "quadratic": ({"111": 0.4}, (), 1.2 * A**2 * np.array([0.5, 0, 0, 0.5, 0, 0, 0])),
+    "cubic as an effect": (
+        {},
+        (make_effect("cubic_stiffness", {"coefficient": 1.2}),),
+        1.2 * A**3 * np.array([0, 0.75, 0, 0, 0, 0.25, 0]),
+    ),
+    # c q²q̇ = −cΩA³ cos²τ sin τ = −cΩA³ (sin τ + sin 3τ)/4
+    "van der Pol": (
+        {},
+        (make_effect("van_der_pol_damping", {"coefficient": 0.9}),),
+        -0.9 * OMEGA * A**3 / 4 * np.array([0, 0, 1, 0, 0, 0, 1]),
+    ),
+    # c q̇³ = −cΩ³A³ (3 sin τ − sin 3τ)/4
+    "cubic damping": (
+        {},
+        (make_effect("cubic_damping", {"coefficient": 0.9}),),
+        -0.9 * (OMEGA * A) ** 3 / 4 * np.array([0, 0, 3, 0, 0, 0, -1]),
+    ),
+    "preload": (
+        {},
+        (make_effect("static_preload", {"constant_force": 0.6}),),
+        0.6 * np.array([1, 0, 0, 0, 0, 0, 0]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_residual_of_a_harmonic_motion_is_the_known_one(name):
+    potential, effects, nonlinear = KNOWN[name]
+    balance = harmonic_balance(one_mode(potential, effects), 0.9, 0.1, harmonic_order=3)
+    x = jnp.zeros((7, 1)).at[1].set(A)
+    residual = balance.residual(balance.point(x, jnp.array(OMEGA)))
+    wanted = (LINEAR + nonlinear) / (W**2 * 0.1)
+    np.testing.assert_allclose(residual, wanted, rtol=0, atol=1e-13)  # rounding
+
+
+def test_point_and_coefficients_are_inverse():
+    balance = harmonic_balance(flat_beam(), 1e-2, 3e-5, harmonic_order=2)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(5, 4)))
+    point = balance.point(x, jnp.array(600.0))
+    np.testing.assert_allclose(balance.coefficients(point), x, rtol=1e-15)
+    assert float(point[-1]) == pytest.approx(600.0 / (2 * np.pi * 79.02), rel=1e-14)
+
+
+def test_residual_does_not_depend_on_units():
+    """Lengths in millimetres, times in milliseconds: same scaled point, same scaled residual."""
+    point = jnp.asarray(np.random.default_rng(4).normal(size=8))
+    balance = harmonic_balance(one_mode({"1111": 0.3, "111": 0.1}), 0.9, 0.5, harmonic_order=3)
+    # q [kg^1/2 mm] = 1e3 q; c in (mm/ms²)/mm³ … : V [kg mm²/ms²] = V·1e6/1e6, so c_d = c/1e3^d.
+    small = one_mode({"1111": 0.3e-12, "111": 0.1e-9}, omega=2.0e-3, participation=1.5)
+    small_balance = harmonic_balance(small, 0.9e-3, 500.0, harmonic_order=3)
+    np.testing.assert_allclose(
+        small_balance.residual(point), balance.residual(point), rtol=0, atol=1e-13
+    )
+
+
+# -------------------------------------------------------------------------------------- set-up
+
+
+def test_samples_by_default_and_on_request():
+    assert harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3).n_samples == 16
+    assert harmonic_balance(one_mode({"1111": 1.0}), 1.0, 1.0, harmonic_order=9).n_samples == 40
+    effect = (make_effect("gap_stiffness", {"stiffness": 1.0, "gap": 1.0}),)
+    assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 128
+    assert harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3, n_samples=7).n_samples == 7
+
+
+def test_wrong_settings_are_refused():
+    with pytest.raises(ValueError, match="`harmonic_order` must be 1 or more, but is 0"):
+        harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=0)
+    with pytest.raises(ValueError, match=r"`n_samples` must be above 6, .* but is 6"):
+        harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3, n_samples=6)
+
+
+def test_resonance_displacement_solves_its_balance():
+    force, participation, w = 0.9, 1.5, 2.0
+    load = force * participation
+    # The grid of amplitudes has steps of 6 %; between them it is interpolated to 1e-3.
+    linear = resonance_displacement(one_mode(ratio=0.01), force)
+    assert linear == pytest.approx(load / (2 * 0.01 * w * w), rel=1e-3)
+    hard = resonance_displacement(one_mode({"1111": 0.3}, ratio=0.01), force)
+    wanted = brentq(lambda q: 0.04 * np.sqrt(4 + 3 * 0.3 * q**2) * q - load, 1e-3, 1e3)
+    assert hard == pytest.approx(wanted, rel=1e-3)
+    drag = make_effect("quadratic_damping", {"coefficient": 0.6})
+    # 8cΩQ/3π · ω Q = P
+    wanted = np.sqrt(load * 3 * np.pi / (8 * 0.6)) / w
+    assert resonance_displacement(one_mode({}, (drag,), ratio=0.0), force) == pytest.approx(
+        wanted, rel=1e-3
+    )
+    # Never below the static displacement, and never the near-infinity of an undamped resonance.
+    assert resonance_displacement(one_mode(ratio=0.9), force) == pytest.approx(load / w**2)
+    assert resonance_displacement(one_mode(ratio=0.0), force) <= 1.001e4 * load / w**2
+    modes = linear_modes([2.0, 1.0], [0.01, 0.01], [[1.0, 1.0]], [0.0, 3.0])
+    assert resonance_displacement(structure(modes), 2.0) == pytest.approx(6.0)
