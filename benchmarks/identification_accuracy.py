@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
+from snrmjax import plot
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
 
 HERTZ = 2 * np.pi
@@ -109,7 +110,7 @@ def study(
         "resonances": [],
     }
     for curve in responses:
-        exact = [k for k in curve.at_events("phase_resonance")]
+        exact = curve.at_events("phase_resonance")
         k = max(exact, key=lambda k: abs(curve.velocity[k, 1, 0]))
         predicted = max(
             sj.resonances(backbone, model.modes, curve.force),
@@ -163,24 +164,21 @@ def main() -> None:
     result, backbone = study(curved, data, "displacement", branch, responses, (0.0, 0.0))
     print(json.dumps(result))
     if len(sys.argv) > 1:
-        draw(Path(sys.argv[1]), curved, backbone, responses, data)
-
-
-def draw(
-    folder: Path,
-    model: sj.Structure,
-    backbone: sj.Backbone,
-    responses: list[sj.ResponseCurve],
-    data: sj.SteadyStates,
-) -> None:
-    """The curved beam's responses at the paper's three forces over harmonic balance."""
-    from snrmjax import plot
-
-    folder.mkdir(parents=True, exist_ok=True)
-    predicted = [
-        (force, sj.predict_response(backbone, model.modes, force)) for force in CURVED_BEAM_FORCES
-    ]
-    del predicted, data, plot, responses
+        folder = Path(sys.argv[1])
+        folder.mkdir(parents=True, exist_ok=True)
+        figure = plot.response_figure(
+            backbone,
+            [
+                part
+                for force in CURVED_BEAM_FORCES
+                for part in sj.predict_response(
+                    backbone, curved.modes, force, from_frequency=25 * HERTZ
+                )
+            ],
+            [r for f in CURVED_BEAM_FORCES for r in sj.resonances(backbone, curved.modes, f)],
+            simulated=responses,
+        )
+        plot.save_figure(figure, folder / "curved_responses.png")
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def closed_form_with_roots(
     return (*far, *near)
 
 
-def median_time(function, *args: jax.Array) -> float:  # noqa: ANN001
+def median_time(function, *args: jax.Array) -> float:
     """Median of seven runs after one that compiles."""
     jax.block_until_ready(function(*args))
     times = []

@@ -103,7 +103,7 @@ def fit_axis(axes: Axes, direction: str, points: Any, others: Any = (), bars: An
     outside = int(np.sum((value < ends[0]) | (value > ends[1])))
     if outside:
         note = f"{outside} point{'s' if outside > 1 else ''} off the {direction} axis"
-        place = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": 9.5}
+        place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": 9.5}
         axes.text(0.99, 0.99 if direction == "y" else 0.93, note, color="0.3", **place)
 
 

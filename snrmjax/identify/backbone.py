@@ -231,10 +231,8 @@ def _best_smoothing(
         level = np.argsort(np.argsort(amplitude)) % 3
     sample = (amplitude, values, std, level, fixed)
     tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
-    best = min(tried, key=lambda one: one.score)
-    # Of all weights that are not clearly worse than the best one, the smoothest.
-    chosen = max(k for k, one in enumerate(tried) if one.score <= best.score + best.score_std)
-    return weights[chosen], tried[chosen].sizes
+    best = int(np.argmin([one.score for one in tried]))
+    return weights[best], tried[best].sizes
 
 
 def _anchor_report(

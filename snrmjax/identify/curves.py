@@ -176,7 +176,9 @@ def fit_curve(
     if fixed_first is not None:
         at_knots[0], free = fixed_first / unit, slice(1, n)
     information = np.sum(1.0 / spread**2) / n
-    rough = np.sqrt(smoothing * information) * _bending(np.asarray(CURVES[kind].abscissa(knots)))
+    rough = np.sqrt(smoothing * information) * _bending(
+        np.asarray(CURVES[kind].abscissa(jnp.asarray(knots)))
+    )
     pinned = -rough[:, 0] * at_knots[0] if fixed_first is not None else np.zeros(len(rough))
     # The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
     for _ in range(12):
@@ -209,7 +211,6 @@ class LeftOut(NamedTuple):
     """How well levels are predicted by the others."""
 
     score: float  # error²/std², mean of the better three quarters of the levels; infinity = none
-    score_std: float  # 1σ of the score, from its scatter over the levels
     sizes: ErrorSizes
 
 
@@ -240,13 +241,12 @@ def predict_left_out(
         errors.append(values[left] - predicted)
         spreads.append(std[left])
     if not errors:
-        return LeftOut(np.inf, np.inf, AS_STATED)
+        return LeftOut(np.inf, AS_STATED)
     pairs = zip(errors, spreads, strict=True)
     squares = np.sort([np.mean((error / spread) ** 2) for error, spread in pairs])
     # A few levels that no curve predicts, at a sharp bend, must not decide for all.
-    squares = squares[: -(-3 * len(squares) // 4)]
-    score, score_std = float(np.mean(squares)), float(np.std(squares) / np.sqrt(len(squares)))
-    return LeftOut(score, score_std, error_sizes(errors, spreads))
+    score = float(np.mean(squares[: -(-3 * len(squares) // 4)]))
+    return LeftOut(score, error_sizes(errors, spreads))
 
 
 def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
