@@ -203,6 +203,12 @@ def test_headline_numbers_are_those_of_the_curves(identification, modes, data):
     assert change == pytest.approx(expected[1] - expected[0], abs=0.05)
     damping = float(rows["damping ratio (± 95 %)"].split(" ±")[0])
     assert damping == pytest.approx(2.0, rel=5e-3)
+    for name, unit in (("frequency", "Hz"), ("damping", "%")):
+        ends = re.fullmatch(
+            rf"(\S+) {unit} at \S+ m/s to (\S+) {unit} at \S+ m/s",
+            rows[f"lowest to highest {name}"],
+        )
+        assert float(ends[1]) < float(ends[2])
     assert rows["points used"] == f"32 of 32 at sensor tip {NASTY}"
     assert rows["left out"] == "none"
     assert rows["phases measured"] == "−40° to 40°, 0° is resonance"

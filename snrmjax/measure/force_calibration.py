@@ -150,9 +150,10 @@ def _fit_levels(
     adjusted: tuple[bool, bool, bool],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Force, ω_j, ζ_j and ψ of every level, their std, the force covariance, misfit and status."""
-    best, std, shared, misfit, status = jax.vmap(
-        lambda member: _fit_level(modes, data, member, use_stated, adjusted)
-    )(members)
+    # One after the other: a batch would wait for its slowest level, and compile for longer.
+    best, std, shared, misfit, status = jax.lax.map(
+        lambda member: _fit_level(modes, data, member, use_stated, adjusted), members
+    )
     good = status == int(ForceStatus.SUCCESSFUL)
     covariance = jnp.diag(std[:, 0] ** 2) + shared @ shared.T
     covariance = jnp.where(good[:, None] & good, covariance, jnp.nan)
@@ -200,16 +201,21 @@ def _fit_level(
         force = unknown[0] * jnp.exp(1j * unknown[3])
         return weighted(force * unit_response(unknown[1:3]) - measured)
 
-    def with_best_force(mode: Float[Array, " 2"]) -> Float[Array, " 4"]:
-        unit, target = unit_response(mode), weighted(measured)
+    target = weighted(measured)
+
+    def eliminated(mode: Float[Array, " 2"]) -> tuple[Float[Array, " 4"], Float[Array, " number"]]:
+        """The unknowns and deviations with the best F and ψ, as F e^{iψ} = a + ib."""
+        unit = unit_response(mode)
         real = weighted(unit)
         if not adjusted[2]:
-            return jnp.stack([real @ target / (real @ real), *mode, 0.0])
+            a = real @ target / (real @ real)
+            return jnp.stack([a, *mode, 0.0]), a * real - target
         imag = weighted(1j * unit)
-        common = real @ imag / (real @ real)
-        b = (imag - common * real) @ target / ((imag - common * real) @ imag)
+        across_real = imag - (real @ imag / (real @ real)) * real
+        b = across_real @ target / (across_real @ imag)
         a = real @ (target - b * imag) / (real @ real)
-        return jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
+        best = jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
+        return best, a * real + b * imag - target
 
     frequencies, ratios = natural[None], damping[None]
     lowest = jnp.min(jnp.where(member, data.frequency, jnp.inf))
@@ -219,7 +225,7 @@ def _fit_level(
     if adjusted[1]:
         ratios = jnp.maximum(damping, 1e-4) * 2.0 ** jnp.arange(-3.0, 4.0)
     grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
-    misfits = jax.lax.map(lambda mode: jnp.sum(deviation(with_best_force(mode)) ** 2), grid)
+    misfits = jax.lax.map(lambda mode: jnp.sum(eliminated(mode)[1] ** 2), grid)
     start = grid[jnp.nanargmin(misfits)]
     iterated = np.flatnonzero(adjusted[:2])
 
@@ -230,7 +236,7 @@ def _fit_level(
     mode, found = start, jnp.all(jnp.isfinite(measured))
     if iterated.size:
         solution: optx.Solution = optx.least_squares(
-            lambda step, _: deviation(with_best_force(mode_of(step))),
+            lambda step, _: eliminated(mode_of(step))[1],
             optx.LevenbergMarquardt(rtol=1e-6, atol=1e-7),
             jnp.zeros(iterated.size),
             max_steps=128,
@@ -238,7 +244,7 @@ def _fit_level(
         )
         mode = mode_of(solution.value)
         found &= jnp.asarray(solution.result == optx.RESULTS.successful)
-    best = with_best_force(mode)
+    best, remaining = eliminated(mode)
     scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
     sensitivity = jax.jacfwd(deviation)(best) * scale
     free = np.array([True, *adjusted])
@@ -246,7 +252,7 @@ def _fit_level(
     singular = jnp.linalg.svd(upper, compute_uv=False)
     inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
     freedom = 2 * n_used - upper.shape[0]
-    squares = jnp.sum(deviation(best) ** 2)
+    squares = jnp.sum(remaining**2)
     misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
     # Stated errors that do not explain the misfit are too small for the model: enlarge them.
     at_least_one = jnp.maximum(1.0, jnp.nan_to_num(misfit, nan=1.0))

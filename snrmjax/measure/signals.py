@@ -174,11 +174,16 @@ def _fit_batch(
     def one(record: Float[Array, " sample"], omega: Float[Array, ""]) -> HarmonicFit:
         return _fit_one(time, record, omega, reference_time, max_condition, orders, refine)
 
-    # One frequency for all: the factorisation is then shared by all records.
-    each = None if frequency.ndim == 0 else 0
-    fit = jax.vmap(one, in_axes=(0, each))(
-        records.reshape(-1, time.size), frequency if each is None else frequency.reshape(-1)
-    )
+    rows = records.reshape(-1, time.size)
+    if refine:
+        # One after the other: a batch would wait for its slowest record.
+        each = jnp.broadcast_to(frequency, records.shape[:-1]).reshape(-1)
+        fit = jax.lax.map(lambda pair: one(*pair), (rows, each))
+    elif frequency.ndim == 0:
+        # One frequency for all: the factorisation is then shared by all records.
+        fit = jax.vmap(lambda row: one(row, frequency))(rows)
+    else:
+        fit = jax.vmap(one)(rows, frequency.reshape(-1))
     return jax.tree.map(lambda leaf: leaf.reshape(records.shape[:-1] + leaf.shape[1:]), fit)
 
 

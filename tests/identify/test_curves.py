@@ -204,18 +204,35 @@ class TestFit:
         assert abs(float(wrong.curve.values[1]) - 4.0) > 1e-3  # the next one gives way
 
     def test_the_penalised_fit_is_the_smallest_sum(self):
-        """Piecewise linear, a linear problem: against scipy-free stacked least squares."""
+        """Piecewise linear, a linear problem: against stacked least squares by numpy."""
         amplitude, truth, level = sample("piecewise_linear")
         rng = np.random.default_rng(2)
         values, std = truth + 0.1 * rng.normal(size=60), rng.uniform(0.05, 0.2, 60)
-        fit = fit_curve("piecewise_linear", KNOTS, 0.3, amplitude, values, std, level)
+        fit = fit_curve("piecewise_linear", KNOTS, 1e-3, amplitude, values, std, level)
         hats = np.stack([np.interp(amplitude, KNOTS, column) for column in np.eye(6)], axis=1)
-        # Second differences weigh as much as the points tell about one knot on average.
-        rough = np.sqrt(0.3 * np.sum(1 / std**2) / 6) * np.diff(np.eye(6), n=2, axis=0)
+        # ∫(g″)² over the knots scaled to 0…1, g″ from the parabola through three neighbours,
+        # against what the points tell about one knot on average.
+        u, rough = (KNOTS - KNOTS[0]) / (KNOTS[-1] - KNOTS[0]), []
+        for k in range(4):
+            near = slice(k, k + 3)
+            curvature = [2 * np.polyfit(u[near], column[near], 2)[0] for column in np.eye(6)]
+            rough.append(np.sqrt((u[k + 2] - u[k]) / 2) * np.array(curvature))
+        rough = np.sqrt(1e-3 * np.sum(1 / std**2) / 6) * np.array(rough)
         stacked = np.concatenate([hats / std[:, None], rough])
         right = np.concatenate([values / std, np.zeros(4)])
         best = np.linalg.lstsq(stacked, right, rcond=None)[0]
-        np.testing.assert_allclose(fit.curve.values, best, rtol=1e-10)  # condition below 1e3
+        # The normal equations square a condition number below 1e3.
+        np.testing.assert_allclose(fit.curve.values, best, rtol=1e-9)
+
+    @both_kinds
+    def test_much_smoothing_is_a_line_in_the_abscissa(self, kind):
+        amplitude, truth, level = sample(kind)
+        std = np.random.default_rng(2).uniform(0.05, 0.2, 60)
+        fit = fit_curve(kind, KNOTS, 1e9, amplitude, truth, std, level)
+        power = 2 if kind == "spline" else 1
+        line = np.polyfit(amplitude**power, truth, 1, w=1 / std)
+        # The curve gives way by 1e-9 of its bending, and rounding grows by the same weight.
+        np.testing.assert_allclose(fit.curve.values, np.polyval(line, KNOTS**power), rtol=1e-5)
 
     @both_kinds
     def test_covariance_against_monte_carlo(self, kind):
@@ -278,7 +295,17 @@ class TestLeftOut:
             line = np.polyfit(amplitude[kept], values[kept], 1)
             error = values[~kept] - np.polyval(line, amplitude[~kept])
             squares.append(np.mean((error / 0.1) ** 2))
-        np.testing.assert_allclose(left.score, np.exp(np.mean(np.log(squares))), rtol=1e-10)
+        np.testing.assert_allclose(left.score, np.mean(squares), rtol=1e-10)  # rounding
+
+    def test_a_level_that_nothing_predicts_does_not_decide(self):
+        amplitude = np.linspace(0.2, 2.0, 40)
+        level, values = np.repeat(np.arange(8), 5), np.where(np.arange(40) // 5 == 4, 50.0, 0.0)
+        knots = amplitude[2::5].copy()
+        knots[0], knots[-1] = 0.2, 2.0
+        arguments = ("piecewise_linear", knots, 1e-8, amplitude)
+        left = predict_left_out(*arguments, values, np.ones(40), level)
+        # The level itself misses by 50, its neighbours by less: the other five agree.
+        assert left.score < 0.1 * 50**2 / 8
 
     def test_levels_that_only_a_continued_curve_reaches_are_left_aside(self):
         amplitude, level = np.array([1.0, 1.1, 2.0, 2.1]), np.array([0, 0, 1, 1])
