@@ -130,7 +130,8 @@ def _typical_states(told: Presentation) -> list[int]:
     level = np.asarray(points.level)[int(np.argmax(amplitude))]
     rows = np.flatnonzero((np.asarray(points.level) == level) & np.isfinite(amplitude))
     ordered = rows[np.argsort(phase[rows])]
-    return sorted({int(ordered[0]), int(ordered[len(ordered) // 2]), int(ordered[-1])})
+    # dict, not set: the order is the caption's, and a level may have fewer than three states.
+    return list(dict.fromkeys(int(ordered[k]) for k in (0, len(ordered) // 2, -1)))
 
 
 LOOPS_CAPTION = (

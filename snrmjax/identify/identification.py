@@ -95,10 +95,12 @@ def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tupl
             "(damping) of the measured phasor."
         )
     level_hz = fit.level_frequency_std / (2 * np.pi)
-    if level_hz > 0 or fit.level_damping_std > 0:
+    shared = [f"{level_hz:.2g} Hz"] if level_hz > 0 else []
+    if fit.level_damping_std > 0:
+        shared.append(f"{100 * fit.level_damping_std:.2g} % of critical damping")
+    if shared:
         notes.append(
-            f"levels differ from one another by {level_hz:.2g} Hz and "
-            f"{100 * fit.level_damping_std:.2g} % of critical damping (1σ); the bands include it."
+            f"levels differ from one another by {' and '.join(shared)} (1σ); the bands include it."
         )
     if fit.anchor is not None:
         anchor = fit.anchor

@@ -144,8 +144,9 @@ def predict_response(
             closed=not main,
         )
         keep = (curve.frequency >= from_frequency) & (curve.frequency <= to_frequency)
-        if keep.any():
-            curves.append(_subset(curve, keep))
+        # A range that cuts the peak off leaves two pieces, which no line may join.
+        runs = np.split(np.arange(len(keep)), np.flatnonzero(np.diff(keep.astype(int))) + 1)
+        curves += [_subset(curve, run) for run in runs if run.size and keep[run[0]]]
     return curves
 
 

@@ -299,7 +299,7 @@ class TestLeftOut:
 
     def test_a_level_that_nothing_predicts_does_not_decide(self):
         amplitude = np.linspace(0.2, 2.0, 40)
-        level, values = np.repeat(np.arange(8), 5), np.where(np.arange(40) // 5 == 4, 50.0, 0.0)
+        level, values = np.repeat(np.arange(8), 5), np.where(np.arange(40) // 5 == 4, 60.0, 10.0)
         knots = amplitude[2::5].copy()
         knots[0], knots[-1] = 0.2, 2.0
         arguments = ("piecewise_linear", knots, 1e-8, amplitude)
