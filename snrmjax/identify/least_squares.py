@@ -35,11 +35,13 @@ def penalised_least_squares(
     """
     x, y = design / std[:, None], target / std
     shared = members / std[:, None]
-    bread = np.linalg.pinv(x.T @ x + penalty.T @ penalty, hermitian=True)
-    arms = bread @ (x.T @ shared)
+    # By singular values, not normal equations: a strong penalty would drown what points say.
+    inverse = np.linalg.pinv(np.concatenate([x, penalty]), rcond=1e-15)
+    of_points = inverse[:, : len(x)]
+    arms = of_points @ shared
     return LeastSquares(
-        values=bread @ (x.T @ y + penalty.T @ penalty_target),
-        unshared_covariance=bread @ (x.T @ x) @ bread,
+        values=of_points @ y + inverse[:, len(x) :] @ penalty_target,
+        unshared_covariance=of_points @ of_points.T,
         shared_covariance=arms @ arms.T,
     )
 

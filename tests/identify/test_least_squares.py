@@ -69,6 +69,19 @@ def test_covariance_against_monte_carlo():
     np.testing.assert_allclose(np.mean(found, axis=0), truth, atol=0.03)
 
 
+def test_a_penalty_much_stiffer_than_the_points():
+    # All values equal, by a penalty of 1e9: what is left is the weighted mean.
+    ones = np.eye(PARAMETERS)[LEVEL % PARAMETERS]
+    stiff = 1e9 * np.diff(np.eye(PARAMETERS), axis=0)
+    zeros = np.zeros(PARAMETERS - 1)
+    result = penalised_least_squares(ones, TARGET, STD, MEMBERS, stiff, zeros)
+    weight = 1 / STD**2
+    mean = np.sum(weight * TARGET) / np.sum(weight)
+    # Rounding 1e-16 times 1e9: normal equations would have lost everything.
+    np.testing.assert_allclose(result.values, mean, rtol=1e-6)
+    np.testing.assert_allclose(result.unshared_covariance, 1 / np.sum(weight), rtol=1e-6)
+
+
 def test_parameters_that_no_point_sees_stay_at_zero():
     design = DESIGN.copy()
     design[:, 2] = 0.0
