@@ -171,19 +171,13 @@ def _fit_batch(
     orders: tuple[int, ...],
     refine: bool,
 ) -> HarmonicFit:
-    def one(record: Float[Array, " sample"], omega: Float[Array, ""]) -> HarmonicFit:
-        return _fit_one(time, record, omega, reference_time, max_condition, orders, refine)
+    def one(pair: tuple[Array, Array]) -> HarmonicFit:
+        return _fit_one(time, *pair, reference_time, max_condition, orders, refine)
 
-    rows = records.reshape(-1, time.size)
-    if refine:
-        # One after the other: a batch would wait for its slowest record.
-        each = jnp.broadcast_to(frequency, records.shape[:-1]).reshape(-1)
-        fit = jax.lax.map(lambda pair: one(*pair), (rows, each))
-    elif frequency.ndim == 0:
-        # One frequency for all: the factorisation is then shared by all records.
-        fit = jax.vmap(lambda row: one(row, frequency))(rows)
-    else:
-        fit = jax.vmap(one)(rows, frequency.reshape(-1))
+    # One after the other: a batch would wait for its slowest record, and large batches of small
+    # factorisations have been seen to hang in XLA's thread pool on two cores.
+    each = jnp.broadcast_to(frequency, records.shape[:-1])
+    fit = jax.lax.map(one, (records.reshape(-1, time.size), each.reshape(-1)))
     return jax.tree.map(lambda leaf: leaf.reshape(records.shape[:-1] + leaf.shape[1:]), fit)
 
 
@@ -286,7 +280,7 @@ def _least_squares(
 def _least_squares_jvp(
     primals: tuple[Array, Array], tangents: tuple[Array, Array]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """By the normal equations: XLA's derivative of many QR factorisations can hang on a CPU."""
+    """By the normal equations, which cost less than the derivative of the QR factorisation."""
     (design, values), (design_dot, values_dot) = primals, tangents
     upper, coefficients = _least_squares(design, values)
     gram_dot = design_dot.T @ design + design.T @ design_dot

@@ -1,5 +1,7 @@
 """Continuation on curves whose points, folds and ends are known exactly."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,6 @@ from snrmjax.simulate.continuation import (
 )
 
 STEPS = StepControl()
-UPWARD = jnp.array([0.0, 1.0])
 
 
 def s_curve(point):
@@ -48,31 +49,32 @@ def nothing(point):
     return jnp.array([x**2 + 1]), jnp.array([[2 * x, 0.0]])
 
 
+PROBLEMS = (s_curve, circle, pole, broken, nothing)
+
+
+@partial(jax.jit, static_argnames=("steps", "max_points"))
+def compiled(which, start, direction, ends, limit, across, steps, max_points):
+    """All problems in one: which of them is a number, so that this compiles once."""
+
+    def problem(point):
+        return jax.lax.switch(which, PROBLEMS, point)
+
+    return follow_curve(problem, start, direction, *ends, limit, steps, max_points, across)
+
+
 def followed(
     problem,
     start,
     *,
-    direction=UPWARD,
+    direction=(0.0, 1.0),
     ends=(-2.0, 2.0),
     limit=np.inf,
     steps=STEPS,
     max_points=800,
-    across=None,
+    across=(0.0, 1.0),
 ):
-    def run(start, ends, limit):
-        return follow_curve(
-            problem,
-            start,
-            jnp.asarray(direction),
-            ends[0],
-            ends[1],
-            limit,
-            steps,
-            max_points,
-            None if across is None else jnp.asarray(across),
-        )
-
-    curve = jax.jit(run)(jnp.asarray(start), jnp.asarray(ends), jnp.asarray(limit))
+    numbers = (jnp.asarray(part, dtype=float) for part in (start, direction, ends, limit, across))
+    curve = compiled(PROBLEMS.index(problem), *numbers, steps=steps, max_points=max_points)
     n = int(curve.n_points)
     assert np.all(np.isfinite(curve.points[:n]))
     assert np.all(np.isfinite(curve.tangents[:n]))
@@ -122,23 +124,23 @@ def test_steps_keep_to_their_limits(s_points):
     assert np.sum(np.diff(np.sign(np.diff(points[:, 1]))) != 0) == 2
 
 
+@jax.jit
+def located_fold(here, tangent, there):
+    return locate_event(s_curve, lambda _, t: t[-1], here, tangent, there, STEPS)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_folds_are_located(s_points, sign):
     points, tangents, _ = s_points
     fold = sign / np.sqrt(3)
     k = int(np.searchsorted(points[:, 0], fold)) - 1
-    locate = jax.jit(
-        lambda here, tangent, there: locate_event(
-            s_curve, lambda _, t: t[-1], here, tangent, there, STEPS
-        )
-    )
-    found, tangent, resolved = locate(points[k], tangents[k], points[k + 1])
+    found, tangent, resolved = located_fold(points[k], tangents[k], points[k + 1])
     assert bool(resolved)
     # Newton to 1e-11; the tangent's share along λ is then 6x·δx/(3x²−1…) of that order.
     np.testing.assert_allclose(found, [fold, fold**3 - fold], atol=1e-10)
     assert abs(float(tangent[-1])) < 1e-10
     # An event that is not there is not resolved.
-    *_, resolved = locate(points[k + 5], tangents[k + 5], points[k + 6])
+    *_, resolved = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
     assert not bool(resolved)
 
 
@@ -160,9 +162,9 @@ def test_a_coarse_curve_and_a_fine_one_agree(s_points):
 
 
 def test_a_closed_curve_ends_at_the_point_limit():
-    points, _, status = followed(circle, [-0.8, -0.6], max_points=300)
+    points, _, status = followed(circle, [-0.8, -0.6])
     assert status == CurveStatus.POINT_LIMIT
-    assert len(points) == 300
+    assert len(points) == 800
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
     angle = np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
     assert np.all(np.diff(angle) < 0)  # from (−0.8, −0.6) up in λ: clockwise, and never back
@@ -199,9 +201,7 @@ def test_an_equation_without_solution_has_no_start():
 
 
 def test_a_start_may_be_corrected_at_fixed_amplitude():
-    points, tangents, _ = followed(
-        circle, [0.3, 0.9], direction=[1.0, 0.0], across=[1.0, 0.0], max_points=20
-    )
+    points, tangents, _ = followed(circle, [0.3, 0.9], direction=[1.0, 0.0], across=[1.0, 0.0])
     assert points[0, 0] == pytest.approx(0.3, abs=1e-12)
     assert points[0, 1] == pytest.approx(np.sqrt(1 - 0.09), abs=1e-12)
     assert tangents[0, 0] > 0
