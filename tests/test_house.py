@@ -16,7 +16,8 @@ ROOMS = {
     "identify": {"model", "measure", "simulate"},
     "diagnose": {"model", "measure", "simulate", "identify"},
     "sweep": {"model", "measure", "simulate", "identify", "diagnose"},
-    "io": {"model", "measure"},
+    # Files are on the roof: `io.results` writes what the numerical rooms find.
+    "io": {"model", "measure", "simulate", "identify"},
 }
 NUMERICAL = set(ROOMS) - {"io"}
 # The top of the package gives names to users; rooms name the module they mean.
@@ -29,6 +30,8 @@ FILE_FORMATS = {
     *("scipy.io", "platformdirs"),
 }
 LONGEST = 450
+# Two rooms in one, to be divided: each may not grow beyond what it is.
+OVERLONG = {"snrmjax.measure.signals": 692, "snrmjax.plot": 470}
 
 
 def imported_modules(tree, module, *, is_package):
@@ -74,7 +77,7 @@ def violations(module, source, *, rooms, is_package=False):
         if isinstance(node, ast.ExceptHandler) and node.type is None:
             found.append(f"{module}:{node.lineno}: a bare except")
     length = len(source.splitlines())
-    if length > LONGEST:
+    if length > OVERLONG.get(module, LONGEST):
         found.append(f"{module}: {length} lines, more than {LONGEST}")
     return found
 

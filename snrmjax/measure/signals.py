@@ -171,13 +171,18 @@ def _fit_batch(
     orders: tuple[int, ...],
     refine: bool,
 ) -> HarmonicFit:
-    def one(pair: tuple[Array, Array]) -> HarmonicFit:
-        return _fit_one(time, *pair, reference_time, max_condition, orders, refine)
+    def one(record: Float[Array, " sample"], omega: Float[Array, ""]) -> HarmonicFit:
+        return _fit_one(time, record, omega, reference_time, max_condition, orders, refine)
 
-    # One after the other: a batch would wait for its slowest record, and large batches of small
-    # factorisations have been seen to hang in XLA's thread pool on two cores.
-    each = jnp.broadcast_to(frequency, records.shape[:-1])
-    fit = jax.lax.map(one, (records.reshape(-1, time.size), each.reshape(-1)))
+    rows = records.reshape(-1, time.size)
+    if frequency.ndim == 0 and not refine:
+        # One frequency for all: one factorisation serves all records.
+        fit = jax.vmap(lambda row: one(row, frequency))(rows)
+    else:
+        # One after the other: a batch would wait for its slowest record, and large batches of
+        # factorisations have been seen to hang in XLA's thread pool on two cores.
+        each = jnp.broadcast_to(frequency, records.shape[:-1]).reshape(-1)
+        fit = jax.lax.map(lambda pair: one(*pair), (rows, each))
     return jax.tree.map(lambda leaf: leaf.reshape(records.shape[:-1] + leaf.shape[1:]), fit)
 
 

@@ -121,7 +121,7 @@ def test_every_curve_of_a_batch_is_the_curve_alone(small_curves):
 # -------------------------------------------------------------------------------- the two beams
 
 
-@pytest.mark.parametrize(("which", "start", "every"), [("flat", 0, 13), ("curved", 1, 11)])
+@pytest.mark.parametrize(("which", "start", "every"), [("flat", 0, 19), ("curved", 1, 17)])
 def test_orbits_close_in_time(which, start, every, request, time_domain, state_of):
     """Points of a curve, refined with 21 harmonics, come back to their start after a period."""
     if which == "flat":
@@ -381,10 +381,11 @@ def test_a_structure_of_nan_has_no_start():
 
 def test_an_undamped_resonance_is_not_crossed():
     """Both ends climb it until their points are used up, and both parts come back."""
-    parts = forced_response(with_drag(0.0), [0.2], 1.0, 3.0, harmonic_order=3)
+    # From 1.1 on: at 1.0 the second harmonic would stand at the undamped resonance itself.
+    parts = forced_response(with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3)
     assert [part.status for part in parts] == [CurveStatus.POINT_LIMIT] * 2
     assert [len(part.frequency) for part in parts] == [4000, 4000]
-    assert parts[0].frequency[0] == 1.0
+    assert parts[0].frequency[0] == 1.1
     assert parts[1].frequency[-1] == 3.0
     assert parts[0].frequency.max() < 2.0 < parts[1].frequency.min()
     for part in parts:  # in the order of the frequency, and true where they are

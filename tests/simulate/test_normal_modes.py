@@ -76,18 +76,7 @@ def effect_branch():
 
 def test_frequency_converges_with_the_harmonics(duffing_branch, effect_branch):
     errors = {}
-    for order, branch in (
-        (1, nonlinear_normal_mode(duffing(), 60.0, harmonic_order=1, max_points=500)),
-        (3, effect_branch),
-        (9, duffing_branch),
-    ):
-        if order == 1:
-            # One harmonic has a closed form for all amplitudes: Ω² = ω² + ¾·4c a².
-            assert branch.status == CurveStatus.POINT_LIMIT
-            assert len(branch.frequency) == 500
-            fundamental = branch.coefficients[:, 1, 0]
-            wanted = np.sqrt(W**2 + 3 * QUARTIC * fundamental**2)
-            np.testing.assert_allclose(branch.frequency, wanted, rtol=1e-12)
+    for order, branch in ((3, effect_branch), (9, duffing_branch)):
         amplitude = branch.coefficients[:, :, 0].sum(axis=1)
         at_three = np.argmin(np.abs(amplitude - 3.0))
         exact = exact_frequency(amplitude[at_three])
@@ -95,7 +84,6 @@ def test_frequency_converges_with_the_harmonics(duffing_branch, effect_branch):
         # The first odd harmonic that is left out, of the order of the error but not far below.
         left_out = nome(amplitude[at_three]) ** ((order + 1) // 2)
         assert left_out / 20 < errors[order] < 3 * left_out
-    assert errors[3] < errors[1] / 10
     assert errors[9] < errors[3] / 1000
 
 
