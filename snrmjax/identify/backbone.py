@@ -185,9 +185,7 @@ def _fit_pair(
     linear = np.asarray(points.linear_variance)[use]
     # Nothing stated: one relative error for amplitude and phase alike, none for the force.
     errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
-    # The method is exact at resonance and errs with the correction it makes from there.
-    sine = np.sin(np.angle(np.asarray(points.mode_velocity)[use]))
-    far = 1.0 if stated else np.sqrt(1.0 + (OFF_RESONANCE * sine) ** 2)
+    far = 1.0 if stated else mistrust(points)[use]
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
@@ -213,6 +211,15 @@ def _fit_pair(
         return best, sizes
 
     return fit(0), fit(1)
+
+
+def mistrust(points: BackbonePoints) -> Float[np.ndarray, " state"]:
+    """Errors of points relative to one at resonance, where no noise is stated.
+
+    The method is exact at resonance and errs with the correction it makes from there.
+    """
+    sine = np.sin(np.angle(np.asarray(points.mode_velocity)))
+    return np.sqrt(1.0 + (OFF_RESONANCE * sine) ** 2)
 
 
 def _best_smoothing(

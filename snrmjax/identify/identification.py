@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.backbone import BackboneFit, CurveFamily, fit_backbone
+from snrmjax.identify.backbone import BackboneFit, CurveFamily, fit_backbone, mistrust
 from snrmjax.identify.backbone_points import (
     AmplitudeArgument,
     AmplitudeMeasure,
@@ -54,7 +54,8 @@ def identify_backbone(
 def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not."""
     sensitivity = np.asarray(points.sensitivity)
-    spread = np.array(fit.noise_scale)[None, :, None] * np.array([0.0, 1.0, 1.0])
+    scale = mistrust(points)[:, None] * np.array(fit.noise_scale)
+    spread = scale[:, :, None] * np.array([0.0, 1.0, 1.0])
     own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
     frequency_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), fit.level_frequency_std)
@@ -92,7 +93,7 @@ def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tupl
         notes.append(
             "no noise is stated: it was estimated from the scatter of left-out levels, "
             f"{100 * fit.noise_scale[0]:.2g} % (frequency) and {100 * fit.noise_scale[1]:.2g} % "
-            "(damping) of the measured phasor."
+            "(damping) of the measured phasor at resonance, more off it."
         )
     level_hz = fit.level_frequency_std / (2 * np.pi)
     shared = [f"{level_hz:.2g} Hz"] if level_hz > 0 else []

@@ -1,5 +1,6 @@
 """Indicators that say how close a measured steady state is to a (non)linear resonance."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +42,13 @@ def nnm_appropriation(
             f"`orders` {orders} names, but has shape {jnp.shape(velocity_amplitudes)}."
         )
     require_orders("orders", orders)
+    return _appropriation(amplitudes, tuple(orders))
+
+
+@eqx.filter_jit
+def _appropriation(
+    amplitudes: Complex[Array, "*batch sensor harmonic"], orders: tuple[int, ...]
+) -> Float[Array, "*batch"]:
     order = np.asarray(orders, dtype=int)
     aligned, total = _aligned_and_total(amplitudes, np.asarray(order % 2 == 1))
     counts = (total > 0) & (order > 0)
@@ -62,9 +70,7 @@ def mode_indicator(velocity: Complex[Array, "*batch sensor"]) -> Float[Array, "*
     >>> mode_indicator(jnp.array([3.0 + 4.0j])).round(12)
     Array(0.36, dtype=float64)
     """
-    aligned, total = _aligned_and_total(jnp.atleast_1d(velocity)[..., None], np.array([True]))
-    counts = total[..., 0] > 0
-    return jnp.where(counts, aligned[..., 0] / jnp.where(counts, total[..., 0], 1.0), jnp.nan)
+    return nnm_appropriation(jnp.atleast_1d(velocity)[..., None], (1,))
 
 
 def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[Array, " state"]:
@@ -82,6 +88,11 @@ def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[
     >>> appropriation_of(data).round(12)
     Array([1. , 0.5], dtype=float64)
     """
+    return _appropriation_of(data, jnp.asarray(significance, dtype=float))
+
+
+@eqx.filter_jit
+def _appropriation_of(data: SteadyStates, significance: Float[Array, ""]) -> Float[Array, " state"]:
     higher = [k for k, order in enumerate(data.harmonic_order) if order > 1]
     harmonics = data.harmonics[..., np.asarray(higher, dtype=int)]
     usable = data.measured[..., None] & jnp.isfinite(harmonics)
