@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.backbone import Backbone
+from snrmjax.identify.backbone_points import AmplitudeArgument
 from snrmjax.identify.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
 
@@ -57,13 +58,16 @@ def resonances(backbone: Backbone, modes: LinearModes, force: float) -> list[Res
     """
     _require_force(force)
     amplitude = _scan(backbone)
-    excess = np.asarray(_resonance_excess(backbone, jnp.asarray(amplitude), jnp.asarray(force)))
+    load = abs(float(backbone.modal_constant)) * force
+    excess = _on_backbone(backbone, amplitude).excess(load)
     at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
     found = []
     for k in at:
         low, high = amplitude[k], amplitude[k + 1]
         start = low - excess[k] * (high - low) / (excess[k + 1] - excess[k])
-        root, good = _newton_resonance(backbone, jnp.asarray(force), start, low, high)
+        root, good = _newton_resonance(
+            backbone, *(jnp.asarray(v) for v in (force, start, low, high))
+        )
         if bool(good):
             found.append(_resonance(backbone, modes, force, float(root)))
     return found
@@ -117,18 +121,13 @@ def predict_response(
     """
     _require_force(force)
     scan = _scan(backbone)
-    load = jnp.abs(backbone.modal_constant) * force
-    inside = np.asarray(_branches(backbone, jnp.asarray(scan), load)[2]) >= 0
-    edges = np.flatnonzero(np.diff(inside.astype(int)))
+    load = abs(float(backbone.modal_constant)) * force
+    inside = _on_backbone(backbone, scan).frequencies(load)[2] >= 0
     starts = [scan[0]] if inside[0] else []
     ends: list[float] = []
-    for k in edges:
-        low, high = scan[k], scan[k + 1]
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            same = (_margin(backbone, middle, load) >= 0) == inside[k]
-            low, high = (middle, high) if same else (low, middle)
-        (ends if inside[k] else starts).append(low if inside[k] else high)
+    for k in np.flatnonzero(np.diff(inside.astype(int))):
+        edge = _edge(backbone, load, scan[k], scan[k + 1], inside[k])
+        (ends if inside[k] else starts).append(edge)
     if inside[-1]:
         ends.append(scan[-1])
     curves = []
@@ -160,11 +159,76 @@ def _scan(backbone: Backbone) -> Float[np.ndarray, " point"]:
     return CONTINUED * float(backbone.largest) * np.linspace(0.0, 1.0, _SCAN + 1)
 
 
+class _OnBackbone(NamedTuple):
+    """ω̃², 2ζ̃ω̃ and their slopes at some amplitudes; what follows from them is plain NumPy."""
+
+    amplitude: Float[np.ndarray, " point"]
+    squared: Float[np.ndarray, " point"]
+    damping: Float[np.ndarray, " point"]
+    squared_slope: Float[np.ndarray, " point"]
+    damping_slope: Float[np.ndarray, " point"]
+    argument: AmplitudeArgument
+
+    def excess(self, load: float) -> Float[np.ndarray, " point"]:
+        """v·2ζ̃ω̃ − |A|F: zero at a phase resonance."""
+        displacement = self.argument == "displacement"
+        with np.errstate(invalid="ignore"):
+            velocity = self.amplitude * (np.sqrt(self.squared) if displacement else 1.0)
+        return velocity * self.damping - load
+
+    def frequencies(self, load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ω² below and above resonance, and the margin, negative where there is no Ω."""
+        with np.errstate(divide="ignore"):
+            ratio = (load / self.amplitude) ** 2
+        if self.argument == "displacement":
+            middle = self.squared - 0.5 * self.damping**2
+            margin = ratio - self.damping**2 * self.squared + 0.25 * self.damping**4
+        else:
+            middle = self.squared + 0.5 * (ratio - self.damping**2)
+            margin = middle**2 - self.squared**2
+            # Without real frequencies the product of the roots, ω̃⁴, still lets both be negative.
+            margin = np.where(middle > 0, margin, -np.abs(margin))
+        root = np.sqrt(np.maximum(margin, 0.0))
+        with np.errstate(invalid="ignore"):
+            return middle - root, middle + root, margin
+
+    def stable(self, frequency: Float[np.ndarray, " point"]) -> Bool[np.ndarray, " point"]:
+        """Stability of the averaged equations at (amplitude, Ω), see `predict_response`."""
+        stiffness = self.squared - frequency**2
+        turn = frequency**2 * self.damping * self.damping_slope
+        # d(A²F²)/da at fixed Ω, without a positive factor.
+        rise = stiffness**2 + (self.damping * frequency) ** 2
+        rise += self.amplitude * (stiffness * self.squared_slope + turn)
+        return (rise > 0) & (2 * self.damping + self.amplitude * self.damping_slope > 0)
+
+
+def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> _OnBackbone:
+    value, damping, slope, damping_slope = map(np.asarray, _values_and_slopes(backbone, amplitude))
+    return _OnBackbone(amplitude, value, damping, slope, damping_slope, backbone.argument)
+
+
 @eqx.filter_jit
-def _resonance_excess(backbone: Backbone, amplitude: Array, force: Array) -> Array:
-    """v·2ζ̃ω̃ − |A|F: zero at a phase resonance."""
-    load = jnp.abs(backbone.modal_constant) * force
-    return backbone.velocity(amplitude) * backbone.modal_damping(amplitude) - load
+def _values_and_slopes(
+    backbone: Backbone, amplitude: Float[np.ndarray, " point"]
+) -> tuple[Array, Array, Array, Array]:
+    at = jnp.asarray(amplitude)
+
+    def curves(a: Array) -> tuple[Array, Array]:
+        return backbone.squared_frequency(a), backbone.modal_damping(a)
+
+    # Both curves hold point by point: one push forward along ones gives every slope.
+    values, slopes = jax.jvp(curves, (at,), (jnp.ones_like(at),))
+    return *values, *slopes
+
+
+def _edge(backbone: Backbone, load: float, low: float, high: float, inside: bool) -> float:
+    """Amplitude between two scanned ones where response begins or ends, kept on its inner side."""
+    for _ in range(5):
+        fine = low + (high - low) * np.linspace(0.0, 1.0, _SCAN + 1)
+        same = (_on_backbone(backbone, fine).frequencies(load)[2] >= 0) == inside
+        k = max(int(np.argmin(same)), 1)
+        low, high = fine[k - 1], fine[k]
+    return low if inside else high
 
 
 @eqx.filter_jit
@@ -175,7 +239,8 @@ def _newton_resonance(
     load = jnp.abs(backbone.modal_constant) * force
 
     def equation(share: Array, _: None) -> Array:
-        return _resonance_excess(backbone, share * high, force) / load
+        amplitude = share * high
+        return backbone.velocity(amplitude) * backbone.modal_damping(amplitude) / load - 1.0
 
     solution: optx.Solution = optx.root_find(
         equation,
@@ -211,9 +276,9 @@ def _picard(backbone: Backbone, force: Array, start: Array, max_steps: int) -> t
 
 
 def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: float) -> Resonance:
-    at = jnp.asarray(amplitude)
-    frequency, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
-    velocity = _velocity(backbone, modes, force, frequency, frequency, damping)
+    frequency, damping, velocity = _on_resonance(
+        backbone, modes, jnp.asarray(force), jnp.asarray(amplitude)
+    )
     return Resonance(
         force=force,
         amplitude=amplitude,
@@ -224,10 +289,20 @@ def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: 
     )
 
 
+@eqx.filter_jit
+def _on_resonance(
+    backbone: Backbone, modes: LinearModes, force: Array, amplitude: Array
+) -> tuple[Array, Array, Array]:
+    frequency = backbone.natural_frequency(amplitude)
+    damping = backbone.damping_ratio(amplitude)
+    return frequency, damping, _velocity(backbone, modes, force, frequency, frequency, damping)
+
+
+@eqx.filter_jit
 def _velocity(
     backbone: Backbone,
     modes: LinearModes,
-    force: float,
+    force: Array,
     frequency: Array,
     natural_frequency: Array,
     damping_ratio: Array,
@@ -240,42 +315,6 @@ def _velocity(
     return own + residual_velocity(modes, frequency, load)[..., r]
 
 
-@eqx.filter_jit
-def _branches(backbone: Backbone, amplitude: Array, load: Array) -> tuple[Array, Array, Array]:
-    """Squared frequencies below and above resonance, and the margin that must not be negative."""
-    squared, damping = backbone.squared_frequency(amplitude), backbone.modal_damping(amplitude)
-    if backbone.argument == "displacement":
-        middle = squared - 0.5 * damping**2
-        margin = (load / amplitude) ** 2 - damping**2 * squared + 0.25 * damping**4
-    else:
-        middle = squared + 0.5 * ((load / amplitude) ** 2 - damping**2)
-        margin = middle**2 - squared**2
-        # Without real frequencies the product of the roots, ω̃⁴, still lets both be negative.
-        margin = jnp.where(middle > 0, margin, -jnp.abs(margin))
-    root = jnp.sqrt(jnp.maximum(margin, 0.0))
-    return middle - root, middle + root, margin
-
-
-def _margin(backbone: Backbone, amplitude: float, load: Array) -> float:
-    return float(_branches(backbone, jnp.asarray(amplitude), load)[2])
-
-
-@eqx.filter_jit
-def _is_stable(backbone: Backbone, amplitude: Array, frequency: Array) -> Array:
-    """Stability of the averaged equations at (amplitude, Ω)."""
-
-    def squared_force(a: Array, omega: Array) -> Array:
-        squared, damping = backbone.squared_frequency(a), backbone.modal_damping(a)
-        scale = a if backbone.argument == "displacement" else a / omega
-        return scale**2 * ((squared - omega**2) ** 2 + (damping * omega) ** 2)
-
-    def one(a: Array, omega: Array) -> Array:
-        damping, slope = jax.value_and_grad(backbone.modal_damping)(a)
-        return (jax.grad(squared_force)(a, omega) > 0) & (2 * damping + a * slope > 0)
-
-    return jax.vmap(one)(amplitude, frequency)
-
-
 def _one_curve(
     backbone: Backbone,
     modes: LinearModes,
@@ -286,29 +325,31 @@ def _one_curve(
     *,
     closed: bool,
 ) -> PredictedResponse:
-    load = jnp.abs(backbone.modal_constant) * force
+    load = abs(float(backbone.modal_constant)) * force
     # Points crowd where both sides meet: there the frequency changes with a square root.
     angle = np.linspace(0.0, 1.0, points_per_side)
     share = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
     amplitude = low + (high - low) * share
-    below, above, _ = (np.asarray(a) for a in _branches(backbone, jnp.asarray(amplitude), load))
-    both = np.concatenate([amplitude, amplitude[::-1]])
-    squared = np.concatenate([below, above[::-1]])
+    both = _on_backbone(backbone, np.concatenate([amplitude, amplitude[::-1]]))
+    below, above, _ = both.frequencies(load)
+    squared = np.concatenate([below[:points_per_side], above[points_per_side:]])
     # Points without a real frequency are dropped at the end: every force has the same shapes,
     # and the functions below are compiled once.
     keep = squared > 0
     frequency = np.sqrt(np.where(keep, squared, 1.0))
-    at, omega = jnp.asarray(both), jnp.asarray(frequency)
-    natural, damping = backbone.natural_frequency(at), backbone.damping_ratio(at)
-    velocity = np.asarray(_velocity(backbone, modes, force, omega, natural, damping))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        natural = np.sqrt(both.squared)
+        ratio = both.damping / (2 * natural)
+    arrays = (jnp.asarray(v) for v in (force, frequency, natural, ratio))
+    velocity = np.asarray(_velocity(backbone, modes, *arrays))
     curve = PredictedResponse(
         force=force,
         frequency=frequency,
         velocity=velocity,
-        amplitude=both,
-        stable=np.asarray(_is_stable(backbone, at, omega)),
-        branch=tuple(np.where(frequency <= np.asarray(natural), "lead", "lag").tolist()),
-        continued=both > float(backbone.largest) * (1 + 1e-9),
+        amplitude=both.amplitude,
+        stable=both.stable(frequency),
+        branch=tuple(np.where(frequency <= natural, "lead", "lag").tolist()),
+        continued=both.amplitude > float(backbone.largest) * (1 + 1e-9),
         isolated=closed,
     )
     return _subset(curve, keep)
