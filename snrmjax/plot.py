@@ -9,10 +9,8 @@ import io
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
@@ -41,7 +39,6 @@ from snrmjax.drawing import (
 )
 from snrmjax.identify.backbone import Backbone
 from snrmjax.identify.backbone_points import BackbonePoints
-from snrmjax.identify.curves import CurveFit
 from snrmjax.identify.prediction import CONTINUED, PredictedResponse, Resonance
 from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
@@ -55,7 +52,7 @@ from snrmjax.simulate.normal_modes import NormalModeBranch
 BAND = 1.96
 """Half the width of a 95 % band in standard deviations."""
 
-_CURVE_POINTS = 300
+_CURVE_POINTS = 200  # as many as files have: one compiled function serves both
 
 
 class BackboneSamples(NamedTuple):
@@ -98,24 +95,19 @@ def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
 
 def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
     """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
-    start = jnp.minimum(backbone.smallest, backbone.squared_frequency.knots[0])
-    amplitude = jnp.linspace(start, reach * backbone.largest, _CURVE_POINTS)
-    return BackboneSamples(*(np.asarray(one) for one in _sampled(backbone, amplitude)))
-
-
-@eqx.filter_jit
-def _sampled(backbone: Backbone, amplitude: Array) -> tuple[Array, ...]:
-    modal_damping = CurveFit(backbone.modal_damping, backbone.modal_damping_covariance)
-    std, damping_std = backbone.std(amplitude)
-    return (
-        backbone.velocity(amplitude),
-        backbone.natural_frequency(amplitude) / HERTZ,
-        BAND * std / HERTZ,
-        100 * backbone.damping_ratio(amplitude),
-        100 * BAND * damping_std,
-        modal_damping.curve(amplitude),
-        BAND * modal_damping.std(amplitude),
-        amplitude > backbone.largest,
+    start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
+    amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
+    values = backbone.values(amplitude)
+    omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
+    return BackboneSamples(
+        velocity=np.asarray(values.velocity),
+        frequency=omega / HERTZ,
+        frequency_error=BAND * omega_std / HERTZ,
+        damping=100 * damping,
+        damping_error=100 * BAND * damping_std,
+        modal_damping=modal,
+        modal_damping_error=BAND * modal_std,
+        beyond=np.asarray(amplitude) > float(backbone.largest),
     )
 
 

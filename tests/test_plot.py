@@ -77,17 +77,18 @@ def pieces(axes, colour):
     ]
 
 
-@eqx.filter_jit
-def evaluate(backbone, amplitude):
-    std = backbone.std(amplitude)
-    velocity, frequency = backbone.velocity(amplitude), backbone.natural_frequency(amplitude)
-    return velocity, frequency, *std, backbone.modal_damping(amplitude)
-
-
 def at_ends(backbone):
     """Velocity, ω̃, the 1σ of ω̃ and ζ̃, and modal damping at the ends of the data."""
     ends = jnp.stack([backbone.smallest, backbone.largest])
-    return [np.asarray(one) for one in evaluate(backbone, ends)]
+    at = backbone.values(ends)
+    chosen = (
+        at.velocity,
+        at.natural_frequency,
+        at.natural_frequency_std,
+        at.damping_ratio_std,
+        at.modal_damping,
+    )
+    return [np.asarray(one) for one in chosen]
 
 
 def legend_names(figure):

@@ -40,6 +40,18 @@ class Anchor(NamedTuple):
     largest_damping_shift: float
 
 
+class BackboneValues(NamedTuple):
+    """A backbone at some amplitudes, with 1σ."""
+
+    velocity: Float[Array, " point"]  # m/s
+    natural_frequency: Float[Array, " point"]  # rad/s
+    natural_frequency_std: Float[Array, " point"]
+    damping_ratio: Float[Array, " point"]
+    damping_ratio_std: Float[Array, " point"]
+    modal_damping: Float[Array, " point"]  # 2ζ̃ω̃, 1/s
+    modal_damping_std: Float[Array, " point"]
+
+
 class Backbone(eqx.Module):
     """ω̃ and ζ̃ of one mode as functions of the amplitude of its motion at one sensor.
 
@@ -58,31 +70,46 @@ class Backbone(eqx.Module):
     argument: AmplitudeArgument = eqx.field(static=True)
     sensor: str = eqx.field(static=True)
 
+    @eqx.filter_jit
     def natural_frequency(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ω̃ in rad/s."""
         squared = self.squared_frequency(amplitude)
         return jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
 
+    @eqx.filter_jit
     def damping_ratio(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ζ̃ as a fraction of critical."""
         return self.modal_damping(amplitude) / (2 * self.natural_frequency(amplitude))
 
+    @eqx.filter_jit
     def velocity(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Velocity amplitude in m/s on the backbone, where Ω = ω̃."""
         if self.argument == "velocity":
             return jnp.asarray(amplitude)
         return amplitude * self.natural_frequency(amplitude)
 
-    def std(
-        self, amplitude: Float[Array, " point"]
-    ) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
-        """1σ of ω̃ (rad/s) and of ζ̃ at some amplitudes."""
+    @eqx.filter_jit
+    def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
+        """All that the backbone says at some amplitudes, with standard deviations (1σ).
+
+        The two curves' errors are taken as independent.
+        """
         squared = CurveFit(self.squared_frequency, self.squared_frequency_covariance)
         damping = CurveFit(self.modal_damping, self.modal_damping_covariance)
-        omega, zeta = self.natural_frequency(amplitude), self.damping_ratio(amplitude)
+        omega = self.natural_frequency(amplitude)
+        modal = self.modal_damping(amplitude)
         omega_std = squared.std(amplitude) / (2 * omega)
-        zeta_std = jnp.hypot(damping.std(amplitude) / (2 * omega), zeta * omega_std / omega)
-        return omega_std, zeta_std
+        modal_std = damping.std(amplitude)
+        zeta = modal / (2 * omega)
+        return BackboneValues(
+            velocity=self.velocity(amplitude),
+            natural_frequency=omega,
+            natural_frequency_std=omega_std,
+            damping_ratio=zeta,
+            damping_ratio_std=jnp.hypot(modal_std / (2 * omega), zeta * omega_std / omega),
+            modal_damping=modal,
+            modal_damping_std=modal_std,
+        )
 
 
 class BackboneFit(NamedTuple):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.identify.backbone import Backbone, BackboneValues
 from snrmjax.identify.identification import Identification
 from snrmjax.identify.points import PointStatus
 from snrmjax.identify.prediction import PredictedResponse, Resonance
@@ -36,7 +37,7 @@ def write_response(path: Path, model: Structure, curves: Sequence[ResponseCurve]
             "frequency_hz": np.concatenate([c.frequency for c in curves]) / HERTZ,
             "velocity_h1_re_m_s": fundamental.real,
             "velocity_h1_im_m_s": fundamental.imag,
-            "velocity_peak_m_s": np.concatenate([_peaks(c.velocity[:, :, r]) for c in curves]),
+            "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
             "stable": np.concatenate([c.stable for c in curves]),
             "event": [event for c in curves for event in c.event],
         },
@@ -87,16 +88,15 @@ def write_backbone(path: Path, identification: Identification) -> None:
     """
     backbone = identification.fit.backbone
     start = 0.0 if identification.fit.anchor is not None else float(backbone.smallest)
-    amplitude = jnp.linspace(start, float(backbone.largest), BACKBONE_POINTS)
-    frequency_std, damping_std = backbone.std(amplitude)
+    values = _sampled(backbone, start)
     write_table(
         path,
         {
-            "velocity_m_s": backbone.velocity(amplitude),
-            "natural_frequency_hz": np.asarray(backbone.natural_frequency(amplitude)) / HERTZ,
-            "natural_frequency_std_hz": np.asarray(frequency_std) / HERTZ,
-            "damping_ratio": backbone.damping_ratio(amplitude),
-            "damping_ratio_std": damping_std,
+            "velocity_m_s": values.velocity,
+            "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,
+            "natural_frequency_std_hz": np.asarray(values.natural_frequency_std) / HERTZ,
+            "damping_ratio": values.damping_ratio,
+            "damping_ratio_std": values.damping_ratio_std,
         },
     )
 
@@ -129,9 +129,9 @@ def summarise(
     """The headline numbers of an identification, by name, in the units of the files."""
     points, fit = identification.points, identification.fit
     backbone = fit.backbone
-    amplitude = jnp.linspace(float(backbone.smallest), float(backbone.largest), BACKBONE_POINTS)
-    frequency = np.asarray(backbone.natural_frequency(amplitude)) / HERTZ
-    damping, velocity = backbone.damping_ratio(amplitude), backbone.velocity(amplitude)
+    values = _sampled(backbone, float(backbone.smallest))
+    frequency = np.asarray(values.natural_frequency) / HERTZ
+    damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
     anchor = fit.anchor
     return {
@@ -181,6 +181,11 @@ def summarise(
         ],
         "notes": list(identification.notes),
     }
+
+
+def _sampled(backbone: Backbone, start: float) -> BackboneValues:
+    amplitude = np.linspace(start, float(backbone.largest), BACKBONE_POINTS)
+    return backbone.values(jnp.asarray(amplitude))
 
 
 def _numbered(force: np.ndarray) -> np.ndarray:

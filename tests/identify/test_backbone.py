@@ -241,7 +241,8 @@ class TestStd:
             ]
             omega.append(np.sqrt(drawn[0]))
             zeta.append(drawn[1] / (2 * omega[-1]))
-        omega_std, zeta_std = backbone.std(jnp.asarray(at))
+        values = backbone.values(jnp.asarray(at))
+        omega_std, zeta_std = values.natural_frequency_std, values.damping_ratio_std
         # 2000 draws know a standard deviation to 1.6 %.
         np.testing.assert_allclose(omega_std, np.std(omega, axis=0), rtol=0.07)
         np.testing.assert_allclose(zeta_std, np.std(zeta, axis=0), rtol=0.07)
@@ -263,7 +264,7 @@ class TestAnchor:
         backbone, zero = fit.backbone, jnp.zeros(1)
         np.testing.assert_allclose(backbone.natural_frequency(zero), W0, rtol=1e-14)
         np.testing.assert_allclose(backbone.damping_ratio(zero), RATE / (2 * W0), rtol=1e-14)
-        np.testing.assert_allclose(backbone.std(zero)[0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(backbone.values(zero).natural_frequency_std, 0.0, atol=1e-12)
         assert fitted(data, n_knots=5).anchor is None
 
     def test_without_an_error_nothing_is_moved(self):
@@ -292,8 +293,10 @@ class TestAnchor:
         # The gap is given at the linear mode's frequency, ω0 + 2.
         truth = RATE / (2 * (W0 + 2.0)) - 1.2 * RATE / (2 * W0)
         np.testing.assert_allclose(report.damping_gap, truth, rtol=1e-4)
-        assert report.largest_frequency_shift >= 0
-        assert report.largest_damping_shift >= 0
+        # Among the points the curves move towards the linear mode, if at all, and not beyond it;
+        # where the penalty is weak they bend below the points alone.
+        assert -0.02 < report.largest_frequency_shift <= 2.0
+        assert -0.01 * abs(truth) < report.largest_damping_shift <= abs(truth)
 
     @pytest.mark.parametrize("sign", [1, -1])
     def test_a_force_offset_shows_as_a_gap_of_its_size(self, sign):
