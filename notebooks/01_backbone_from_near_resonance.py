@@ -277,11 +277,11 @@ show(
 # that the amplitude can keep up.
 
 # %%
-(large,) = sj.forced_response(curved, [4e-3], 30 * HERTZ, 220 * HERTZ)
+(large,) = sj.forced_response(curved, [8e-3], 40 * HERTZ, 400 * HERTZ)
 size = np.abs(large.velocity[:, 1, 0])
-near = np.flatnonzero(large.stable & (size > 0.7 * size.max()) & (size < 0.97 * size.max()))
+near = np.flatnonzero(large.stable & (size > 0.6 * size.max()) & (size < 0.95 * size.max()))[::3]
 frequency, orbits = jnp.asarray(large.frequency[near]), jnp.asarray(large.coefficients[near])
-for factor in np.linspace(3, 1, 13)[1:]:
+for factor in np.geomspace(3, 1, 13)[1:]:
     between = sj.structure(
         printed.modes,
         sj.polynomial_potential({"111": -3.4380e9 / 3, "1111": factor * 6.2183e12 / 4}, 1),
@@ -332,8 +332,8 @@ headline = {
     "flat beam, resonance frequency within 0.1 %": all(abs(f) < 1e-3 for _, f in flat_errors),
     "curved beam, median % <= 0.35": np.median(curved_errors) <= 0.35,
     "curved beam, worst % <= 1.5": curved_errors.max() <= 1.5,
-    "47 to 48 1/s with the peak": 46.5 < monostable_damping["peak"] < 48,
-    "the same in the other reading": 46.5 < printed_damping["peak"] < 48,
+    "47 to 48 1/s with the peak": 47 < monostable_damping["peak"] < 48,
+    "the same in the other reading": 47 < printed_damping["peak"] < 48,
     "limit in closed form": abs(limit_peak - 47.4) < 0.1,
 }
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -12,8 +12,9 @@ import interpax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.interpolate import PchipInterpolator
+from scipy.linalg import lstsq
 
 from snrmjax.identify.least_squares import ErrorSizes, error_sizes, penalised_least_squares
 
@@ -167,44 +168,101 @@ def fit_curve(
     first knot. `sizes` scale the two parts of the covariance.
     Returns `CurveFit`.
     """
-    unit = float(np.max(np.abs(values)))
-    target, spread = np.asarray(values) / unit, np.asarray(std) / unit
-    members = np.asarray(level)[:, None] == np.unique(level)
-    n = len(knots)
-    at_knots = np.full(n, float(np.mean(target)))
-    free = slice(0, n)
-    if fixed_first is not None:
-        at_knots[0], free = fixed_first / unit, slice(1, n)
-    information = np.sum(1.0 / spread**2) / n
-    rough = np.sqrt(smoothing * information) * _bending(
-        np.asarray(CURVES[kind].abscissa(jnp.asarray(knots)))
+    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    at_knots, _, slopes = _settle(problem)
+    free, n = problem.free, len(knots)
+    result = penalised_least_squares(
+        slopes[:, free],
+        np.zeros(len(amplitude)),
+        problem.spread,
+        np.asarray(level)[:, None] == np.unique(level),
+        problem.rough[:, free],
+        np.zeros(len(problem.rough)),
     )
-    pinned = -rough[:, 0] * at_knots[0] if fixed_first is not None else np.zeros(len(rough))
-    # The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
-    for _ in range(12):
-        current, slopes = _linearised(kind, knots, at_knots, amplitude)
-        offset = target - current + slopes[:, free] @ at_knots[free]
-        result = penalised_least_squares(
-            slopes[:, free],
-            offset,
-            spread,
-            members,
-            rough[:, free],
-            pinned,
-        )
-        moved = float(np.max(np.abs(result.values - at_knots[free])))
-        at_knots[free] = result.values
-        if moved < 1e-9 or kind == PiecewiseLinear.kind:
-            break
     covariance = np.zeros((n, n))
-    tau = sizes.level_std / unit
+    tau = sizes.level_std / problem.unit
     covariance[free, free] = (
         sizes.noise_scale**2 * result.unshared_covariance + tau**2 * result.shared_covariance
     )
     return CurveFit(
-        curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * unit)),
-        covariance=jnp.asarray(covariance * unit**2),
+        curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * problem.unit)),
+        covariance=jnp.asarray(covariance * problem.unit**2),
     )
+
+
+class _Problem(NamedTuple):
+    """A fit in values of order one."""
+
+    kind: str
+    knots: np.ndarray
+    amplitude: np.ndarray
+    target: np.ndarray
+    spread: np.ndarray
+    rough: np.ndarray  # rows of the roughness penalty
+    first: float  # where the first knot starts, and stays if it is not free
+    free: slice  # the knots that are fitted
+    unit: float  # of the values
+
+
+def _problem(
+    kind: str,
+    knots: np.ndarray,
+    smoothing: float,
+    amplitude: np.ndarray,
+    values: np.ndarray,
+    std: np.ndarray,
+    fixed_first: float | None,
+) -> _Problem:
+    unit = float(np.max(np.abs(values)))
+    target, spread = np.asarray(values) / unit, np.asarray(std) / unit
+    information = np.sum(1.0 / spread**2) / len(knots)
+    bending = _bending(np.asarray(CURVES[kind].abscissa(jnp.asarray(knots))))
+    return _Problem(
+        kind=kind,
+        knots=knots,
+        amplitude=amplitude,
+        target=target,
+        spread=spread,
+        rough=np.sqrt(smoothing * information) * bending,
+        first=float(np.mean(target)) if fixed_first is None else fixed_first / unit,
+        free=slice(0 if fixed_first is None else 1, len(knots)),
+        unit=unit,
+    )
+
+
+def _settle(problem: _Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values at the knots, the curve at the points and its derivatives there.
+
+    The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
+    """
+    at_knots = np.full(len(problem.knots), float(np.mean(problem.target)))
+    at_knots[0] = problem.first
+    everything = np.ones(len(problem.target), dtype=bool)
+    for _ in range(12):
+        current, slopes = _linearised(problem.kind, problem.knots, at_knots, problem.amplitude)
+        step = _step(problem, at_knots, current, slopes, everything)
+        at_knots = at_knots + step
+        if np.max(np.abs(step)) < 1e-9:
+            break
+    return at_knots, current + slopes @ step, slopes
+
+
+def _step(
+    problem: _Problem,
+    at_knots: np.ndarray,
+    current: np.ndarray,
+    slopes: np.ndarray,
+    used: Bool[np.ndarray, " point"],
+) -> np.ndarray:
+    """Change of the values at the knots that fits some of the points best."""
+    free = problem.free
+    spread = problem.spread[used]
+    design = np.concatenate([slopes[used, free] / spread[:, None], problem.rough[:, free]])
+    right = np.concatenate([(problem.target - current)[used] / spread, -problem.rough @ at_knots])
+    step = np.zeros(len(at_knots))
+    # Not by normal equations: a strong penalty would drown what the points say.
+    step[free] = lstsq(design, right, cond=1e-15, lapack_driver="gelsy", check_finite=False)[0]
+    return step
 
 
 class LeftOut(NamedTuple):
@@ -226,18 +284,21 @@ def predict_left_out(
 ) -> LeftOut:
     """Leave out every level in turn and predict it from a curve through the others.
 
+    A level is left out of the problem linearised at the fit to all of them: a shape-preserving
+    spline is nearly linear in its values, and one linear solve a level is fast.
     Points outside the amplitudes of the other levels are left aside: they would be continued,
     not interpolated.
     """
+    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    at_knots, current, slopes = _settle(problem)
     errors, spreads = [], []
     for one in np.unique(level):
         kept, left = level != one, level == one
         left &= (amplitude >= amplitude[kept].min()) & (amplitude <= amplitude[kept].max())
         if not left.any():
             continue
-        sample = (amplitude[kept], values[kept], std[kept], level[kept])
-        fit = fit_curve(kind, knots, smoothing, *sample, fixed_first=fixed_first)
-        predicted, _ = _linearised(kind, knots, np.asarray(fit.curve.values), amplitude[left])
+        step = _step(problem, at_knots, current, slopes, kept)
+        predicted = (current + slopes @ step)[left] * problem.unit
         errors.append(values[left] - predicted)
         spreads.append(std[left])
     if not errors:

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import snrmjax.identify.backbone as backbone_module
 from snrmjax.identify.backbone import Backbone, fit_backbone
 from snrmjax.identify.backbone_points import identify_points
 from snrmjax.identify.curves import ShapePreservingSpline, _linearised
@@ -160,15 +159,6 @@ class TestExactPoints:
         )
 
 
-@pytest.fixture(scope="module")
-def few_weights():
-    """Every fifth weight of the penalty: the study below would take minutes with all of them."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(backbone_module, "SMOOTHING", (1e-8, 1e-3, 1e2, 1e6))
-    yield
-    patch.undo()
-
-
 def study(seeds, **errors):
     """Standardised errors of both curves on the grid, and what the fits say of the noise."""
     scores, sizes = [], []
@@ -188,7 +178,6 @@ def study(seeds, **errors):
     return np.array(scores), np.array(sizes)
 
 
-@pytest.mark.usefixtures("few_weights")
 class TestBands:
     def test_bands_of_stated_noise_cover_the_truth(self):
         scores, sizes = study(200, amplitude=0.01, phase=0.01, force=0.005)
