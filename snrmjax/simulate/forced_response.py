@@ -244,28 +244,38 @@ def _assemble(
             model.modes.sensors,
         )
     points, labels = _insert_events(balance, curve, n, steps)
-    coefficients = jax.vmap(balance.coefficients)(_padded(points))
-    frequency = _padded(points)[:, -1] * balance.frequency_scale
-    velocity = velocity_phasors(coefficients, frequency, model.modes.mode_shape)
-    n_steps = steps_per_period(model, float(np.min(np.asarray(frequency))))
-    stable = is_stable(floquet_multipliers(model, coefficients, frequency, n_steps))
-    keep = len(points)
+    slowest = float(np.min(points[:, -1])) * float(balance.frequency_scale)
+    motion = _motion(balance, jnp.asarray(padded(points)), steps_per_period(model, slowest))
+    frequency, coefficients, velocity, stable = (np.asarray(a)[: len(points)] for a in motion)
     return ResponseCurve(
         force=force,
-        frequency=np.asarray(frequency)[:keep],
-        coefficients=np.asarray(coefficients)[:keep],
-        velocity=np.asarray(velocity)[:keep],
-        stable=np.asarray(stable)[:keep],
+        frequency=frequency,
+        coefficients=coefficients,
+        velocity=velocity,
+        stable=stable,
         event=labels,
         status=CurveStatus(int(curve.status)),
         sensors=model.modes.sensors,
     )
 
 
-def _padded(points: np.ndarray) -> Array:
-    """Points padded with copies of the last to a multiple of 128, so that few shapes compile."""
-    missing = -len(points) % 128
-    return jnp.asarray(np.concatenate([points, np.repeat(points[-1:], missing, axis=0)]))
+@eqx.filter_jit
+def _motion(
+    balance: HarmonicBalance, points: Array, n_steps: int
+) -> tuple[Array, Array, Array, Array]:
+    """Frequency, coefficients, velocity and stability along a curve."""
+    model = balance.model
+    coefficients = jax.vmap(balance.coefficients)(points)
+    frequency = points[:, -1] * balance.frequency_scale
+    velocity = velocity_phasors(coefficients, frequency, model.modes.mode_shape)
+    stable = is_stable(floquet_multipliers(model, coefficients, frequency, n_steps))
+    return frequency, coefficients, velocity, stable
+
+
+def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
+    """Rows with copies of the last up to a power of two of them, so that few shapes compile."""
+    missing = max(at_least, 1 << (len(rows) - 1).bit_length()) - len(rows)
+    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
 
 
 def _insert_events(

@@ -98,22 +98,30 @@ def _follow(
 
 
 def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
-    model, n = balance.model, int(curve.n_points)
-    points = curve.points[:n]
+    n = int(curve.n_points)
+    frequency, coefficients, velocity, energy = (
+        np.asarray(a)[:n] for a in _motion(balance, curve.points)
+    )
+    return NormalModeBranch(
+        frequency=frequency,
+        coefficients=coefficients,
+        velocity=velocity,
+        energy=energy,
+        status=CurveStatus(int(curve.status)),
+        sensors=balance.model.modes.sensors,
+    )
+
+
+@eqx.filter_jit
+def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Frequency, coefficients, velocity and energy along a curve."""
+    model = balance.model
     coefficients = jax.vmap(balance.coefficients)(points)
     frequency = points[:, -1] * balance.frequency_scale
     full = _with_sines(coefficients)
     velocity = velocity_phasors(full, frequency, model.modes.mode_shape)
     at_rest = jnp.sum(coefficients, axis=1)  # q(0), where the velocity vanishes
-    energy = model.potential_energy(at_rest)
-    return NormalModeBranch(
-        frequency=np.asarray(frequency),
-        coefficients=np.asarray(coefficients),
-        velocity=np.asarray(velocity),
-        energy=np.asarray(energy),
-        status=CurveStatus(int(curve.status)),
-        sensors=model.modes.sensors,
-    )
+    return frequency, coefficients, velocity, model.potential_energy(at_rest)
 
 
 def _with_sines(

@@ -9,7 +9,12 @@ import numpy as np
 
 from snrmjax.measure.steady_states import SteadyStates, steady_states
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.forced_response import ResponseCurve, forced_response, solve_at_frequency
+from snrmjax.simulate.forced_response import (
+    ResponseCurve,
+    forced_response,
+    padded,
+    solve_at_frequency,
+)
 from snrmjax.simulate.harmonics import velocity_phasors
 
 
@@ -33,6 +38,7 @@ class VirtualTest(NamedTuple):
 
 
 NO_ERRORS = MeasurementErrors()
+_BLOCK = 4096
 
 
 def phase_resonance_test(
@@ -98,9 +104,9 @@ def phase_resonance_test(
             "no stable state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range."
         )
-    exact, converged = solve_at_frequency(
-        model, jnp.asarray(force), jnp.asarray(frequency), jnp.asarray(np.stack(starts))
-    )
+    asked = (np.array(force), np.array(frequency), np.stack(starts))
+    solved = solve_at_frequency(model, *(jnp.asarray(padded(one, 64)) for one in asked))
+    exact, converged = (one[: len(force)] for one in solved)
     # Beside a fold, Newton's method at fixed frequency may leave for the other branch.
     found = _mode_phase(model, np.asarray(exact))
     keep = np.asarray(converged) & (np.abs(found - np.array(phases)) < 0.05)
@@ -203,7 +209,10 @@ def _with_errors(
     keys = jax.random.split(jax.random.key(seed), 6)
 
     def normal(key: jax.Array, *shape: int) -> np.ndarray:
-        return np.asarray(jax.random.normal(key, shape))
+        # Drawn in blocks of one length, which compiles once.
+        size = int(np.prod(shape))
+        blocks = jax.random.normal(key, (-(-size // _BLOCK) * _BLOCK,))
+        return np.asarray(blocks)[:size].reshape(shape)
 
     groups, group = np.unique(level, return_inverse=True)
     gain = errors.level_gain * normal(keys[3], len(groups))[group]
