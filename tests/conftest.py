@@ -1,0 +1,23 @@
+"""One store of compiled programs for all workers and all commands that the tests start."""
+
+import os
+import shutil
+import tempfile
+
+import pytest
+
+_STORE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before JAX is imported, and before workers, which inherit the environment, are started."""
+    if _STORE not in os.environ:
+        config.snrmjax_store = tempfile.mkdtemp(prefix="snrmjax-tests-")
+        os.environ[_STORE] = config.snrmjax_store
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if hasattr(config, "snrmjax_store"):
+        shutil.rmtree(config.snrmjax_store, ignore_errors=True)
+        del os.environ[_STORE]
