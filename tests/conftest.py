@@ -21,3 +21,14 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     if hasattr(config, "snrmjax_store"):
         shutil.rmtree(config.snrmjax_store, ignore_errors=True)
         del os.environ[_STORE]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation(request: pytest.FixtureRequest):
+    """Compile quickly where compilation is most of the time; simulations run long and are not."""
+    import jax
+
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", "simulate" not in request.path.parts)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

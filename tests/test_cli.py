@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from snrmjax.cli import main
+
 MODEL = """name = "test mode"
 [[mode]]
 frequency_hz = 64.78
@@ -147,40 +149,50 @@ BAD_DATA = {
 }
 
 
+@pytest.fixture
+def run_here(monkeypatch, capsys):
+    """A command in this process, which saves the import: exit code and stderr."""
+
+    def call(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["snrmjax", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().err
+
+    return call
+
+
 @pytest.mark.parametrize("name", BAD_DATA)
-def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, name):
+def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, run_here, name):
     model, data = files
     text, named = BAD_DATA[name]
     data.write_text(text)
     out = tmp_path / "out"
-    done = run("identify", str(data), "--model", str(model), "--out", str(out))
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
-    (line,) = [one for one in done.stderr.splitlines() if one.startswith("error: ")]
+    code, stderr = run_here("identify", str(data), "--model", str(model), "--out", str(out))
+    assert code == 2
+    assert "Traceback" not in stderr
+    (line,) = [one for one in stderr.splitlines() if one.startswith("error: ")]
     assert "data.csv" in line
     assert named in line
     assert not out.exists()
 
 
-def test_wrong_model_and_wrong_range_end_with_two(files, tmp_path):
+def test_a_wrong_model_ends_with_two(files, tmp_path, run_here):
     model, data = files
     model.write_text(MODEL.replace("damping_ratio", "dampng_ratio"))
     out = tmp_path / "out"
-    done = run("identify", str(data), "--model", str(model), "--out", str(out))
-    assert done.returncode == 2
-    assert re.search(r"dampng_ratio.*damping_ratio", done.stderr)
-    model.write_text(MODEL)
+    code, stderr = run_here("identify", str(data), "--model", str(model), "--out", str(out))
+    assert code == 2
+    assert re.search(r"dampng_ratio.*damping_ratio", stderr)
+    assert not out.exists()
+
+
+def test_a_wrong_range_ends_with_two(files, tmp_path):
+    model, _ = files
+    out = tmp_path / "out"
     done = run(
-        "simulate",
-        str(model),
-        "--force",
-        "1e-4",
-        "--from-hz",
-        "80",
-        "--to-hz",
-        "50",
-        "--out",
-        str(out),
+        *("simulate", str(model), "--force", "1e-4", "--from-hz", "80", "--to-hz", "50"),
+        *("--out", str(out)),
     )
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
