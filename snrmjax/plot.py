@@ -7,7 +7,7 @@ critical damping. Figures need no display and change none of matplotlib's settin
 
 import io
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -46,26 +46,18 @@ from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop, peak_amplitude
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
+from snrmjax.plot_data import (
+    BAND,
+    measured_near,
+    phase_of,
+    sample_backbone,
+    sensor_index,
+    span_of,
+    usable_damping,
+    velocity_of,
+)
 from snrmjax.simulate.forced_response import ResponseCurve
 from snrmjax.simulate.normal_modes import NormalModeBranch
-
-BAND = 1.96
-"""Half the width of a 95 % band in standard deviations."""
-
-_CURVE_POINTS = 200  # as many as files have: one compiled function serves both
-
-
-class BackboneSamples(NamedTuple):
-    """A backbone at some amplitudes, in the units of the figures; errors are 95 %."""
-
-    velocity: np.ndarray  # m/s
-    frequency: np.ndarray  # Hz
-    frequency_error: np.ndarray  # Hz
-    damping: np.ndarray  # % of critical
-    damping_error: np.ndarray
-    modal_damping: np.ndarray  # 1/s
-    modal_damping_error: np.ndarray
-    beyond: np.ndarray  # whether the amplitude exceeds the measured ones
 
 
 class DampingSeries(NamedTuple):
@@ -91,36 +83,6 @@ def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dots_per_inch)
     return buffer.getvalue()
-
-
-def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
-    """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
-    start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
-    amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
-    values = backbone.values(amplitude)
-    omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
-    return BackboneSamples(
-        velocity=np.asarray(values.velocity),
-        frequency=omega / HERTZ,
-        frequency_error=BAND * omega_std / HERTZ,
-        damping=100 * damping,
-        damping_error=100 * BAND * damping_std,
-        modal_damping=modal,
-        modal_damping_error=BAND * modal_std,
-        beyond=np.asarray(amplitude) > float(backbone.largest),
-    )
-
-
-def velocity_of(
-    curve: PredictedResponse | ResponseCurve | NormalModeBranch, sensor: str
-) -> np.ndarray:
-    """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
-
-    A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.
-    """
-    if isinstance(curve, PredictedResponse):
-        return curve.velocity
-    return curve.velocity[:, 1, _sensor_index(curve.sensors, sensor)]
 
 
 def backbone_figure(
@@ -154,7 +116,7 @@ def backbone_figure(
     velocity = curve.velocity / unit.size
 
     figure, ((speeds, phases, dampings),) = panels(13.0, 4.7, 1, 3)
-    for axes, y in ((speeds, measured), (phases, _phase(points.mode_velocity, backbone))):
+    for axes, y in ((speeds, measured), (phases, phase_of(points.mode_velocity, backbone))):
         marks(axes, omega[use], y[use], DOT, "measured")
         marks(axes, omega[~use], y[~use], CROSS, "measured, left out")
     marks(dampings, own[~use], damping[~use], CROSS)
@@ -223,12 +185,14 @@ def response_figure(
     forces = sorted({c.force for c in every})
     if not forces:
         raise ValueError("there is no response to show: `predicted` and `simulated` are empty.")
-    spans = [frequency_range] if frequency_range else [_span(c, sensor) for c in predicted or exact]
+    spans = (
+        [frequency_range] if frequency_range else [span_of(c, sensor) for c in predicted or exact]
+    )
     low, high = min(s[0] for s in spans) / HERTZ, max(s[1] for s in spans) / HERTZ
     spine = sample_backbone(backbone, reach=CONTINUED)
     figure, rows = panels(10.5, 0.8 + 3.1 * len(forces), len(forces), 2)
     for force, (speeds, phases) in zip(forces, rows, strict=True):
-        omega, states = _measured_at(measured, sensor, force, force_tolerance)
+        omega, states = measured_near(measured, sensor, force, force_tolerance)
         curves = [c for c in every if c.force == force]
         velocities = [velocity_of(curve, sensor) for curve in curves]
         largest = np.nanmax(np.abs(np.concatenate([*velocities, states])))
@@ -238,14 +202,14 @@ def response_figure(
             speeds.plot(x, y, ":", color=IDENTIFIED, **style)
         phases.axhline(0.0, color="0.6", linewidth=1.0, zorder=1)
         for curve, v in zip(curves, velocities, strict=True):
-            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, _phase(v, backbone))):
+            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, phase_of(v, backbone))):
                 x = curve.frequency / HERTZ
                 if isinstance(curve, PredictedResponse):
                     name, colour, width, beyond = "predicted", IDENTIFIED, 1.5, curve.continued
                 else:
                     name, colour, width, beyond = "harmonic balance", SIMULATED, 3.0, None
                 response_line(axes, x, y, curve.stable, name, colour, width, beyond)
-        for axes, y in ((speeds, np.abs(states) / unit.size), (phases, _phase(states, backbone))):
+        for axes, y in ((speeds, np.abs(states) / unit.size), (phases, phase_of(states, backbone))):
             marks(axes, omega, y, DOT, "measured")
         found = [(one.frequency / HERTZ, one.velocity) for one in resonances if one.force == force]
         star = {**STAR, "markersize": 15.0, "zorder": 5}
@@ -352,7 +316,7 @@ def force_velocity_figure(
     Reference: Kwarta & Allen, Fig. 2.
     """
     name = sensor or data.sensors[0]
-    r = _sensor_index(data.sensors, name)
+    r = sensor_index(data.sensors, name)
     good = np.flatnonzero(np.asarray(data.measured[:, r]) & np.isfinite(np.asarray(data.force)))
     wrong = [k for k in states if k not in good]
     if wrong or not len(states):
@@ -400,14 +364,15 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
         raise ValueError("there is no damping to show: no series has points or a backbone.")
     figure, ((axes,),) = panels(7.5, 5.2, 1, 1)
     curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in shown]
-    largest = [c.velocity for c in curves if c] + [_usable(s.points)[0] for s in shown if s.points]
+    largest = [c.velocity for c in curves if c]
+    largest += [usable_damping(s.points)[0] for s in shown if s.points]
     unit = unit_for(np.concatenate(largest), "m/s")
     dots: list[float] = []
     lines: list[float] = [] if linear is None else [linear]
     for number, (one, curve) in enumerate(zip(shown, curves, strict=True)):
         colour, name = SERIES[number % len(SERIES)], plain(one.label)
         if one.points is not None:
-            velocity, damping = _usable(one.points)
+            velocity, damping = usable_damping(one.points)
             style = {**DOT, "color": colour, "alpha": 0.7}
             marks(axes, velocity / unit.size, damping, style, None if curve else name)
             dots += [*damping]
@@ -424,39 +389,3 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
     name_axes(axes, "", f"Velocity amplitude ({unit.name})", "Modal damping 2ζω (1/s)")
     legend(figure)
     return figure
-
-
-def _usable(points: BackbonePoints) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity on the backbone (m/s) and modal damping (1/s) of the points that curves use."""
-    use = np.asarray(points.usable)
-    return np.asarray(points.backbone_velocity)[use], np.asarray(points.modal_damping)[use]
-
-
-def _phase(velocity: Any, backbone: Backbone) -> np.ndarray:
-    """Velocity phase in degrees, 0 at resonance whatever the sign of the modal constant."""
-    return np.angle(np.asarray(velocity) * np.sign(float(backbone.modal_constant))) / DEGREE
-
-
-def _sensor_index(sensors: tuple[str, ...], name: str) -> int:
-    if name not in sensors:
-        raise ValueError(f"the sensor must be one of {list(sensors)}, but is {name!r}.")
-    return sensors.index(name)
-
-
-def _span(curve: PredictedResponse | ResponseCurve, sensor: str) -> tuple[float, float]:
-    amplitude = np.abs(velocity_of(curve, sensor))
-    inside = curve.frequency[amplitude >= 0.25 * amplitude.max()]
-    margin = 0.1 * np.ptp(inside)
-    return inside.min() - margin, inside.max() + margin
-
-
-def _measured_at(
-    measured: SteadyStates | None, sensor: str, force: float, tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (Hz) and phasors (m/s) of the steady states under about this force."""
-    if measured is None:
-        return np.zeros(0), np.zeros(0, dtype=np.complex128)
-    r = _sensor_index(measured.sensors, sensor)
-    near = np.abs(np.asarray(measured.force) / force - 1) <= tolerance
-    near &= np.asarray(measured.measured[:, r])
-    return np.asarray(measured.frequency)[near] / HERTZ, np.asarray(measured.velocity)[near, r]

@@ -18,13 +18,8 @@ from snrmjax.io.files import FilePath, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
-from snrmjax.plot import (
-    backbone_figure,
-    png_bytes,
-    response_figure,
-    sample_backbone,
-    velocity_of,
-)
+from snrmjax.plot import backbone_figure, png_bytes, response_figure
+from snrmjax.plot_data import sample_backbone, velocity_of
 from snrmjax.simulate.forced_response import ResponseCurve
 from snrmjax.simulate.normal_modes import NormalModeBranch
 

@@ -259,13 +259,19 @@ def _best_smoothing(
     level: np.ndarray,
     fixed: float | None,
 ) -> tuple[float, ErrorSizes]:
-    """The weight of the roughness penalty that predicts left-out levels best, and their errors."""
+    """The weight of the roughness penalty that predicts left-out levels best, and their errors.
+
+    Of weights that do not differ by more than the score's own standard error, √(2/levels) of it,
+    the smallest: bands know the spread of a curve, not the bias that smoothing gives it.
+    """
     if len(np.unique(level)) < 3:
         # One or two levels: leave out every third point in turn instead.
         level = np.argsort(np.argsort(amplitude)) % 3
     sample = (amplitude, values, std, level, fixed)
     tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
-    best = int(np.argmin([one.score for one in tried]))
+    scores = np.array([one.score for one in tried])
+    alike = scores.min() * (1 + np.sqrt(2 / len(np.unique(level))))
+    best = int(np.argmax(scores <= alike))
     return weights[best], tried[best].sizes
 
 

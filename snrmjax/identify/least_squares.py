@@ -62,7 +62,8 @@ def error_sizes(
     prediction from the other levels, taken as half as large in variance, which is what two
     neighbours with errors of their own give: τ² = ⟨mean²⟩/1.5 − ⟨s²/Σ std⁻²⟩.
 
-    Arguments: errors and stated 1σ of every left-out level. τ is 0 for fewer than three levels.
+    Arguments: errors and stated 1σ of every left-out level. τ is 0 for fewer than three levels,
+    and where the means do not exceed s² by more than their own standard error √(2/levels).
     """
     within, count, means, floors = 0.0, 0, [], []
     for error, spread in zip(errors, std, strict=True):
@@ -73,5 +74,9 @@ def error_sizes(
         means.append(mean**2)
         floors.append(1.0 / float(np.sum(weight)))
     squared = within / count if count > 0 else 0.0
-    level = np.mean(means) / 1.5 - squared * np.mean(floors) if len(means) > 2 else 0.0
-    return ErrorSizes(float(np.sqrt(squared)), float(np.sqrt(max(level, 0.0))))
+    if len(means) < 3:
+        return ErrorSizes(float(np.sqrt(squared)), 0.0)
+    expected = squared * np.mean(floors)
+    level = np.mean(means) / 1.5 - expected
+    shared = level > np.sqrt(2 / len(means)) * expected
+    return ErrorSizes(float(np.sqrt(squared)), float(np.sqrt(level)) if shared else 0.0)

@@ -1,0 +1,100 @@
+"""What figures read off results: sampled backbones, phasors and phases, in the figures' units."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.identify.backbone import Backbone
+from snrmjax.identify.backbone_points import BackbonePoints
+from snrmjax.identify.prediction import PredictedResponse
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.simulate.forced_response import ResponseCurve
+from snrmjax.simulate.normal_modes import NormalModeBranch
+
+BAND = 1.96
+"""Half the width of a 95 % band in standard deviations."""
+
+_CURVE_POINTS = 200  # as many as files have: one compiled function serves both
+
+
+class BackboneSamples(NamedTuple):
+    """A backbone at some amplitudes, in the units of the figures; errors are 95 %."""
+
+    velocity: np.ndarray  # m/s
+    frequency: np.ndarray  # Hz
+    frequency_error: np.ndarray  # Hz
+    damping: np.ndarray  # % of critical
+    damping_error: np.ndarray
+    modal_damping: np.ndarray  # 1/s
+    modal_damping_error: np.ndarray
+    beyond: np.ndarray  # whether the amplitude exceeds the measured ones
+
+
+def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
+    """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
+    start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
+    amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
+    values = backbone.values(amplitude)
+    omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
+    return BackboneSamples(
+        velocity=np.asarray(values.velocity),
+        frequency=omega / HERTZ,
+        frequency_error=BAND * omega_std / HERTZ,
+        damping=100 * damping,
+        damping_error=100 * BAND * damping_std,
+        modal_damping=modal,
+        modal_damping_error=BAND * modal_std,
+        beyond=np.asarray(amplitude) > float(backbone.largest),
+    )
+
+
+def velocity_of(
+    curve: PredictedResponse | ResponseCurve | NormalModeBranch, sensor: str
+) -> np.ndarray:
+    """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
+
+    A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.
+    """
+    if isinstance(curve, PredictedResponse):
+        return curve.velocity
+    return curve.velocity[:, 1, sensor_index(curve.sensors, sensor)]
+
+
+def usable_damping(points: BackbonePoints) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity on the backbone (m/s) and modal damping (1/s) of the points that curves use."""
+    use = np.asarray(points.usable)
+    return np.asarray(points.backbone_velocity)[use], np.asarray(points.modal_damping)[use]
+
+
+def phase_of(velocity: Any, backbone: Backbone) -> np.ndarray:
+    """Velocity phase in degrees, 0 at resonance whatever the sign of the modal constant."""
+    return np.angle(np.asarray(velocity) * np.sign(float(backbone.modal_constant))) / DEGREE
+
+
+def sensor_index(sensors: tuple[str, ...], name: str) -> int:
+    """Place of a sensor among all, or a `ValueError` that names these."""
+    if name not in sensors:
+        raise ValueError(f"the sensor must be one of {list(sensors)}, but is {name!r}.")
+    return sensors.index(name)
+
+
+def span_of(curve: PredictedResponse | ResponseCurve, sensor: str) -> tuple[float, float]:
+    """Frequencies (rad/s) between which a response exceeds a quarter of its peak, and a margin."""
+    amplitude = np.abs(velocity_of(curve, sensor))
+    inside = curve.frequency[amplitude >= 0.25 * amplitude.max()]
+    margin = 0.1 * np.ptp(inside)
+    return inside.min() - margin, inside.max() + margin
+
+
+def measured_near(
+    measured: SteadyStates | None, sensor: str, force: float, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (Hz) and phasors (m/s) of the steady states under about this force."""
+    if measured is None:
+        return np.zeros(0), np.zeros(0, dtype=np.complex128)
+    r = sensor_index(measured.sensors, sensor)
+    near = np.abs(np.asarray(measured.force) / force - 1) <= tolerance
+    near &= np.asarray(measured.measured[:, r])
+    return np.asarray(measured.frequency)[near] / HERTZ, np.asarray(measured.velocity)[near, r]
