@@ -10,7 +10,9 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -187,7 +189,7 @@ def effect_parameters(kind: str) -> tuple[str, ...]:
 def make_effect(kind: str, parameters: dict[str, float]) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
 
-    Raises `ValueError` for an unknown kind, an unknown parameter or a missing one.
+    Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter.
 
     >>> make_effect("cubic_stiffness", {"coefficient": 2.0}).force(jnp.array(3.0), jnp.array(0.0))
     Array(54., dtype=float64)
@@ -197,4 +199,7 @@ def make_effect(kind: str, parameters: dict[str, float]) -> AbstractEffect:
     wanted = effect_parameters(kind)
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
+    for name, value in parameters.items():
+        if not isinstance(value, jax.Array) and not np.isfinite(value):
+            raise ValueError(f"`{name}` of {kind} must be finite, but is {value}.")
     return EFFECTS[kind](**{k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()})

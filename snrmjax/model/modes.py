@@ -67,6 +67,7 @@ def linear_modes(
         raise ValueError(
             f"`mode_shape` must have shape (sensors, {n_modes} modes), but has {shape.shape}."
         )
+    _require("mode_shape", shape.reshape(-1), np.isfinite(shape.reshape(-1)), "finite")
     n_sensors = shape.shape[0]
     names = sensors or tuple(f"sensor {k + 1}" for k in range(n_sensors))
     if len(names) != n_sensors:
@@ -87,6 +88,8 @@ def linear_modes(
             f"`rigid_body_shape` must have shape ({n_sensors} sensors, rigid-body modes), "
             f"but has {rigid_shape.shape}."
         )
+    flat = rigid_shape.reshape(-1)
+    _require("rigid_body_shape", flat, np.isfinite(flat), "finite")
     rigid_participation = _vector(
         "rigid_body_participation",
         [] if rigid_body_participation is None else rigid_body_participation,

@@ -93,7 +93,8 @@ def phase_resonance_test(
         reached, ends = _swept(curve)
         jumps += [(level, f) for f in ends]
         phase = _mode_phase(model, curve.coefficients)
-        for k, share in _spread_in_phase(phase, reached, smallest, largest, points_per_level):
+        near = reached & _around_resonance(curve, phase, largest)
+        for k, share in _spread_in_phase(phase, near, smallest, largest, points_per_level):
             levels.append(level)
             force.append(curve.force)
             frequency.append(_between(curve.frequency, k, share))
@@ -129,6 +130,26 @@ def _mode_phase(model: Structure, coefficients: np.ndarray) -> np.ndarray:
     j = model.modes.mode_of_interest
     cosine, sine = coefficients[:, 1, j], coefficients[:, 2, j]
     return np.angle(1j * (cosine - 1j * sine) * np.sign(float(model.modes.participation[j])))
+
+
+def _around_resonance(curve: ResponseCurve, phase: np.ndarray, largest: float) -> np.ndarray:
+    """Points from the strongest phase resonance on, either way, until the phase is too far off.
+
+    At a superharmonic resonance, far below, the phase may come back into the range: no test for
+    the mode would look there. Without a phase resonance in the curve every point counts.
+    """
+    n = len(phase)
+    resonances = curve.at_events("phase_resonance")
+    if not resonances.size:
+        return np.ones(n, dtype=bool)
+    centre = resonances[np.argmax(np.abs(curve.velocity[resonances, 1, 0]))]
+    # One point beyond the limit is kept on either side: states lie between points.
+    far = np.flatnonzero(np.abs(phase) > largest)
+    below, above = far[far < centre], far[far > centre]
+    first = below[-1] if below.size else 0
+    last = above[0] if above.size else n - 1
+    index = np.arange(n)
+    return (index >= first) & (index <= last)
 
 
 def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:

@@ -99,6 +99,7 @@ def test_force_slopes_and_symmetry(kind):
         ("gap_stiffness", {"stiffness": 1.0}, r"takes the parameters \['stiffness', 'gap'\]"),
         ("cubic_damping", {"coefficient": 1.0, "gap": 1.0}, r"not \['coefficient', 'gap'\]"),
         ("cubic_damping", {"koefficient": 1.0}, "cubic_damping takes"),
+        ("cubic_damping", {"coefficient": np.nan}, "`coefficient` of cubic_damping must be finite"),
     ],
 )
 def test_effects_that_do_not_exist_are_refused(kind, parameters, message):

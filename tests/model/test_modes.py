@@ -176,6 +176,8 @@ GOOD = {
         ({"damping_ratio": [0.01]}, r"`damping_ratio` must be a vector of 2.*\(1,\)"),
         ({"mode_shape": [[2.0]]}, r"`mode_shape` must have shape \(sensors, 2 modes\).*\(1, 1\)"),
         ({"mode_shape": np.zeros((0, 2))}, "`mode_shape`"),
+        ({"mode_shape": [[2.0, np.nan]]}, "`mode_shape` must be finite, but entry 1 is nan"),
+        ({"rigid_body_shape": [[np.inf]]}, "`rigid_body_shape` must be finite, but entry 0"),
         ({"participation": [3.0]}, "`participation` must be a vector of 2"),
         ({"participation": [3.0, np.inf]}, "`participation` must be finite.*entry 1 is inf"),
         ({"sensors": ("a", "b")}, "`sensors` names 2 sensors, but `mode_shape` has 1"),

@@ -52,6 +52,17 @@ def test_states_lie_inside_the_range_and_are_different(appropriation):
     np.testing.assert_array_equal(states.force, np.repeat(FORCES, 8))
 
 
+def test_a_superharmonic_resonance_is_passed_over():
+    # At 1.779 mN the phase comes back to 42° at 27.6 Hz, a quarter of the resonance's frequency.
+    test = phase_resonance_test(curved_beam(), [CURVED_BEAM_FORCES[2]], 20 * HZ, 130 * HZ)
+    (curve,) = test.curves
+    phase = np.angle(curve.velocity[:, 1, 0])
+    below = curve.stable & (curve.frequency < 40 * HZ)
+    assert np.any(below & (np.cos(phase) ** 2 > 0.5)), "there is nothing to pass over"
+    assert np.all(test.steady_states.frequency > 80 * HZ)
+    assert len(test.steady_states.frequency) == 5
+
+
 def test_a_linear_structure_is_recorded_evenly_and_exactly():
     states = run(TINY).steady_states
     model = curved_beam()
