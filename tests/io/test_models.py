@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -595,7 +596,10 @@ BATCH = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), structure(small()))
     [
         (structure(small(participation=[0.0])), "`participation` must be a number other than zero"),
         (structure(small(mode_shape=[[0.0]])), "zero at every sensor"),
-        (structure(small(mode_shape=[[np.nan]])), "must be a finite number"),
+        (
+            eqx.tree_at(lambda m: m.modes.mode_shape, structure(small()), jnp.array([[jnp.nan]])),
+            "must be a finite number",
+        ),
         (structure(small(sensors=(" a ",))), "without spaces around it"),
         (structure(small(), level_gain_std=-1.0), "`level_gain_std` must be zero or positive"),
         (structure(small(), level_phase_std=np.inf), "`level_phase_std_deg` must be a finite"),

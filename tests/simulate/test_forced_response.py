@@ -1,5 +1,6 @@
 """Forced responses against linear formulas, closed orbits in time, and the paper's numbers."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -371,7 +372,8 @@ def with_drag(coefficient):
 
 
 def test_a_structure_of_nan_has_no_start():
-    parts = forced_response(with_drag(np.nan), [0.2], 1.0, 3.0, harmonic_order=3)
+    broken = eqx.tree_at(lambda m: m.effects[0].coefficient, with_drag(0.1), jnp.array(jnp.nan))
+    parts = forced_response(broken, [0.2], 1.0, 3.0, harmonic_order=3)
     assert [part.status for part in parts] == [CurveStatus.NO_START] * 2
     for part in parts:
         assert len(part.frequency) == len(part.event) == len(part.stable) == 0
