@@ -12,6 +12,7 @@ from snrmjax.identify.curves import (
     AS_STATED,
     AbstractCurve,
     CurveFit,
+    LeftOut,
     fit_curve,
     log_slope,
     place_knots,
@@ -261,18 +262,26 @@ def _best_smoothing(
 ) -> tuple[float, ErrorSizes]:
     """The weight of the roughness penalty that predicts left-out levels best, and their errors.
 
-    Of weights that do not differ by more than the score's own standard error, √(2/levels) of it,
-    the smallest: bands know the spread of a curve, not the bias that smoothing gives it.
+    Of weights whose predictions of the same levels are not worse by more than the standard error
+    of that difference, the smallest: bands know the spread of a curve, not the bias that smoothing
+    gives it.
     """
     if len(np.unique(level)) < 3:
         # One or two levels: leave out every third point in turn instead.
         level = np.argsort(np.argsort(amplitude)) % 3
     sample = (amplitude, values, std, level, fixed)
     tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
-    scores = np.array([one.score for one in tried])
-    alike = scores.min() * (1 + np.sqrt(2 / len(np.unique(level))))
-    best = int(np.argmax(scores <= alike))
-    return weights[best], tried[best].sizes
+    best = min(tried, key=lambda one: one.score)
+    # Levels that no curve predicts must not decide here either.
+    fair = np.argsort(best.squares)[: -(-3 * len(best.squares) // 4)]
+
+    def as_good(one: LeftOut) -> bool:
+        worse = (one.squares - best.squares)[fair]
+        return worse.size < 2 or np.mean(worse) <= np.std(worse, ddof=1) / np.sqrt(worse.size)
+
+    # The best one is as good as itself.
+    chosen = next(k for k, one in enumerate(tried) if as_good(one))
+    return weights[chosen], tried[chosen].sizes
 
 
 def _anchor_report(

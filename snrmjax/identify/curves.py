@@ -270,6 +270,7 @@ class LeftOut(NamedTuple):
 
     score: float  # error²/std², mean of the better three quarters of the levels; infinity = none
     sizes: ErrorSizes
+    squares: Float[np.ndarray, " level"]  # error²/std² of every level that was predicted
 
 
 def predict_left_out(
@@ -302,12 +303,12 @@ def predict_left_out(
         errors.append(values[left] - predicted)
         spreads.append(std[left])
     if not errors:
-        return LeftOut(np.inf, AS_STATED)
+        return LeftOut(np.inf, AS_STATED, np.zeros(0))
     pairs = zip(errors, spreads, strict=True)
-    squares = np.sort([np.mean((error / spread) ** 2) for error, spread in pairs])
+    squares = np.array([np.mean((error / spread) ** 2) for error, spread in pairs])
     # A few levels that no curve predicts, at a sharp bend, must not decide for all.
-    score = float(np.mean(squares[: -(-3 * len(squares) // 4)]))
-    return LeftOut(score, error_sizes(errors, spreads))
+    score = float(np.mean(np.sort(squares)[: -(-3 * len(squares) // 4)]))
+    return LeftOut(score, error_sizes(errors, spreads), squares)
 
 
 def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
