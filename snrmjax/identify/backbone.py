@@ -262,9 +262,9 @@ def _best_smoothing(
 ) -> tuple[float, ErrorSizes]:
     """The weight of the roughness penalty that predicts left-out levels best, and their errors.
 
-    Of weights whose predictions of the same levels are not worse by more than the standard error
-    of that difference, the smallest: bands know the spread of a curve, not the bias that smoothing
-    gives it.
+    Of weights whose predictions are as good, the smallest: bands know the spread of a curve, not
+    the bias that smoothing gives it. As good is a score within its own standard error, √(2/levels)
+    of it, that also differs from the best, level by level, by no more than that difference's.
     """
     if len(np.unique(level)) < 3:
         # One or two levels: leave out every third point in turn instead.
@@ -277,7 +277,11 @@ def _best_smoothing(
 
     def as_good(one: LeftOut) -> bool:
         worse = (one.squares - best.squares)[fair]
-        return worse.size < 2 or np.mean(worse) <= np.std(worse, ddof=1) / np.sqrt(worse.size)
+        n = worse.size
+        if n < 2:
+            return one is best
+        near = one.score <= best.score * (1 + np.sqrt(2 / n))
+        return near and np.mean(worse) <= np.std(worse, ddof=1) / np.sqrt(n)
 
     # The best one is as good as itself.
     chosen = next(k for k, one in enumerate(tried) if as_good(one))

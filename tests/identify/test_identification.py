@@ -16,8 +16,11 @@ W0, ZETA, SHAPE, PARTICIPATION = 500.0, 0.01, 2.0, 1.5
 MODES = sj.linear_modes([W0], [ZETA], [[SHAPE]], [PARTICIPATION])
 
 
-def linear_test(seed, noise, *, stated=False, level_gain=0.0, levels=6):
-    """States of a linear mode by its own formula, with a relative error of the phasor."""
+def linear_test(seed, noise, *, stated=False, more_off_it=0.0, levels=6):
+    """States of a linear mode by its own formula, with a relative error of the phasor.
+
+    `more_off_it` makes the error grow with the distance from resonance.
+    """
     rng = np.random.default_rng(seed)
     level = np.repeat(np.arange(levels), 5)
     force = np.linspace(0.2, 1.0, levels)[level]
@@ -25,7 +28,8 @@ def linear_test(seed, noise, *, stated=False, level_gain=0.0, levels=6):
     dynamic = W0**2 - frequency**2 + 2j * ZETA * W0 * frequency
     exact = 1j * frequency * SHAPE * PARTICIPATION * force / dynamic
     error = noise * (rng.normal(size=exact.size) + 1j * rng.normal(size=exact.size))
-    velocity = exact * (1 + error) * (1 + level_gain * rng.normal(size=levels)[level])
+    error *= np.sqrt(1 + (more_off_it * np.sin(np.angle(exact))) ** 2)
+    velocity = exact * (1 + error)
     spread = {"velocity_std": noise * np.abs(velocity), "phase_std": np.full(level.size, noise)}
     return sj.steady_states(level, frequency, force, velocity, **(spread if stated else {}))
 
@@ -113,11 +117,12 @@ class TestLinearMode:
     def test_point_errors_that_were_not_stated_come_from_the_scatter(self):
         scores = []
         for seed in range(20):
-            points = sj.identify_backbone(linear_test(seed, 0.01), MODES).points
+            points = sj.identify_backbone(linear_test(seed, 0.005, more_off_it=4.0), MODES).points
             scores.append((points.natural_frequency - W0) / points.natural_frequency_std)
             scores.append((points.damping_ratio - ZETA) / points.damping_ratio_std)
-        # Points off resonance are mistrusted although here they are as good as those at it.
-        assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.1
+        # Twenty seeds of 24 degrees of freedom know their rms to 3 %, but every fit bends with
+        # its points: smaller residuals, too small a scale.
+        assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.2
 
     def test_stated_errors_are_left_as_stated(self):
         data = linear_test(0, 0.01, stated=True)
