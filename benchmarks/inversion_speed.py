@@ -3,8 +3,10 @@
 Run: python benchmarks/inversion_speed.py [number of measurements]
 
 Random measurements, a residual linear part between 0 and 3 times the response, both signs of the
-modal constant; every answer is put back into Eqs. (12) and (17) of the paper, written here in
-NumPy. Prints one JSON line: sizes, times (median of 7, compile time apart), worst errors.
+modal constant; one in ten is an edge case: a phase within 1e-9° of 0°, −90° or −180° in the
+paper's reference, no force, NaN. Every answer is put back into Eqs. (12) and (17) of the paper,
+written here in NumPy. Prints one JSON line: sizes, times (median of 7, compile time apart), worst
+errors, and how many members neither have a value nor say why.
 """
 
 import json
@@ -37,6 +39,22 @@ def measurements(n: int, seed: int = 0) -> dict[str, np.ndarray]:
         "mode": mode,
         "residual": residual,
     }
+
+
+def with_edge_cases(sample: dict[str, np.ndarray], seed: int = 1) -> dict[str, np.ndarray]:
+    """The same with every tenth member at an edge; `edge` marks them."""
+    rng = np.random.default_rng(seed)
+    sample = {name: values.copy() for name, values in sample.items()}
+    n = len(sample["mode"])
+    kind = np.where(np.arange(n) % 10 == 0, rng.integers(0, 5, n), -1)
+    for number, degrees in enumerate((90.0, 0.0, -90.0)):  # the paper's 0°, −90°, −180°
+        here = kind == number
+        angle = np.radians(degrees + rng.uniform(-1e-9, 1e-9, here.sum()))
+        turn = np.exp(1j * angle) * np.sign(sample["constant"][here])
+        sample["mode"][here] = np.abs(sample["mode"][here]) * turn
+    sample["constant"][kind == 3] = 0.0
+    sample["mode"][kind == 4] = np.nan
+    return sample | {"edge": kind >= 0}
 
 
 def closed_form_with_roots(
@@ -84,7 +102,7 @@ def worst_residuals(points: sj.SnrmPoints, sample: dict[str, np.ndarray]) -> tup
 def main() -> None:
     """Measure and print."""
     n = int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000
-    sample = measurements(n)
+    sample = with_edge_cases(measurements(n))
     constant, frequency, residual, mode = (
         jnp.asarray(sample[k]) for k in ("constant", "frequency", "residual", "mode")
     )
@@ -94,6 +112,12 @@ def main() -> None:
     points = sj.invert_phasor(*phasor)
     names, counts = np.unique(np.asarray(points.status), return_counts=True)
     amplitude, natural = worst_residuals(points, sample)
+    solved = np.isfinite(points.natural_frequency) & np.isfinite(points.damping_ratio)
+    answered = np.isin(
+        points.status,
+        [sj.PointStatus.OK, sj.PointStatus.TWO_ROOTS, sj.PointStatus.NEGATIVE_DAMPING],
+    )
+    error = np.abs(np.asarray(points.natural_frequency) / sample["natural"] - 1)
     seconds = {
         "closed_form_triple_s": median_time(jax.jit(closed_form_with_roots), *triple),
         "newton_triple_s": median_time(sj.invert_amplitude_phase, *triple),
@@ -111,9 +135,8 @@ def main() -> None:
                 },
                 "worst_relative_error_eq12": amplitude,
                 "worst_relative_error_eq17": natural,
-                "worst_frequency_error": float(
-                    np.nanmax(np.abs(np.asarray(points.natural_frequency) / sample["natural"] - 1))
-                ),
+                "status_and_value_disagree": int(np.sum(solved != answered)),
+                "worst_frequency_error": float(np.nanmax(error[~sample["edge"]])),
                 **{k: round(v, 4) for k, v in seconds.items()},
                 "newton_over_closed_form": round(
                     seconds["newton_triple_s"] / seconds["closed_form_triple_s"], 2
