@@ -179,7 +179,12 @@ def identify(
     ] = Measure.fundamental,
     curve: Annotated[Family, typer.Option(help="Family of the curves.")] = Family.spline,
     knots: Annotated[
-        int | None, typer.Option(help="Number of knots; chosen by prediction if not given.", min=2)
+        int | None,
+        typer.Option(
+            help="Knots of each curve; if not given, up to 60, and their smoothness is chosen by "
+            "how well left-out levels are predicted.",
+            min=2,
+        ),
     ] = None,
     anchor: Annotated[
         bool, typer.Option("--anchor", help="Pin the curves at the linear mode at zero amplitude.")
