@@ -18,15 +18,9 @@ from snrmjax.io.files import (
     suggestion,
     write_atomically,
 )
-from snrmjax.io.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.model.effects import (
-    DECLARED_EFFECTS,
-    EFFECTS,
-    AbstractEffect,
-    effect_parameters,
-    make_effect,
-)
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.modes import LinearModes, linear_modes
 from snrmjax.model.potential import (
     Monomial,
@@ -35,6 +29,7 @@ from snrmjax.model.potential import (
     parse_monomial,
     polynomial_potential,
 )
+from snrmjax.model.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 from snrmjax.model.structure import Structure, structure
 
 _MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
@@ -248,13 +243,9 @@ def _effect(table: _Table) -> AbstractEffect:
         names = effect_parameters(kind)
         table = _Table(table.entries, f"{table.place} ({kind})")
         table.check_keys(("kind", *names))
-        return make_effect(kind, {name: table.number(name) for name in names})
-    if kind in DECLARED_EFFECTS:
-        raise ValueError(
-            f"`kind` of {table.place} is {kind!r}, a name that this version reads but an effect "
-            "that it cannot simulate yet."
-        )
-    near = suggestion(kind, (*EFFECTS, *DECLARED_EFFECTS))
+        rules = EFFECTS[kind].rules
+        return make_effect(kind, {name: table.number(name, *rules.get(name, ())) for name in names})
+    near = suggestion(kind, EFFECTS)
     known = "" if near else f" (known are {', '.join(sorted(EFFECTS))})"
     raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}{known}.")
 

@@ -1,5 +1,6 @@
 """A structure: linear modes, a polynomial potential and further effects."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,9 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.effects import AbstractEffect
+from snrmjax.model.effect_base import (
+    AbstractAddedMode,
+    AbstractEffect,
+    AbstractForce,
+    AbstractForceSpectrum,
+    AbstractHysteresis,
+    AbstractLinearChange,
+    AbstractMeasurementEffect,
+    AbstractMemoryless,
+)
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
+
+
+class LinearTerms(NamedTuple):
+    """The linear part m q̈ + d q̇ + k q of every modal equation, linear changes included."""
+
+    mass: Float[Array, " mode"]  # relative to the modal mass
+    damping: Float[Array, " mode"]  # 1/s
+    stiffness: Float[Array, " mode"]  # 1/s²
 
 
 class Structure(eqx.Module):
@@ -18,6 +36,7 @@ class Structure(eqx.Module):
 
     `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ errors that all measurements
     of one level share; they belong to the test set-up and travel with the model file.
+    `test_order`, from 0 to 1, is when in a test the structure is looked at.
     """
 
     modes: LinearModes
@@ -25,6 +44,7 @@ class Structure(eqx.Module):
     effects: tuple[AbstractEffect, ...] = ()
     level_gain_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     level_phase_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    test_order: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     name: str = eqx.field(static=True, default="structure")
 
     @property
@@ -32,29 +52,82 @@ class Structure(eqx.Module):
         """Number of flexible modes."""
         return self.modes.n_modes
 
+    @property
+    def memoryless(self) -> tuple[AbstractMemoryless, ...]:
+        """The effects whose force depends on the present state alone."""
+        return tuple(e for e in self.effects if isinstance(e, AbstractMemoryless))
+
+    @property
+    def hysteretic(self) -> tuple[AbstractHysteresis, ...]:
+        """The effects whose force over a cycle needs the whole cycle: friction."""
+        return tuple(e for e in self.effects if isinstance(e, AbstractHysteresis))
+
+    @property
+    def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
+        """The effects that falsify the record, in the order in which they act."""
+        found = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
+        return tuple(sorted(found, key=lambda effect: effect.stage))
+
+    def linear_terms(self) -> LinearTerms:
+        """Mass 1, damping 2ζω and stiffness ω² of every mode, with the linear changes."""
+        modes, j = self.modes, self.modes.mode_of_interest
+        frequency, ratio = modes.natural_frequency, modes.damping_ratio
+        terms = LinearTerms(jnp.ones(self.n_modes), 2 * ratio * frequency, frequency**2)
+        for effect in self.effects:
+            if isinstance(effect, AbstractLinearChange):
+                added = effect.linear_terms(frequency[j], ratio[j], self.test_order)
+                terms = LinearTerms(
+                    *(term.at[j].add(change) for term, change in zip(terms, added, strict=True))
+                )
+        return terms
+
+    def load_orders(self) -> Float[Array, " order"]:
+        """Cosine amplitudes of the force's harmonics 0 to 3, relative to its fundamental."""
+        fundamental = jnp.array([0.0, 1.0, 0.0, 0.0])
+        orders = fundamental
+        for effect in self.effects:
+            if isinstance(effect, AbstractForceSpectrum):
+                orders = orders + (effect.load_orders() - fundamental)
+        return orders
+
     def nonlinear_force(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
     ) -> Float[Array, "time mode"]:
-        """Nonlinear modal force ∂V/∂q + Σ effects at time samples, in kg^1/2 m/s²."""
-        force = self.potential.force(displacement)
-        j = self.modes.mode_of_interest
-        for effect in self.effects:
-            values = jax.vmap(effect.force)(displacement[:, j], velocity[:, j])
+        """Nonlinear modal force ∂V/∂q + Σ effects over a steady cycle, in kg^1/2 m/s².
+
+        Arguments: equally spaced samples of one period (without friction, any samples).
+        """
+        forces = tuple(e for e in self.effects if isinstance(e, AbstractForce))
+        return self._force(forces, displacement, velocity)
+
+    def memoryless_force(
+        self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
+    ) -> Float[Array, "time mode"]:
+        """The part of `nonlinear_force` without friction, at any samples, in kg^1/2 m/s²."""
+        return self._force(self.memoryless, displacement, velocity)
+
+    def _force(
+        self, effects: tuple[AbstractForce, ...], displacement: Array, velocity: Array
+    ) -> Array:
+        force, j = self.potential.force(displacement), self.modes.mode_of_interest
+        for effect in effects:
+            values = effect.cycle_force(displacement[:, j], velocity[:, j])
             force = force.at[:, j].add(values)
         return force
 
     def potential_energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:
-        """Energy in J of a structure held at rest: linear, polynomial and of the effects.
+        """Energy in J of a structure held at rest: linear, polynomial and of memoryless effects.
 
         The effects' part is the work ∫ f(s, 0) ds from zero, by Gauss's rule with 64 points:
-        exact for a polynomial force, to about 1e-4 of it where the force has a kink.
+        exact for a polynomial force, to about 1e-4 of it where the force has a kink. What
+        friction stores is left out.
         """
-        linear = 0.5 * (displacement**2 @ self.modes.natural_frequency**2)
+        linear = 0.5 * (displacement**2 @ self.linear_terms().stiffness)
         energy = linear + self.potential.energy(displacement)
         node, weight = np.polynomial.legendre.leggauss(64)
         q = displacement[..., self.modes.mode_of_interest, None]
         path = 0.5 * (jnp.asarray(node) + 1) * q
-        for effect in self.effects:
+        for effect in self.memoryless:
             values = jnp.vectorize(effect.force)(path, jnp.zeros_like(path))
             energy = energy + 0.5 * q[..., 0] * (values @ jnp.asarray(weight))
         return energy
@@ -62,10 +135,10 @@ class Structure(eqx.Module):
     def tangent_stiffness(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
     ) -> Float[Array, "time mode mode"]:
-        """∂(nonlinear force)/∂q at time samples, in 1/s²."""
+        """∂(force)/∂q at time samples, in 1/s²: potential and memoryless effects, no friction."""
         tangent = self.potential.stiffness(displacement)
         j = self.modes.mode_of_interest
-        for effect in self.effects:
+        for effect in self.memoryless:
             slope = jax.vmap(jax.grad(effect.force, argnums=0))
             tangent = tangent.at[:, j, j].add(slope(displacement[:, j], velocity[:, j]))
         return tangent
@@ -73,10 +146,10 @@ class Structure(eqx.Module):
     def tangent_damping(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
     ) -> Float[Array, " time"]:
-        """∂(force of the effects)/∂q̇ on the mode of interest at time samples, in 1/s."""
+        """∂(force)/∂q̇ on the mode of interest at time samples, in 1/s: memoryless effects."""
         j = self.modes.mode_of_interest
         tangent = jnp.zeros(displacement.shape[0])
-        for effect in self.effects:
+        for effect in self.memoryless:
             slope = jax.vmap(jax.grad(effect.force, argnums=1))
             tangent = tangent + slope(displacement[:, j], velocity[:, j])
         return tangent
@@ -112,6 +185,22 @@ def structure(
     )
 
 
+def simulated_structure(model: Structure) -> Structure:
+    """The structure that is simulated: with the further modes of its internal resonances.
+
+    A further mode follows the others, is driven by no force and seen by no sensor. Returns the
+    model itself where no effect adds a mode.
+    """
+    adding = [e for e in model.effects if isinstance(e, AbstractAddedMode)]
+    if not adding:
+        return model
+    modes, potential = model.modes, model.potential
+    for effect in adding:
+        modes, potential = effect.expanded(modes, potential)
+    rest = tuple(e for e in model.effects if not isinstance(e, AbstractAddedMode))
+    return dataclasses.replace(model, modes=modes, potential=potential, effects=rest)
+
+
 class Equilibrium(NamedTuple):
     """A static state: its displacement (kg^1/2 m), energy (J) and whether it is stable."""
 
@@ -126,13 +215,14 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     Solves ω²q + f(q, 0) = 0: for one mode and a polynomial restoring force by its roots,
     otherwise by Newton's method from many starts (a search, not a proof of completeness).
     A structure whose list has more than one stable entry is bistable: its forced response has
-    wells that a curve followed from rest does not visit.
+    wells that a curve followed from rest does not visit. Friction, which could hold a structure
+    elsewhere, is left out, and so are further modes (see `simulated_structure`).
 
     Returns the distinct equilibria found, sorted by |q|.
     """
     n = model.n_modes
-    squared = np.asarray(model.modes.natural_frequency) ** 2
-    if n == 1 and not model.effects:
+    squared = np.asarray(model.linear_terms().stiffness)
+    if n == 1 and not model.memoryless:
         polynomial = np.zeros(max(model.potential.degree, 2))
         polynomial[1] = squared[0]
         for monomial, value in zip(
@@ -173,10 +263,10 @@ def _newton(
     model: Structure, starts: Float[Array, "start mode"]
 ) -> tuple[Float[Array, "start mode"], Float[Array, " start"]]:
     """Ends of Newton's method for ω²q + f(q, 0) = 0, and what is left of the force over ω²."""
-    squared = model.modes.natural_frequency**2
+    squared = model.linear_terms().stiffness
 
     def balance(q: Array) -> Array:
-        return squared * q + model.nonlinear_force(q[None], jnp.zeros((1, q.size)))[0]
+        return squared * q + model.memoryless_force(q[None], jnp.zeros((1, q.size)))[0]
 
     def step(_: int, q: Array) -> Array:
         return q - jnp.linalg.solve(_energy_and_tangent(model, q)[1], balance(q))
@@ -191,16 +281,17 @@ def _energy_and_tangent(
 ) -> tuple[Float[Array, ""], Float[Array, "mode mode"]]:
     """Potential energy and tangent stiffness, the linear part included, at rest."""
     tangent = model.tangent_stiffness(q[None], jnp.zeros((1, q.size)))[0]
-    return model.potential_energy(q), jnp.diag(model.modes.natural_frequency**2) + tangent
+    return model.potential_energy(q), jnp.diag(model.linear_terms().stiffness) + tangent
 
 
 def displacement_scale(model: Structure) -> np.ndarray:
     """The displacement of each mode (kg^1/2 m) at which its own nonlinear force is not small.
 
-    Where a term of the potential matches the linear force, or the effects change it by a tenth.
+    Where a term of the potential matches the linear force, or memoryless effects change it by a
+    tenth of it.
     Sets the scale of searches and continuations; modes without own terms take the median.
     """
-    squared = np.asarray(model.modes.natural_frequency) ** 2
+    squared = np.asarray(model.linear_terms().stiffness)
     scale = np.full(model.n_modes, np.nan)
     for monomial, value in zip(
         model.potential.monomials, np.asarray(model.potential.coefficient), strict=True
@@ -209,12 +300,12 @@ def displacement_scale(model: Structure) -> np.ndarray:
         if set(monomial) == {mode} and degree > 2 and value != 0.0:
             own = (squared[mode] / (degree * abs(value))) ** (1.0 / (degree - 2))
             scale[mode] = np.fmin(scale[mode], own)
-    if model.effects:
+    if model.memoryless:
         j = model.modes.mode_of_interest
         grid = np.logspace(-12, 3, 601)
         q = np.concatenate([[0.0], grid, -grid])
         values = np.zeros(q.shape)
-        for effect in model.effects:
+        for effect in model.memoryless:
             values += np.asarray(jax.vmap(effect.force)(jnp.asarray(q), jnp.zeros(q.shape)))
         change = np.abs(values[1:] - values[0]).reshape(2, -1).max(axis=0)
         reached = change > 0.1 * squared[j] * grid

@@ -13,13 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.io.models import read_model, write_model
-from snrmjax.model.effects import (
-    DECLARED_EFFECTS,
-    EFFECTS,
-    AbstractEffect,
-    effect_parameters,
-    make_effect,
-)
+from snrmjax.model.effect_base import AbstractMemoryless
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structure import Structure, structure
@@ -156,14 +151,17 @@ def test_accepts(tmp_path, content):
 
 @pytest.mark.parametrize("kind", EFFECTS)
 def test_reads_every_effect(tmp_path, kind):
-    names = effect_parameters(kind)
-    lines = [f"{name} = {k + 1}.5" for k, name in enumerate(names)]
-    model = read(tmp_path, MINIMAL + f'[[effect]]\nkind = "{kind}"\n' + "\n".join(lines))
-    (effect,) = model.effects
-    assert isinstance(effect, EFFECTS[kind])
-    assert [float(getattr(effect, name)) for name in names] == [
-        k + 1.5 for k, _ in enumerate(names)
-    ]
+    # Different numbers that every rule allows.
+    values = {name: k + 1.5 for k, name in enumerate(effect_parameters(kind))}
+    values |= {name: 0.25 for name in values if name == "damping_ratio"}
+    lines = [f"{name} = {value}" for name, value in values.items()]
+    content = MINIMAL + f'[[effect]]\nkind = "{kind}"\n' + "\n".join(lines)
+    path = tmp_path / "copy.toml"
+    write_model(path, read(tmp_path, content))
+    assert all(line in path.read_text() for line in lines)
+    (effect,) = read_model(path).effects
+    assert type(effect) is EFFECTS[kind]
+    assert {name: float(getattr(effect, name)) for name in values} == values
 
 
 # ------------------------------------------------------------------------------ refused
@@ -395,7 +393,7 @@ BAD = {
         swapped('"quadratic_damping"', '"quadratic_dampng"'),
         ["effect 1 of model.toml", "'quadratic_dampng'", "did you mean `quadratic_damping`"],
     ),
-    "near miss of a declared effect": (
+    "near miss of an effect of another sort": (
         swapped('"quadratic_damping"', '"frequency_drft"'),
         ["effect 1 of model.toml", "'frequency_drft'", "did you mean `frequency_drift`"],
     ),
@@ -423,6 +421,22 @@ BAD = {
         swapped("stiffness = 1000", 'stiffness = "stiff"'),
         ["`stiffness`", "a number", "effect 2 of model.toml (gap_stiffness)", "'stiff'"],
     ),
+    "parameter of another effect": (
+        MINIMAL + '[[effect]]\nkind = "coulomb_friction"\nforce = 1\nsmoothing_velocity = 1\n',
+        ["effect 1 of model.toml (coulomb_friction)", "unknown key 'smoothing_velocity'"],
+    ),
+    "near miss of a slider's parameter": (
+        MINIMAL + '[[effect]]\nkind = "jenkins_slider"\nstiffness = 1\nslip_displacment = 1\n',
+        ["effect 1 of model.toml (jenkins_slider)", "did you mean `slip_displacement`"],
+    ),
+    "parameter out of its range": (
+        MINIMAL + '[[effect]]\nkind = "iwan_microslip"\ncoefficient = 1\nexponent = 3.0\n',
+        ["`exponent`", "above 1 and below 3", "effect 1 of model.toml (iwan_microslip)", "3.0"],
+    ),
+    "mass that leaves nothing": (
+        MINIMAL + '[[effect]]\nkind = "added_mass"\nmass = -1\n',
+        ["`mass`", "above -1", "effect 1 of model.toml (added_mass)"],
+    ),
     "infinite parameter": (
         swapped("stiffness = 1000", "stiffness = inf"),
         ["`stiffness`", "finite", "effect 2 of model.toml (gap_stiffness)", "inf"],
@@ -438,11 +452,16 @@ def test_refuses(tmp_path, case, check_message):
     check_message(error, parts)
 
 
-@pytest.mark.parametrize("kind", sorted(DECLARED_EFFECTS - set(EFFECTS)))
-def test_says_which_effects_it_cannot_simulate(tmp_path, kind, check_message):
-    with pytest.raises(ValueError, match="cannot simulate") as error:
-        read(tmp_path, MINIMAL + f'[[effect]]\nkind = "{kind}"\nforce = 0.01\n')
-    check_message(error, [f"'{kind}'", "effect 1 of model.toml"])
+def test_the_effects_are_those_of_the_format():
+    kinds = """
+        linear_frequency_shift linear_damping_change cubic_stiffness quadratic_stiffness
+        quintic_stiffness bilinear_stiffness gap_stiffness one_sided_stop coulomb_friction
+        jenkins_slider iwan_microslip quadratic_damping cubic_damping van_der_pol_damping
+        frequency_drift added_mass force_gain_error force_offset_error sensor_gain_error
+        sensor_phase_error internal_resonance_1_3 internal_resonance_1_2 residual_mode
+        mode_shape_change force_harmonics static_preload
+    """
+    assert sorted(EFFECTS) == sorted(kinds.split())
 
 
 def test_refuses_a_missing_file_and_a_folder(tmp_path, check_message):
@@ -489,6 +508,22 @@ def test_reads_or_refuses_a_damaged_model(tmp_path_factory, data):
 
 finite = st.floats(-1e200, 1e200)
 spread = st.one_of(st.just(0.0), st.floats(0.0, 1e200))
+above_minus_one = st.floats(-1.0, 1e200, exclude_min=True)
+# What the parameters with a rule may be.
+PARAMETERS = {
+    "relative_shift": above_minus_one,
+    "relative_drift": above_minus_one,
+    "mass": above_minus_one,
+    "gain": above_minus_one,
+    "force": spread,
+    "gap": spread,
+    "stiffness": spread,
+    "coefficient": spread,
+    "slip_displacement": st.floats(1e-200, 1e200),
+    "exponent": st.floats(1.0, 3.0, exclude_min=True, exclude_max=True),
+    "frequency_hz": st.floats(1e-200, 1e200),
+    "damping_ratio": st.floats(0.0, 1.0, exclude_max=True),
+}
 
 
 @st.composite
@@ -530,7 +565,9 @@ def models(draw):
             coefficient_std={m: draw(spread) for m in sorted(monomials)},
         ),
         effects=tuple(
-            make_effect(kind, {name: draw(finite) for name in effect_parameters(kind)})
+            make_effect(
+                kind, {name: draw(PARAMETERS.get(name, finite)) for name in effect_parameters(kind)}
+            )
             for kind in kinds
         ),
         level_gain_std=draw(spread),
@@ -576,7 +613,7 @@ def test_numbers_of_a_file_stay_as_they_are(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["copy.toml", "model.toml"]
 
 
-class Unheard(AbstractEffect):
+class Unheard(AbstractMemoryless):
     kind = "unheard_of"
 
     def force(self, displacement, velocity):

@@ -2,19 +2,22 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model import effects
-from snrmjax.model.effects import (
-    DECLARED_EFFECTS,
-    EFFECTS,
-    AbstractEffect,
-    effect_parameters,
-    make_effect,
+from snrmjax.model import (
+    effect_base,
+    effects,
+    friction,
+    linear_changes,
+    measurement_chain,
+    mode_coupling,
 )
+from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 # kind: parameters, force by hand, and whether it is odd in (q, q̇), even, or neither.
 FAMILY = {
@@ -41,16 +44,53 @@ DISSIPATIVE = {"quadratic_damping", "cubic_damping", "van_der_pol_damping"}
 STATES = [(q, v) for q in (-1.5, -0.41, -0.1, 0.0, 0.39, 0.7) for v in (-2.0, -0.3, 0.0, 1.1)]
 
 
+# The other kinds of CONTRACT.md with their parameters in order.
+OTHER_KINDS = {
+    "linear_frequency_shift": ("relative_shift",),
+    "linear_damping_change": ("damping_ratio_change",),
+    "added_mass": ("mass",),
+    "frequency_drift": ("relative_drift",),
+    "coulomb_friction": ("force",),
+    "jenkins_slider": ("stiffness", "slip_displacement"),
+    "iwan_microslip": ("coefficient", "exponent"),
+    "force_gain_error": ("gain",),
+    "force_offset_error": ("offset",),
+    "sensor_gain_error": ("gain",),
+    "sensor_phase_error": ("phase_deg",),
+    "internal_resonance_1_3": ("coefficient", "frequency_hz", "damping_ratio"),
+    "internal_resonance_1_2": ("coefficient", "frequency_hz", "damping_ratio"),
+    "residual_mode": ("receptance",),
+    "mode_shape_change": ("coefficient",),
+    "force_harmonics": ("second", "third"),
+}
+MODULES = (effect_base, effects, friction, linear_changes, measurement_chain, mode_coupling)
+
+
 def test_the_family_is_complete():
-    assert set(FAMILY) == set(EFFECTS)
+    assert set(EFFECTS) == set(FAMILY) | set(OTHER_KINDS)
+    assert len(EFFECTS) == len(FAMILY) + len(OTHER_KINDS) == 26
     classes = {
         value
-        for _, value in inspect.getmembers(effects, inspect.isclass)
-        if issubclass(value, AbstractEffect) and value is not AbstractEffect
+        for module in MODULES
+        for _, value in inspect.getmembers(module, inspect.isclass)
+        if issubclass(value, AbstractEffect) and not value.__name__.startswith("Abstract")
     }
     assert classes == set(EFFECTS.values())
     assert all(effect.kind == kind for kind, effect in EFFECTS.items())
-    assert not DECLARED_EFFECTS & set(EFFECTS)
+    assert {k for k, e in EFFECTS.items() if issubclass(e, AbstractMemoryless)} == set(FAMILY)
+
+
+@pytest.mark.parametrize("kind", OTHER_KINDS)
+def test_parameters_in_order_and_as_arrays(kind):
+    names = OTHER_KINDS[kind]
+    assert effect_parameters(kind) == names
+    values = dict.fromkeys(names, 0.5) | ({"exponent": 1.5} if "exponent" in names else {})
+    effect = make_effect(kind, values)
+    for name in names:
+        value = getattr(effect, name)
+        assert eqx.is_array(value)
+        assert value.shape == ()
+        assert set(EFFECTS[kind].rules) <= set(names)
 
 
 @pytest.mark.parametrize("kind", FAMILY)
@@ -95,13 +135,49 @@ def test_force_slopes_and_symmetry(kind):
     ("kind", "parameters", "message"),
     [
         ("cubic", {"coefficient": 1.0}, "unknown effect kind 'cubic'; known are.*cubic_stiffness"),
-        ("coulomb_friction", {"force": 1.0}, "unknown effect kind 'coulomb_friction'"),
+        ("coulomb", {"force": 1.0}, "unknown effect kind 'coulomb'"),
         ("gap_stiffness", {"stiffness": 1.0}, r"takes the parameters \['stiffness', 'gap'\]"),
         ("cubic_damping", {"coefficient": 1.0, "gap": 1.0}, r"not \['coefficient', 'gap'\]"),
         ("cubic_damping", {"koefficient": 1.0}, "cubic_damping takes"),
         ("cubic_damping", {"coefficient": np.nan}, "`coefficient` of cubic_damping must be finite"),
+        ("cubic_damping", {"coefficient": jnp.inf}, "`coefficient` of cubic_damping must be fin"),
+        ("coulomb_friction", {"force": 1.0, "smoothing_velocity": 1.0}, r"\['force'\], not"),
+        ("gap_stiffness", {"stiffness": 1.0, "gap": -1.0}, "`gap` of gap_.* zero or positive.* -1"),
+        ("coulomb_friction", {"force": -1.0}, "`force` of coulomb_friction must be zero or pos"),
+        (
+            "jenkins_slider",
+            {"stiffness": 1.0, "slip_displacement": 0.0},
+            "`slip_displacement` of jenkins_slider must be positive, but is 0",
+        ),
+        (
+            "jenkins_slider",
+            {"stiffness": -1.0, "slip_displacement": 1.0},
+            "`stiffness` of jenkins_slider must be zero or positive",
+        ),
+        (
+            "iwan_microslip",
+            {"coefficient": 1.0, "exponent": 3.0},
+            "`exponent` of iwan_microslip must be above 1 and below 3, but is 3",
+        ),
+        ("iwan_microslip", {"coefficient": 1.0, "exponent": 1.0}, "`exponent` of iwan_.* is 1"),
+        ("iwan_microslip", {"coefficient": -1.0, "exponent": 2.0}, "`coefficient` of iwan_mic"),
+        ("linear_frequency_shift", {"relative_shift": -1.0}, "`relative_shift` .* above -1"),
+        ("frequency_drift", {"relative_drift": -1.5}, "`relative_drift` .* above -1, but is -1.5"),
+        ("added_mass", {"mass": -1.0}, "`mass` of added_mass must be above -1"),
+        ("force_gain_error", {"gain": -1.0}, "`gain` of force_gain_error must be above -1"),
+        ("sensor_gain_error", {"gain": -2.0}, "`gain` of sensor_gain_error must be above -1"),
+        (
+            "internal_resonance_1_3",
+            {"coefficient": 1.0, "frequency_hz": 0.0, "damping_ratio": 0.0},
+            "`frequency_hz` of internal_resonance_1_3 must be positive",
+        ),
+        (
+            "internal_resonance_1_2",
+            {"coefficient": 1.0, "frequency_hz": 1.0, "damping_ratio": 1.0},
+            "`damping_ratio` of internal_resonance_1_2 must be from 0 to below 1, but is 1",
+        ),
     ],
 )
-def test_effects_that_do_not_exist_are_refused(kind, parameters, message):
+def test_effects_and_parameters_that_cannot_be_are_refused(kind, parameters, message):
     with pytest.raises(ValueError, match=message):
         make_effect(kind, parameters)

@@ -1,4 +1,4 @@
-"""Rules that a number in a file must keep: what is expected, and whether a number is it."""
+"""Rules that a number must keep: what is expected, and whether a number is it."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,8 +14,10 @@ class Rule(NamedTuple):
 POSITIVE = Rule("positive", lambda value: value > 0)
 NOT_NEGATIVE = Rule("zero or positive", lambda value: value >= 0)
 NOT_ZERO = Rule("a number other than zero", lambda value: value != 0)
+ABOVE_MINUS_ONE = Rule("above -1", lambda value: value > -1)
 FRACTION = Rule("from 0 to 1", lambda value: 0 <= value <= 1)
 BELOW_ONE = Rule("from 0 to below 1", lambda value: 0 <= value < 1)
+BETWEEN_ONE_AND_THREE = Rule("above 1 and below 3", lambda value: 1 < value < 3)
 WHOLE = Rule("a whole number", lambda value: value == int(value))
 SHORT = Rule("of at most 15 digits", lambda value: abs(value) < 1e15)
 # In rad/s it must still be a number.
