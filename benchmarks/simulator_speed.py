@@ -1,0 +1,523 @@
+"""Seconds a point of a forced response, against other programs and against the bare LU solves.
+
+Run: python benchmarks/simulator_speed.py [--without-peers] [--out DIR] [--environments DIR]
+
+Two curves with nine harmonics around all their folds: the flat beam (77 unknowns with the
+frequency) and the monostable curved beam (20). The peers get the equations as numbers, not the
+package, and run in environments of their own: pyHarm-os, jaxcont, and a plain NumPy/SciPy program
+(`peers/`). The limit is as many LU factorisations as snrmjax used, and nothing else. All methods
+take turns, medians of several warm runs; the first run is given apart as compile time. Every
+curve is compared with snrmjax's of 31 harmonics (the truncation of nine shows there) and of nine
+in fine steps (errors of the method show there): the largest distance of a point to the reference,
+in the plane of frequency over the first natural frequency and velocity over its peak.
+
+Also: the first curve of a cold process, with and without a compilation cache; a second model of
+the same size; 64 forces one by one against the batch verb. One JSON line each, ratios last; the
+curves go to `--out` as .npz.
+"""
+
+import argparse
+import inspect
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import snrmjax as sj
+
+HERTZ = 2 * np.pi
+PEERS = Path(__file__).parent / "peers"
+HARMONICS, REFERENCE_HARMONICS = 9, 31
+ROUNDS = {"snrmjax": 5, "numpy_scipy": 5, "jaxcont": 5, "pyHarm": 3, "lu": 5}
+SOLVES_PER_POINT = 3.0  # where a curve does not count its factorisations in `n_solves`
+PEER_LIMIT_SECONDS = 300.0  # for one answer of a peer
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # faster at these sizes
+
+
+class Case(NamedTuple):
+    """One curve to follow."""
+
+    beam: str
+    model: sj.Structure
+    force: float  # N
+    from_hz: float
+    to_hz: float
+    downward: bool  # the peers start where the linear response is a good guess
+
+    @property
+    def unknowns(self) -> int:
+        """Coefficients and the frequency."""
+        return (2 * HARMONICS + 1) * self.model.n_modes + 1
+
+
+CASES = (
+    Case("flat", sj.flat_beam(), 1.334e-2, 60.0, 120.0, downward=False),
+    Case("curved", sj.curved_beam("monostable"), 1.779e-3, 25.0, 140.0, downward=True),
+)
+
+
+def tell(**fields: object) -> None:
+    """One JSON line."""
+    rounded = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in fields.items()}
+    print(json.dumps({"benchmark": "simulator_speed", **rounded}), flush=True)
+
+
+# snrmjax itself -----------------------------------------------------------------------------
+
+
+def respond(
+    case: Case, model: sj.Structure | None = None, **settings: object
+) -> list[sj.ResponseCurve]:
+    """The public verb for one case; two parts where neither end is reached from the other."""
+    return sj.forced_response(
+        model or case.model,
+        [case.force],
+        case.from_hz * HERTZ,
+        case.to_hz * HERTZ,
+        **{"harmonic_order": HARMONICS, **settings},
+    )
+
+
+def curve_only() -> dict[str, object] | None:
+    """Settings that leave out stability and events, as the peers do; None where there are none."""
+    known = inspect.signature(sj.forced_response).parameters
+    settings = {name: False for name in ("stability", "events") if name in known}
+    return settings or None
+
+
+def midspan(curves: list[sj.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency (Hz) and velocity amplitude of the fundamental (m/s) along the curve."""
+    frequency = np.concatenate([np.asarray(c.frequency) for c in curves]) / HERTZ
+    return frequency, np.concatenate([np.abs(np.asarray(c.velocity)[:, 1, 0]) for c in curves])
+
+
+def solves(curves: list[sj.ResponseCurve]) -> int:
+    """Factorisations behind some curves: counted, or estimated from the points."""
+    counts = [getattr(c, "n_solves", None) for c in curves]
+    if all(count is not None for count in counts):
+        return int(np.sum([np.asarray(count) for count in counts]))
+    return round(SOLVES_PER_POINT * sum(len(c.frequency) for c in curves))
+
+
+def reference(case: Case, harmonics: int) -> tuple[np.ndarray, np.ndarray]:
+    """The curve in steps so fine that its chords do not matter."""
+    fine = sj.StepControl(largest=0.005, angle=0.01, tolerance=1e-10)
+    return midspan(respond(case, harmonic_order=harmonics, steps=fine, max_points=12000))
+
+
+def distance(case: Case, curve: tuple, target: tuple) -> float:
+    """Largest distance of a curve's points within the range to the polyline of the target."""
+    natural = float(case.model.modes.natural_frequency[0]) / HERTZ
+    unit = np.array([natural, np.max(target[1])])
+    inside = (curve[0] >= case.from_hz) & (curve[0] <= case.to_hz)
+    points = np.stack(curve, axis=1)[inside] / unit
+    nodes = np.stack(target, axis=1) / unit
+    begin, along = nodes[:-1], np.diff(nodes, axis=0)
+    length = np.maximum(np.sum(along**2, axis=1), 1e-300)
+    worst = 0.0
+    for point in points:
+        share = np.clip(np.sum((point - begin) * along, axis=1) / length, 0, 1)
+        gaps = np.linalg.norm(begin + share[:, None] * along - point, axis=1)
+        worst = max(worst, float(np.min(gaps)))
+    return worst
+
+
+# The peers ----------------------------------------------------------------------------------
+
+
+def write_problem(case: Case, scale: float, target: Path) -> None:
+    """The equations of a case as numbers."""
+    modes, potential = case.model.modes, case.model.potential
+    force: dict[tuple[int, ...], np.ndarray] = {}
+    for monomial, value in zip(potential.monomials, np.asarray(potential.coefficient), strict=True):
+        for mode in sorted(set(monomial)):
+            rest = list(monomial)
+            rest.remove(mode)
+            entry = force.setdefault(tuple(rest), np.zeros(case.model.n_modes))
+            entry[mode] += monomial.count(mode) * value
+    steps = sj.StepControl()
+    ends = (case.to_hz, case.from_hz) if case.downward else (case.from_hz, case.to_hz)
+    problem = {
+        "natural_frequency": modes.natural_frequency.tolist(),
+        "damping_ratio": modes.damping_ratio.tolist(),
+        "participation": modes.participation.tolist(),
+        "mode_shape": modes.mode_shape[0].tolist(),
+        "monomials": list(force),
+        "coefficient": [row.tolist() for row in force.values()],
+        "force": case.force,
+        "from_hz": ends[0],
+        "to_hz": ends[1],
+        "harmonic_order": HARMONICS,
+        "n_samples": 4 * HARMONICS + 4,
+        "displacement_scale": scale,
+        "first_step": steps.first,
+        "largest_step": steps.largest,
+        "smallest_step": steps.smallest,
+        "tolerance": steps.tolerance,
+    }
+    target.write_text(json.dumps(problem))
+
+
+def environment(folder: Path, peer: str) -> Path:
+    """The Python of a peer's own environment, made on first use."""
+    python = folder / peer / "bin" / "python"
+    if not python.exists():
+        subprocess.run([sys.executable, "-m", "venv", folder / peer], check=True)
+        requirements = PEERS / f"requirements_{peer}.txt"
+        install = [python, "-m", "pip", "install", "--quiet", "-r", requirements]
+        subprocess.run(install, check=True, stdout=sys.stderr)
+    return python
+
+
+class Peer:
+    """A peer that has followed its curve once and follows it again whenever asked."""
+
+    def __init__(self, python: Path, script: str, case: Case, out: Path):
+        name = f"{script.removesuffix('_peer.py')}_{case.beam}"
+        self.curve = out / f"{name}.npz"
+        variables = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+        with (out / f"{name}.log").open("w") as log:
+            self.process = subprocess.Popen(
+                [python, PEERS / script, out / f"problem_{case.beam}.json", self.curve],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                env=variables | ONE_THREAD,
+            )
+        default = {"method": script.removesuffix("_peer.py"), "version": "unknown"}
+        self.first = default | self.answer()
+        self.seconds: list[float] = []
+
+    def answer(self) -> dict:
+        """The next line of the peer, or a status that says that none came."""
+        timer = threading.Timer(PEER_LIMIT_SECONDS, self.process.kill)
+        timer.start()
+        line = self.process.stdout.readline()
+        timer.cancel()
+        return json.loads(line) if line else {"status": "ended or ran too long without an answer"}
+
+    def run(self) -> None:
+        """One more timed run."""
+        if "points" not in self.first or self.process.poll() is not None:
+            return
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        reply = self.answer()
+        if "seconds" in reply:
+            self.seconds.append(reply["seconds"])
+
+    def close(self) -> None:
+        """Let it end."""
+        self.process.stdin.close()
+        self.process.wait(timeout=30)
+
+
+# The limit ----------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def _factorise(matrix: jax.Array, repeats: int) -> jax.Array:
+    def body(_: int, carry: jax.Array) -> jax.Array:
+        # The next matrix hangs on the last factors, so that none is left out.
+        return matrix + 1e-30 * jax.lax.linalg.lu(carry)[0][0, 0]
+
+    return jax.lax.fori_loop(0, repeats, body, matrix)
+
+
+def lu_seconds_jax(size: int, repeats: int = 2000) -> float:
+    """Seconds of one LU factorisation inside one compiled loop."""
+    matrix = jnp.asarray(np.random.default_rng(0).normal(size=(size, size)))
+    return timed(lambda: jax.block_until_ready(_factorise(matrix, repeats)))[0] / repeats
+
+
+def lu_seconds_lapack(size: int) -> float:
+    """Seconds of one call of LAPACK's dgetrf from Python."""
+    command = [sys.executable, PEERS / "scipy_peer.py", "--lu", str(size)]
+    done = subprocess.run(
+        command, check=True, capture_output=True, text=True, env=os.environ | ONE_THREAD
+    )
+    return json.loads(done.stdout)["seconds"]
+
+
+def timed(function) -> tuple[float, object]:
+    """Seconds of a call, and what it gave."""
+    begin = time.perf_counter()
+    result = function()
+    return time.perf_counter() - begin, result
+
+
+# The measurements ---------------------------------------------------------------------------
+
+
+def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object]:
+    """All methods on one beam in turn; prints their lines and returns the ratios."""
+    targets = {h: reference(case, h) for h in (HARMONICS, REFERENCE_HARMONICS)}
+    np.savez(
+        out / f"reference_{case.beam}.npz",
+        frequency_hz=targets[REFERENCE_HARMONICS][0],
+        velocity=targets[REFERENCE_HARMONICS][1],
+    )
+    ours = {"snrmjax": {}} | ({"snrmjax, curve only": curve_only()} if curve_only() else {})
+    first, curves, seconds = {}, {}, {}
+    for name, settings in ours.items():
+        first[name], curves[name] = timed(lambda settings=settings: respond(case, **settings))
+        seconds[name] = []
+    motion = np.concatenate([np.asarray(c.coefficients)[:, 1:3] for c in curves["snrmjax"]])
+    write_problem(case, float(np.max(np.abs(motion))), out / f"problem_{case.beam}.json")
+    peers = [Peer(python, f"{name}_peer.py", case, out) for name, python in pythons.items()]
+    lu_seconds_jax(case.unknowns)
+    lu = {"dgetrf": [], "jax": []}
+    for turn in range(max(ROUNDS.values())):
+        for name, settings in ours.items():
+            if turn < ROUNDS["snrmjax"]:
+                seconds[name].append(timed(lambda settings=settings: respond(case, **settings))[0])
+        for peer in peers:
+            if turn < ROUNDS.get(peer.first["method"], 0):
+                peer.run()
+        if turn < ROUNDS["lu"]:
+            lu["dgetrf"].append(lu_seconds_lapack(case.unknowns))
+            lu["jax"].append(lu_seconds_jax(case.unknowns))
+    for peer in peers:
+        peer.close()
+
+    def report(method: str, curve: tuple, compile_seconds: float, **fields: object) -> float:
+        warm = fields["seconds"]
+        tell(
+            measurement="forced_response",
+            method=method,
+            beam=case.beam,
+            unknowns=case.unknowns,
+            points=len(curve[0]),
+            compile_seconds=compile_seconds,
+            seconds_per_point=warm / len(curve[0]),
+            distance_to_31_harmonics=distance(case, curve, targets[REFERENCE_HARMONICS]),
+            distance_to_9_harmonics=distance(case, curve, targets[HARMONICS]),
+            **fields,
+        )
+        return warm / len(curve[0])
+
+    per_point: dict[str, float] = {}
+    for name in ours:
+        curve, warm = midspan(curves[name]), float(np.median(seconds[name]))
+        np.savez(
+            out / f"{name.replace(', ', '_').replace(' ', '_')}_{case.beam}.npz",
+            frequency_hz=curve[0],
+            velocity=curve[1],
+        )
+        per_point[name] = report(
+            name,
+            curve,
+            first[name] - warm,
+            seconds=warm,
+            version=f"snrmjax {version('snrmjax')}, jax {jax.__version__}",
+            settings="with stability and events" if not ours[name] else "without",
+            status=" + ".join(sj.CurveStatus(int(c.status)).name for c in curves[name]),
+            reached_hz=float(curve[0][-1]),
+            n_solves=solves(curves[name]),
+            n_solves_counted=hasattr(curves[name][0], "n_solves"),
+        )
+    for peer in peers:
+        told = dict(peer.first)
+        if not peer.seconds:
+            tell(measurement="forced_response", beam=case.beam, **told)
+            continue
+        saved, warm = np.load(peer.curve), float(np.median(peer.seconds))
+        curve = (saved["frequency_hz"], saved["velocity"])
+        per = report(
+            told["method"],
+            curve,
+            told["prepare_seconds"] + told["first_seconds"] - warm,
+            seconds=warm,
+            **{k: told[k] for k in ("version", "settings", "status", "reached_hz", "n_solves")},
+        )
+        if told["status"] == "ok":
+            per_point[told["method"]] = per
+    count = solves(curves["snrmjax"])
+    limit = {}
+    for name, times in lu.items():
+        one = float(np.median(times))
+        limit[name] = one * count
+        tell(
+            measurement="lu_limit",
+            method=name,
+            beam=case.beam,
+            unknowns=case.unknowns,
+            factorisations=count,
+            seconds=limit[name],
+            seconds_per_factorisation=one,
+        )
+    best_limit = min(limit.values())
+    ratios: dict[str, object] = {"beam": case.beam}
+    for name in ours:
+        label = "ours" if name == "snrmjax" else "curve_only"
+        ratios[f"{label}_over_lu_limit"] = float(np.median(seconds[name])) / best_limit
+        others = {k: v for k, v in per_point.items() if k not in ours}
+        if others:
+            fastest = min(others, key=others.get)
+            ratios["fastest_peer"] = fastest
+            ratios[f"fastest_peer_over_{label}"] = others[fastest] / per_point[name]
+        if "pyHarm" in others:
+            ratios[f"pyharm_over_{label}"] = others["pyHarm"] / per_point[name]
+    return ratios
+
+
+COLD_PROCESS = """
+import json, time
+begin = time.perf_counter()
+import snrmjax as sj
+imported = time.perf_counter()
+model = sj.flat_beam()
+sj.forced_response(model, [{force}], {lower}, {upper}, harmonic_order={harmonics})
+done = time.perf_counter()
+sj.forced_response(model, [{force}], {lower}, {upper}, harmonic_order={harmonics})
+again = time.perf_counter()
+print(json.dumps([imported - begin, done - imported, again - done]))
+"""
+
+
+def cold_process(repeats: int = 3) -> None:
+    """From the start of a process to its first curve: no cache, an empty one, a filled one."""
+    case = CASES[0]
+    script = COLD_PROCESS.format(
+        force=case.force,
+        lower=case.from_hz * HERTZ,
+        upper=case.to_hz * HERTZ,
+        harmonics=HARMONICS,
+    )
+    plain = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    with tempfile.TemporaryDirectory() as cache:
+        cached = plain | {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",  # as the commands set it
+        }
+        for name, variables, n in (
+            ("none", plain, repeats),
+            ("empty", cached, 1),
+            ("filled", cached, repeats),
+        ):
+            rows = []
+            for _ in range(n):
+                command = [sys.executable, "-c", script]
+                whole, done = timed(
+                    lambda command=command, variables=variables: subprocess.run(
+                        command, check=True, capture_output=True, text=True, env=variables
+                    )
+                )
+                rows.append([*json.loads(done.stdout.splitlines()[-1]), whole])
+            imports, first, second, whole = np.median(rows, axis=0).tolist()
+            tell(
+                measurement="first_curve_of_a_cold_process",
+                beam=case.beam,
+                compilation_cache=name,
+                import_seconds=imports,
+                first_curve_seconds=first,
+                second_curve_seconds=second,
+                process_seconds=whole - second,
+                repeats=n,
+            )
+
+
+def second_model() -> None:
+    """Another model of the same size: its first curve against a warm one, and compilations."""
+    compiled: list[float] = []
+
+    def listen(event: str, seconds: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            compiled.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    for case in CASES:
+        respond(case)
+        warm = float(np.median([timed(lambda case=case: respond(case))[0] for _ in range(3)]))
+        potential = case.model.potential
+        changed = sj.polynomial_potential(
+            dict(zip(potential.monomials, 1.02 * np.asarray(potential.coefficient), strict=True)),
+            case.model.n_modes,
+        )
+        other = eqx.tree_at(lambda m: m.potential, case.model, changed)
+        compiled.clear()
+        first, curves = timed(lambda case=case, other=other: respond(case, other))
+        count = len(compiled)
+        tell(
+            measurement="second_model_of_the_same_size",
+            beam=case.beam,
+            warm_seconds=warm,
+            first_seconds=first,
+            compilations=count,
+            points=sum(len(c.frequency) for c in curves),
+            first_over_warm=first / warm,
+        )
+
+
+def batch(n_forces: int = 64) -> None:
+    """Many forces as single calls and as one batch."""
+    verb = getattr(sj, "forced_response_batch", None)
+    for case in CASES:
+        fields = {"measurement": "batch_of_forces", "beam": case.beam, "forces": n_forces}
+        if verb is None:
+            tell(**fields, status="skipped: snrmjax has no forced_response_batch")
+            continue
+        forces = np.geomspace(0.1 * case.force, case.force, n_forces).tolist()
+        ends = (case.from_hz * HERTZ, case.to_hz * HERTZ)
+
+        def one_by_one(case: Case = case, forces: list = forces, ends: tuple = ends) -> list:
+            return [
+                sj.forced_response(case.model, [force], *ends, harmonic_order=HARMONICS)
+                for force in forces
+            ]
+
+        def together(case: Case = case, forces: list = forces, ends: tuple = ends) -> object:
+            return jax.block_until_ready(verb(case.model, forces, *ends, harmonic_order=HARMONICS))
+
+        first = {f.__name__: timed(f)[0] for f in (one_by_one, together)}
+        runs = [(timed(one_by_one)[0], timed(together)[0]) for _ in range(3)]
+        single, batched = np.median(runs, axis=0).tolist()
+        tell(
+            **fields,
+            status="ok",
+            single_calls_seconds=single,
+            batch_seconds=batched,
+            batch_compile_seconds=first["together"] - batched,
+            single_over_batch=single / batched,
+        )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--without-peers", action="store_true", help="NumPy/SciPy and LU only")
+    parser.add_argument("--out", type=Path, help="folder for curves and logs (else temporary)")
+    parser.add_argument(
+        "--environments", type=Path, help="folder of the peers' environments (else temporary)"
+    )
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        out = (options.out or Path(scratch) / "out").resolve()
+        folder = (options.environments or Path(scratch) / "environments").resolve()
+        out.mkdir(parents=True, exist_ok=True)
+        pythons = {"scipy": Path(sys.executable)}
+        if not options.without_peers:
+            for name in ("jaxcont", "pyharm"):
+                pythons[name] = environment(folder, name)
+        ratios = [compare(case, out, pythons) for case in CASES]
+    cold_process()
+    second_model()
+    batch()
+    for row in ratios:
+        tell(measurement="ratios", **row)
+
+
+if __name__ == "__main__":
+    main()
