@@ -6,10 +6,15 @@ Two curves with nine harmonics around all their folds: the flat beam (77 unknown
 frequency) and the monostable curved beam (20). The peers get the equations as numbers, not the
 package, and run in environments of their own: pyHarm-os, jaxcont, and a plain NumPy/SciPy program
 (`peers/`). The limit is as many LU factorisations as snrmjax used, and nothing else. All methods
-take turns, medians of several warm runs; the first run is given apart as compile time. Every
-curve is compared with snrmjax's of 31 harmonics (the truncation of nine shows there) and of nine
-in fine steps (errors of the method show there): the largest distance of a point to the reference,
-in the plane of frequency over the first natural frequency and velocity over its peak.
+take turns, medians of several warm runs; the first run is given apart as compile time. snrmjax's
+public verb also locates events and judges stability, which no peer does: "snrmjax, curve only"
+is the same curve without.
+
+Every curve is compared with snrmjax's of 31 harmonics (the truncation of nine shows there) and of
+nine in fine steps (errors of the method show there): the largest distance of a point to the
+reference, in the plane of frequency over the first natural frequency and velocity over its peak.
+`reference_not_covered` is the opposite distance, from the reference to the chords between the
+points: about the square of a step, unless a method left out a part of the curve.
 
 Also: the first curve of a cold process, with and without a compilation cache; a second model of
 the same size; 64 forces one by one against the batch verb. One JSON line each, ratios last; the
@@ -17,6 +22,7 @@ curves go to `--out` as .npz.
 """
 
 import argparse
+import importlib
 import inspect
 import json
 import os
@@ -33,6 +39,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 import snrmjax as sj
 
@@ -40,6 +47,7 @@ HERTZ = 2 * np.pi
 PEERS = Path(__file__).parent / "peers"
 HARMONICS, REFERENCE_HARMONICS = 9, 31
 ROUNDS = {"snrmjax": 5, "numpy_scipy": 5, "jaxcont": 5, "pyHarm": 3, "lu": 5}
+PEER_TOLERANCE = 1e-8  # on the last step or the residual, in scaled unknowns
 SOLVES_PER_POINT = 3.0  # where a curve does not count its factorisations in `n_solves`
 PEER_LIMIT_SECONDS = 300.0  # for one answer of a peer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # faster at these sizes
@@ -89,11 +97,51 @@ def respond(
     )
 
 
-def curve_only() -> dict[str, object] | None:
-    """Settings that leave out stability and events, as the peers do; None where there are none."""
+def curve_only(case: Case) -> list[sj.ResponseCurve]:
+    """The curve without stability and events, as the peers follow it.
+
+    By settings of the public verb where it has them, otherwise by the step behind it.
+    """
     known = inspect.signature(sj.forced_response).parameters
     settings = {name: False for name in ("stability", "events") if name in known}
-    return settings or None
+    if settings:
+        return respond(case, **settings)
+    module = importlib.import_module("snrmjax.simulate.forced_response")
+    balance = module.harmonic_balance(
+        case.model,
+        case.force,
+        module.resonance_displacement(case.model, case.force),
+        harmonic_order=HARMONICS,
+    )
+    ends = jnp.asarray([case.from_hz, case.to_hz]) * HERTZ
+    found = module._follow(balance, ends, sj.StepControl(), 4000, jnp.array(case.downward))
+    n = int(found.n_points)
+    points = np.asarray(found.points)[:n]
+    size = case.unknowns - 1
+    x = points[:, :size].reshape(n, -1, case.model.n_modes) * float(balance.displacement_scale)
+    omega = points[:, -1] * float(balance.frequency_scale)
+    shape = np.asarray(case.model.modes.mode_shape)
+    amplitude = omega * np.hypot(x[:, 1] @ shape[0], x[:, 2] @ shape[0])
+    return [
+        Followed(
+            frequency=omega,
+            velocity=np.stack([np.zeros(n), amplitude], axis=1)[:, :, None],
+            status=sj.CurveStatus(int(found.status)),
+            n_solves=getattr(found, "n_solves", None),
+        )
+    ]
+
+
+class Followed(NamedTuple):
+    """What of a `ResponseCurve` this benchmark needs."""
+
+    frequency: np.ndarray  # rad/s
+    velocity: np.ndarray  # (point, harmonic, sensor)
+    status: sj.CurveStatus
+    n_solves: object
+
+
+METHODS = {"snrmjax": respond, "snrmjax, curve only": curve_only}
 
 
 def midspan(curves: list[sj.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,15 +159,24 @@ def solves(curves: list[sj.ResponseCurve]) -> int:
 
 
 def reference(case: Case, harmonics: int) -> tuple[np.ndarray, np.ndarray]:
-    """The curve in steps so fine that its chords do not matter."""
-    fine = sj.StepControl(largest=0.005, angle=0.01, tolerance=1e-10)
-    return midspan(respond(case, harmonic_order=harmonics, steps=fine, max_points=12000))
-
-
-def distance(case: Case, curve: tuple, target: tuple) -> float:
-    """Largest distance of a curve's points within the range to the polyline of the target."""
+    """The curve in fine steps, and between them by a spline: its chords do not matter."""
+    fine = sj.StepControl(largest=0.01, angle=0.02, tolerance=1e-10)
+    curves = respond(case, harmonic_order=harmonics, steps=fine, max_points=8000)
+    frequency, velocity = midspan(curves)
+    # The spline runs along the arc of all unknowns: in the plane alone the curve may have cusps.
+    x = np.concatenate([np.asarray(c.coefficients).reshape(len(c.frequency), -1) for c in curves])
     natural = float(case.model.modes.natural_frequency[0]) / HERTZ
-    unit = np.array([natural, np.max(target[1])])
+    unknowns = np.concatenate([x / np.max(np.abs(x)), frequency[:, None] / natural], axis=1)
+    chord = np.linalg.norm(np.diff(unknowns, axis=0), axis=1)
+    apart = np.concatenate([[True], chord > 1e-7])
+    arc = np.concatenate([[0.0], np.cumsum(chord)])[apart]
+    between = np.interp(np.arange(8 * len(arc) - 7) / 8, np.arange(len(arc)), arc)
+    spline = CubicSpline(arc, np.stack([frequency, velocity], axis=1)[apart])
+    return tuple(spline(between).T)
+
+
+def distance(case: Case, curve: tuple, target: tuple, unit: np.ndarray) -> float:
+    """Largest distance of a curve's points within the range to the polyline of the target."""
     inside = (curve[0] >= case.from_hz) & (curve[0] <= case.to_hz)
     points = np.stack(curve, axis=1)[inside] / unit
     nodes = np.stack(target, axis=1) / unit
@@ -164,19 +221,24 @@ def write_problem(case: Case, scale: float, target: Path) -> None:
         "first_step": steps.first,
         "largest_step": steps.largest,
         "smallest_step": steps.smallest,
-        "tolerance": steps.tolerance,
+        "angle": steps.angle,
+        "tolerance": PEER_TOLERANCE,
     }
     target.write_text(json.dumps(problem))
 
 
-def environment(folder: Path, peer: str) -> Path:
-    """The Python of a peer's own environment, made on first use."""
+def environment(folder: Path, peer: str) -> Path | None:
+    """The Python of a peer's own environment, made on first use; None when it cannot be."""
     python = folder / peer / "bin" / "python"
-    if not python.exists():
-        subprocess.run([sys.executable, "-m", "venv", folder / peer], check=True)
-        requirements = PEERS / f"requirements_{peer}.txt"
+    requirements = PEERS / f"requirements_{peer}.txt"
+    try:
+        if not python.exists():
+            subprocess.run([sys.executable, "-m", "venv", folder / peer], check=True)
         install = [python, "-m", "pip", "install", "--quiet", "-r", requirements]
         subprocess.run(install, check=True, stdout=sys.stderr)
+    except subprocess.CalledProcessError as error:
+        tell(measurement="environment", method=peer, status=f"skipped: not installed ({error})")
+        return None
     return python
 
 
@@ -187,6 +249,9 @@ class Peer:
         name = f"{script.removesuffix('_peer.py')}_{case.beam}"
         self.curve = out / f"{name}.npz"
         variables = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+        # A home of its own: numba compiles in this run too, and pyHarm's settings go nowhere else.
+        self.home = tempfile.TemporaryDirectory()
+        variables |= {"HOME": self.home.name, "NUMBA_CACHE_DIR": self.home.name}
         with (out / f"{name}.log").open("w") as log:
             self.process = subprocess.Popen(
                 [python, PEERS / script, out / f"problem_{case.beam}.json", self.curve],
@@ -195,6 +260,7 @@ class Peer:
                 stderr=log,
                 text=True,
                 env=variables | ONE_THREAD,
+                cwd=self.home.name,
             )
         default = {"method": script.removesuffix("_peer.py"), "version": "unknown"}
         self.first = default | self.answer()
@@ -222,6 +288,7 @@ class Peer:
         """Let it end."""
         self.process.stdin.close()
         self.process.wait(timeout=30)
+        self.home.cleanup()
 
 
 # The limit ----------------------------------------------------------------------------------
@@ -263,26 +330,19 @@ def timed(function) -> tuple[float, object]:
 
 def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object]:
     """All methods on one beam in turn; prints their lines and returns the ratios."""
-    targets = {h: reference(case, h) for h in (HARMONICS, REFERENCE_HARMONICS)}
-    np.savez(
-        out / f"reference_{case.beam}.npz",
-        frequency_hz=targets[REFERENCE_HARMONICS][0],
-        velocity=targets[REFERENCE_HARMONICS][1],
-    )
-    ours = {"snrmjax": {}} | ({"snrmjax, curve only": curve_only()} if curve_only() else {})
-    first, curves, seconds = {}, {}, {}
-    for name, settings in ours.items():
-        first[name], curves[name] = timed(lambda settings=settings: respond(case, **settings))
-        seconds[name] = []
+    first, curves = {}, {}
+    for name, method in METHODS.items():
+        first[name], curves[name] = timed(lambda method=method: method(case))
+    seconds: dict[str, list[float]] = {name: [] for name in METHODS}
     motion = np.concatenate([np.asarray(c.coefficients)[:, 1:3] for c in curves["snrmjax"]])
     write_problem(case, float(np.max(np.abs(motion))), out / f"problem_{case.beam}.json")
     peers = [Peer(python, f"{name}_peer.py", case, out) for name, python in pythons.items()]
     lu_seconds_jax(case.unknowns)
     lu = {"dgetrf": [], "jax": []}
     for turn in range(max(ROUNDS.values())):
-        for name, settings in ours.items():
+        for name, method in METHODS.items():
             if turn < ROUNDS["snrmjax"]:
-                seconds[name].append(timed(lambda settings=settings: respond(case, **settings))[0])
+                seconds[name].append(timed(lambda method=method: method(case))[0])
         for peer in peers:
             if turn < ROUNDS.get(peer.first["method"], 0):
                 peer.run()
@@ -291,8 +351,16 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
             lu["jax"].append(lu_seconds_jax(case.unknowns))
     for peer in peers:
         peer.close()
+    targets = {h: reference(case, h) for h in (HARMONICS, REFERENCE_HARMONICS)}
+    np.savez(
+        out / f"reference_{case.beam}.npz",
+        frequency_hz=targets[REFERENCE_HARMONICS][0],
+        velocity=targets[REFERENCE_HARMONICS][1],
+    )
+    natural = float(case.model.modes.natural_frequency[0]) / HERTZ
+    unit = np.array([natural, np.max(targets[REFERENCE_HARMONICS][1])])
 
-    def report(method: str, curve: tuple, compile_seconds: float, **fields: object) -> float:
+    def report(method: str, curve: tuple, compile_seconds: float | None, **fields: object) -> float:
         warm = fields["seconds"]
         tell(
             measurement="forced_response",
@@ -302,14 +370,15 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
             points=len(curve[0]),
             compile_seconds=compile_seconds,
             seconds_per_point=warm / len(curve[0]),
-            distance_to_31_harmonics=distance(case, curve, targets[REFERENCE_HARMONICS]),
-            distance_to_9_harmonics=distance(case, curve, targets[HARMONICS]),
+            distance_to_31_harmonics=distance(case, curve, targets[REFERENCE_HARMONICS], unit),
+            distance_to_9_harmonics=distance(case, curve, targets[HARMONICS], unit),
+            reference_not_covered=distance(case, targets[HARMONICS], curve, unit),
             **fields,
         )
         return warm / len(curve[0])
 
     per_point: dict[str, float] = {}
-    for name in ours:
+    for name in METHODS:
         curve, warm = midspan(curves[name]), float(np.median(seconds[name]))
         np.savez(
             out / f"{name.replace(', ', '_').replace(' ', '_')}_{case.beam}.npz",
@@ -319,14 +388,14 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
         per_point[name] = report(
             name,
             curve,
-            first[name] - warm,
+            first[name] - warm if name == "snrmjax" else None,  # the other shares its program
             seconds=warm,
             version=f"snrmjax {version('snrmjax')}, jax {jax.__version__}",
-            settings="with stability and events" if not ours[name] else "without",
+            settings="stability and events too" if name == "snrmjax" else "",
             status=" + ".join(sj.CurveStatus(int(c.status)).name for c in curves[name]),
             reached_hz=float(curve[0][-1]),
             n_solves=solves(curves[name]),
-            n_solves_counted=hasattr(curves[name][0], "n_solves"),
+            n_solves_counted=getattr(curves[name][0], "n_solves", None) is not None,
         )
     for peer in peers:
         told = dict(peer.first)
@@ -338,38 +407,35 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
         per = report(
             told["method"],
             curve,
-            told["prepare_seconds"] + told["first_seconds"] - warm,
+            max(told["prepare_seconds"] + told["first_seconds"] - warm, 0.0),
             seconds=warm,
             **{k: told[k] for k in ("version", "settings", "status", "reached_hz", "n_solves")},
         )
         if told["status"] == "ok":
             per_point[told["method"]] = per
-    count = solves(curves["snrmjax"])
-    limit = {}
-    for name, times in lu.items():
-        one = float(np.median(times))
-        limit[name] = one * count
+    one = {name: float(np.median(times)) for name, times in lu.items()}
+    count = solves(curves["snrmjax, curve only"])
+    for name, each in one.items():
         tell(
             measurement="lu_limit",
             method=name,
             beam=case.beam,
             unknowns=case.unknowns,
             factorisations=count,
-            seconds=limit[name],
-            seconds_per_factorisation=one,
+            seconds=each * count,
+            seconds_per_factorisation=each,
         )
-    best_limit = min(limit.values())
-    ratios: dict[str, object] = {"beam": case.beam}
-    for name in ours:
-        label = "ours" if name == "snrmjax" else "curve_only"
-        ratios[f"{label}_over_lu_limit"] = float(np.median(seconds[name])) / best_limit
-        others = {k: v for k, v in per_point.items() if k not in ours}
-        if others:
-            fastest = min(others, key=others.get)
-            ratios["fastest_peer"] = fastest
-            ratios[f"fastest_peer_over_{label}"] = others[fastest] / per_point[name]
-        if "pyHarm" in others:
-            ratios[f"pyharm_over_{label}"] = others["pyHarm"] / per_point[name]
+    peer_times = {k: v for k, v in per_point.items() if k not in METHODS}
+    fastest = min(peer_times, key=peer_times.get, default=None)
+    ratios: dict[str, object] = {"beam": case.beam, "fastest_peer": fastest}
+    for name, label in (("snrmjax", "ours"), ("snrmjax, curve only", "curve_only")):
+        ratios[f"{label}_over_lu_limit"] = float(np.median(seconds[name])) / (
+            min(one.values()) * count
+        )
+        if fastest:
+            ratios[f"fastest_peer_over_{label}"] = peer_times[fastest] / per_point[name]
+        if "pyHarm" in peer_times:
+            ratios[f"pyharm_over_{label}"] = peer_times["pyHarm"] / per_point[name]
     return ratios
 
 
@@ -510,7 +576,9 @@ def main() -> None:
         pythons = {"scipy": Path(sys.executable)}
         if not options.without_peers:
             for name in ("jaxcont", "pyharm"):
-                pythons[name] = environment(folder, name)
+                python = environment(folder, name)
+                if python:
+                    pythons[name] = python
         ratios = [compare(case, out, pythons) for case in CASES]
     cold_process()
     second_model()

@@ -37,9 +37,16 @@ from snrmjax.model.potential import (
 )
 from snrmjax.model.structure import Structure, equilibria, structure
 from snrmjax.simulate.continuation import CurveStatus, StepControl
-from snrmjax.simulate.forced_response import ResponseCurve, forced_response, solve_at_frequency
+from snrmjax.simulate.forced_response import (
+    ResponseBatch,
+    forced_response,
+    forced_response_batch,
+    solve_at_frequency,
+)
 from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.normal_modes import NormalModeBranch, nonlinear_normal_mode
+from snrmjax.simulate.response_curve import ResponseCurve
+from snrmjax.simulate.stability import StabilityLoss, floquet_multipliers
 from snrmjax.simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
 
 __all__ = [
@@ -55,9 +62,11 @@ __all__ = [
     "PolynomialPotential",
     "PredictedResponse",
     "Resonance",
+    "ResponseBatch",
     "ResponseCurve",
     "SnrmPoints",
     "SteadyStates",
+    "StabilityLoss",
     "StepControl",
     "Structure",
     "VirtualTest",
@@ -69,7 +78,9 @@ __all__ = [
     "equilibria",
     "fit_backbone",
     "flat_beam",
+    "floquet_multipliers",
     "forced_response",
+    "forced_response_batch",
     "identify_backbone",
     "identify_points",
     "invert_amplitude_phase",

@@ -37,7 +37,8 @@ class Problem:
     first_step: float  # along the curve, in unknowns over their scales
     largest_step: float
     smallest_step: float
-    tolerance: float
+    angle: float  # rad, aimed at between neighbouring tangents by those that look at it
+    tolerance: float  # on the last Newton step or the residual, scaled
 
     @property
     def n_modes(self) -> int:

@@ -18,7 +18,6 @@ from peer_problem import Curve, Polynomial, Problem, basis, end_status, linear_s
 from scipy.linalg import lu_factor, lu_solve
 from scipy.linalg.lapack import dgetrf
 
-ANGLE = 0.08  # rad, aimed at between neighbouring tangents
 ITERATIONS = 8
 MAX_POINTS = 4000
 
@@ -101,14 +100,14 @@ def solver(problem: Problem) -> Callable[[], Curve]:
             )
             n_solves += count
             turn = np.arccos(np.clip(new_tangent @ tangent, -1, 1)) if converged else np.inf
-            if turn > 3 * ANGLE:
+            if turn > 3 * problem.angle:
                 step /= 2
                 if step < problem.smallest_step:
                     break
                 continue
             point, tangent = new, new_tangent
             points.append(point)
-            grow = np.clip(ANGLE / max(turn, 1e-3), 0.5, 1.5)
+            grow = np.clip(problem.angle / max(turn, 1e-3), 0.5, 1.5)
             if count >= ITERATIONS - 2:
                 grow = min(grow, 0.7)
             step = min(step * grow, problem.largest_step)

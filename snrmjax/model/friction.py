@@ -143,7 +143,7 @@ class IwanMicroslip(AbstractSliders):
     f = −∫₀^R c p (p − 1) s^(p−2) z_s ds, where R is half the range of q over the cycle; sliders
     above R do not slip and, being part of the linear frequency, add nothing. By Gauss's rule
     with 48 points in w = (s/R)^(p−1). For q = Q cos Ωt, Δ(2ζ̃ω̃) = 4c(p − 1)Q^(p−1)/(π(p + 1)Ω),
-    from which the rule is off by less than 1e-3 (p from 1.1 to 2.9), and Δ(ω̃²) ≈ −cQ^(p−1).
+    from which the rule is off by less than 1e-4 (p from 1.05 to 2.95), and Δ(ω̃²) ≈ −cQ^(p−1).
 
     `coefficient` c in (kg^1/2 m)^(1−p)/s², `exponent` p between 1 and 3 (p = 2: evenly dense).
     Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1867998.

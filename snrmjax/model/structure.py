@@ -162,11 +162,12 @@ def structure(
     effects: tuple[AbstractEffect, ...] = (),
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
+    test_order: float = 0.0,
     name: str = "structure",
 ) -> Structure:
     """Build a `Structure`; without a potential it is linear but for its effects.
 
-    Arguments: `level_gain_std` relative, `level_phase_std` in rad.
+    Arguments: `level_gain_std` relative, `level_phase_std` in rad, `test_order` from 0 to 1.
     Raises `ValueError` when potential and modes disagree about the number of modes.
     """
     if potential is None:
@@ -181,6 +182,7 @@ def structure(
         effects=tuple(effects),
         level_gain_std=jnp.asarray(float(level_gain_std)),
         level_phase_std=jnp.asarray(float(level_phase_std)),
+        test_order=jnp.asarray(float(test_order)),
         name=name,
     )
 

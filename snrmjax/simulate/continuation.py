@@ -21,6 +21,8 @@ class CurveStatus(IntEnum):
     STEP_TOO_SMALL = 3  # Newton's method failed even for the smallest step
     NO_START = 4  # no solution was found to start from
     AMPLITUDE_LIMIT = 5  # grew past the largest amplitude asked for
+    CLOSED = 6  # came back to its first point: an isolated loop
+    INVALID = 7  # asked for with numbers that are no structure or no force
 
 
 STATUS_MESSAGE: dict[CurveStatus, str] = {
@@ -34,6 +36,10 @@ STATUS_MESSAGE: dict[CurveStatus, str] = {
         "no solution at the start; start farther from resonance or lower the force"
     ),
     CurveStatus.AMPLITUDE_LIMIT: "stopped at the largest amplitude asked for",
+    CurveStatus.INVALID: (
+        "not followed: the force or a parameter of the model is not finite, or the force is zero"
+    ),
+    CurveStatus.CLOSED: "came back to where it started: an isolated loop",
 }
 
 
@@ -42,10 +48,15 @@ class StepControl(NamedTuple):
 
     first: float = 0.01
     smallest: float = 1e-7
-    largest: float = 0.04
-    angle: float = 0.08  # rad, aimed at between neighbouring tangents
-    tolerance: float = 1e-8  # on the last Newton step
+    largest: float = 0.05
+    angle: float = 0.1  # rad, aimed at between neighbouring tangents
+    tolerance: float = 1e-9  # on the error that is left after the last Newton step
     iterations: int = 8
+
+
+def traced(control: StepControl) -> StepControl:
+    """The same settings as arrays, so that other numbers do not compile anew."""
+    return StepControl(*(jnp.asarray(value) for value in control))
 
 
 class Curve(NamedTuple):
@@ -55,38 +66,58 @@ class Curve(NamedTuple):
     tangents: Float[Array, "point unknown"]
     n_points: Int[Array, ""]
     status: Int[Array, ""]
+    n_solves: Int[Array, ""]  # linear systems factorised on the way
+
+
+class Correction(NamedTuple):
+    """Where Newton's method went."""
+
+    point: Point
+    tangent: Point  # of unit length, along the direction asked for
+    n_solves: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def correct(
-    linearised: Linearised, start: Point, direction: Point, tolerance: float, iterations: int
-) -> tuple[Point, Point, Int[Array, ""], Bool[Array, ""]]:
+    linearised: Linearised,
+    start: Point,
+    direction: Point,
+    tolerance: float | Array,
+    iterations: int | Array,
+) -> Correction:
     """Newton's method in the hyperplane through `start` across `direction`.
 
-    One LU factorisation gives both the Newton step and the tangent. Returns the point, its unit
-    tangent (along `direction`), the iterations used and whether the last step was below
-    `tolerance`.
+    One LU factorisation of the bordered matrix, with both right-hand sides as further columns,
+    gives the Newton step and the tangent. Ends when the error that is left falls below
+    `tolerance`; it is judged by the last step times what that step left of the residual. The
+    tangent belongs to the iterate before the last step.
     """
-    last = jnp.zeros(start.shape[0]).at[-1].set(1.0)
+    size = start.shape[0]
 
     def body(state: tuple) -> tuple:
         point, _, count, _, _ = state
         residual, jacobian = linearised(point)
-        matrix = jnp.concatenate([jacobian, direction[None]])
-        offset = direction @ (point - start)
-        right = jnp.stack([jnp.append(residual, offset), last], axis=1)
-        solved = jnp.linalg.solve(matrix, right)
+        right = jnp.stack([residual, jnp.zeros(size - 1)], axis=1)
+        border = jnp.concatenate([direction, jnp.stack([direction @ (point - start), 1.0])])
+        matrix = jnp.concatenate([jnp.concatenate([jacobian, right], axis=1), border[None]])
+        # The columns behind the square part come out multiplied by the inverse of L.
+        factors = jax.lax.linalg.lu(matrix)[0]
+        solved = jax.lax.linalg.triangular_solve(
+            factors[:, :size], factors[:, size:], left_side=True, lower=False
+        )
+        new = point - solved[:, 0]
         step = jnp.max(jnp.abs(solved[:, 0]))
-        return point - solved[:, 0], solved[:, 1], count + 1, step, jnp.isfinite(step)
+        left = jnp.max(jnp.abs(linearised(new)[0])) / jnp.max(jnp.abs(residual))
+        done = (step <= tolerance) | ((step * left <= tolerance) & (step < 0.1))
+        return new, solved[:, 1], count + 1, done, jnp.isfinite(step)
 
     def going(state: tuple) -> Array:
-        _, _, count, step, finite = state
-        return finite & (count < iterations) & (step > tolerance)
+        _, _, count, done, finite = state
+        return finite & ~done & (count < iterations)
 
-    state = (start, direction, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
-    # The first comparison must not stop on the infinite step: `going` sees finite = True.
-    point, tangent, count, step, finite = jax.lax.while_loop(going, body, state)
-    tangent = tangent / jnp.linalg.norm(tangent)
-    return point, tangent, count, finite & (step <= tolerance)
+    state = (start, direction, jnp.array(0), jnp.array(False), jnp.array(True))
+    point, tangent, count, done, finite = jax.lax.while_loop(going, body, state)
+    return Correction(point, tangent / jnp.linalg.norm(tangent), count, done & finite)
 
 
 def follow_curve(
@@ -103,82 +134,154 @@ def follow_curve(
     """Follow a curve of solutions of R(x, λ) = 0 from `start` until λ leaves [lower, upper].
 
     Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
-    corrected at its own λ, or across `start_across`; `direction` says which way to go. A step is
-    halved when Newton's method fails or the tangent turns by more than three times
-    `control.angle`, otherwise it is chosen so that the next turn comes near `control.angle`.
-    The last point of a curve that left the range lies on its end.
+    corrected at its own λ, or across `start_across`; `direction` says which way to go. The next
+    point is guessed by the cubic through the last two points and their tangents. A step is
+    halved when Newton's method fails, when it ends far from the guess, or when the tangent turns
+    by more than three times `control.angle`; otherwise it is chosen so that the next turn comes
+    near `control.angle`.
+    The last point of a curve that left the range lies on its end; that of a closed one is the
+    first again.
     Raises `ValueError` when `max_points` is below 2.
     """
     if max_points < 2:
         raise ValueError(f"`max_points` must be 2 or more, but is {max_points}.")
     size = start.shape[0]
     at_lambda = jnp.zeros(size).at[-1].set(1.0)
-    first, tangent, _, found = correct(
-        linearised,
-        start,
-        at_lambda if start_across is None else start_across,
-        control.tolerance,
-        5 * control.iterations,
-    )
-    tangent = tangent * jnp.where(tangent @ direction < 0, -1.0, 1.0)
-    points = jnp.full((max_points, size), jnp.nan).at[0].set(jnp.where(found, first, jnp.nan))
-    tangents = jnp.full((max_points, size), jnp.nan).at[0].set(tangent)
+    across = at_lambda if start_across is None else start_across
+    first, ordinary, to_end = 0, 1, 2  # what the next correction is for
     running = jnp.array(-1)
-    status = jnp.where(found, running, int(CurveStatus.NO_START))
 
-    def body(state: tuple) -> tuple:
-        points, tangents, n, step, _ = state
-        here, tangent = points[n - 1], tangents[n - 1]
-        guess = here + step * tangent
-        new, new_tangent, count, converged = correct(
-            linearised, guess, tangent, control.tolerance, control.iterations
+    def body(state: _Walk) -> _Walk:
+        n, here, tangent = state.n_points, state.here, state.tangent
+        guess = _extrapolated(
+            state.back, state.back_tangent, here, tangent, state.step, n >= 2
         )
-        cosine = jnp.clip(new_tangent @ tangent, -1.0, 1.0)
-        turn = jnp.arccos(cosine)
-        good = converged & (turn < 3 * control.angle)
+        row = tangent
+        is_first, is_end = state.aim == first, state.aim == to_end
+        guess = jnp.where(is_first, start, jnp.where(is_end, state.pending, guess))
+        row = jnp.where(is_first, across, jnp.where(is_end, at_lambda, row))
+        patience = jnp.where(is_first | is_end, 5 * control.iterations, control.iterations)
+        found = correct(linearised, guess, row, control.tolerance, patience)
+        new = found.point
+        ahead = jnp.where(is_first, direction, tangent)
+        new_tangent = found.tangent * jnp.where(found.tangent @ ahead < 0, -1.0, 1.0)
+
+        turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
+        miss = jnp.linalg.norm(new - guess)
+        near = (miss < 0.3 * state.step) & (turn < 3 * control.angle)
+        good = found.converged & (is_first | is_end | near)
         beyond_upper, beyond_lower = new[-1] > upper, new[-1] < lower
-        leaving = good & (beyond_upper | beyond_lower)
+        leaving = good & (beyond_upper | beyond_lower) & (state.aim == ordinary)
         end = jnp.where(beyond_upper, upper, lower)
-
-        def to_end(_: None) -> tuple[Array, Array, Array]:
-            share = (end - here[-1]) / (new[-1] - here[-1])
-            on_end = (here + share * (new - here)).at[-1].set(end)
-            last, last_tangent, _count, ok = correct(
-                linearised, on_end, at_lambda, control.tolerance, 5 * control.iterations
-            )
-            sign = jnp.where(last_tangent @ tangent < 0, -1.0, 1.0)
-            return last, sign * last_tangent, ok
-
-        def keep(_: None) -> tuple[Array, Array, Array]:
-            return new, new_tangent, good
-
-        new, new_tangent, good = jax.lax.cond(leaving, to_end, keep, None)
-        points = points.at[n].set(jnp.where(good, new, points[n]))
-        tangents = tangents.at[n].set(jnp.where(good, new_tangent, tangents[n]))
-        grow = jnp.clip(control.angle / jnp.maximum(turn, 1e-3), 0.5, 1.5)
-        grow = jnp.where(count >= control.iterations - 2, jnp.minimum(grow, 0.7), grow)
+        share = (end - here[-1]) / (new[-1] - here[-1])
+        pending = jnp.where(leaving, (here + share * (new - here)).at[-1].set(end), state.pending)
+        origin = state.origin
+        on_the_way = tangent @ (origin - here)
+        closed = good & (n > 4) & (on_the_way > 0) & (on_the_way <= tangent @ (new - here))
+        closed &= jnp.linalg.norm(origin - here) <= 2.0 * on_the_way
+        closed &= new_tangent @ state.origin_tangent > 0.5
+        # A point that only happens to lie on the way has others where the curve passes it.
+        passed = here + on_the_way / jnp.maximum(tangent @ (new - here), 1e-300) * (new - here)
+        closed &= jnp.linalg.norm(passed - origin) < 0.2 * jnp.linalg.norm(new - here)
+        new = jnp.where(closed, origin, new)
+        keep = good & ~leaving
+        place = jnp.where(is_first, 0, n)
+        # Rows are only written here, never read, so that the loop need not copy them; a row that
+        # is not kept is written again later, or is beyond the last.
+        points = state.points.at[place].set(jnp.where(keep, new, jnp.nan))
+        tangents = state.tangents.at[place].set(jnp.where(keep, new_tangent, jnp.nan))
+        n = jnp.where(is_first, 1, n + keep)
+        grow = jnp.clip(control.angle / jnp.maximum(turn, 1e-3), 0.5, 2.0)
+        grow = jnp.where(found.n_solves >= 4, jnp.minimum(grow, 0.7), grow)
         factor = jnp.where(good, grow, 0.5)
-        new_step = jnp.minimum(step * factor, control.largest)
-        n = n + good
-        status = jnp.where(
-            leaving & good,
-            jnp.where(beyond_upper, int(CurveStatus.UPPER_END), int(CurveStatus.LOWER_END)),
-            jnp.where(
-                good & (jnp.max(jnp.abs(new[:-1])) > largest_amplitude),
-                int(CurveStatus.AMPLITUDE_LIMIT),
-                jnp.where(
-                    new_step < control.smallest,
-                    int(CurveStatus.STEP_TOO_SMALL),
-                    jnp.where(n >= max_points, int(CurveStatus.POINT_LIMIT), running),
-                ),
-            ),
+        longest = jnp.minimum(state.step * factor, control.largest)
+        step = jnp.where(is_first | leaving, state.step, longest)
+        largest_now = jnp.max(jnp.abs(new[:-1]))
+        ends = (
+            (is_first & ~good, CurveStatus.NO_START),
+            (is_end & good & (new[-1] >= upper), CurveStatus.UPPER_END),
+            (is_end & good & (new[-1] <= lower), CurveStatus.LOWER_END),
+            (closed & keep, CurveStatus.CLOSED),
+            (keep & ~is_first & (largest_now > largest_amplitude), CurveStatus.AMPLITUDE_LIMIT),
+            (step < control.smallest, CurveStatus.STEP_TOO_SMALL),
+            (n >= max_points, CurveStatus.POINT_LIMIT),
         )
-        return points, tangents, n, new_step, status
+        status = running
+        for happened, what in reversed(ends):
+            status = jnp.where(happened, int(what), status)
+        aim = jnp.where(leaving, to_end, ordinary)
+        return _Walk(
+            points=points,
+            tangents=tangents,
+            here=jnp.where(keep, new, here),
+            tangent=jnp.where(keep, new_tangent, tangent),
+            back=jnp.where(keep, here, state.back),
+            back_tangent=jnp.where(keep, tangent, state.back_tangent),
+            origin=jnp.where(is_first, new, origin),
+            origin_tangent=jnp.where(is_first, new_tangent, state.origin_tangent),
+            pending=pending,
+            n_points=n,
+            step=step,
+            aim=aim,
+            status=status,
+            n_solves=state.n_solves + found.n_solves,
+        )
 
-    state = (points, tangents, jnp.array(1), jnp.array(control.first), status)
-    points, tangents, n, _, status = jax.lax.while_loop(lambda s: s[-1] == running, body, state)
-    started = status != int(CurveStatus.NO_START)
-    return Curve(points, tangents, jnp.where(started, n, 0), status)
+    unset = jnp.full((max_points, size), jnp.nan)
+    walk = _Walk(
+        points=unset,
+        tangents=unset,
+        here=start,
+        tangent=direction,
+        back=start,
+        back_tangent=direction,
+        origin=start,
+        origin_tangent=direction,
+        pending=start,
+        n_points=jnp.array(1),
+        step=jnp.minimum(jnp.asarray(control.first), control.largest),
+        aim=jnp.array(first),
+        status=running,
+        n_solves=jnp.array(0),
+    )
+    walk = jax.lax.while_loop(lambda state: state.status == running, body, walk)
+    started = walk.status != int(CurveStatus.NO_START)
+    n_points = jnp.where(started, walk.n_points, 0)
+    return Curve(walk.points, walk.tangents, n_points, walk.status, walk.n_solves)
+
+
+class _Walk(NamedTuple):
+    """The state of a curve that is being followed."""
+
+    points: Array
+    tangents: Array
+    here: Array
+    tangent: Array
+    back: Array
+    back_tangent: Array
+    origin: Array
+    origin_tangent: Array
+    pending: Array
+    n_points: Array
+    step: Array
+    aim: Array
+    status: Array
+    n_solves: Array
+
+
+def _extrapolated(
+    back: Point, back_tangent: Point, here: Point, tangent: Point, step: Array, known: Array
+) -> Point:
+    """Where the cubic through two points and their tangents is, a step behind the second."""
+    gap = jnp.where(known, jnp.linalg.norm(here - back), 1.0)
+    share = jnp.where(known, step / gap, 0.0)
+    chord = (here - back) / gap
+    # here + step·t + (step²)·a + (step² · (step + gap))·b, from Hermite's divided differences.
+    second = (tangent - chord) / gap
+    third = (tangent - 2 * chord + back_tangent) / gap**2
+    bend = step**2 * (second + (step + gap) * third)
+    trusted = known & (share < 3.0)
+    return here + step * tangent + jnp.where(trusted, bend, 0.0)
 
 
 def locate_event(
@@ -188,42 +291,56 @@ def locate_event(
     tangent: Point,
     there: Point,
     control: StepControl,
+    wanted: Bool[Array, ""] | bool = True,
 ) -> tuple[Point, Point, Bool[Array, ""]]:
     """The point between two neighbours where `test(point, tangent)` changes sign.
 
     Illinois' variant of the secant method in the arclength, each trial corrected across the
     tangent. Returns the point, its tangent and whether the sign change was resolved between the
-    neighbours, or beside them by less than the tangents of a curve are late.
+    neighbours, or beside them by less than the tangents of a curve are late. Where it is not
+    `wanted` nothing is computed.
     """
     length = tangent @ (there - here)
+    trials = 40
 
-    def trial(share: Array) -> tuple[Array, Array, Array, Array]:
+    def body(state: tuple) -> tuple:
+        count, low, high, f_low, f_high, side, share, *_ = state
         # Interpolating between the neighbours keeps every guess near the curve.
         guess = here + share * (there - here)
         guess = guess + (share * length - tangent @ (guess - here)) * tangent
-        point, direction, _, ok = correct(
+        found = correct(
             linearised, guess, tangent, 1e-3 * control.tolerance, 2 * control.iterations
         )
-        return test(point, direction), point, direction, ok
+        value = test(found.point, found.tangent)
+        is_low, is_high = count == 0, count == 1
+        inner = ~is_low & ~is_high
+        in_upper = inner & (jnp.sign(value) == jnp.sign(f_low))
+        in_lower = inner & ~in_upper
+        new_low = jnp.where(in_upper, share, low)
+        new_high = jnp.where(in_lower, share, high)
+        new_f_low = jnp.where(
+            in_upper | is_low, value, jnp.where(in_lower & (side == -1), 0.5 * f_low, f_low)
+        )
+        new_f_high = jnp.where(
+            in_lower | is_high, value, jnp.where(in_upper & (side == 1), 0.5 * f_high, f_high)
+        )
+        side = jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0))
+        secant = (new_low * new_f_high - new_high * new_f_low) / (new_f_high - new_f_low)
+        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (new_low + new_high))
+        next_share = jnp.where(is_low, 1.0, secant)
+        settled = (inner & (jnp.abs(next_share - share) < 1e-12)) | (inner & (value == 0))
+        return (
+            *(count + 1, new_low, new_high, new_f_low, new_f_high, side),
+            *(jnp.where(settled, share, next_share), found.point, found.tangent),
+            *(found.converged, settled),
+        )
 
-    low, high = jnp.array(0.0), jnp.array(1.0)
-    f_low, *_ = trial(low)
-    f_high, *_ = trial(high)
-
-    def body(_step: int, state: tuple) -> tuple:
-        low, high, f_low, f_high, side = state
-        share = (low * f_high - high * f_low) / (f_high - f_low)
-        share = jnp.where(jnp.isfinite(share), share, 0.5 * (low + high))
-        value, *_ = trial(share)
-        in_upper = jnp.sign(value) == jnp.sign(f_low)
-        new_low, new_high = jnp.where(in_upper, share, low), jnp.where(in_upper, high, share)
-        f_new_low = jnp.where(in_upper, value, jnp.where(side == -1, 0.5 * f_low, f_low))
-        f_new_high = jnp.where(in_upper, jnp.where(side == 1, 0.5 * f_high, f_high), value)
-        return new_low, new_high, f_new_low, f_new_high, jnp.where(in_upper, 1, -1)
-
-    state = (low, high, f_low, f_high, jnp.array(0))
-    low, high, f_low, f_high, _ = jax.lax.fori_loop(0, 16, body, state)
-    share = jnp.where(jnp.abs(f_low) < jnp.abs(f_high), low, high)
-    _, point, direction, ok = trial(share)
+    zero, one = jnp.array(0.0), jnp.array(1.0)
+    state = (
+        *(jnp.array(0), zero, one, zero, zero, jnp.array(0), zero, here, tangent),
+        *(jnp.array(True), ~jnp.asarray(wanted)),
+    )
+    state = jax.lax.while_loop(lambda s: ~s[-1] & (s[0] < trials), body, state)
+    _, _, _, f_low, f_high, _, share, point, direction, converged, _ = state
     inside = jnp.abs(share - 0.5) < 0.51
-    return point, direction, ok & inside & (f_low * f_high <= 0)
+    return point, direction, converged & inside & (f_low * f_high <= 0) & jnp.asarray(wanted)

@@ -1,22 +1,23 @@
 """Forced responses by harmonic balance: whole curves, folds and resonances included."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.model.structure import Structure
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.blocks import as_arrays, mapped, over_cores, stacked, taken
 from snrmjax.simulate.continuation import (
     Curve,
     CurveStatus,
     StepControl,
     correct,
     follow_curve,
-    locate_event,
+    traced,
 )
 from snrmjax.simulate.harmonic_balance import (
     HarmonicBalance,
@@ -24,27 +25,10 @@ from snrmjax.simulate.harmonic_balance import (
     linear_coefficients,
     resonance_displacement,
 )
-from snrmjax.simulate.harmonics import velocity_phasors
-from snrmjax.simulate.stability import floquet_multipliers, is_stable, steps_per_period
+from snrmjax.simulate.response_curve import FollowedCurve, ResponseCurve, assembled
 
 DEFAULT_STEPS = StepControl()
-
-
-class ResponseCurve(NamedTuple):
-    """One forced response in order along the curve, unstable parts included."""
-
-    force: float  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
-    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
-    stable: Bool[np.ndarray, " point"]
-    event: tuple[str, ...]  # "", "fold", "peak" or "phase_resonance" for every point
-    status: CurveStatus
-    sensors: tuple[str, ...]
-
-    def at_events(self, kind: str) -> np.ndarray:
-        """Indices of the points at which an event of this kind was located."""
-        return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
+_BLOCK = 8  # curves that one program follows
 
 
 def forced_response(
@@ -57,49 +41,348 @@ def forced_response(
     steps: StepControl = DEFAULT_STEPS,
     max_points: int = 4000,
     n_samples: int | None = None,
+    stability: bool = True,
 ) -> list[ResponseCurve]:
     """Follow the response to a cosine force through a frequency range, once for every force.
 
-    Starts from the linear response at `from_frequency` and follows the curve around its folds
-    by pseudo-arclength continuation until it leaves the range. Folds, peaks of the velocity
-    fundamental at the first sensor and phase resonances of the mode of interest are located
-    between the steps and inserted with a name in `event`.
+    Starts from the linear response at `from_frequency`, or where that leads nowhere from the
+    response to a force that rises from zero, and follows the curve around its folds by
+    pseudo-arclength continuation until it leaves the range. Located between the steps and
+    inserted with a name in `event` are folds ("fold"), peaks of the velocity fundamental at the
+    first sensor ("peak"), phase resonances of the mode of interest ("phase_resonance") and, with
+    `stability`, bifurcations ("branch_point", "period_doubling", "neimark_sacker").
 
     Arguments: `forces` in N, frequencies in rad/s.
     Returns one `ResponseCurve` for every force; its `status` says how it ended. When the curve
     from the lower end does not reach the upper one, it is followed from the upper end instead,
     and when that does not reach the lower end either, both parts are returned, a part without a
-    start being empty. Isolated branches and second wells are not searched for.
+    start being empty. Isolated branches and second wells: `isolated_responses`.
     Raises `ValueError` for a force that is not positive and for an empty or endless frequency
     range.
+
+    >>> from snrmjax import flat_beam
+    >>> curve = forced_response(flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)[0]
+    >>> curve.status.name, curve.at_events("phase_resonance").size
+    ('UPPER_END', 1)
+    """
+    forces = list(forces)
+    for force in forces:
+        if not force > 0 or not np.isfinite(force):
+            raise ValueError(f"every force must be positive, but one is {force!r} N.")
+    batch = forced_response_batch(
+        [model] * len(forces),
+        forces,
+        from_frequency,
+        to_frequency,
+        harmonic_order=harmonic_order,
+        steps=steps,
+        max_points=max_points,
+        n_samples=n_samples,
+        stability=stability,
+    )
+    return [part for parts in batch.curves for part in parts]
+
+
+class ResponseBatch(NamedTuple):
+    """Forced responses of many members; NaN where a member has no such point."""
+
+    status: Int[np.ndarray, " member"]  # a `CurveStatus` for every member
+    n_points: Int[np.ndarray, " member"]
+    peak_frequency: Float[np.ndarray, " member"]  # rad/s, of the highest peak
+    peak_velocity: Float[np.ndarray, " member"]  # m/s, fundamental at the first sensor
+    resonance_frequency: Float[np.ndarray, " member"]  # rad/s, of the strongest phase resonance
+    resonance_velocity: Float[np.ndarray, " member"]  # m/s
+    n_folds: Int[np.ndarray, " member"]
+    curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
+
+
+def forced_response_batch(
+    models: Structure | Sequence[Structure],
+    forces: float | Sequence[float] | Float[np.ndarray, " member"],
+    from_frequency: float,
+    to_frequency: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 4000,
+    n_samples: int | None = None,
+    stability: bool = True,
+    keep_curves: bool = True,
+    chunk: int = 256,
+    progress: Callable[[int, int], None] | None = None,
+) -> ResponseBatch:
+    """Forced responses of many models, forces or both, over all cores or on an accelerator.
+
+    Every member is what `forced_response` gives. Members are followed in blocks of one size: on a
+    CPU one after the other, with a block on every core; on an accelerator side by side. Other
+    numbers, or more members, do not compile anew. Memory is bounded by `chunk`, the members at
+    work at a time, beside the curves that are kept.
+
+    Arguments: `models` one or many, with the same modes, monomials and effects; `forces` in N,
+    one or many; frequencies in rad/s. `progress` is called with the members done and all of them.
+    Returns a `ResponseBatch`. A member that fails has its status, and NaN in its values; the
+    others are untouched. Raises `ValueError` when the numbers of models and forces disagree, for
+    models of different kinds and for an empty or endless frequency range.
     """
     if not 0 < from_frequency < to_frequency < np.inf:
         raise ValueError(
             "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
             f"{from_frequency:g} and {to_frequency:g} rad/s."
         )
-    curves = []
-    for force in forces:
-        if not force > 0 or not np.isfinite(force):
-            raise ValueError(f"every force must be positive, but one is {force!r} N.")
-        scale = resonance_displacement(model, force)
-        balance = harmonic_balance(
-            model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
+    members, loads = _paired(models, forces)
+    # Which rows of one object are many times the same model is known before it is expanded.
+    expanded = {id(m): simulated_structure(m) for m in members}
+    ends = jnp.asarray([from_frequency, to_frequency])
+    settings = _Settings(harmonic_order, n_samples, max_points, traced(steps), stability)
+    rows: list[tuple[ResponseCurve, ...]] = []
+    summaries = []
+    for begin in range(0, len(members), chunk):
+        some = [expanded[id(m)] for m in members[begin : begin + chunk]]
+        found = _chunk_of_curves(some, loads[begin : begin + chunk], ends, settings)
+        summaries += [_summary(parts) for parts in found]
+        rows += found if keep_curves else []
+        if progress is not None:
+            progress(min(begin + chunk, len(members)), len(members))
+    columns = [np.array(column) for column in zip(*summaries, strict=True)]
+    if not columns:
+        columns = [np.zeros(0)] * 7
+    return ResponseBatch(*columns, curves=tuple(rows))
+
+
+class _Settings(NamedTuple):
+    harmonic_order: int
+    n_samples: int | None
+    max_points: int
+    steps: StepControl
+    stability: bool
+
+
+def _paired(models: Structure | Sequence[Structure], forces) -> tuple[list, np.ndarray]:
+    loads = np.atleast_1d(np.asarray(forces, dtype=np.float64))
+    members = [models] if isinstance(models, Structure) else list(models)
+    if len(members) == 1:
+        members = members * len(loads)
+    if len(loads) == 1:
+        loads = np.repeat(loads, len(members))
+    if len(members) != len(loads):
+        raise ValueError(
+            f"`models` and `forces` must be as many, or one, but are {len(members)} and "
+            f"{len(loads)}."
         )
-        ends = jnp.asarray([from_frequency, to_frequency])
-        upward = _follow(balance, ends, steps, max_points, jnp.array(False))
-        if int(upward.status) == CurveStatus.UPPER_END:
-            curves.append(_assemble(balance, upward, float(force), steps))
-            continue
-        # Below a strong softening the lower end has several solutions; the upper end has one.
-        downward = _follow(balance, ends, steps, max_points, jnp.array(True))
-        if int(downward.status) == CurveStatus.LOWER_END:
-            curves.append(_assemble(balance, _reversed(downward), float(force), steps))
-            continue
-        curves += [
-            _assemble(balance, part, float(force), steps) for part in (upward, _reversed(downward))
+    return members, loads
+
+
+def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
+    """The numbers of one member in the order of `ResponseBatch`."""
+    best = {"peak": (np.nan, np.nan), "phase_resonance": (np.nan, np.nan)}
+    for part in parts:
+        for kind, (_, height) in list(best.items()):
+            for k in part.at_events(kind):
+                velocity = float(np.abs(part.velocity[k, 1, 0]))
+                if not velocity <= height:
+                    best[kind], height = (float(part.frequency[k]), velocity), velocity
+    status = parts[0].status
+    folds = sum(part.at_events("fold").size for part in parts)
+    points = sum(len(part.frequency) for part in parts)
+    return (int(status), points, *best["peak"], *best["phase_resonance"], folds)
+
+
+def _chunk_of_curves(
+    models: list[Structure], forces: np.ndarray, ends: Array, settings: _Settings
+) -> list[tuple[ResponseCurve, ...]]:
+    finite = [all(bool(jnp.all(jnp.isfinite(a))) for a in jax.tree.leaves(m)) for m in models]
+    valid = np.isfinite(forces) & (forces > 0) & np.array(finite)
+    good = np.flatnonzero(valid)
+    balances = _balances(
+        [models[k] for k in (good if good.size else [0])],
+        forces[good] if good.size else np.ones(1),
+        settings,
+    )
+    upward = _followed(balances, np.arange(len(good)), ends, settings, downward=False)
+    # Beside a superharmonic resonance the linear response is no start: let the force rise.
+    lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
+    if lost:
+        again = _followed(balances, np.array(lost), ends, settings, downward=False, ramp=True)
+        for k, curve in zip(lost, again, strict=True):
+            upward[k] = curve
+    # Below a strong softening the lower end has several solutions; the upper end has one.
+    short = [k for k, c in enumerate(upward) if c.status != CurveStatus.UPPER_END]
+    downward = _followed(balances, np.array(short, dtype=int), ends, settings, downward=True)
+    owner, parts = [], []
+    for k, curve in enumerate(upward):
+        pieces = [curve]
+        if k in short:
+            back = downward[short.index(k)].reversed()
+            pieces = [back] if back.status == CurveStatus.UPPER_END else [curve, back]
+        owner += [k] * len(pieces)
+        parts += pieces
+    results: list[list[ResponseCurve]] = [[] for _ in models]
+    jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
+
+    def finished(job: np.ndarray) -> list[ResponseCurve]:
+        own = taken(balances, np.array([owner[e] for e in job]))
+        some = [parts[e] for e in job]
+        return assembled(own, some, settings.steps, stability=settings.stability)
+
+    for job, curves in zip(jobs, over_cores(finished, jobs), strict=True):
+        for e, curve in zip(job, curves, strict=True):
+            results[good[owner[e]]].append(curve)
+    for k in np.flatnonzero(~valid):
+        results[k].append(_no_curve(models[k], float(forces[k]), settings))
+    return [tuple(curves) for curves in results]
+
+
+def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCurve:
+    order = settings.harmonic_order
+    sensors = model.modes.sensors
+    return ResponseCurve(
+        force,
+        np.zeros(0),
+        np.zeros((0, 2 * order + 1, model.n_modes)),
+        np.zeros((0, order + 1, len(sensors)), dtype=np.complex128),
+        np.zeros(0, dtype=bool),
+        (),
+        CurveStatus.INVALID,
+        sensors,
+    )
+
+
+def _balances(
+    models: list[Structure], forces: np.ndarray, settings: _Settings
+) -> HarmonicBalance:
+    """The balances of all members, stacked."""
+    same = all(model is models[0] for model in models)
+    scales = _scales(
+        as_arrays(stacked(models[:1] if same else models)), jnp.asarray(forces), same
+    )
+    balances = [
+        harmonic_balance(
+            model,
+            force,
+            scale,
+            harmonic_order=settings.harmonic_order,
+            n_samples=settings.n_samples,
+        )
+        for model, force, scale in zip(models, forces, np.asarray(scales), strict=True)
+    ]
+    return stacked(balances)
+
+
+@eqx.filter_jit
+def _scales(models: Structure, forces: Array, same: bool) -> Float[Array, " member"]:
+    if same:
+        first = jax.tree.map(lambda a: a[0], models)
+        return jax.lax.map(lambda force: resonance_displacement(first, force), forces)
+    return jax.lax.map(lambda row: resonance_displacement(*row), (models, forces))
+
+
+def _followed(
+    balances: HarmonicBalance,
+    index: np.ndarray,
+    ends: Array,
+    settings: _Settings,
+    *,
+    downward: bool,
+    ramp: bool = False,
+) -> list[FollowedCurve]:
+    """The curves of the members `index`, in blocks over the cores."""
+    size = 1 if len(index) == 1 else _BLOCK
+    jobs = [index[b : b + size] for b in range(0, len(index), size)]
+
+    def follow(job: np.ndarray) -> list[FollowedCurve]:
+        rows = job[np.minimum(np.arange(size), len(job) - 1)]
+        mine = as_arrays(taken(balances, rows))
+        wanted = jnp.arange(size) < len(job)
+        starts, ready = (_ramped if ramp else _linear_starts)(
+            mine, ends, jnp.array(downward), settings.steps, settings.max_points
+        )
+        curve = _follow(
+            *(mine, starts, ends, settings.steps, settings.max_points),
+            *(jnp.array(downward), wanted & ready),
+        )
+        n_points, status, n_solves = (
+            np.asarray(a) for a in (curve.n_points, curve.status, curve.n_solves)
+        )
+        return [
+            FollowedCurve(
+                np.asarray(curve.points[k, : n_points[k]]),
+                np.asarray(curve.tangents[k, : n_points[k]]),
+                CurveStatus(int(status[k])),
+                int(n_solves[k]),
+            )
+            for k in range(len(job))
         ]
-    return curves
+
+    return [curve for block in over_cores(follow, jobs) for curve in block]
+
+
+@eqx.filter_jit
+def _linear_starts(
+    balances: HarmonicBalance, ends: Array, downward: Array, steps: StepControl, max_points: int
+) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
+    begin = jnp.where(downward, ends[1], ends[0])
+
+    def one(balance: HarmonicBalance) -> Array:
+        x = linear_coefficients(balance.model, balance.force, begin, balance.harmonic_order)
+        return balance.point(x, begin)
+
+    starts = jax.vmap(one)(balances)
+    return starts, jnp.ones(starts.shape[0], dtype=bool)
+
+
+@eqx.filter_jit
+def _ramped(
+    balances: HarmonicBalance, ends: Array, downward: Array, steps: StepControl, max_points: int
+) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
+    """Starts found by following the response at the first frequency to a rising force."""
+    begin = jnp.where(downward, ends[1], ends[0])
+
+    def one(balance: HarmonicBalance) -> tuple[Array, Array]:
+        load = balance.force * balance.load()
+        frequency = begin / balance.frequency_scale
+
+        def rising(point: Array) -> tuple[Array, Array]:
+            now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
+            residual, jacobian = now.linearised(point.at[-1].set(frequency))
+            return residual, jacobian.at[:, -1].set(-load)
+
+        rest = jnp.zeros(balance.size + 1)
+        curve = follow_curve(
+            *(rising, rest, rest.at[-1].set(1.0), jnp.array(-1.0), jnp.array(1.0)),
+            *(jnp.array(jnp.inf), steps, max_points),
+        )
+        last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
+        return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
+
+    return mapped(one, balances)
+
+
+@eqx.filter_jit
+def _follow(
+    balances: HarmonicBalance,
+    starts: Float[Array, "member unknown"],
+    ends: Float[Array, " end"],
+    steps: StepControl,
+    max_points: int,
+    downward: Bool[Array, ""],
+    wanted: Bool[Array, " member"],
+) -> Curve:
+    """Curves from their starts through the frequency range; those not wanted do not start."""
+
+    def one(balance: HarmonicBalance, start: Array, wanted: Array) -> Curve:
+        direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
+        return follow_curve(
+            balance.linearised,
+            jnp.where(wanted, start, jnp.nan),
+            direction,
+            ends[0] / balance.frequency_scale,
+            ends[1] / balance.frequency_scale,
+            jnp.array(jnp.inf),
+            steps,
+            max_points,
+        )
+
+    return mapped(one, balances, starts, wanted)
 
 
 def solve_at_frequency(
@@ -128,189 +411,7 @@ def _solve_batch(model: Structure, force: Array, frequency: Array, start: Array)
         balance = harmonic_balance(model, force, scale, harmonic_order=harmonic_order)
         guess = balance.point(start, frequency)
         fixed = jnp.zeros_like(guess).at[-1].set(1.0)
-        point, _, _, converged = correct(balance.linearised, guess, fixed, 1e-10, 30)
-        return balance.coefficients(point), converged
+        found = correct(balance.linearised, guess, fixed, 1e-10, 30)
+        return balance.coefficients(found.point), found.converged
 
     return jax.lax.map(lambda args: one(*args), (force, frequency, start))
-
-
-@eqx.filter_jit
-def _follow(
-    balance: HarmonicBalance,
-    ends: Array,
-    steps: StepControl,
-    max_points: int,
-    downward: Bool[Array, ""],
-) -> Curve:
-    model, order = balance.model, balance.harmonic_order
-    begin = jnp.where(downward, ends[1], ends[0])
-    start = balance.point(linear_coefficients(model, balance.force, begin, order), begin)
-    direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
-    return follow_curve(
-        balance.linearised,
-        start,
-        direction,
-        ends[0] / balance.frequency_scale,
-        ends[1] / balance.frequency_scale,
-        jnp.array(jnp.inf),
-        steps,
-        max_points,
-    )
-
-
-def _reversed(curve: Curve) -> Curve:
-    """The same curve in the opposite order."""
-    n = curve.n_points
-    order = jnp.where(jnp.arange(len(curve.points)) < n, n - 1 - jnp.arange(len(curve.points)), -1)
-    end = {
-        int(CurveStatus.LOWER_END): CurveStatus.UPPER_END,
-        int(CurveStatus.UPPER_END): CurveStatus.LOWER_END,
-    }.get(int(curve.status), CurveStatus(int(curve.status)))
-    return Curve(curve.points[order], -curve.tangents[order], n, jnp.array(int(end)))
-
-
-def _mode_velocity(balance: HarmonicBalance, point: Array) -> Array:
-    """Phasor of the velocity fundamental of the mode of interest, scaled."""
-    modes = balance.model.modes
-    x = balance.coefficients(point)[:, modes.mode_of_interest] / balance.displacement_scale
-    return (
-        1j * point[-1] * (x[1] - 1j * x[2]) * jnp.sign(modes.participation[modes.mode_of_interest])
-    )
-
-
-def _sensor_velocity(balance: HarmonicBalance, point: Array) -> Array:
-    """|velocity fundamental|² at the first sensor, scaled."""
-    shape = balance.model.modes.mode_shape[0]
-    x = balance.coefficients(point) @ shape / balance.displacement_scale
-    return point[-1] ** 2 * (x[1] ** 2 + x[2] ** 2)
-
-
-def _test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Array:
-    """Functions that vanish at a fold, at a peak and at a phase resonance."""
-    slope = jax.jvp(lambda p: _sensor_velocity(balance, p), (point,), (tangent,))[1]
-    return jnp.stack([tangent[-1], slope, _mode_velocity(balance, point).imag])
-
-
-EVENT_KINDS = ("fold", "peak", "phase_resonance")
-
-
-@eqx.filter_jit
-def _all_test_values(balance: HarmonicBalance, points: Array, tangents: Array) -> tuple:
-    values = jax.vmap(lambda p, t: _test_values(balance, p, t))(points, tangents)
-    in_phase = jax.vmap(lambda p: _mode_velocity(balance, p).real)(points)
-    return values, in_phase
-
-
-@eqx.filter_jit
-def _locate(
-    balance: HarmonicBalance,
-    kind: Array,
-    here: Array,
-    tangent: Array,
-    there: Array,
-    steps: StepControl,
-) -> tuple:
-    def one(args: tuple) -> tuple:
-        kind, here, tangent, there = args
-        return locate_event(
-            balance.linearised,
-            lambda p, t: _test_values(balance, p, t)[kind],
-            here,
-            tangent,
-            there,
-            steps,
-        )
-
-    return jax.lax.map(one, (kind, here, tangent, there))
-
-
-def _assemble(
-    balance: HarmonicBalance, curve: Curve, force: float, steps: StepControl
-) -> ResponseCurve:
-    """Trim a curve, insert its events, add velocities and stability."""
-    n = int(curve.n_points)
-    size = balance.n_coefficients
-    model = balance.model
-    if n == 0:
-        n_sensors = len(model.modes.sensors)
-        return ResponseCurve(
-            force,
-            np.zeros(0),
-            np.zeros((0, size, model.n_modes)),
-            np.zeros((0, balance.harmonic_order + 1, n_sensors), dtype=np.complex128),
-            np.zeros(0, dtype=bool),
-            (),
-            CurveStatus(int(curve.status)),
-            model.modes.sensors,
-        )
-    points, labels = _insert_events(balance, curve, n, steps)
-    slowest = float(np.min(points[:, -1])) * float(balance.frequency_scale)
-    motion = _motion(balance, jnp.asarray(padded(points)), steps_per_period(model, slowest))
-    frequency, coefficients, velocity, stable = (np.asarray(a)[: len(points)] for a in motion)
-    return ResponseCurve(
-        force=force,
-        frequency=frequency,
-        coefficients=coefficients,
-        velocity=velocity,
-        stable=stable,
-        event=labels,
-        status=CurveStatus(int(curve.status)),
-        sensors=model.modes.sensors,
-    )
-
-
-@eqx.filter_jit
-def _motion(
-    balance: HarmonicBalance, points: Array, n_steps: int
-) -> tuple[Array, Array, Array, Array]:
-    """Frequency, coefficients, velocity and stability along a curve."""
-    model = balance.model
-    coefficients = jax.vmap(balance.coefficients)(points)
-    frequency = points[:, -1] * balance.frequency_scale
-    velocity = velocity_phasors(coefficients, frequency, model.modes.mode_shape)
-    stable = is_stable(floquet_multipliers(model, coefficients, frequency, n_steps))
-    return frequency, coefficients, velocity, stable
-
-
-def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
-    """Rows with copies of the last up to a power of two of them, so that few shapes compile."""
-    missing = max(at_least, 1 << (len(rows) - 1).bit_length()) - len(rows)
-    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
-
-
-def _insert_events(
-    balance: HarmonicBalance, curve: Curve, n: int, steps: StepControl
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    values, in_phase = (
-        np.asarray(v)[:n] for v in _all_test_values(balance, curve.points, curve.tangents)
-    )
-    points = np.asarray(curve.points)[:n]
-    labels = [""] * n
-    change = np.signbit(values[:-1]) != np.signbit(values[1:])
-    # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
-    change[:, 1] &= values[:-1, 1] > 0
-    change[:, 2] &= (in_phase[:-1] > 0) & (in_phase[1:] > 0)
-    where, kind = np.nonzero(change)
-    if not where.size:
-        return points, tuple(labels)
-    pad = -len(where) % 8
-    index, what = np.append(where, [where[0]] * pad), np.append(kind, [kind[0]] * pad)
-    found, _, resolved = _locate(
-        balance,
-        jnp.asarray(what),
-        curve.points[index],
-        curve.tangents[index],
-        curve.points[index + 1],
-        steps,
-    )
-    found, resolved = np.asarray(found), np.asarray(resolved)
-    here, tangent = points[where], np.asarray(curve.tangents)[where]
-    along = np.einsum("ku,ku->k", found[: len(where)] - here, tangent)
-    rows = [(k, 0.0, points[k], "") for k in range(n)]
-    rows += [
-        (int(where[e]), float(along[e]), found[e], EVENT_KINDS[kind[e]])
-        for e in range(len(where))
-        if resolved[e]
-    ]
-    rows.sort(key=lambda row: (row[0], row[1]))
-    return np.array([row[2] for row in rows]), tuple(row[3] for row in rows)

@@ -5,13 +5,20 @@ the natural frequency of the mode of interest, and the residual accordingly.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import averaged_force
+from snrmjax.model.averaging import averaged_effect
+from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.harmonics import alias_free_samples, harmonic_basis, squared_orders
+from snrmjax.simulate.harmonics import (
+    alias_free_samples,
+    harmonic_basis,
+    squared_orders,
+    tangent_blocks,
+)
 
 
 class HarmonicBalance(eqx.Module):
@@ -52,6 +59,17 @@ class HarmonicBalance(eqx.Module):
         scaled = coefficients.reshape(-1) / self.displacement_scale
         return jnp.append(scaled, frequency / self.frequency_scale)
 
+    def load(self) -> Float[Array, " equation"]:
+        """Scaled force of one newton: the right-hand side for `force` = 1."""
+        model = self.model
+        load = jnp.zeros((self.n_coefficients, model.n_modes))
+        if not self.cosine_only:
+            spectrum = model.load_orders()
+            orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
+            rows = np.maximum(2 * orders - 1, 0)
+            load = load.at[rows].set(spectrum[orders, None] * model.modes.participation)
+        return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
+
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
         """R(x, λ): force balance of every coefficient over ω²·displacement scale."""
         return self._balance(point, with_jacobian=False)[0]
@@ -63,51 +81,69 @@ class HarmonicBalance(eqx.Module):
         return self._balance(point, with_jacobian=True)
 
     def _balance(self, point: Array, *, with_jacobian: bool) -> tuple[Array, Array]:
-        model, modes = self.model, self.model.modes
+        model, fs = self.model, self.frequency_scale
         n, size = model.n_modes, self.n_coefficients
         basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
-        x = self.coefficients(point)
-        omega = point[-1] * self.frequency_scale
-        stiffness = modes.natural_frequency**2
-        damping = 2 * modes.damping_ratio * modes.natural_frequency
+        terms = model.linear_terms()
+        stiffness, damping = terms.stiffness / fs**2, terms.damping / fs
         h2 = squared_orders(self.harmonic_order, cosine_only=self.cosine_only)[:, None]
-        samples = jnp.asarray(basis.synthesis) @ x
-        rate = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
-        slope = basis.derivative @ x
-        load = jnp.zeros((size, n)).at[1].set(self.force * modes.participation)
-        balance = (
-            (stiffness - h2 * omega**2) * x
-            + omega * damping * slope
-            + basis.analysis @ model.nonlinear_force(samples, rate)
-            - load
-        )
-        unit = self.frequency_scale**2 * self.displacement_scale
-        residual = balance.reshape(-1) / unit
+        inertia = h2 * terms.mass
+        x, omega = point[:-1].reshape(size, n), point[-1]
+        slope = jnp.asarray(basis.derivative) @ x
+        samples = jnp.asarray(basis.synthesis) @ (x * self.displacement_scale)
+        by_omega = jnp.asarray(basis.synthesis) @ (slope * (fs * self.displacement_scale))
+        rate = omega * by_omega
+        unit = fs**2 * self.displacement_scale
+        internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
+        balance = (stiffness - omega**2 * inertia) * x + omega * damping * slope + internal
+        residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
         tangent = model.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
-        blocks = (jnp.asarray(basis.product) @ tangent).reshape(size, size, n, n)
+        blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
+        blocks = blocks.transpose(0, 2, 1, 3)
+        eye, own = jnp.eye(size)[:, None, :], np.arange(n)
         linear = (
-            jnp.diag(jnp.ones(size))[:, :, None] * stiffness
-            - jnp.diag(h2[:, 0])[:, :, None] * omega**2
-            + omega * jnp.asarray(basis.derivative)[:, :, None] * damping
+            eye * stiffness[:, None]
+            - omega**2 * eye * inertia[:, :, None]
+            + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
         )
-        blocks = blocks + linear[..., None] * jnp.eye(n)
-        by_frequency = -2 * omega * h2 * x + damping * slope
-        if model.effects:
-            j = modes.mode_of_interest
-            viscous = model.tangent_damping(samples, rate)
-            own = omega * (basis.product_rate @ viscous).reshape(size, size)
-            blocks = blocks.at[:, :, j, j].add(own)
-            by_frequency = by_frequency.at[:, j].add(
-                basis.analysis @ (viscous * rate[:, j] / omega)
-            )
-        by_x = blocks.transpose(0, 2, 1, 3).reshape(size * n, size * n)
-        columns = [
-            by_x * (self.displacement_scale / unit),
-            by_frequency.reshape(-1, 1) * (self.frequency_scale / unit),
-        ]
-        return residual, jnp.concatenate(columns, axis=1)
+        blocks = blocks.at[:, own, :, own].add(linear.transpose(1, 0, 2))
+        column = damping * slope - 2 * omega * inertia * x
+        if model.effects and not self.cosine_only:
+            added, by_rate = self._effects(samples, rate, by_omega, omega)
+            j = model.modes.mode_of_interest
+            blocks = blocks.at[:, j, :, j].add(added)
+            column = column.at[:, j].add(by_rate)
+        by_x = blocks.reshape(size * n, size * n)
+        return residual, jnp.concatenate([by_x, column.reshape(-1, 1)], axis=1)
+
+    def _effects(
+        self, samples: Array, rate: Array, by_omega: Array, omega: Array
+    ) -> tuple[Array, Array]:
+        """What velocity and history add on the mode of interest: the block and the λ column."""
+        model, j = self.model, self.model.modes.mode_of_interest
+        basis = harmonic_basis(self.harmonic_order, self.n_samples)
+        unit = self.frequency_scale**2 * self.displacement_scale
+        q, v, v_omega = samples[:, j], rate[:, j], by_omega[:, j]
+        viscous = model.tangent_damping(samples, rate)
+        viscous_blocks = tangent_blocks(basis, viscous[:, None])[:, :, 0] @ basis.derivative
+        block = viscous_blocks * (omega / self.frequency_scale)
+        change = viscous * v_omega
+        if model.hysteretic:
+
+            def cycle(q: Array, v: Array) -> Array:
+                return sum((e.cycle_force(q, v) for e in model.hysteretic), jnp.zeros_like(q))
+
+            def along(direction: Array, direction_rate: Array) -> Array:
+                return jax.jvp(cycle, (q, v), (direction, direction_rate))[1]
+
+            shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
+            rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
+            rates = rates * (omega * self.frequency_scale * self.displacement_scale)
+            block = block + basis.analysis @ jax.vmap(along)(shapes, rates).T / unit
+            change = change + along(jnp.zeros_like(q), v_omega)
+        return block, basis.analysis @ change / unit
 
 
 def harmonic_balance(
@@ -137,6 +173,8 @@ def harmonic_balance(
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
         if model.effects:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
+        if model.hysteretic and not cosine_only:
+            n_samples = max(n_samples, 256)
     modes = model.modes
     return HarmonicBalance(
         model=model,
@@ -153,41 +191,40 @@ def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:
     """Displacement coefficients of the linear response: where a forced response starts."""
-    modes = model.modes
-    stiffness = (
-        modes.natural_frequency**2
-        - frequency**2
-        + 2j * modes.damping_ratio * modes.natural_frequency * frequency
-    )
-    phasor = force * modes.participation / stiffness
+    terms = model.linear_terms()
+    stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
+    phasor = force * model.modes.participation / stiffness
     start = jnp.zeros((2 * harmonic_order + 1, model.n_modes))
     return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
 
 
-def resonance_displacement(model: Structure, force: float) -> float:
+def resonance_displacement(
+    model: Structure, force: Float[Array, ""] | float
+) -> Float[Array, ""]:
     """Rough displacement (kg^1/2 m) of the mode of interest at resonance: a scale, no result.
 
     Solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, and with the
     averages of the effects. The damping counts as at least that of ζ = 5e-5, and the scale is
     at least the static displacement of every mode, so that no motion is small beside it.
     """
-    modes, j = model.modes, model.modes.mode_of_interest
-    omega = float(modes.natural_frequency[j])
+    modes, terms, j = model.modes, model.linear_terms(), model.modes.mode_of_interest
+    omega = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
     least_damping = 1e-4 * omega
-    damping = 2 * float(modes.damping_ratio[j]) * omega
-    load = abs(force * float(modes.participation[j]))
-    own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
-    quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
-    static = np.max(np.abs(force * np.asarray(modes.participation / modes.natural_frequency**2)))
-    if load == 0:
-        return float(static)
-    amplitude = load / (max(damping, least_damping) * omega) * np.logspace(-9, 0, 361)
-    stiffness, viscous = omega**2 + quartic * amplitude**2, np.full(amplitude.shape, damping)
+    load = jnp.abs(force * modes.participation[j])
+    quartic = jnp.zeros(())
+    if (j,) * 4 in model.potential.monomials:
+        own = model.potential.coefficient[model.potential.monomials.index((j,) * 4)]
+        quartic = jnp.maximum(3.0 * own, 0.0)
+    static = jnp.max(jnp.abs(force * modes.participation / terms.stiffness))
+    largest = load / (jnp.maximum(terms.damping[j], least_damping) * omega)
+    largest = jnp.maximum(largest, 1e-300)
+    amplitude = largest * jnp.logspace(-9, 0, 361)
+    stiffness = terms.stiffness[j] + quartic * amplitude**2
+    viscous = jnp.full(amplitude.shape, terms.damping[j])
     for effect in model.effects:
-        average = averaged_force(
-            effect.force, jnp.asarray(amplitude), jnp.asarray(omega), n_samples=128
-        )
-        stiffness = stiffness + np.maximum(average.stiffness, 0.0)
-        viscous = viscous + np.asarray(average.damping)
-    needed = np.maximum(viscous, least_damping) * np.sqrt(stiffness) * amplitude
-    return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
+        if isinstance(effect, AbstractForce):
+            average = averaged_effect(effect, amplitude, omega, n_samples=128)
+            stiffness = stiffness + jnp.maximum(average.stiffness, 0.0)
+            viscous = viscous + average.damping
+    needed = jnp.maximum(viscous, least_damping) * jnp.sqrt(stiffness) * amplitude
+    return jnp.maximum(static, jnp.interp(load, jax.lax.cummax(needed), amplitude))

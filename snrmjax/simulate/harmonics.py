@@ -18,8 +18,9 @@ class HarmonicBasis(NamedTuple):
     synthesis: np.ndarray  # (time, coefficient): samples over one period
     analysis: np.ndarray  # (coefficient, time): its left inverse
     derivative: np.ndarray  # (coefficient, coefficient): d/dτ
-    product: np.ndarray  # (coefficient · coefficient, time): analysis ⊗ synthesis
-    product_rate: np.ndarray  # the same with the derivative of the synthesis
+    spectrum: np.ndarray  # (order, time): cosine sums of orders 0…2H, then their sine sums
+    row: np.ndarray  # (2, coefficient · coefficient): rows of `spectrum` in each product
+    sign: np.ndarray  # (2, coefficient · coefficient): their factors
 
 
 @lru_cache(maxsize=64)
@@ -48,11 +49,46 @@ def harmonic_basis(
             derivative[2 * h, 2 * h - 1] = -h
     analysis = synthesis.T * (2.0 / n_samples)
     analysis[0] *= 0.5
-    size = synthesis.shape[1]
-    rate = synthesis @ derivative
-    product = np.einsum("at,tb->abt", analysis, synthesis).reshape(size * size, n_samples)
-    product_rate = np.einsum("at,tb->abt", analysis, rate).reshape(size * size, n_samples)
-    return HarmonicBasis(synthesis, analysis, derivative, product, product_rate)
+    double = np.outer(np.arange(2 * harmonic_order + 1), tau)
+    spectrum = np.concatenate([np.cos(double), np.sin(double)]) * (2.0 / n_samples)
+    row, sign = _product_to_sum(harmonic_order, cosine_only)
+    return HarmonicBasis(synthesis, analysis, derivative, spectrum, row, sign)
+
+
+def _product_to_sum(harmonic_order: int, cosine_only: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Which two sums make up the product of each pair of basis functions, and with which sign.
+
+    cos aτ cos bτ = ½cos(a−b)τ + ½cos(a+b)τ, and likewise with sines.
+    """
+    orders = np.arange(1, harmonic_order + 1)
+    order = np.concatenate([[0], orders if cosine_only else np.repeat(orders, 2)])
+    is_sine = np.zeros(order.size, dtype=bool) if cosine_only else np.arange(order.size) % 2 == 0
+    is_sine[0] = False
+    difference = order[:, None] - order[None, :]
+    total = order[:, None] + order[None, :]
+    left, right = is_sine[:, None], is_sine[None, :]
+    mixed = left ^ right
+    offset = np.where(mixed, 2 * harmonic_order + 1, 0)
+    first = np.where(mixed, np.where(left, 1, -1) * np.sign(difference), 1.0)
+    second = np.where(left & right, -1.0, 1.0)
+    half = np.where(order[:, None] == 0, 0.25, 0.5)
+    row = np.stack([np.abs(difference) + offset, total + offset]).reshape(2, -1)
+    return row, np.stack([half * first, half * second]).reshape(2, -1)
+
+
+def tangent_blocks(
+    basis: HarmonicBasis, samples: Float[Array, "time entry"]
+) -> Float[Array, "coefficient coefficient entry"]:
+    """∂(coefficients of k·q)/∂(coefficients of q) for every entry k of `samples` over a period.
+
+    The products of two basis functions are sums of harmonics up to 2H, so 2(2H + 1) Fourier
+    sums hold all of the blocks.
+    """
+    sums = jnp.asarray(basis.spectrum) @ samples
+    size = basis.synthesis.shape[1]
+    sign = jnp.asarray(basis.sign)[:, :, None]
+    blocks = sign[0] * sums[basis.row[0]] + sign[1] * sums[basis.row[1]]
+    return blocks.reshape(size, size, -1)
 
 
 def squared_orders(harmonic_order: int, *, cosine_only: bool = False) -> np.ndarray:

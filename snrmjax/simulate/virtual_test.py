@@ -9,13 +9,10 @@ import numpy as np
 
 from snrmjax.measure.steady_states import SteadyStates, steady_states
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.forced_response import (
-    ResponseCurve,
-    forced_response,
-    padded,
-    solve_at_frequency,
-)
+from snrmjax.simulate.blocks import padded
+from snrmjax.simulate.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.harmonics import velocity_phasors
+from snrmjax.simulate.response_curve import ResponseCurve
 
 
 class MeasurementErrors(NamedTuple):

@@ -1,0 +1,88 @@
+"""Many problems of one shape at once: stacked, in blocks of one size, over the cores."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
+    """Rows with copies of the last up to a power of two of them, so that few shapes compile."""
+    missing = max(at_least, 1 << (len(rows) - 1).bit_length()) - len(rows)
+    return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
+
+
+def stacked(trees: Sequence[T]) -> T:
+    """One tree whose arrays have a leading axis over `trees`.
+
+    Raises `ValueError` when the trees differ in anything but the numbers in their arrays.
+    """
+    arrays, fixed = eqx.partition(list(trees), eqx.is_array)
+    first = jax.tree.structure(arrays[0]), fixed[0]
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(arrays[0])]
+    for number, (array, rest) in enumerate(zip(arrays, fixed, strict=True)):
+        same = (jax.tree.structure(array), rest) == first
+        if not same or [np.shape(leaf) for leaf in jax.tree.leaves(array)] != shapes:
+            raise ValueError(
+                f"models of a batch must have the same modes, monomials and effects, but number "
+                f"{number} differs from the first in more than numbers."
+            )
+    together = jax.tree.map(lambda *leaves: np.stack([np.asarray(a) for a in leaves]), *arrays)
+    return eqx.combine(together, fixed[0])
+
+
+def taken(tree: T, rows: np.ndarray | int) -> T:
+    """Rows of a stacked tree, on the host."""
+    return jax.tree.map(lambda a: np.asarray(a)[rows] if eqx.is_array_like(a) else a, tree)
+
+
+def on_accelerator() -> bool:
+    """Whether the default device is anything but a CPU."""
+    return jax.default_backend() != "cpu"
+
+
+def mapped(function: Callable[..., R], *rows: object) -> R:
+    """`function` of every row: one after the other on a CPU, side by side on an accelerator.
+
+    On a CPU lanes of a `vmap` wait for the slowest of them and their small matrices are
+    factorised one by one anyway.
+    """
+    if on_accelerator():
+        return jax.vmap(function)(*rows)
+    return jax.lax.map(lambda row: function(*row), rows)
+
+
+def over_cores(
+    function: Callable[[T], R],
+    jobs: Sequence[T],
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[R]:
+    """`function` of every job, in as many threads as there are cores.
+
+    JAX's compiled programs do not hold Python's lock, so they run side by side. `progress` is
+    called with the jobs done and all of them, from the calling thread.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    workers = 1 if on_accelerator() else min(len(jobs), cores or 1)
+    results = []
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        running = [pool.submit(function, job) for job in jobs] if workers > 1 else jobs
+        for done, job in enumerate(running, start=1):
+            results.append(job.result() if workers > 1 else function(job))
+            if progress is not None:
+                progress(done, len(jobs))
+    return results
+
+
+def as_arrays(tree: T) -> T:
+    """Arrays of the host as arrays of the device."""
+    return jax.tree.map(lambda a: jnp.asarray(a) if isinstance(a, np.ndarray) else a, tree)

@@ -1,0 +1,350 @@
+"""Folds, peaks, phase resonances and bifurcations along curves of periodic motions."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.simulate.blocks import as_arrays, mapped, taken
+from snrmjax.simulate.continuation import StepControl, correct, locate_event
+from snrmjax.simulate.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.stability import floquet_multipliers
+
+EVENT_KINDS = ("fold", "peak", "phase_resonance")
+BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
+_BLOCK = 8  # intervals that one call works on
+_INSIDE = 7  # points inside an interval that is looked at more closely
+
+
+class Walked(NamedTuple):
+    """Points along one curve and what was found at them, on the host."""
+
+    points: Float[np.ndarray, "point unknown"]
+    tangents: Float[np.ndarray, "point unknown"]
+    labels: tuple[str, ...]
+
+
+def mode_velocity(balance: HarmonicBalance, point: Array) -> Complex[Array, ""]:
+    """Phasor of the velocity fundamental of the mode of interest, scaled."""
+    modes = balance.model.modes
+    x = point[:-1].reshape(balance.n_coefficients, -1)[:, modes.mode_of_interest]
+    return (
+        1j * point[-1] * (x[1] - 1j * x[2]) * jnp.sign(modes.participation[modes.mode_of_interest])
+    )
+
+
+def sensor_velocity(balance: HarmonicBalance, point: Array) -> Float[Array, ""]:
+    """|velocity fundamental|² at the first sensor, scaled."""
+    shape = balance.model.modes.mode_shape[0]
+    x = point[:-1].reshape(balance.n_coefficients, -1) @ shape
+    return point[-1] ** 2 * (x[1] ** 2 + x[2] ** 2) / jnp.max(jnp.abs(shape)) ** 2
+
+
+def test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Float[Array, " kind"]:
+    """Functions that vanish at a fold, at a peak and at a phase resonance."""
+    slope = jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
+    return jnp.stack([tangent[-1], slope, mode_velocity(balance, point).imag])
+
+
+@eqx.filter_jit
+def _all_test_values(balance: HarmonicBalance, points: Array, tangents: Array) -> tuple:
+    """Values and slopes, along the curve, of what the test functions are made of."""
+
+    def one(point: Array, tangent: Array) -> tuple:
+        def heights(p: Array) -> Array:
+            velocity = mode_velocity(balance, p)
+            return jnp.stack([p[-1], sensor_velocity(balance, p), velocity.imag, velocity.real])
+
+        return jax.jvp(heights, (point,), (tangent,))
+
+    return jax.vmap(one)(points, tangents)
+
+
+@eqx.filter_jit
+def _locate(
+    balances: HarmonicBalance, kind: Array, here: Array, tangent: Array, there: Array, wanted: Array,
+    steps: StepControl,
+) -> tuple:
+    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+        kind, here, tangent, there, wanted = row
+
+        def test(point: Array, direction: Array) -> Array:
+            return test_values(balance, point, direction)[kind]
+
+        return locate_event(balance.linearised, test, here, tangent, there, steps, wanted)
+
+    return mapped(one, balances, kind, here, tangent, there, wanted)
+
+
+@eqx.filter_jit
+def _between(
+    balances: HarmonicBalance, here: Array, tangent: Array, there: Array, share: Array,
+    wanted: Array, steps: StepControl,
+) -> tuple:
+    """Points of the curve at shares of the way between neighbours, with their tangents."""
+
+    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+        here, tangent, there, share, wanted = row
+        length = tangent @ (there - here)
+        guess = here + share * (there - here)
+        guess = guess + (share * length - tangent @ (guess - here)) * tangent
+        patience = jnp.where(wanted, 2 * steps.iterations, 0)
+        found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
+        return found.point, found.tangent, found.converged
+
+    return mapped(one, balances, here, tangent, there, share, wanted)
+
+
+def _in_blocks(function, balances: HarmonicBalance, owner: np.ndarray, rows: tuple, steps) -> list:
+    """A jitted function of rows, called with blocks of one size."""
+    n = len(owner)
+    parts = []
+    for begin in range(0, n, _BLOCK):
+        index = np.minimum(np.arange(begin, begin + _BLOCK), n - 1)
+        wanted = jnp.asarray(np.arange(begin, begin + _BLOCK) < n)
+        arguments = tuple(jnp.asarray(row[index]) for row in rows)
+        mine = as_arrays(taken(balances, owner[index]))
+        found = function(mine, *arguments, wanted, steps)
+        parts.append([np.asarray(part)[: n - begin] for part in found])
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
+def with_events(
+    balances: HarmonicBalance, curves: list[Walked], steps: StepControl
+) -> list[Walked]:
+    """The curves with their folds, peaks and phase resonances inserted.
+
+    Arguments: `balances` stacked, one for every curve. Between neighbours every change of sign
+    is located; where the cubic through both hints at two changes, the interval is divided first.
+    A peak is a maximum of the velocity fundamental at the first sensor; a phase resonance has
+    the velocity in phase with the force.
+    """
+    divided = _divided(balances, curves, steps)
+    owner, kind, position = [], [], []
+    for number, curve in enumerate(divided):
+        if len(curve.points) < 2:
+            continue
+        heights, slopes = _heights(balances, number, curve)
+        values = np.stack([slopes[:, 0], slopes[:, 1], heights[:, 2]], axis=1)
+        change = np.signbit(values[:-1]) != np.signbit(values[1:])
+        # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
+        change[:, 1] &= values[:-1, 1] > 0
+        change[:, 2] &= (heights[:-1, 3] > 0) & (heights[1:, 3] > 0)
+        where, what = np.nonzero(change)
+        owner += [number] * len(where)
+        kind += what.tolist()
+        position += where.tolist()
+    if not owner:
+        return divided
+    here = np.stack([divided[o].points[k] for o, k in zip(owner, position, strict=True)])
+    ahead = np.stack([divided[o].tangents[k] for o, k in zip(owner, position, strict=True)])
+    there = np.stack([divided[o].points[k + 1] for o, k in zip(owner, position, strict=True)])
+    rows = (np.array(kind), here, ahead, there)
+    found, tangents, resolved = _in_blocks(_locate, balances, np.array(owner), rows, steps)
+    labels = [EVENT_KINDS[k] if ok else "" for k, ok in zip(kind, resolved, strict=True)]
+    return _inserted(divided, owner, position, found, tangents, labels)
+
+
+def _heights(
+    balances: HarmonicBalance, number: int, curve: Walked
+) -> tuple[np.ndarray, np.ndarray]:
+    """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength."""
+    size = max(128, 1 << (len(curve.points) - 1).bit_length())
+    fill = ((0, size - len(curve.points)), (0, 0))
+    arrays = (jnp.asarray(np.pad(a, fill)) for a in (curve.points, curve.tangents))
+    found = _all_test_values(as_arrays(taken(balances, number)), *arrays)
+    heights, slopes = (np.asarray(a)[: len(curve.points)] for a in found)
+    return heights, slopes
+
+
+def _divided(
+    balances: HarmonicBalance, curves: list[Walked], steps: StepControl
+) -> list[Walked]:
+    """The curves with points added where two events may lie between neighbours."""
+    owner, position, share = [], [], []
+    for number, curve in enumerate(curves):
+        if len(curve.points) < 2:
+            continue
+        heights, slopes = _heights(balances, number, curve)
+        length = np.linalg.norm(np.diff(curve.points, axis=0), axis=1)
+        doubtful = np.zeros(len(length), dtype=bool)
+        for column in range(2):
+            doubtful |= _slope_may_vanish_twice(heights[:, column], slopes[:, column], length)
+        doubtful |= _may_vanish_twice(heights[:, 2], slopes[:, 2], length)
+        for k in np.flatnonzero(doubtful):
+            owner += [number] * _INSIDE
+            position += [int(k)] * _INSIDE
+            share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
+    if not owner:
+        return curves
+    found, tangents, ok = _points_between(balances, curves, owner, position, share, steps)
+    keep = np.flatnonzero(ok)
+    return _inserted(
+        curves,
+        [owner[k] for k in keep],
+        [position[k] for k in keep],
+        found[keep],
+        tangents[keep],
+        [""] * len(keep),
+        always=True,
+    )
+
+
+def _points_between(
+    balances: HarmonicBalance, curves: list[Walked], owner: list, position: list, share: list,
+    steps: StepControl,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pairs = list(zip(owner, position, strict=True))
+    here = np.stack([curves[o].points[k] for o, k in pairs])
+    ahead = np.stack([curves[o].tangents[k] for o, k in pairs])
+    there = np.stack([curves[o].points[k + 1] for o, k in pairs])
+    rows = (here, ahead, there, np.array(share))
+    found, tangents, ok = _in_blocks(_between, balances, np.array(owner), rows, steps)
+    turned = np.einsum("ku,ku->k", tangents, ahead) < 0
+    return found, np.where(turned[:, None], -tangents, tangents), ok
+
+
+def _slope_may_vanish_twice(
+    height: np.ndarray, slope: np.ndarray, length: np.ndarray
+) -> Bool[np.ndarray, " interval"]:
+    """Whether the slope keeps its sign at both ends but the cubic between them turns back."""
+    first, last = slope[:-1], slope[1:]
+    chord = np.diff(height) / length
+    # p'(u) = first + u(6 chord − 4 first − 2 last) + u²(3 first + 3 last − 6 chord), u in 0…1.
+    a, b = 3 * (first + last) - 6 * chord, 6 * chord - 4 * first - 2 * last
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = -b / (2 * a)
+        extreme = first - b**2 / (4 * a)
+    same = np.signbit(first) == np.signbit(last)
+    least = np.minimum(np.abs(first), np.abs(last))
+    # A margin, since the cubic is only near the curve.
+    turns = extreme * np.sign(first) < 0.3 * least
+    return same & (u > 0) & (u < 1) & turns
+
+
+def _may_vanish_twice(
+    height: np.ndarray, slope: np.ndarray, length: np.ndarray
+) -> Bool[np.ndarray, " interval"]:
+    """Whether the height keeps its sign at both ends but the cubic between them comes near zero."""
+    first, last = height[:-1], height[1:]
+    same = np.signbit(first) == np.signbit(last)
+    towards = (slope[:-1] * first < 0) & (slope[1:] * last > 0)
+    # The tangents from both ends bound a convex piece from below.
+    bound = np.minimum(
+        np.abs(first) - np.abs(slope[:-1]) * length, np.abs(last) - np.abs(slope[1:]) * length
+    )
+    return same & towards & (bound < 0)
+
+
+def _inserted(
+    curves: list[Walked], owner: list, position: list, points: np.ndarray, tangents: np.ndarray,
+    labels: list[str], *, always: bool = False,
+) -> list[Walked]:
+    """The curves with labelled points put in their places, in order along each step."""
+    result = []
+    for number, curve in enumerate(curves):
+        mine = [
+            e for e, o in enumerate(owner) if o == number and (always or labels[e])
+        ]
+        if not mine:
+            result.append(curve)
+            continue
+        where = np.array([position[e] for e in mine])
+        ahead = curve.tangents[where]
+        new, turn = points[mine], tangents[mine]
+        along = np.einsum("ku,ku->k", new - curve.points[where], ahead)
+        turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
+        n = len(curve.points)
+        order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
+        names = list(curve.labels) + [labels[e] for e in mine]
+        result.append(
+            Walked(
+                np.concatenate([curve.points, new])[order],
+                np.concatenate([curve.tangents, turn])[order],
+                tuple(names[k] for k in order),
+            )
+        )
+    return result
+
+
+def with_bifurcations(
+    balance: HarmonicBalance,
+    curve: Walked,
+    multipliers: Complex[np.ndarray, "point multiplier"],
+    steps: StepControl,
+) -> tuple[Walked, Complex[np.ndarray, "point multiplier"]]:
+    """The curve with the points inserted where a multiplier crosses the unit circle.
+
+    A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
+    bifurcation, and +1 away from a fold a branch point. Returns the curve and the multipliers
+    with the rows of the new points. `balance` is stacked, of one member.
+    """
+    regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
+    outside = np.sum(np.abs(multipliers) > 1.0, axis=1)
+    crossings = []
+    for k, following in zip(regular[:-1], regular[1:], strict=True):
+        change = abs(int(outside[following]) - int(outside[k]))
+        across_fold = following > k + 1
+        if change == 0 or (across_fold and change == 1):
+            continue
+        if not np.all(np.isfinite(multipliers[[k, following]])):
+            continue
+        crossings.append(k if not across_fold else following - 1)
+    if not crossings:
+        return curve, multipliers
+    return _located_bifurcations(balance, curve, multipliers, crossings, steps)
+
+
+def _located_bifurcations(
+    balance: HarmonicBalance, curve: Walked, multipliers: np.ndarray, crossings: list[int],
+    steps: StepControl,
+) -> tuple[Walked, np.ndarray]:
+    """Divide the intervals until the crossing is known to a millionth of a step."""
+    member = as_arrays(taken(balance, 0))
+    low, high = np.zeros(len(crossings)), np.ones(len(crossings))
+    first = np.sum(np.abs(multipliers[crossings]) > 1.0, axis=1)
+    for _ in range(7):
+        shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
+        owner = [0] * shares.size
+        position = np.repeat(crossings, _INSIDE).tolist()
+        found, tangents, ok = _points_between(
+            balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
+        )
+        rows = _multipliers_of(member, found)
+        count = np.where(
+            ok, np.sum(np.abs(rows) > 1.0, axis=1), np.repeat(first, _INSIDE)
+        ).reshape(shares.shape)
+        beyond = count != first[:, None]
+        index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
+        edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
+        pick = np.arange(len(crossings))
+        low, high = edges[pick, index], edges[pick, index + 1]
+    owner, share = [0] * len(crossings), (0.5 * (low + high)).tolist()
+    found, tangents, ok = _points_between(balance, [curve], owner, list(crossings), share, steps)
+    rows = _multipliers_of(member, found)
+    labels = [_crossing_kind(row) if good else "" for row, good in zip(rows, ok, strict=True)]
+    new = _inserted([curve], owner, list(crossings), found, tangents, labels)[0]
+    merged = np.full((len(new.points), multipliers.shape[1]), np.nan, dtype=np.complex128)
+    added = {tuple(point): row for point, row in zip(found, rows, strict=True)}
+    old = iter(multipliers)
+    for k, point in enumerate(new.points):
+        merged[k] = added[tuple(point)] if tuple(point) in added else next(old)
+    return new, merged
+
+
+def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:
+    size = (balance.n_coefficients, balance.model.n_modes)
+    x = points[:, :-1].reshape(-1, *size) * np.asarray(balance.displacement_scale)
+    return floquet_multipliers(balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale))
+
+
+def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:
+    """What kind of bifurcation the multiplier nearest to the unit circle makes."""
+    nearest = multipliers[np.argmin(np.abs(np.abs(multipliers) - 1.0))]
+    # At a crossing of +1 or −1 two multipliers of a light damped mode may be close by.
+    if abs(nearest.imag) > 1e-4:
+        return "neimark_sacker"
+    return "period_doubling" if nearest.real < 0 else "branch_point"

@@ -1,0 +1,143 @@
+"""One forced response as a curve, with its events, multipliers and how it ended."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.simulate.blocks import as_arrays, over_cores, padded, taken
+from snrmjax.simulate.continuation import CurveStatus, StepControl
+from snrmjax.simulate.events import Walked, with_bifurcations, with_events
+from snrmjax.simulate.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.harmonics import velocity_phasors
+from snrmjax.simulate.stability import (
+    StabilityLoss,
+    floquet_multipliers,
+    is_stable,
+    stability_loss,
+)
+
+
+class ResponseCurve(NamedTuple):
+    """One forced response in order along the curve, unstable parts included."""
+
+    force: float  # N
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
+    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
+    stable: Bool[np.ndarray, " point"]
+    event: tuple[str, ...]  # "" or what happens at the point; see `forced_response`
+    status: CurveStatus
+    sensors: tuple[str, ...]
+    multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
+    n_solves: int = 0  # linear systems factorised to follow the curve
+    branch: str = "main"  # "main", or how an isolated one was reached
+
+    def at_events(self, kind: str) -> np.ndarray:
+        """Indices of the points at which an event of this kind was located."""
+        return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
+
+    @property
+    def stability_loss(self) -> tuple[StabilityLoss, ...]:
+        """By which kind of multiplier each point is unstable.
+
+        Raises `ValueError` when the curve was followed without stability.
+        """
+        if self.multipliers is None:
+            raise ValueError("this curve was followed without stability: ask for it.")
+        return stability_loss(self.multipliers)
+
+
+class FollowedCurve(NamedTuple):
+    """A curve as the continuation left it, trimmed, on the host."""
+
+    points: Float[np.ndarray, "point unknown"]
+    tangents: Float[np.ndarray, "point unknown"]
+    status: CurveStatus
+    n_solves: int
+
+    def reversed(self) -> "FollowedCurve":
+        """The same curve in the opposite order."""
+        end = {
+            CurveStatus.LOWER_END: CurveStatus.UPPER_END,
+            CurveStatus.UPPER_END: CurveStatus.LOWER_END,
+        }.get(self.status, self.status)
+        return FollowedCurve(self.points[::-1], -self.tangents[::-1], end, self.n_solves)
+
+
+def assembled(
+    balances: HarmonicBalance,
+    curves: Sequence[FollowedCurve],
+    steps: StepControl,
+    *,
+    stability: bool = True,
+    branch: str = "main",
+) -> list[ResponseCurve]:
+    """Curves with their events and bifurcations inserted, velocities and multipliers.
+
+    Arguments: `balances` stacked, one for every curve; `steps` with which they were followed.
+    """
+    walked = [Walked(c.points, c.tangents, ("",) * len(c.points)) for c in curves]
+    walked = with_events(balances, walked, steps)
+
+    def finished(number: int) -> ResponseCurve:
+        balance = as_arrays(taken(balances, number))
+        curve, multipliers = walked[number], None
+        if stability:
+            multipliers = _multipliers(balance, curve)
+            one = jax.tree.map(lambda a: np.asarray(a)[None] if eqx.is_array(a) else a, balance)
+            curve, multipliers = with_bifurcations(one, curve, multipliers, steps)
+        return _response(balance, curve, multipliers, curves[number], branch)
+
+    return over_cores(finished, range(len(curves)))
+
+
+def _multipliers(balance: HarmonicBalance, curve: Walked) -> Complex[np.ndarray, "point _"]:
+    shape = (len(curve.points), balance.n_coefficients, balance.model.n_modes)
+    x = curve.points[:, :-1].reshape(shape) * np.asarray(balance.displacement_scale)
+    omega = curve.points[:, -1] * np.asarray(balance.frequency_scale)
+    return floquet_multipliers(balance.model, x, omega)
+
+
+def _response(
+    balance: HarmonicBalance,
+    curve: Walked,
+    multipliers: np.ndarray | None,
+    followed: FollowedCurve,
+    branch: str,
+) -> ResponseCurve:
+    model, n = balance.model, len(curve.points)
+    if n == 0:
+        frequency, velocity = np.zeros(0), np.zeros((0, balance.harmonic_order + 1, 0))
+        coefficients = np.zeros((0, balance.n_coefficients, model.n_modes))
+        velocity = np.zeros((0, balance.harmonic_order + 1, len(model.modes.sensors)), complex)
+    else:
+        motion = _motion(balance, jnp.asarray(padded(curve.points)))
+        frequency, coefficients, velocity = (np.asarray(a)[:n] for a in motion)
+    stable = np.zeros(n, dtype=bool) if multipliers is None else is_stable(multipliers)
+    return ResponseCurve(
+        force=float(balance.force),
+        frequency=frequency,
+        coefficients=coefficients,
+        velocity=velocity,
+        stable=stable,
+        event=curve.labels,
+        status=followed.status,
+        sensors=model.modes.sensors,
+        multipliers=multipliers,
+        n_solves=followed.n_solves,
+        branch=branch,
+    )
+
+
+@eqx.filter_jit
+def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array]:
+    """Frequency, coefficients and velocity along a curve."""
+    coefficients = jax.vmap(balance.coefficients)(points)
+    frequency = points[:, -1] * balance.frequency_scale
+    velocity = velocity_phasors(coefficients, frequency, balance.model.modes.mode_shape)
+    return frequency, coefficients, velocity
