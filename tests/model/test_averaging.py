@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from snrmjax.model.averaging import averaged_force, averaged_response
+from snrmjax.model.averaging import averaged_effect, averaged_force, averaged_response
 from snrmjax.model.effects import make_effect
 
 AMPLITUDE = np.array([0.3, 0.5, 0.9, 4.0])
@@ -115,6 +115,31 @@ def test_averages_follow_the_closed_formulas(name):
     np.testing.assert_allclose(average.stiffness, wanted, rtol=tolerance, atol=EXACT * largest)
     wanted = np.broadcast_to(damping(AMPLITUDE, FREQUENCY), AMPLITUDE.shape)
     np.testing.assert_allclose(average.damping, wanted, rtol=tolerance, atol=EXACT * largest)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "tolerance"),
+    [
+        ("cubic_stiffness", {"coefficient": 1.3}, EXACT),
+        ("quadratic_stiffness", {"coefficient": 1.3}, EXACT),
+        ("gap_stiffness", {"stiffness": 1.3, "gap": 0.4}, KINK),
+        ("quadratic_damping", {"coefficient": 1.3}, KINK),
+        ("van_der_pol_damping", {"coefficient": 1.3}, EXACT),
+    ],
+)
+def test_averages_over_a_cycle_are_those_of_the_law(kind, parameters, tolerance):
+    effect = make_effect(kind, parameters)
+    amplitude, frequency = jnp.asarray(AMPLITUDE)[:, None], jnp.asarray(FREQUENCY[:2])
+    cycle = averaged_effect(effect, amplitude, frequency, n_samples=SAMPLES)
+    law = averaged_force(
+        effect.force, *jnp.broadcast_arrays(amplitude, frequency), n_samples=SAMPLES
+    )
+    for one, other in zip(cycle, law, strict=True):
+        assert one.shape == (4, 2)
+        largest = max(float(jnp.max(jnp.abs(jnp.stack(law)))), 1.0)
+        np.testing.assert_allclose(one, other, rtol=tolerance, atol=EXACT * largest)
+    alone = averaged_effect(effect, amplitude[1, 0], frequency[1], n_samples=SAMPLES)
+    np.testing.assert_allclose(alone.stiffness, cycle.stiffness[1, 1], rtol=EXACT, atol=EXACT)
 
 
 def test_averages_of_a_law_without_a_formula_against_adaptive_quadrature():

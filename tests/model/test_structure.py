@@ -111,6 +111,80 @@ def test_potential_energy_is_the_work_of_the_forces():
     np.testing.assert_allclose(smooth.potential_energy(q), wanted[:, 0], rtol=1e-13)
 
 
+def with_friction():
+    """Two modes with a potential and every sort of effect; the first mode is of interest."""
+    kinds = {
+        "coulomb_friction": {"force": 0.3},
+        "cubic_stiffness": {"coefficient": 1.3},
+        "jenkins_slider": {"stiffness": 9.0, "slip_displacement": 0.4},
+        "added_mass": {"mass": 0.5},
+        "iwan_microslip": {"coefficient": 2.0, "exponent": 1.5},
+        "sensor_gain_error": {"gain": 0.1},
+        "quadratic_damping": {"coefficient": 0.6},
+        "linear_frequency_shift": {"relative_shift": 0.1},
+        "force_harmonics": {"second": 0.1, "third": 0.2},
+        "internal_resonance_1_3": {"coefficient": 5.0, "frequency_hz": 1.0, "damping_ratio": 0.1},
+    }
+    return structure(
+        modes_of(2.0, 5.0),
+        polynomial_potential({"1122": 0.7}, 2),
+        effects=tuple(make_effect(kind, parameters) for kind, parameters in kinds.items()),
+    )
+
+
+def test_friction_acts_over_the_cycle_and_nowhere_else():
+    model = with_friction()
+    kinds = [[e.kind for e in part] for part in (model.memoryless, model.hysteretic)]
+    assert kinds == [
+        ["cubic_stiffness", "quadratic_damping"],
+        ["coulomb_friction", "jenkins_slider", "iwan_microslip"],
+    ]
+    t = 2 * np.pi * np.arange(32)[:, None] / 32
+    t = t + np.array([0.1, 0.7])
+    q, v = jnp.asarray(np.cos(t)), jnp.asarray(-3 * np.sin(t))
+    # Potential and memoryless effects by hand.
+    x, y = np.asarray(q).T
+    pace = np.asarray(v)[:, 0]
+    smooth = np.stack([1.4 * x * y**2 + 1.3 * x**3 + 0.6 * pace * abs(pace), 1.4 * x**2 * y], 1)
+    memoryless = eqx.filter_jit(type(model).memoryless_force)(model, q, v)
+    np.testing.assert_allclose(memoryless, smooth, rtol=0, atol=1e-14)  # rounding
+    added = np.asarray(eqx.filter_jit(type(model).nonlinear_force)(model, q, v)) - smooth
+    np.testing.assert_allclose(added[:, 1], 0.0, atol=1e-14)
+    wanted = sum(np.asarray(e.cycle_force(q[:, 0], v[:, 0])) for e in model.hysteretic)
+    np.testing.assert_allclose(added[:, 0], wanted, rtol=0, atol=1e-14)
+    assert np.max(np.abs(wanted)) > 1.0
+    # Tangents: those of the part without friction.
+    stiffness = eqx.filter_jit(type(model).tangent_stiffness)(model, q, v)
+    damping = eqx.filter_jit(type(model).tangent_damping)(model, q, v)
+    np.testing.assert_allclose(stiffness[:, 0, 0], 1.4 * y**2 + 3.9 * x**2, rtol=1e-13)
+    np.testing.assert_allclose(damping, 1.2 * abs(pace), rtol=1e-13)
+
+
+def test_statics_know_linear_changes_and_no_friction():
+    # k = ω²(1 + 0.1)² = 4.84; a q³ with a = −1.21 gives q = ±2, where the energy is kq²/4.
+    effects = {
+        "cubic_stiffness": {"coefficient": -1.21},
+        "linear_frequency_shift": {"relative_shift": 0.1},
+        "jenkins_slider": {"stiffness": 9.0, "slip_displacement": 0.01},
+        "iwan_microslip": {"coefficient": 2.0, "exponent": 1.5},
+        "coulomb_friction": {"force": 5.0},
+    }
+    found = equilibria(single(**effects))
+    places = sorted(float(e.displacement[0]) for e in found)
+    np.testing.assert_allclose(places, [-2, 0, 2], atol=1e-9)
+    assert [e.stable for e in found] == [True, False, False]
+    assert found[-1].energy == pytest.approx(4.84, rel=1e-9)
+    # Where the force changes by a tenth of the linear one; the grid is 6 % wide.
+    scale = displacement_scale(single(**effects))
+    assert scale[0] == pytest.approx(np.sqrt(0.1 * 4.84 / 1.21), rel=0.06)
+    # The same by the roots of the potential's polynomial, without memoryless effects.
+    del effects["cubic_stiffness"]
+    found = equilibria(single(potential={"1111": -1.21 / 4}, **effects))
+    places = sorted(float(e.displacement[0]) for e in found)
+    np.testing.assert_allclose(places, [-2, 0, 2], atol=1e-12)
+    assert displacement_scale(single(**effects)) == [1e-3]
+
+
 # ----------------------------------------------------------------------------------- equilibria
 
 
@@ -211,4 +285,10 @@ def test_what_is_not_said_is_linear_and_exact():
     assert model.tangent_stiffness(q, q).shape == (4, 2, 2)
     assert model.tangent_damping(q, q).shape == (4,)
     assert (float(model.level_gain_std), float(model.level_phase_std)) == (0.0, 0.0)
+    assert float(model.test_order) == 0.0
+    assert model.memoryless == model.hysteretic == model.measurement_effects == ()
+    mass, damping, stiffness = model.linear_terms()
+    np.testing.assert_array_equal(mass, [1.0, 1.0])
+    np.testing.assert_array_equal(damping, [0.04, 0.06])
+    np.testing.assert_array_equal(stiffness, [4.0, 9.0])
     assert (model.n_modes, model.name, model.effects) == (2, "structure", ())
