@@ -26,7 +26,7 @@ from snrmjax.identify.prediction import (
 from snrmjax.identify.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from snrmjax.measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
 from snrmjax.measure.steady_states import SteadyStates, join_steady_states, steady_states
-from snrmjax.model.averaging import averaged_force, averaged_response
+from snrmjax.model.averaging import averaged_effect, averaged_force, averaged_response
 from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import LinearModes, linear_modes, linear_response
@@ -65,12 +65,13 @@ __all__ = [
     "ResponseBatch",
     "ResponseCurve",
     "SnrmPoints",
-    "SteadyStates",
     "StabilityLoss",
+    "SteadyStates",
     "StepControl",
     "Structure",
     "VirtualTest",
     "appropriation_of",
+    "averaged_effect",
     "averaged_force",
     "averaged_response",
     "closed_form",

@@ -254,7 +254,8 @@ def write_model(path: FilePath, model: Structure) -> None:
     """Write a structure as the TOML that `read_model` reads.
 
     Numbers are written in full, so that reading gives them back exactly, angular frequencies and
-    phases to one rounding of the unit conversion. The file appears whole or not at all.
+    phases to one rounding of the unit conversion. The test order is not in it: that is the data's.
+    The file appears whole or not at all.
 
     Raises `ValueError` when a file could not hold the model: the rules of the reader apply.
     """

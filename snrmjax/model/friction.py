@@ -4,6 +4,8 @@ A slider with the stuck stiffness k_t and the slip displacement x_s is a spring 
 that rests on a friction surface. The block's position z is pushed along where the spring's
 stretch q − z would exceed ±x_s (the "play" of q). The linear frequency is that of the stuck
 structure, so what a slider adds is k_t (q − z) − k_t q = −k_t z: nothing before the first slip.
+
+Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 """
 
 from abc import abstractmethod
@@ -146,7 +148,7 @@ class IwanMicroslip(AbstractSliders):
     from which the rule is off by less than 1e-4 (p from 1.05 to 2.95), and Δ(ω̃²) ≈ −cQ^(p−1).
 
     `coefficient` c in (kg^1/2 m)^(1−p)/s², `exponent` p between 1 and 3 (p = 2: evenly dense).
-    Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1867998.
+    Reference: Segalman, ASME J. Appl. Mech. 72 (2005), 752, doi:10.1115/1.1989354.
     """
 
     kind: ClassVar[str] = "iwan_microslip"
