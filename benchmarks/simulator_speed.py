@@ -234,7 +234,7 @@ def environment(folder: Path, peer: str) -> Path | None:
     try:
         if not python.exists():
             subprocess.run([sys.executable, "-m", "venv", folder / peer], check=True)
-        install = [python, "-m", "pip", "install", "--quiet", "-r", requirements]
+        install = [python, "-m", "pip", "install", "-qq", "-r", requirements]
         subprocess.run(install, check=True, stdout=sys.stderr)
     except subprocess.CalledProcessError as error:
         tell(measurement="environment", method=peer, status=f"skipped: not installed ({error})")
