@@ -45,6 +45,12 @@ from snrmjax.simulate.forced_response import (
 )
 from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.normal_modes import NormalModeBranch, nonlinear_normal_mode
+from snrmjax.simulate.periodic_motion import (
+    PeriodicMotion,
+    motions_at_velocities,
+    periodic_motion,
+    response_at_velocities,
+)
 from snrmjax.simulate.response_curve import ResponseCurve
 from snrmjax.simulate.stability import StabilityLoss, floquet_multipliers
 from snrmjax.simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
@@ -58,6 +64,7 @@ __all__ = [
     "LinearModes",
     "MeasurementErrors",
     "NormalModeBranch",
+    "PeriodicMotion",
     "PointStatus",
     "PolynomialPotential",
     "PredictedResponse",
@@ -91,9 +98,11 @@ __all__ = [
     "linear_response",
     "make_effect",
     "mode_indicator",
+    "motions_at_velocities",
     "nnm_appropriation",
     "nonlinear_mode_velocity",
     "nonlinear_normal_mode",
+    "periodic_motion",
     "phase_resonance_test",
     "polynomial_potential",
     "potential_from_force_table",
@@ -101,6 +110,7 @@ __all__ = [
     "reference_sensor",
     "resonance_by_fixed_point",
     "resonances",
+    "response_at_velocities",
     "snrm_velocity",
     "solve_at_frequency",
     "steady_states",

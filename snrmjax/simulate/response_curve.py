@@ -41,6 +41,10 @@ class ResponseCurve(NamedTuple):
         """Indices of the points at which an event of this kind was located."""
         return np.array([k for k, e in enumerate(self.event) if kind in e.split("+")], dtype=int)
 
+    def point(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients (kg^1/2 m) and frequency (rad/s) of a point: a start for other solvers."""
+        return self.coefficients[k], self.frequency[k]
+
     @property
     def stability_loss(self) -> tuple[StabilityLoss, ...]:
         """By which kind of multiplier each point is unstable.

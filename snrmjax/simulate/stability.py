@@ -9,18 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.friction import AbstractSliders
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.blocks import padded
+from snrmjax.simulate.blocks import over_cores, padded
 
-_BLOCK = 64  # points whose linearised motions are integrated side by side
-# Symmetric composition of order 6 with 9 stages: Kahan & Li, Math. Comp. 66 (1997) 1089.
-_STAGES = (
-    *(0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981),
-    *(0.08221359629355080023, 0.79854399093482996340, 0.08221359629355080023),
-    *(-0.70624617255763935981, 0.33259913678935943860, 0.39216144400731413928),
-)
+_BLOCK = 32  # points whose linearised motions are integrated side by side
+_SEGMENT = 32  # steps whose propagators are computed side by side
+_GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
 class StabilityLoss(Enum):
@@ -44,34 +39,36 @@ def floquet_multipliers(
     coefficients: Float[Array, "point coefficient mode"],
     frequency: Float[Array, " point"],
     *,
-    steps_per_cycle: int = 12,
+    steps_per_cycle: int = 6,
 ) -> Complex[np.ndarray, "point multiplier"]:
     """Floquet multipliers of periodic motions: eigenvalues of the map over one period.
 
-    Integrates m δq̈ + C(t)δq̇ + K(t)δq = 0 with the tangent matrices along the motion by a
-    composition of order 6 that keeps a conservative structure's multipliers on the unit circle,
+    Integrates m δq̈ + C(t)δq̇ + K(t)δq = 0 with the tangent matrices along the motion by Magnus'
+    method of order 6, which keeps a conservative structure's multipliers on the unit circle,
     however light the damping. Sliders are linearised as they are: dragged or stuck. A motion is
     stable when all multipliers lie inside the unit circle.
 
     Arguments: Fourier coefficients (kg^1/2 m) of the structure as simulated, `frequency` in
     rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are worked on in blocks of
-    one size, so that the number of points does not compile anew.
+    one size, so that neither their number nor that of the steps compiles anew.
     Returns NaN for points that are not finite.
+    Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
     """
     values = np.asarray(coefficients, dtype=np.float64)
     omega = np.asarray(frequency, dtype=np.float64)
-    n_points = len(values)
-    found = np.full((n_points, 2 * model.n_modes), np.nan, dtype=np.complex128)
-    for begin in range(0, n_points, _BLOCK):
+    if not len(values):
+        return np.zeros((0, 2 * model.n_modes), dtype=np.complex128)
+
+    def block(begin: int) -> np.ndarray:
         here = slice(begin, begin + _BLOCK)
-        rows, speed = padded(values[here], _BLOCK), padded(omega[here], _BLOCK)
-        n_steps = _steps(model, jnp.asarray(rows), jnp.asarray(speed), steps_per_cycle)
-        maps = np.asarray(monodromy(model, jnp.asarray(rows), jnp.asarray(speed), n_steps))
-        finite = np.all(np.isfinite(maps), axis=(1, 2))
-        maps = np.where(finite[:, None, None], maps, 0.0)
-        multipliers = np.where(finite[:, None], np.linalg.eigvals(maps), np.nan)
-        found[here] = multipliers[: len(found[here])]
-    return found
+        rows = jnp.asarray(padded(values[here], _BLOCK))
+        speed = jnp.asarray(padded(omega[here], _BLOCK))
+        maps = monodromy(model, rows, speed, _segments(model, rows, speed, steps_per_cycle))
+        maps = np.asarray(maps)[: len(values[here])]
+        finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]
+        return np.where(finite, np.linalg.eigvals(np.where(finite[:, :, None], maps, 0.0)), np.nan)
+
+    return np.concatenate(over_cores(block, range(0, len(values), _BLOCK)))
 
 
 def is_stable(
@@ -100,33 +97,53 @@ def stability_loss(
 
 
 @eqx.filter_jit
-def _steps(
+def _segments(
     model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: int
 ) -> Int[Array, ""]:
-    """Steps over one period that resolve the fastest tangent frequency along the motions."""
-    terms = model.linear_terms()
-    order = (coefficients.shape[1] - 1) // 2
+    """Segments of a period whose steps resolve the fastest tangent frequency of the motions."""
+    terms, (_, friction, _) = model.linear_terms(), _sliders(model, coefficients, frequency)
 
     def fastest(tau: Array) -> Array:
-        q, v = _state_at(coefficients, frequency, tau)
-        k = (jnp.diag(terms.stiffness) + model.tangent_stiffness(q, v)) / terms.mass[:, None]
-        return jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=2), axis=1)) / frequency
+        k, c = _tangents(model, friction, coefficients, frequency, tau[None])
+        rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1), axis=-1))
+        return jnp.maximum(rate, 0.5 * jnp.max(c, axis=-1))[0]
 
     cycles = jnp.max(jnp.nan_to_num(jax.lax.map(fastest, 2 * jnp.pi * jnp.arange(48) / 48)))
-    smooth = all(isinstance(e, AbstractMemoryless) for e in model.effects)
-    least = max(24, 6 * order) if smooth and not model.effects else 512
-    return jnp.clip(jnp.ceil(steps_per_cycle * cycles), least, 50_000).astype(int)
+    least = 512 if model.effects else 8 * (coefficients.shape[1] // 2)
+    n_steps = jnp.maximum(steps_per_cycle * cycles, least) + 0 * terms.mass[0]
+    return jnp.clip(jnp.ceil(n_steps / _SEGMENT), 1, 1000).astype(int)
 
 
-def _state_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
-    """q and q̇ of all points at the phase τ, the same for all or one for each."""
+def _tangents(
+    model: Structure, friction: list, coefficients: Array, frequency: Array, tau: Array
+) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode"]]:
+    """K/mΩ² and C/mΩ (by mode) of all points at phases τ (time,) or (time, point)."""
+    j, (n_points, _, n) = model.modes.mode_of_interest, coefficients.shape
+    terms = model.linear_terms()
+    q, v = _states_at(coefficients, frequency, jnp.broadcast_to(tau.T, (n_points, len(tau))).T)
+    flat_q, flat_v = q.reshape(-1, n), v.reshape(-1, n)
+    k = model.tangent_stiffness(flat_q, flat_v).reshape(*q.shape, n)
+    viscous = model.tangent_damping(flat_q, flat_v).reshape(q.shape[:2])
+    for effect in friction:
+        slope = jax.vmap(
+            lambda e, q, v: jax.grad(e.state_force, argnums=1)(q, v, e.initial_states())
+        )
+        viscous = viscous + jax.vmap(lambda q, v: slope(effect, q, v))(q[..., j], v[..., j])
+    c = jnp.broadcast_to(terms.damping, q.shape).at[..., j].add(viscous)
+    per_mass = terms.mass * frequency[:, None]
+    k = (k + jnp.diag(terms.stiffness)) / (per_mass * frequency[:, None])[:, :, None]
+    return k, c / per_mass
+
+
+def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
+    """q and q̇ of all points at phases τ (time, point), as (time, point, mode)."""
     orders = jnp.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
-    angle = jnp.broadcast_to(tau, frequency.shape)[:, None] * orders
+    angle = tau[..., None] * orders
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     mean, a, b = coefficients[:, 0], coefficients[:, 1::2], coefficients[:, 2::2]
-    q = mean + jnp.einsum("ph,phm->pm", cosine, a) + jnp.einsum("ph,phm->pm", sine, b)
-    rate = jnp.einsum("ph,phm->pm", cosine, orders[:, None] * b)
-    rate = rate - jnp.einsum("ph,phm->pm", sine, orders[:, None] * a)
+    q = mean + jnp.einsum("tph,phm->tpm", cosine, a) + jnp.einsum("tph,phm->tpm", sine, b)
+    rate = jnp.einsum("tph,phm->tpm", cosine, orders[:, None] * b)
+    rate = rate - jnp.einsum("tph,phm->tpm", sine, orders[:, None] * a)
     return q, frequency[:, None] * rate
 
 
@@ -135,72 +152,93 @@ def monodromy(
     model: Structure,
     coefficients: Float[Array, "point coefficient mode"],
     frequency: Float[Array, " point"],
-    n_steps: Int[Array, ""],
+    n_segments: Int[Array, ""],
 ) -> Float[Array, "point state state"]:
-    """The linearised map of (δq, δq̇/Ω) over one period, from `n_steps` steps.
+    """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
 
-    Each stage goes half a step of damping and drift, a kick by the stiffness at its middle, and
-    back: second order and symmetric, with the damping exact.
+    `n_segments` segments of 64 steps; the propagators of a segment's steps are computed side by
+    side and then applied one after the other.
     """
     n, j, n_points = model.n_modes, model.modes.mode_of_interest, frequency.shape[0]
     terms = model.linear_terms()
     begin, friction, memory = _sliders(model, coefficients, frequency)
-    step = 2 * jnp.pi / n_steps
-    shares = jnp.asarray(_STAGES)
-    # Where a stage's middle lies within its step.
-    middles = jnp.cumsum(shares) - 0.5 * shares
+    step = 2 * jnp.pi / (n_segments * _SEGMENT)
+    unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
+    size = 2 * n + (memory is not None)
 
-    def tangents(tau: Array) -> tuple[Array, Array]:
-        """K/mΩ² and C/mΩ of all points, the latter by mode."""
-        q, v = _state_at(coefficients, frequency, begin + tau)
-        k = jnp.diag(terms.stiffness) + model.tangent_stiffness(q, v)
-        viscous = model.tangent_damping(q, v)
-        for effect in friction:
-            slope = jax.vmap(
-                lambda e, q, v: jax.grad(e.state_force, argnums=1)(q, v, e.initial_states())
-            )
-            viscous = viscous + slope(effect, q[:, j], v[:, j])
-        c = jnp.broadcast_to(terms.damping, (n_points, n)).at[:, j].add(viscous)
-        per_mass = terms.mass * frequency[:, None]
-        return k / (per_mass * frequency[:, None])[:, :, None], c / per_mass
-
-    def stage(state: tuple, k: Array, share: Array, middle: Array) -> tuple:
-        q, v, z = state
-        h = share * step
-        stiffness, damping = tangents((k + middle) * step)
-        decay = jnp.exp(-0.5 * h * damping)[:, :, None]
-        v = v * decay
-        q = q + 0.5 * h * v
-        # Written out as a sum of products, which vectorises; small batched products do not.
-        force = jnp.sum(stiffness[:, :, :, None] * q[:, None, :, :], axis=2)
-        if memory is not None:
-            dragged = memory.dragged[k * memory.dragged.shape[0] // n_steps]
-            block = jnp.where(dragged[:, :, None], q[:, j, None, :], z)
+    def generators(start: Array, held: Array | None) -> Array:
+        """The matrices A of y' = A y at the Gauss points of a segment's steps."""
+        tau = start + step * (jnp.arange(_SEGMENT)[:, None] + _GAUSS).reshape(-1)
+        k, c = _tangents(model, friction, coefficients, frequency, begin + tau[:, None])
+        a = jnp.zeros((len(tau), n_points, size, size))
+        if memory is not None and held is not None:
             per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
-            force = force.at[:, j].add(-jnp.sum(per_mass[:, :, None] * block, axis=1))
-        v = v - h * force
-        q = q + 0.5 * h * v
-        return q, v * decay, z
+            dragged = jnp.repeat(jnp.sum(jnp.where(held, 0.0, per_mass), axis=2), 3, axis=0)
+            k = k.at[:, :, j, j].add(-dragged)
+            a = a.at[:, :, n + j, 2 * n].set(1.0 / unit)
+        own = np.arange(n)
+        a = a.at[:, :, own, n + own].set(unit[:, None])
+        a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
+        a = a.at[:, :, n + own, n + own].set(-c)
+        return a.reshape(_SEGMENT, 3, n_points, size, size)
 
-    def advance(k: Array, state: tuple) -> tuple:
-        def one(i: Array, state: tuple) -> tuple:
-            return stage(state, k, shares[i], middles[i])
-
-        q, v, z = jax.lax.fori_loop(0, len(_STAGES), one, state)
+    def segment(number: Array, state: tuple) -> tuple:
+        held = None
         if memory is not None:
-            dragged = memory.dragged[k * memory.dragged.shape[0] // n_steps]
-            z = jnp.where(dragged[:, :, None], q[:, j, None, :], z)
-        return q, v, z
+            index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * len(memory.dragged)
+            held = ~memory.dragged[index // (n_segments * _SEGMENT)]
+        start = number * _SEGMENT * step
+        propagators = _magnus(generators(start, held), step)
 
-    eye = jnp.broadcast_to(jnp.eye(2 * n), (n_points, 2 * n, 2 * n))
-    q, v = eye[:, :n], eye[:, n:]
-    if memory is None:
-        z = jnp.zeros((n_points, 0, 2 * n))
-    else:
+        def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
+            y, z = state
+            propagator, stuck = item
+            if memory is None:
+                return (propagator @ y, z), None
+            per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
+            pull = jnp.sum(jnp.where(stuck, per_mass, 0.0)[:, :, None] * z, axis=1)
+            y = propagator[:, :-1, :-1] @ y + propagator[:, :-1, -1:] * pull[:, None, :]
+            return (y, jnp.where(stuck[:, :, None], z, y[:, j, None, :])), None
+
+        return jax.lax.scan(advance, state, (propagators, held))[0]
+
+    y = jnp.broadcast_to(jnp.eye(2 * n), (n_points, 2 * n, 2 * n))
+    z = jnp.zeros((n_points, 0, 2 * n))
+    if memory is not None:
         slips = jnp.any(memory.dragged, axis=0)
-        z = jnp.where(slips[:, :, None], q[:, j, None, :], 0.0)
-    q, v, _ = jax.lax.fori_loop(0, n_steps, advance, (q, v, z))
-    return jnp.concatenate([q, v], axis=1)
+        z = jnp.where(slips[:, :, None], y[:, j, None, :], 0.0)
+    return jax.lax.fori_loop(0, n_segments, segment, (y, z))[0]
+
+
+def _magnus(
+    generators: Float[Array, "step gauss point state state"], step: Array
+) -> Float[Array, "step point state state"]:
+    """Propagators over steps from y' = A(t) y at their three Gauss points."""
+
+    def bracket(a: Array, b: Array) -> Array:
+        return a @ b - b @ a
+
+    first, middle, last = (step * generators[:, i] for i in range(3))
+    slope = np.sqrt(15.0) / 3.0 * (last - first)
+    bend = 10.0 / 3.0 * (last - 2 * middle + first)
+    inner = bracket(middle, slope)
+    outer = -bracket(middle, 2 * bend + inner) / 60.0
+    exponent = middle + bend / 12.0
+    exponent = exponent + bracket(-20.0 * middle - bend + inner, slope + outer) / 240.0
+    return _exponential(exponent)
+
+
+def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*batch state state"]:
+    """e^M by Taylor's series of order 9 of M/16 and squaring: exact to rounding for |M| up to 3."""
+    x = matrix / 16.0
+    x2 = x @ x
+    x3 = x2 @ x
+    eye = jnp.eye(matrix.shape[-1])
+    high = eye / 720 + x / 5040 + x2 / 40320 + x3 / 362880
+    result = (high @ x3 + (eye / 6 + x / 24 + x2 / 120)) @ x3 + (eye + x + x2 / 2)
+    for _ in range(4):
+        result = result @ result
+    return result
 
 
 def _sliders(
@@ -215,8 +253,8 @@ def _sliders(
         return jnp.zeros_like(frequency), [], None
     j, n_samples = model.modes.mode_of_interest, 512
     tau = 2 * jnp.pi * jnp.arange(n_samples) / n_samples
-    q, v = jax.vmap(lambda t: _state_at(coefficients, frequency, t))(tau)
-    q, v = q[:, :, j], v[:, :, j]
+    every = jnp.broadcast_to(tau[:, None], (n_samples, len(frequency)))
+    q, v = (part[:, :, j] for part in _states_at(coefficients, frequency, every))
     largest = jnp.argmax(q, axis=0)
     half_range = 0.5 * (jnp.max(q, axis=0) - jnp.min(q, axis=0))
     typical = jnp.sqrt(jnp.mean(v**2, axis=0))
