@@ -183,6 +183,11 @@ def test_statics_know_linear_changes_and_no_friction():
     places = sorted(float(e.displacement[0]) for e in found)
     np.testing.assert_allclose(places, [-2, 0, 2], atol=1e-12)
     assert displacement_scale(single(**effects)) == [1e-3]
+    # k = ω²(1 − 0.9)² = 0.04 and the force 0.02 q(q − 1)(q − 2): 1 is unstable, but only with k.
+    shift = {"linear_frequency_shift": {"relative_shift": -0.9}}
+    found = equilibria(single(potential={"111": -0.02, "1111": 0.005}, **shift))
+    np.testing.assert_allclose([e.displacement[0] for e in found], [0, 1, 2], atol=1e-12)
+    assert [e.stable for e in found] == [True, False, True]
 
 
 # ----------------------------------------------------------------------------------- equilibria
