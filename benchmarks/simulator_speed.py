@@ -7,8 +7,8 @@ frequency) and the monostable curved beam (20). The peers get the equations as n
 package, and run in environments of their own: pyHarm-os, jaxcont, and a plain NumPy/SciPy program
 (`peers/`). The limit is as many LU factorisations as snrmjax used, and nothing else. All methods
 take turns, medians of several warm runs; the first run is given apart as compile time. snrmjax's
-public verb also locates events and judges stability, which no peer does: "snrmjax, curve only"
-is the same curve without.
+public verb also locates events and judges stability, which no peer does: "snrmjax, no stability"
+leaves out the latter. The factorisations that locate events are not counted in the limit.
 
 Every curve is compared with snrmjax's of 31 harmonics (the truncation of nine shows there) and of
 nine in fine steps (errors of the method show there): the largest distance of a point to the
@@ -22,8 +22,6 @@ curves go to `--out` as .npz.
 """
 
 import argparse
-import importlib
-import inspect
 import json
 import os
 import subprocess
@@ -48,7 +46,6 @@ PEERS = Path(__file__).parent / "peers"
 HARMONICS, REFERENCE_HARMONICS = 9, 31
 ROUNDS = {"snrmjax": 5, "numpy_scipy": 5, "jaxcont": 5, "pyHarm": 3, "lu": 5}
 PEER_TOLERANCE = 1e-8  # on the last step or the residual, in scaled unknowns
-SOLVES_PER_POINT = 3.0  # where a curve does not count its factorisations in `n_solves`
 PEER_LIMIT_SECONDS = 300.0  # for one answer of a peer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # faster at these sizes
 
@@ -97,65 +94,18 @@ def respond(
     )
 
 
-def curve_only(case: Case) -> list[sj.ResponseCurve]:
-    """The curve without stability and events, as the peers follow it.
-
-    By settings of the public verb where it has them, otherwise by the step behind it.
-    """
-    known = inspect.signature(sj.forced_response).parameters
-    settings = {name: False for name in ("stability", "events") if name in known}
-    if settings:
-        return respond(case, **settings)
-    module = importlib.import_module("snrmjax.simulate.forced_response")
-    balance = module.harmonic_balance(
-        case.model,
-        case.force,
-        module.resonance_displacement(case.model, case.force),
-        harmonic_order=HARMONICS,
-    )
-    ends = jnp.asarray([case.from_hz, case.to_hz]) * HERTZ
-    found = module._follow(balance, ends, sj.StepControl(), 4000, jnp.array(case.downward))
-    n = int(found.n_points)
-    points = np.asarray(found.points)[:n]
-    size = case.unknowns - 1
-    x = points[:, :size].reshape(n, -1, case.model.n_modes) * float(balance.displacement_scale)
-    omega = points[:, -1] * float(balance.frequency_scale)
-    shape = np.asarray(case.model.modes.mode_shape)
-    amplitude = omega * np.hypot(x[:, 1] @ shape[0], x[:, 2] @ shape[0])
-    return [
-        Followed(
-            frequency=omega,
-            velocity=np.stack([np.zeros(n), amplitude], axis=1)[:, :, None],
-            status=sj.CurveStatus(int(found.status)),
-            n_solves=getattr(found, "n_solves", None),
-        )
-    ]
+def without_stability(case: Case) -> list[sj.ResponseCurve]:
+    """The same without stability, which the peers do not judge either."""
+    return respond(case, stability=False)
 
 
-class Followed(NamedTuple):
-    """What of a `ResponseCurve` this benchmark needs."""
-
-    frequency: np.ndarray  # rad/s
-    velocity: np.ndarray  # (point, harmonic, sensor)
-    status: sj.CurveStatus
-    n_solves: object
-
-
-METHODS = {"snrmjax": respond, "snrmjax, curve only": curve_only}
+METHODS = {"snrmjax": respond, "snrmjax, no stability": without_stability}
 
 
 def midspan(curves: list[sj.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
     """Frequency (Hz) and velocity amplitude of the fundamental (m/s) along the curve."""
     frequency = np.concatenate([np.asarray(c.frequency) for c in curves]) / HERTZ
     return frequency, np.concatenate([np.abs(np.asarray(c.velocity)[:, 1, 0]) for c in curves])
-
-
-def solves(curves: list[sj.ResponseCurve]) -> int:
-    """Factorisations behind some curves: counted, or estimated from the points."""
-    counts = [getattr(c, "n_solves", None) for c in curves]
-    if all(count is not None for count in counts):
-        return int(np.sum([np.asarray(count) for count in counts]))
-    return round(SOLVES_PER_POINT * sum(len(c.frequency) for c in curves))
 
 
 def reference(case: Case, harmonics: int) -> tuple[np.ndarray, np.ndarray]:
@@ -391,11 +341,10 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
             first[name] - warm if name == "snrmjax" else None,  # the other shares its program
             seconds=warm,
             version=f"snrmjax {version('snrmjax')}, jax {jax.__version__}",
-            settings="stability and events too" if name == "snrmjax" else "",
+            settings="events and stability" if name == "snrmjax" else "events",
             status=" + ".join(sj.CurveStatus(int(c.status)).name for c in curves[name]),
             reached_hz=float(curve[0][-1]),
-            n_solves=solves(curves[name]),
-            n_solves_counted=getattr(curves[name][0], "n_solves", None) is not None,
+            n_solves=sum(int(c.n_solves) for c in curves[name]),
         )
     for peer in peers:
         told = dict(peer.first)
@@ -414,7 +363,7 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
         if told["status"] == "ok":
             per_point[told["method"]] = per
     one = {name: float(np.median(times)) for name, times in lu.items()}
-    count = solves(curves["snrmjax, curve only"])
+    count = sum(int(c.n_solves) for c in curves["snrmjax"])
     for name, each in one.items():
         tell(
             measurement="lu_limit",
@@ -428,7 +377,7 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
     peer_times = {k: v for k, v in per_point.items() if k not in METHODS}
     fastest = min(peer_times, key=peer_times.get, default=None)
     ratios: dict[str, object] = {"beam": case.beam, "fastest_peer": fastest}
-    for name, label in (("snrmjax", "ours"), ("snrmjax, curve only", "curve_only")):
+    for name, label in (("snrmjax", "ours"), ("snrmjax, no stability", "no_stability")):
         ratios[f"{label}_over_lu_limit"] = float(np.median(seconds[name])) / (
             min(one.values()) * count
         )
@@ -528,31 +477,29 @@ def second_model() -> None:
 
 
 def batch(n_forces: int = 64) -> None:
-    """Many forces as single calls and as one batch."""
-    verb = getattr(sj, "forced_response_batch", None)
+    """Many forces as single calls and as one batch, without stability."""
     for case in CASES:
-        fields = {"measurement": "batch_of_forces", "beam": case.beam, "forces": n_forces}
-        if verb is None:
-            tell(**fields, status="skipped: snrmjax has no forced_response_batch")
-            continue
+        settings = {"harmonic_order": HARMONICS, "stability": False}
         forces = np.geomspace(0.1 * case.force, case.force, n_forces).tolist()
         ends = (case.from_hz * HERTZ, case.to_hz * HERTZ)
 
-        def one_by_one(case: Case = case, forces: list = forces, ends: tuple = ends) -> list:
-            return [
-                sj.forced_response(case.model, [force], *ends, harmonic_order=HARMONICS)
-                for force in forces
-            ]
+        def one_by_one(
+            case: Case = case, forces: list = forces, ends: tuple = ends, settings: dict = settings
+        ) -> list:
+            return [sj.forced_response(case.model, [force], *ends, **settings) for force in forces]
 
-        def together(case: Case = case, forces: list = forces, ends: tuple = ends) -> object:
-            return jax.block_until_ready(verb(case.model, forces, *ends, harmonic_order=HARMONICS))
+        def together(
+            case: Case = case, forces: list = forces, ends: tuple = ends, settings: dict = settings
+        ) -> object:
+            return sj.forced_response_batch(case.model, forces, *ends, **settings)
 
         first = {f.__name__: timed(f)[0] for f in (one_by_one, together)}
         runs = [(timed(one_by_one)[0], timed(together)[0]) for _ in range(3)]
         single, batched = np.median(runs, axis=0).tolist()
         tell(
-            **fields,
-            status="ok",
+            measurement="batch_of_forces",
+            beam=case.beam,
+            forces=n_forces,
             single_calls_seconds=single,
             batch_seconds=batched,
             batch_compile_seconds=first["together"] - batched,
