@@ -52,6 +52,7 @@ class StepControl(NamedTuple):
     angle: float = 0.1  # rad, aimed at between neighbouring tangents
     tolerance: float = 1e-9  # on the error that is left after the last Newton step
     iterations: int = 8
+    kink: float = 2e-4  # steps below it may turn sharply: a force with a kink bends the curve
 
 
 def traced(control: StepControl) -> StepControl:
@@ -137,8 +138,8 @@ def follow_curve(
     corrected at its own λ, or across `start_across`; `direction` says which way to go. The next
     point is guessed by the cubic through the last two points and their tangents. A step is
     halved when Newton's method fails, when it ends far from the guess, or when the tangent turns
-    by more than three times `control.angle`; otherwise it is chosen so that the next turn comes
-    near `control.angle`.
+    by more than three times `control.angle` (but for a kink, which steps below `control.kink`
+    may pass); otherwise it is chosen so that the next turn comes near `control.angle`.
     The last point of a curve that left the range lies on its end; that of a closed one is the
     first again.
     Raises `ValueError` when `max_points` is below 2.
@@ -168,7 +169,9 @@ def follow_curve(
 
         turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
         miss = jnp.linalg.norm(new - guess)
-        near = (miss < 0.3 * state.step) & (turn < 3 * control.angle)
+        smooth = (miss < 0.3 * state.step) & (turn < 3 * control.angle)
+        kinked = (state.step < control.kink) & (miss < 2 * state.step) & (turn < 0.5 * jnp.pi)
+        near = smooth | kinked
         good = found.converged & (is_first | is_end | near)
         beyond_upper, beyond_lower = new[-1] > upper, new[-1] < lower
         leaving = good & (beyond_upper | beyond_lower) & (state.aim == ordinary)
