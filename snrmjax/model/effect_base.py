@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.modes import LinearModes
@@ -57,6 +58,47 @@ class AbstractMemoryless(AbstractForce):
     ) -> Float[Array, " time"]:
         """See `AbstractForce.cycle_force`; valid for any samples, of one period or not."""
         return jax.vmap(self.force)(displacement, velocity)
+
+
+class AbstractKinked(AbstractMemoryless):
+    """A memoryless force whose slope jumps where a contact opens or closes.
+
+    In time the kink is a kink. Over a cycle it is rounded over a hundredth of half the range of
+    q to either side: harmonic balance sees a cycle at samples, and a kink between two of them
+    would move in steps. The stiffness that a motion feels changes by less than 1e-4 of the
+    contact's.
+    """
+
+    @abstractmethod
+    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
+        """The force with its kinks rounded over ±`width` (kg^1/2 m) of displacement."""
+
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        """See `AbstractMemoryless.force`."""
+        return self.rounded_force(displacement, velocity, jnp.zeros(()))
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """See `AbstractForce.cycle_force`; the kinks are rounded with the cycle's own range."""
+        width = 0.5 * KINK_WIDTH * (jnp.max(displacement) - jnp.min(displacement))
+        return jax.vmap(lambda q, v: self.rounded_force(q, v, width))(displacement, velocity)
+
+
+KINK_WIDTH = 0.02  # over which a kink is rounded, to either side, over half the range of q
+
+
+def ramp(beyond: Scalar, width: Scalar) -> Scalar:
+    """max(x, 0), rounded over ±`width` so that the first two derivatives are continuous.
+
+    >>> ramp(jnp.array([-1.0, 0.0, 3.0]), jnp.array(0.0))
+    Array([0., 0., 3.], dtype=float64)
+    """
+    sharp = jnp.maximum(beyond, 0.0)
+    safe = jnp.where(width > 0, width, 1.0)
+    share = jnp.clip(beyond / safe, -1.0, 1.0)
+    rounded = safe * (1 + share) ** 3 * (3 - share) / 16
+    return jnp.where((width > 0) & (jnp.abs(beyond) < width), rounded, sharp)
 
 
 class AbstractHysteresis(AbstractForce):

@@ -16,7 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless, Scalar
+from snrmjax.model.effect_base import (
+    AbstractEffect,
+    AbstractKinked,
+    AbstractMemoryless,
+    Scalar,
+    ramp,
+)
 from snrmjax.model.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
 from snrmjax.model.linear_changes import (
     AddedMass,
@@ -70,18 +76,18 @@ class QuinticStiffness(AbstractMemoryless):
         return self.coefficient * displacement**5
 
 
-class BilinearStiffness(AbstractMemoryless):
+class BilinearStiffness(AbstractKinked):
     """f = k|q|/2: stiffness differs by k between the two sides; even harmonics ∝ Q."""
 
     kind: ClassVar[str] = "bilinear_stiffness"
     stiffness: Scalar
 
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return 0.5 * self.stiffness * jnp.abs(displacement)
+    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
+        """See `AbstractKinked.rounded_force`."""
+        return 0.5 * self.stiffness * (ramp(displacement, width) + ramp(-displacement, width))
 
 
-class GapStiffness(AbstractMemoryless):
+class GapStiffness(AbstractKinked):
     """A spring k that engages beyond ±gap; threshold and odd harmonics."""
 
     kind: ClassVar[str] = "gap_stiffness"
@@ -89,22 +95,22 @@ class GapStiffness(AbstractMemoryless):
     stiffness: Scalar
     gap: Scalar
 
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        beyond = jnp.maximum(jnp.abs(displacement) - self.gap, 0.0)
-        return self.stiffness * beyond * jnp.sign(displacement)
+    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
+        """See `AbstractKinked.rounded_force`."""
+        above = ramp(displacement - self.gap, width)
+        return self.stiffness * (above - ramp(-displacement - self.gap, width))
 
 
-class OneSidedStop(AbstractMemoryless):
+class OneSidedStop(AbstractKinked):
     """A spring k that engages beyond +gap; threshold and even harmonics."""
 
     kind: ClassVar[str] = "one_sided_stop"
     stiffness: Scalar
     gap: Scalar
 
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.stiffness * jnp.maximum(displacement - self.gap, 0.0)
+    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
+        """See `AbstractKinked.rounded_force`."""
+        return self.stiffness * ramp(displacement - self.gap, width)
 
 
 class QuadraticDamping(AbstractMemoryless):

@@ -15,6 +15,7 @@ from snrmjax.model.effect_base import (
     AbstractForce,
     AbstractForceSpectrum,
     AbstractHysteresis,
+    AbstractKinked,
     AbstractLinearChange,
     AbstractMeasurementEffect,
     AbstractMemoryless,
@@ -63,6 +64,20 @@ class Structure(eqx.Module):
         return tuple(e for e in self.effects if isinstance(e, AbstractHysteresis))
 
     @property
+    def by_cycle(self) -> tuple[AbstractForce, ...]:
+        """The effects whose force over a cycle needs the whole cycle: friction and kinks."""
+        kinds = (AbstractHysteresis, AbstractKinked)
+        return tuple(e for e in self.effects if isinstance(e, kinds))
+
+    @property
+    def pointwise(self) -> "Structure":
+        """The structure without the effects of `by_cycle`."""
+        by_cycle = {id(e) for e in self.by_cycle}
+        return dataclasses.replace(
+            self, effects=tuple(e for e in self.effects if id(e) not in by_cycle)
+        )
+
+    @property
     def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
         """The effects that falsify the record, in the order in which they act."""
         found = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
@@ -95,23 +110,22 @@ class Structure(eqx.Module):
     ) -> Float[Array, "time mode"]:
         """Nonlinear modal force ∂V/∂q + Σ effects over a steady cycle, in kg^1/2 m/s².
 
-        Arguments: equally spaced samples of one period (without friction, any samples).
+        Arguments: equally spaced samples of one period.
         """
-        forces = tuple(e for e in self.effects if isinstance(e, AbstractForce))
-        return self._force(forces, displacement, velocity)
+        force, j = self.potential.force(displacement), self.modes.mode_of_interest
+        for effect in self.effects:
+            if isinstance(effect, AbstractForce):
+                values = effect.cycle_force(displacement[:, j], velocity[:, j])
+                force = force.at[:, j].add(values)
+        return force
 
     def memoryless_force(
         self, displacement: Float[Array, "time mode"], velocity: Float[Array, "time mode"]
     ) -> Float[Array, "time mode"]:
         """The part of `nonlinear_force` without friction, at any samples, in kg^1/2 m/s²."""
-        return self._force(self.memoryless, displacement, velocity)
-
-    def _force(
-        self, effects: tuple[AbstractForce, ...], displacement: Array, velocity: Array
-    ) -> Array:
         force, j = self.potential.force(displacement), self.modes.mode_of_interest
-        for effect in effects:
-            values = effect.cycle_force(displacement[:, j], velocity[:, j])
+        for effect in self.memoryless:
+            values = jax.vmap(effect.force)(displacement[:, j], velocity[:, j])
             force = force.at[:, j].add(values)
         return force
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import averaged_effect
-from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_base import AbstractForce, AbstractKinked
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.harmonics import (
     alias_free_samples,
@@ -99,7 +99,7 @@ class HarmonicBalance(eqx.Module):
         residual = balance.reshape(-1) - self.force * self.load()
         if not with_jacobian:
             return residual, jnp.zeros((0,))
-        tangent = model.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
+        tangent = model.pointwise.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
         blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
         blocks = blocks.transpose(0, 2, 1, 3)
         eye, own = jnp.eye(size)[:, None, :], np.arange(n)
@@ -110,7 +110,7 @@ class HarmonicBalance(eqx.Module):
         )
         blocks = blocks.at[:, own, :, own].add(linear.transpose(1, 0, 2))
         column = damping * slope - 2 * omega * inertia * x
-        if model.effects and not self.cosine_only:
+        if model.effects:
             added, by_rate = self._effects(samples, rate, by_omega, omega)
             j = model.modes.mode_of_interest
             blocks = blocks.at[:, j, :, j].add(added)
@@ -123,17 +123,17 @@ class HarmonicBalance(eqx.Module):
     ) -> tuple[Array, Array]:
         """What velocity and history add on the mode of interest: the block and the λ column."""
         model, j = self.model, self.model.modes.mode_of_interest
-        basis = harmonic_basis(self.harmonic_order, self.n_samples)
+        basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
         unit = self.frequency_scale**2 * self.displacement_scale
         q, v, v_omega = samples[:, j], rate[:, j], by_omega[:, j]
-        viscous = model.tangent_damping(samples, rate)
+        viscous = model.pointwise.tangent_damping(samples, rate)
         viscous_blocks = tangent_blocks(basis, viscous[:, None])[:, :, 0] @ basis.derivative
         block = viscous_blocks * (omega / self.frequency_scale)
         change = viscous * v_omega
-        if model.hysteretic:
+        if model.by_cycle:
 
             def cycle(q: Array, v: Array) -> Array:
-                return sum((e.cycle_force(q, v) for e in model.hysteretic), jnp.zeros_like(q))
+                return sum((e.cycle_force(q, v) for e in model.by_cycle), jnp.zeros_like(q))
 
             def along(direction: Array, direction_rate: Array) -> Array:
                 return jax.jvp(cycle, (q, v), (direction, direction_rate))[1]
@@ -173,8 +173,9 @@ def harmonic_balance(
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
         if model.effects:
             n_samples = max(n_samples, 128, 16 * harmonic_order)
-        if model.hysteretic and not cosine_only:
-            n_samples = max(n_samples, 256)
+        if model.by_cycle:
+            kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
+            n_samples = max(n_samples, 512 if kinked else 256)
     modes = model.modes
     return HarmonicBalance(
         model=model,
