@@ -20,11 +20,33 @@ def padded(rows: np.ndarray, at_least: int = 128) -> np.ndarray:
     return np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)])
 
 
+def by_blocks(
+    function: Callable[..., tuple], size: int, *rows: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A compiled function of rows, called with blocks of `size` rows, the last one filled up."""
+    n = len(rows[0])
+    parts = []
+    for begin in range(0, max(n, 1), size):
+        block = []
+        for row in rows:
+            some = row[begin : begin + size]
+            fill = ((0, size - len(some)), *((0, 0),) * (row.ndim - 1))
+            block.append(jnp.asarray(np.pad(some, fill)))
+        parts.append([np.asarray(a)[: n - begin] for a in function(*block)])
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
 def stacked(trees: Sequence[T]) -> T:
     """One tree whose arrays have a leading axis over `trees`.
 
     Raises `ValueError` when the trees differ in anything but the numbers in their arrays.
     """
+    if all(tree is trees[0] for tree in trees):
+        n = len(trees)
+        return jax.tree.map(
+            lambda a: np.broadcast_to(np.asarray(a), (n, *np.shape(a))) if eqx.is_array(a) else a,
+            trees[0],
+        )
     arrays, fixed = eqx.partition(list(trees), eqx.is_array)
     first = jax.tree.structure(arrays[0]), fixed[0]
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(arrays[0])]
@@ -85,4 +107,7 @@ def over_cores(
 
 def as_arrays(tree: T) -> T:
     """Arrays of the host as arrays of the device."""
-    return jax.tree.map(lambda a: jnp.asarray(a) if isinstance(a, np.ndarray) else a, tree)
+    # All at once: one by one they take longer than the programs that use them. A number of the
+    # host that stayed one would be compiled into the program.
+    held, fixed = eqx.partition(tree, lambda a: isinstance(a, (np.ndarray, np.generic)))
+    return eqx.combine(jax.device_put(held), fixed)

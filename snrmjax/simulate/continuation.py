@@ -154,9 +154,7 @@ def follow_curve(
 
     def body(state: _Walk) -> _Walk:
         n, here, tangent = state.n_points, state.here, state.tangent
-        guess = _extrapolated(
-            state.back, state.back_tangent, here, tangent, state.step, n >= 2
-        )
+        guess = _extrapolated(state.back, state.back_tangent, here, tangent, state.step, n >= 2)
         row = tangent
         is_first, is_end = state.aim == first, state.aim == to_end
         guess = jnp.where(is_first, start, jnp.where(is_end, state.pending, guess))

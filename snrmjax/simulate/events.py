@@ -1,5 +1,6 @@
 """Folds, peaks, phase resonances and bifurcations along curves of periodic motions."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.simulate.blocks import as_arrays, mapped, taken
+from snrmjax.simulate.blocks import as_arrays, by_blocks, mapped, taken
 from snrmjax.simulate.continuation import StepControl, correct, locate_event
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.stability import floquet_multipliers
@@ -16,6 +17,7 @@ from snrmjax.simulate.stability import floquet_multipliers
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
 BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
 _BLOCK = 8  # intervals that one call works on
+_POINTS = 128  # points whose test functions one call evaluates
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
@@ -65,7 +67,12 @@ def _all_test_values(balance: HarmonicBalance, points: Array, tangents: Array) -
 
 @eqx.filter_jit
 def _locate(
-    balances: HarmonicBalance, kind: Array, here: Array, tangent: Array, there: Array, wanted: Array,
+    balances: HarmonicBalance,
+    kind: Array,
+    here: Array,
+    tangent: Array,
+    there: Array,
+    wanted: Array,
     steps: StepControl,
 ) -> tuple:
     def one(balance: HarmonicBalance, *row: Array) -> tuple:
@@ -81,8 +88,13 @@ def _locate(
 
 @eqx.filter_jit
 def _between(
-    balances: HarmonicBalance, here: Array, tangent: Array, there: Array, share: Array,
-    wanted: Array, steps: StepControl,
+    balances: HarmonicBalance,
+    here: Array,
+    tangent: Array,
+    there: Array,
+    share: Array,
+    wanted: Array,
+    steps: StepControl,
 ) -> tuple:
     """Points of the curve at shares of the way between neighbours, with their tangents."""
 
@@ -96,6 +108,17 @@ def _between(
         return found.point, found.tangent, found.converged
 
     return mapped(one, balances, here, tangent, there, share, wanted)
+
+
+def compile_events_ahead(balances: HarmonicBalance, steps: StepControl) -> None:
+    """Have the programs of `with_events` compiled, without a curve yet."""
+    n = _BLOCK
+    one = as_arrays(taken(balances, 0))
+    points = jnp.zeros((_POINTS, one.size + 1))
+    _all_test_values(one, points, points)
+    rows = as_arrays(taken(balances, np.zeros(n, dtype=int)))
+    some, none = points[:n], jnp.zeros(n, dtype=bool)
+    _locate(rows, jnp.zeros(n, dtype=int), some, some, some, none, steps)
 
 
 def _in_blocks(function, balances: HarmonicBalance, owner: np.ndarray, rows: tuple, steps) -> list:
@@ -122,12 +145,14 @@ def with_events(
     A peak is a maximum of the velocity fundamental at the first sensor; a phase resonance has
     the velocity in phase with the force.
     """
-    divided = _divided(balances, curves, steps)
+    known = [_heights(balances, number, curve) for number, curve in enumerate(curves)]
+    divided = _divided(balances, curves, known, steps)
     owner, kind, position = [], [], []
     for number, curve in enumerate(divided):
         if len(curve.points) < 2:
             continue
-        heights, slopes = _heights(balances, number, curve)
+        same = curve is curves[number]
+        heights, slopes = known[number] if same else _heights(balances, number, curve)
         values = np.stack([slopes[:, 0], slopes[:, 1], heights[:, 2]], axis=1)
         change = np.signbit(values[:-1]) != np.signbit(values[1:])
         # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
@@ -152,23 +177,22 @@ def _heights(
     balances: HarmonicBalance, number: int, curve: Walked
 ) -> tuple[np.ndarray, np.ndarray]:
     """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength."""
-    size = max(128, 1 << (len(curve.points) - 1).bit_length())
-    fill = ((0, size - len(curve.points)), (0, 0))
-    arrays = (jnp.asarray(np.pad(a, fill)) for a in (curve.points, curve.tangents))
-    found = _all_test_values(as_arrays(taken(balances, number)), *arrays)
-    heights, slopes = (np.asarray(a)[: len(curve.points)] for a in found)
+    one = as_arrays(taken(balances, number))
+    heights, slopes = by_blocks(
+        lambda *rows: _all_test_values(one, *rows), _POINTS, curve.points, curve.tangents
+    )
     return heights, slopes
 
 
 def _divided(
-    balances: HarmonicBalance, curves: list[Walked], steps: StepControl
+    balances: HarmonicBalance, curves: list[Walked], known: list[tuple], steps: StepControl
 ) -> list[Walked]:
     """The curves with points added where two events may lie between neighbours."""
     owner, position, share = [], [], []
     for number, curve in enumerate(curves):
         if len(curve.points) < 2:
             continue
-        heights, slopes = _heights(balances, number, curve)
+        heights, slopes = known[number]
         length = np.linalg.norm(np.diff(curve.points, axis=0), axis=1)
         doubtful = np.zeros(len(length), dtype=bool)
         for column in range(2):
@@ -194,7 +218,11 @@ def _divided(
 
 
 def _points_between(
-    balances: HarmonicBalance, curves: list[Walked], owner: list, position: list, share: list,
+    balances: HarmonicBalance,
+    curves: list[Walked],
+    owner: list,
+    position: list,
+    share: list,
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pairs = list(zip(owner, position, strict=True))
@@ -240,15 +268,19 @@ def _may_vanish_twice(
 
 
 def _inserted(
-    curves: list[Walked], owner: list, position: list, points: np.ndarray, tangents: np.ndarray,
-    labels: list[str], *, always: bool = False,
+    curves: list[Walked],
+    owner: list,
+    position: list,
+    points: np.ndarray,
+    tangents: np.ndarray,
+    labels: list[str],
+    *,
+    always: bool = False,
 ) -> list[Walked]:
     """The curves with labelled points put in their places, in order along each step."""
     result = []
     for number, curve in enumerate(curves):
-        mine = [
-            e for e, o in enumerate(owner) if o == number and (always or labels[e])
-        ]
+        mine = [e for e, o in enumerate(owner) if o == number and (always or labels[e])]
         if not mine:
             result.append(curve)
             continue
@@ -285,7 +317,7 @@ def with_bifurcations(
     regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
     outside = np.sum(np.abs(multipliers) > 1.0, axis=1)
     crossings = []
-    for k, following in zip(regular[:-1], regular[1:], strict=True):
+    for k, following in itertools.pairwise(regular):
         change = abs(int(outside[following]) - int(outside[k]))
         across_fold = following > k + 1
         if change == 0 or (across_fold and change == 1):
@@ -299,7 +331,10 @@ def with_bifurcations(
 
 
 def _located_bifurcations(
-    balance: HarmonicBalance, curve: Walked, multipliers: np.ndarray, crossings: list[int],
+    balance: HarmonicBalance,
+    curve: Walked,
+    multipliers: np.ndarray,
+    crossings: list[int],
     steps: StepControl,
 ) -> tuple[Walked, np.ndarray]:
     """Divide the intervals until the crossing is known to a millionth of a step."""
@@ -314,9 +349,9 @@ def _located_bifurcations(
             balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
         )
         rows = _multipliers_of(member, found)
-        count = np.where(
-            ok, np.sum(np.abs(rows) > 1.0, axis=1), np.repeat(first, _INSIDE)
-        ).reshape(shares.shape)
+        count = np.where(ok, np.sum(np.abs(rows) > 1.0, axis=1), np.repeat(first, _INSIDE)).reshape(
+            shares.shape
+        )
         beyond = count != first[:, None]
         index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
         edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
@@ -338,7 +373,9 @@ def _located_bifurcations(
 def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:
     size = (balance.n_coefficients, balance.model.n_modes)
     x = points[:, :-1].reshape(-1, *size) * np.asarray(balance.displacement_scale)
-    return floquet_multipliers(balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale))
+    return floquet_multipliers(
+        balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale)
+    )
 
 
 def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:

@@ -1,6 +1,7 @@
 """Forced responses by harmonic balance: whole curves, folds and resonances included."""
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.model.structure import Structure, simulated_structure
-from snrmjax.simulate.blocks import as_arrays, mapped, over_cores, stacked, taken
+from snrmjax.simulate.blocks import as_arrays, mapped, on_accelerator, over_cores, stacked, taken
 from snrmjax.simulate.continuation import (
     Curve,
     CurveStatus,
@@ -24,8 +25,14 @@ from snrmjax.simulate.harmonic_balance import (
     harmonic_balance,
     linear_coefficients,
     resonance_displacement,
+    samples_for,
 )
-from snrmjax.simulate.response_curve import FollowedCurve, ResponseCurve, assembled
+from snrmjax.simulate.response_curve import (
+    FollowedCurve,
+    ResponseCurve,
+    assembled,
+    compile_ahead,
+)
 
 DEFAULT_STEPS = StepControl()
 _BLOCK = 8  # curves that one program follows
@@ -190,14 +197,17 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
 def _chunk_of_curves(
     models: list[Structure], forces: np.ndarray, ends: Array, settings: _Settings
 ) -> list[tuple[ResponseCurve, ...]]:
-    finite = [all(bool(jnp.all(jnp.isfinite(a))) for a in jax.tree.leaves(m)) for m in models]
-    valid = np.isfinite(forces) & (forces > 0) & np.array(finite)
+    leaves = {id(m): jax.tree.leaves(m) for m in models}
+    finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
+    valid = np.isfinite(forces) & (forces > 0) & np.array([finite[id(m)] for m in models])
     good = np.flatnonzero(valid)
-    balances = _balances(
-        [models[k] for k in (good if good.size else [0])],
-        forces[good] if good.size else np.ones(1),
-        settings,
-    )
+    results: list[list[ResponseCurve]] = [[] for _ in models]
+    for k in np.flatnonzero(~valid):
+        results[k].append(_no_curve(models[k], float(forces[k]), settings))
+    if not good.size:
+        return [tuple(curves) for curves in results]
+    balances = _balances([models[k] for k in good], forces[good], settings)
+    ahead = _compiling_ahead(balances, settings)
     upward = _followed(balances, np.arange(len(good)), ends, settings, downward=False)
     # Beside a superharmonic resonance the linear response is no start: let the force rise.
     lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
@@ -208,6 +218,7 @@ def _chunk_of_curves(
     # Below a strong softening the lower end has several solutions; the upper end has one.
     short = [k for k, c in enumerate(upward) if c.status != CurveStatus.UPPER_END]
     downward = _followed(balances, np.array(short, dtype=int), ends, settings, downward=True)
+    ahead.result()
     owner, parts = [], []
     for k, curve in enumerate(upward):
         pieces = [curve]
@@ -216,7 +227,6 @@ def _chunk_of_curves(
             pieces = [back] if back.status == CurveStatus.UPPER_END else [curve, back]
         owner += [k] * len(pieces)
         parts += pieces
-    results: list[list[ResponseCurve]] = [[] for _ in models]
     jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
 
     def finished(job: np.ndarray) -> list[ResponseCurve]:
@@ -227,9 +237,23 @@ def _chunk_of_curves(
     for job, curves in zip(jobs, over_cores(finished, jobs), strict=True):
         for e, curve in zip(job, curves, strict=True):
             results[good[owner[e]]].append(curve)
-    for k in np.flatnonzero(~valid):
-        results[k].append(_no_curve(models[k], float(forces[k]), settings))
     return [tuple(curves) for curves in results]
+
+
+_COMPILED: set = set()
+_COMPILER = ThreadPoolExecutor(1, thread_name_prefix="snrmjax-compile")
+
+
+def _compiling_ahead(balances: HarmonicBalance, settings: _Settings) -> Future:
+    """Where this kind of structure is new, later programs compile beside the first one."""
+    leaves, kind = jax.tree.flatten(balances)
+    key = (kind, tuple(np.shape(leaf)[1:] for leaf in leaves), settings.stability)
+    if key in _COMPILED or on_accelerator():
+        done: Future = Future()
+        done.set_result(None)
+        return done
+    _COMPILED.add(key)
+    return _COMPILER.submit(compile_ahead, balances, settings.steps, stability=settings.stability)
 
 
 def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCurve:
@@ -247,33 +271,19 @@ def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCu
     )
 
 
-def _balances(
-    models: list[Structure], forces: np.ndarray, settings: _Settings
-) -> HarmonicBalance:
-    """The balances of all members, stacked."""
-    same = all(model is models[0] for model in models)
-    scales = _scales(
-        as_arrays(stacked(models[:1] if same else models)), jnp.asarray(forces), same
+def _balances(models: list[Structure], forces: np.ndarray, settings: _Settings) -> HarmonicBalance:
+    """The balances of all members, stacked, on the host."""
+    together = stacked(models)
+    j = models[0].modes.mode_of_interest
+    scales = [resonance_displacement(m, float(f)) for m, f in zip(models, forces, strict=True)]
+    return HarmonicBalance(
+        model=together,
+        force=np.asarray(forces),
+        displacement_scale=np.array(scales),
+        frequency_scale=np.asarray(together.modes.natural_frequency)[:, j],
+        harmonic_order=settings.harmonic_order,
+        n_samples=samples_for(models[0], settings.harmonic_order, settings.n_samples),
     )
-    balances = [
-        harmonic_balance(
-            model,
-            force,
-            scale,
-            harmonic_order=settings.harmonic_order,
-            n_samples=settings.n_samples,
-        )
-        for model, force, scale in zip(models, forces, np.asarray(scales), strict=True)
-    ]
-    return stacked(balances)
-
-
-@eqx.filter_jit
-def _scales(models: Structure, forces: Array, same: bool) -> Float[Array, " member"]:
-    if same:
-        first = jax.tree.map(lambda a: a[0], models)
-        return jax.lax.map(lambda force: resonance_displacement(first, force), forces)
-    return jax.lax.map(lambda row: resonance_displacement(*row), (models, forces))
 
 
 def _followed(
@@ -293,20 +303,21 @@ def _followed(
         rows = job[np.minimum(np.arange(size), len(job) - 1)]
         mine = as_arrays(taken(balances, rows))
         wanted = jnp.arange(size) < len(job)
-        starts, ready = (_ramped if ramp else _linear_starts)(
-            mine, ends, jnp.array(downward), settings.steps, settings.max_points
-        )
-        curve = _follow(
-            *(mine, starts, ends, settings.steps, settings.max_points),
-            *(jnp.array(downward), wanted & ready),
-        )
-        n_points, status, n_solves = (
-            np.asarray(a) for a in (curve.n_points, curve.status, curve.n_solves)
-        )
+        if ramp:
+            starts, ready = _ramped(mine, ends, settings.steps, settings.max_points)
+            curve = _follow(
+                *(mine, ends, settings.steps, settings.max_points),
+                *(jnp.array(downward), wanted & ready, starts),
+            )
+        else:
+            curve = _follow(
+                mine, ends, settings.steps, settings.max_points, jnp.array(downward), wanted
+            )
+        points, tangents, n_points, status, n_solves = (np.asarray(a) for a in curve)
         return [
             FollowedCurve(
-                np.asarray(curve.points[k, : n_points[k]]),
-                np.asarray(curve.tangents[k, : n_points[k]]),
+                points[k, : n_points[k]].copy(),
+                tangents[k, : n_points[k]].copy(),
                 CurveStatus(int(status[k])),
                 int(n_solves[k]),
             )
@@ -317,29 +328,14 @@ def _followed(
 
 
 @eqx.filter_jit
-def _linear_starts(
-    balances: HarmonicBalance, ends: Array, downward: Array, steps: StepControl, max_points: int
-) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
-    begin = jnp.where(downward, ends[1], ends[0])
-
-    def one(balance: HarmonicBalance) -> Array:
-        x = linear_coefficients(balance.model, balance.force, begin, balance.harmonic_order)
-        return balance.point(x, begin)
-
-    starts = jax.vmap(one)(balances)
-    return starts, jnp.ones(starts.shape[0], dtype=bool)
-
-
-@eqx.filter_jit
 def _ramped(
-    balances: HarmonicBalance, ends: Array, downward: Array, steps: StepControl, max_points: int
+    balances: HarmonicBalance, ends: Array, steps: StepControl, max_points: int
 ) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
-    """Starts found by following the response at the first frequency to a rising force."""
-    begin = jnp.where(downward, ends[1], ends[0])
+    """Starts found by following the response at the lower frequency to a rising force."""
 
     def one(balance: HarmonicBalance) -> tuple[Array, Array]:
         load = balance.force * balance.load()
-        frequency = begin / balance.frequency_scale
+        frequency = ends[0] / balance.frequency_scale
 
         def rising(point: Array) -> tuple[Array, Array]:
             now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
@@ -360,16 +356,24 @@ def _ramped(
 @eqx.filter_jit
 def _follow(
     balances: HarmonicBalance,
-    starts: Float[Array, "member unknown"],
     ends: Float[Array, " end"],
     steps: StepControl,
     max_points: int,
     downward: Bool[Array, ""],
     wanted: Bool[Array, " member"],
+    starts: Float[Array, "member unknown"] | None = None,
 ) -> Curve:
-    """Curves from their starts through the frequency range; those not wanted do not start."""
+    """Curves through the frequency range from `starts`, or from the linear response.
 
-    def one(balance: HarmonicBalance, start: Array, wanted: Array) -> Curve:
+    Those not wanted do not start.
+    """
+
+    def one(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
+        if start is None:
+            begin = jnp.where(downward, ends[1], ends[0])
+            order = balance.harmonic_order
+            linear = linear_coefficients(balance.model, balance.force, begin, order)
+            start = balance.point(linear, begin)
         direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
         return follow_curve(
             balance.linearised,
@@ -382,7 +386,7 @@ def _follow(
             max_points,
         )
 
-    return mapped(one, balances, starts, wanted)
+    return mapped(one, balances, wanted, *(() if starts is None else (starts,)))
 
 
 def solve_at_frequency(

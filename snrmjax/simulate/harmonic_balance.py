@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.averaging import averaged_effect
+from snrmjax.model.averaging import AveragedForce, averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.harmonics import (
@@ -162,6 +162,24 @@ def harmonic_balance(
     Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to tell the
     harmonics apart.
     """
+    n_samples = samples_for(model, harmonic_order, n_samples)
+    modes = model.modes
+    return HarmonicBalance(
+        model=model,
+        force=jnp.asarray(force, dtype=jnp.float64),
+        displacement_scale=jnp.asarray(displacement_scale, dtype=jnp.float64),
+        frequency_scale=modes.natural_frequency[modes.mode_of_interest],
+        harmonic_order=harmonic_order,
+        n_samples=n_samples,
+        cosine_only=cosine_only,
+    )
+
+
+def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) -> int:
+    """Time samples over a period: those asked for, or what the model's forces need.
+
+    Raises `ValueError` as `harmonic_balance` does.
+    """
     if harmonic_order < 1:
         raise ValueError(f"`harmonic_order` must be 1 or more, but is {harmonic_order}.")
     if n_samples is not None and n_samples <= 2 * harmonic_order:
@@ -176,16 +194,7 @@ def harmonic_balance(
         if model.by_cycle:
             kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
             n_samples = max(n_samples, 512 if kinked else 256)
-    modes = model.modes
-    return HarmonicBalance(
-        model=model,
-        force=jnp.asarray(force, dtype=jnp.float64),
-        displacement_scale=jnp.asarray(displacement_scale, dtype=jnp.float64),
-        frequency_scale=modes.natural_frequency[modes.mode_of_interest],
-        harmonic_order=harmonic_order,
-        n_samples=n_samples,
-        cosine_only=cosine_only,
-    )
+    return n_samples
 
 
 def linear_coefficients(
@@ -199,33 +208,41 @@ def linear_coefficients(
     return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
 
 
-def resonance_displacement(
-    model: Structure, force: Float[Array, ""] | float
-) -> Float[Array, ""]:
+def resonance_displacement(model: Structure, force: float) -> float:
     """Rough displacement (kg^1/2 m) of the mode of interest at resonance: a scale, no result.
 
     Solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, and with the
     averages of the effects. The damping counts as at least that of ζ = 5e-5, and the scale is
     at least the static displacement of every mode, so that no motion is small beside it.
     """
-    modes, terms, j = model.modes, model.linear_terms(), model.modes.mode_of_interest
-    omega = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
+    modes, j = model.modes, model.modes.mode_of_interest
+    mass, damping, stiffness = (np.asarray(part) for part in model.linear_terms())
+    participation = np.asarray(modes.participation)
+    omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
-    load = jnp.abs(force * modes.participation[j])
-    quartic = jnp.zeros(())
-    if (j,) * 4 in model.potential.monomials:
-        own = model.potential.coefficient[model.potential.monomials.index((j,) * 4)]
-        quartic = jnp.maximum(3.0 * own, 0.0)
-    static = jnp.max(jnp.abs(force * modes.participation / terms.stiffness))
-    largest = load / (jnp.maximum(terms.damping[j], least_damping) * omega)
-    largest = jnp.maximum(largest, 1e-300)
-    amplitude = largest * jnp.logspace(-9, 0, 361)
-    stiffness = terms.stiffness[j] + quartic * amplitude**2
-    viscous = jnp.full(amplitude.shape, terms.damping[j])
-    for effect in model.effects:
-        if isinstance(effect, AbstractForce):
-            average = averaged_effect(effect, amplitude, omega, n_samples=128)
-            stiffness = stiffness + jnp.maximum(average.stiffness, 0.0)
-            viscous = viscous + average.damping
-    needed = jnp.maximum(viscous, least_damping) * jnp.sqrt(stiffness) * amplitude
-    return jnp.maximum(static, jnp.interp(load, jax.lax.cummax(needed), amplitude))
+    load = abs(force * participation[j])
+    own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
+    quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
+    static = float(np.max(np.abs(force * participation / stiffness)))
+    if load == 0:
+        return static
+    largest = load / (max(damping[j], least_damping) * omega)
+    amplitude = largest * np.logspace(-9, 0, 361)
+    needed_stiffness = stiffness[j] + quartic * amplitude**2
+    viscous = np.full(amplitude.shape, damping[j])
+    forces = tuple(e for e in model.effects if isinstance(e, AbstractForce))
+    if forces:
+        added = _averages(forces, jnp.asarray(amplitude), jnp.asarray(omega))
+        needed_stiffness = needed_stiffness + np.maximum(np.asarray(added.stiffness), 0.0)
+        viscous = viscous + np.asarray(added.damping)
+    needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
+    return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
+
+
+@eqx.filter_jit
+def _averages(effects: tuple[AbstractForce, ...], amplitude: Array, omega: Array) -> AveragedForce:
+    """What all effects together do to a mode, by averaging."""
+    each = [averaged_effect(effect, amplitude, omega, n_samples=128) for effect in effects]
+    return AveragedForce(
+        *(sum(part, jnp.zeros_like(amplitude)) for part in zip(*each, strict=True))
+    )

@@ -163,7 +163,7 @@ def _solved(
 
     def newton(_: object, start: Point) -> Point:
         def body(state: tuple) -> tuple:
-            point, count, _, finite = state
+            point, count, _, _ = state
             residual, jacobian = balance.linearised(point)
             value, slope = jax.value_and_grad(test)(point)
             matrix = jnp.concatenate([jacobian, slope[None]])

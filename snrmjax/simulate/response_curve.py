@@ -5,13 +5,17 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.simulate.blocks import as_arrays, over_cores, padded, taken
+from snrmjax.simulate.blocks import as_arrays, by_blocks, over_cores, taken
 from snrmjax.simulate.continuation import CurveStatus, StepControl
-from snrmjax.simulate.events import Walked, with_bifurcations, with_events
+from snrmjax.simulate.events import (
+    Walked,
+    compile_events_ahead,
+    with_bifurcations,
+    with_events,
+)
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.stability import (
@@ -100,6 +104,17 @@ def assembled(
     return over_cores(finished, range(len(curves)))
 
 
+def compile_ahead(balances: HarmonicBalance, steps: StepControl, *, stability: bool) -> None:
+    """Have the programs of `assembled` compiled while the first curve is being followed."""
+    one = as_arrays(taken(balances, 0))
+    points = np.full((2, one.size + 1), 1e-9)
+    points[:, -1] = 1.0
+    if stability:
+        _multipliers(one, Walked(points, points, ("", "")))
+    compile_events_ahead(balances, steps)
+    by_blocks(lambda points: _motion(one, points), 128, points)
+
+
 def _multipliers(balance: HarmonicBalance, curve: Walked) -> Complex[np.ndarray, "point _"]:
     shape = (len(curve.points), balance.n_coefficients, balance.model.n_modes)
     x = curve.points[:, :-1].reshape(shape) * np.asarray(balance.displacement_scale)
@@ -115,13 +130,9 @@ def _response(
     branch: str,
 ) -> ResponseCurve:
     model, n = balance.model, len(curve.points)
-    if n == 0:
-        frequency, velocity = np.zeros(0), np.zeros((0, balance.harmonic_order + 1, 0))
-        coefficients = np.zeros((0, balance.n_coefficients, model.n_modes))
-        velocity = np.zeros((0, balance.harmonic_order + 1, len(model.modes.sensors)), complex)
-    else:
-        motion = _motion(balance, jnp.asarray(padded(curve.points)))
-        frequency, coefficients, velocity = (np.asarray(a)[:n] for a in motion)
+    frequency, coefficients, velocity = by_blocks(
+        lambda points: _motion(balance, points), 128, curve.points
+    )
     stable = np.zeros(n, dtype=bool) if multipliers is None else is_stable(multipliers)
     return ResponseCurve(
         force=float(balance.force),

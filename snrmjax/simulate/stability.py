@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.friction import AbstractSliders
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import over_cores, padded
@@ -63,7 +64,7 @@ def floquet_multipliers(
         here = slice(begin, begin + _BLOCK)
         rows = jnp.asarray(padded(values[here], _BLOCK))
         speed = jnp.asarray(padded(omega[here], _BLOCK))
-        maps = monodromy(model, rows, speed, _segments(model, rows, speed, steps_per_cycle))
+        maps = monodromy(model, rows, speed, steps_per_cycle)
         maps = np.asarray(maps)[: len(values[here])]
         finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]
         return np.where(finite, np.linalg.eigvals(np.where(finite[:, :, None], maps, 0.0)), np.nan)
@@ -96,24 +97,6 @@ def stability_loss(
     return tuple(kinds)
 
 
-@eqx.filter_jit
-def _segments(
-    model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: int
-) -> Int[Array, ""]:
-    """Segments of a period whose steps resolve the fastest tangent frequency of the motions."""
-    terms, (_, friction, _) = model.linear_terms(), _sliders(model, coefficients, frequency)
-
-    def fastest(tau: Array) -> Array:
-        k, c = _tangents(model, friction, coefficients, frequency, tau[None])
-        rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1), axis=-1))
-        return jnp.maximum(rate, 0.5 * jnp.max(c, axis=-1))[0]
-
-    cycles = jnp.max(jnp.nan_to_num(jax.lax.map(fastest, 2 * jnp.pi * jnp.arange(48) / 48)))
-    least = 512 if model.effects else 8 * (coefficients.shape[1] // 2)
-    n_steps = jnp.maximum(steps_per_cycle * cycles, least) + 0 * terms.mass[0]
-    return jnp.clip(jnp.ceil(n_steps / _SEGMENT), 1, 1000).astype(int)
-
-
 def _tangents(
     model: Structure, friction: list, coefficients: Array, frequency: Array, tau: Array
 ) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode"]]:
@@ -125,14 +108,22 @@ def _tangents(
     k = model.tangent_stiffness(flat_q, flat_v).reshape(*q.shape, n)
     viscous = model.tangent_damping(flat_q, flat_v).reshape(q.shape[:2])
     for effect in friction:
-        slope = jax.vmap(
-            lambda e, q, v: jax.grad(e.state_force, argnums=1)(q, v, e.initial_states())
-        )
-        viscous = viscous + jax.vmap(lambda q, v: slope(effect, q, v))(q[..., j], v[..., j])
+        viscous = viscous + _viscous_slope(effect, q[..., j], v[..., j])
     c = jnp.broadcast_to(terms.damping, q.shape).at[..., j].add(viscous)
     per_mass = terms.mass * frequency[:, None]
     k = (k + jnp.diag(terms.stiffness)) / (per_mass * frequency[:, None])[:, :, None]
     return k, c / per_mass
+
+
+def _viscous_slope(
+    effects: AbstractHysteresis, q: Float[Array, "time point"], v: Float[Array, "time point"]
+) -> Float[Array, "time point"]:
+    """∂f/∂q̇ of friction without memory, one effect for every point."""
+
+    def slope(effect: AbstractHysteresis, q: Array, v: Array) -> Array:
+        return jax.grad(effect.state_force, argnums=1)(q, v, effect.initial_states())
+
+    return jax.vmap(lambda q, v: jax.vmap(slope)(effects, q, v))(q, v)
 
 
 def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
@@ -152,16 +143,23 @@ def monodromy(
     model: Structure,
     coefficients: Float[Array, "point coefficient mode"],
     frequency: Float[Array, " point"],
-    n_segments: Int[Array, ""],
+    steps_per_cycle: int | Int[Array, ""],
 ) -> Float[Array, "point state state"]:
     """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
 
-    `n_segments` segments of 64 steps; the propagators of a segment's steps are computed side by
-    side and then applied one after the other.
+    The steps resolve the fastest tangent frequency of all points. The propagators of a segment
+    of steps are computed side by side and then applied one after the other.
     """
     n, j, n_points = model.n_modes, model.modes.mode_of_interest, frequency.shape[0]
     terms = model.linear_terms()
     begin, friction, memory = _sliders(model, coefficients, frequency)
+    phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
+    k, c = _tangents(model, friction, coefficients, frequency, phases)
+    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1)))
+    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(c)))
+    least = 512 if model.effects else 6 * (coefficients.shape[1] // 2)
+    n_steps = jnp.maximum(steps_per_cycle * cycles, least)
+    n_segments = jnp.clip(jnp.ceil(n_steps / _SEGMENT), 1, 1000).astype(int)
     step = 2 * jnp.pi / (n_segments * _SEGMENT)
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
     size = 2 * n + (memory is not None)
