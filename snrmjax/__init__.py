@@ -36,7 +36,15 @@ from snrmjax.model.potential import (
     potential_from_force_table,
 )
 from snrmjax.model.structure import Structure, equilibria, structure
+from snrmjax.simulate.branches import isolated_responses
 from snrmjax.simulate.continuation import CurveStatus, StepControl
+from snrmjax.simulate.controlled import (
+    ControlledCurve,
+    DampedModeBranch,
+    damped_normal_mode,
+    phase_controlled,
+    response_controlled,
+)
 from snrmjax.simulate.forced_response import (
     ResponseBatch,
     forced_response,
@@ -44,7 +52,7 @@ from snrmjax.simulate.forced_response import (
     solve_at_frequency,
 )
 from snrmjax.simulate.harmonics import velocity_phasors
-from snrmjax.simulate.normal_modes import NormalModeBranch, nonlinear_normal_mode
+from snrmjax.simulate.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
 from snrmjax.simulate.periodic_motion import (
     PeriodicMotion,
     motions_at_velocities,
@@ -59,7 +67,9 @@ __all__ = [
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
+    "ControlledCurve",
     "CurveStatus",
+    "DampedModeBranch",
     "Identification",
     "LinearModes",
     "MeasurementErrors",
@@ -76,6 +86,7 @@ __all__ = [
     "SteadyStates",
     "StepControl",
     "Structure",
+    "Tongue",
     "VirtualTest",
     "appropriation_of",
     "averaged_effect",
@@ -83,6 +94,7 @@ __all__ = [
     "averaged_response",
     "closed_form",
     "curved_beam",
+    "damped_normal_mode",
     "equilibria",
     "fit_backbone",
     "flat_beam",
@@ -93,6 +105,7 @@ __all__ = [
     "identify_points",
     "invert_amplitude_phase",
     "invert_phasor",
+    "isolated_responses",
     "join_steady_states",
     "linear_modes",
     "linear_response",
@@ -103,6 +116,7 @@ __all__ = [
     "nonlinear_mode_velocity",
     "nonlinear_normal_mode",
     "periodic_motion",
+    "phase_controlled",
     "phase_resonance_test",
     "polynomial_potential",
     "potential_from_force_table",
@@ -111,6 +125,7 @@ __all__ = [
     "resonance_by_fixed_point",
     "resonances",
     "response_at_velocities",
+    "response_controlled",
     "snrm_velocity",
     "solve_at_frequency",
     "steady_states",

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -71,7 +71,7 @@ def on_accelerator() -> bool:
     return jax.default_backend() != "cpu"
 
 
-def mapped(function: Callable[..., R], *rows: object) -> R:
+def mapped(function: Callable[..., R], *rows: Any) -> R:
     """`function` of every row: one after the other on a CPU, side by side on an accelerator.
 
     On a CPU lanes of a `vmap` wait for the slowest of them and their small matrices are
@@ -97,11 +97,12 @@ def over_cores(
     workers = 1 if on_accelerator() else min(len(jobs), cores or 1)
     results = []
     with ThreadPoolExecutor(max(workers, 1)) as pool:
-        running = [pool.submit(function, job) for job in jobs] if workers > 1 else jobs
-        for done, job in enumerate(running, start=1):
-            results.append(job.result() if workers > 1 else function(job))
+        for done, result in enumerate(
+            map(function, jobs) if workers < 2 else pool.map(function, jobs)
+        ):
+            results.append(result)
             if progress is not None:
-                progress(done, len(jobs))
+                progress(done + 1, len(jobs))
     return results
 
 

@@ -46,18 +46,21 @@ STATUS_MESSAGE: dict[CurveStatus, str] = {
 class StepControl(NamedTuple):
     """Step sizes along the curve, in the scaled unknowns (order one)."""
 
-    first: float = 0.01
-    smallest: float = 1e-7
-    largest: float = 0.05
-    angle: float = 0.1  # rad, aimed at between neighbouring tangents
-    tolerance: float = 1e-9  # on the error that is left after the last Newton step
-    iterations: int = 8
-    kink: float = 2e-4  # steps below it may turn sharply: a force with a kink bends the curve
+    first: float | Array = 0.01
+    smallest: float | Array = 1e-7
+    largest: float | Array = 0.05
+    angle: float | Array = 0.1  # rad, aimed at between neighbouring tangents
+    tolerance: float | Array = 1e-9  # on the error that is left after the last Newton step
+    iterations: int | Array = 8
+    kink: float | Array = (
+        2e-4  # steps below it may turn sharply: a force with a kink bends the curve
+    )
 
 
 def traced(control: StepControl) -> StepControl:
     """The same settings as arrays, so that other numbers do not compile anew."""
-    return StepControl(*(jnp.asarray(value) for value in control))
+    arrays = {name: jnp.asarray(value) for name, value in control._asdict().items()}
+    return StepControl(**arrays)
 
 
 class Curve(NamedTuple):

@@ -278,8 +278,8 @@ def _follow_response(
     start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
     rising = jnp.zeros_like(start).at[-1].set(1.0)
     return follow_curve(
-        *(linearised, start, rising, *(ends / balance.frequency_scale), jnp.array(jnp.inf)),
-        *(steps, max_points),
+        *(linearised, start, rising, ends[0] / balance.frequency_scale),
+        *(ends[1] / balance.frequency_scale, jnp.array(jnp.inf), steps, max_points),
     )
 
 

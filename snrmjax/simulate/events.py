@@ -1,6 +1,7 @@
 """Folds, peaks, phase resonances and bifurcations along curves of periodic motions."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -121,7 +122,13 @@ def compile_events_ahead(balances: HarmonicBalance, steps: StepControl) -> None:
     _locate(rows, jnp.zeros(n, dtype=int), some, some, some, none, steps)
 
 
-def _in_blocks(function, balances: HarmonicBalance, owner: np.ndarray, rows: tuple, steps) -> list:
+def _in_blocks(
+    function: Callable[..., tuple],
+    balances: HarmonicBalance,
+    owner: np.ndarray,
+    rows: tuple[np.ndarray, ...],
+    steps: StepControl,
+) -> list[np.ndarray]:
     """A jitted function of rows, called with blocks of one size."""
     n = len(owner)
     parts = []

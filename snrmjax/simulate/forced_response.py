@@ -11,21 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.model.structure import Structure, simulated_structure
-from snrmjax.simulate.blocks import as_arrays, mapped, on_accelerator, over_cores, stacked, taken
+from snrmjax.simulate.blocks import mapped, on_accelerator, over_cores, taken
 from snrmjax.simulate.continuation import (
-    Curve,
     CurveStatus,
     StepControl,
     correct,
-    follow_curve,
     traced,
 )
+from snrmjax.simulate.following import follow_from_rest, response_balances
 from snrmjax.simulate.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
-    linear_coefficients,
-    resonance_displacement,
-    samples_for,
 )
 from snrmjax.simulate.response_curve import (
     FollowedCurve,
@@ -35,7 +31,7 @@ from snrmjax.simulate.response_curve import (
 )
 
 DEFAULT_STEPS = StepControl()
-_BLOCK = 8  # curves that one program follows
+_BLOCK = 8  # curves that one job completes
 
 
 def forced_response(
@@ -150,10 +146,9 @@ def forced_response_batch(
         rows += found if keep_curves else []
         if progress is not None:
             progress(min(begin + chunk, len(members)), len(members))
-    columns = [np.array(column) for column in zip(*summaries, strict=True)]
-    if not columns:
-        columns = [np.zeros(0)] * 7
-    return ResponseBatch(*columns, curves=tuple(rows))
+    columns = [np.array(column) for column in zip(*summaries, strict=True)] or [np.zeros(0)] * 7
+    named = dict(zip(ResponseBatch._fields[:-1], columns, strict=True))
+    return ResponseBatch(**named, curves=tuple(rows))
 
 
 class _Settings(NamedTuple):
@@ -164,7 +159,9 @@ class _Settings(NamedTuple):
     stability: bool
 
 
-def _paired(models: Structure | Sequence[Structure], forces) -> tuple[list, np.ndarray]:
+def _paired(
+    models: Structure | Sequence[Structure], forces: float | Sequence[float] | np.ndarray
+) -> tuple[list[Structure], np.ndarray]:
     loads = np.atleast_1d(np.asarray(forces, dtype=np.float64))
     members = [models] if isinstance(models, Structure) else list(models)
     if len(members) == 1:
@@ -200,26 +197,30 @@ def _chunk_of_curves(
     leaves = {id(m): jax.tree.leaves(m) for m in models}
     finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
     valid = np.isfinite(forces) & (forces > 0) & np.array([finite[id(m)] for m in models])
-    good = np.flatnonzero(valid)
+    good = np.flatnonzero(valid).tolist()
     results: list[list[ResponseCurve]] = [[] for _ in models]
-    for k in np.flatnonzero(~valid):
+    for k in np.flatnonzero(~valid).tolist():
         results[k].append(_no_curve(models[k], float(forces[k]), settings))
-    if not good.size:
+    if not good:
         return [tuple(curves) for curves in results]
-    balances = _balances([models[k] for k in good], forces[good], settings)
+    balances = response_balances(
+        [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
+    )
+    walk = (ends, settings.steps, settings.max_points)
     ahead = _compiling_ahead(balances, settings)
-    upward = _followed(balances, np.arange(len(good)), ends, settings, downward=False)
+    upward = follow_from_rest(balances, np.arange(len(good)), *walk, downward=False)
     # Beside a superharmonic resonance the linear response is no start: let the force rise.
     lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
     if lost:
-        again = _followed(balances, np.array(lost), ends, settings, downward=False, ramp=True)
+        again = follow_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
         for k, curve in zip(lost, again, strict=True):
             upward[k] = curve
     # Below a strong softening the lower end has several solutions; the upper end has one.
     short = [k for k, c in enumerate(upward) if c.status != CurveStatus.UPPER_END]
-    downward = _followed(balances, np.array(short, dtype=int), ends, settings, downward=True)
+    downward = follow_from_rest(balances, np.array(short, dtype=int), *walk, downward=True)
     ahead.result()
-    owner, parts = [], []
+    owner: list[int] = []
+    parts: list[FollowedCurve] = []
     for k, curve in enumerate(upward):
         pieces = [curve]
         if k in short:
@@ -234,9 +235,9 @@ def _chunk_of_curves(
         some = [parts[e] for e in job]
         return assembled(own, some, settings.steps, stability=settings.stability)
 
-    for job, curves in zip(jobs, over_cores(finished, jobs), strict=True):
-        for e, curve in zip(job, curves, strict=True):
-            results[good[owner[e]]].append(curve)
+    for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
+        for e, response in zip(job, responses, strict=True):
+            results[good[owner[e]]].append(response)
     return [tuple(curves) for curves in results]
 
 
@@ -271,151 +272,41 @@ def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCu
     )
 
 
-def _balances(models: list[Structure], forces: np.ndarray, settings: _Settings) -> HarmonicBalance:
-    """The balances of all members, stacked, on the host."""
-    together = stacked(models)
-    j = models[0].modes.mode_of_interest
-    scales = [resonance_displacement(m, float(f)) for m, f in zip(models, forces, strict=True)]
-    return HarmonicBalance(
-        model=together,
-        force=np.asarray(forces),
-        displacement_scale=np.array(scales),
-        frequency_scale=np.asarray(together.modes.natural_frequency)[:, j],
-        harmonic_order=settings.harmonic_order,
-        n_samples=samples_for(models[0], settings.harmonic_order, settings.n_samples),
-    )
-
-
-def _followed(
-    balances: HarmonicBalance,
-    index: np.ndarray,
-    ends: Array,
-    settings: _Settings,
-    *,
-    downward: bool,
-    ramp: bool = False,
-) -> list[FollowedCurve]:
-    """The curves of the members `index`, in blocks over the cores."""
-    size = 1 if len(index) == 1 else _BLOCK
-    jobs = [index[b : b + size] for b in range(0, len(index), size)]
-
-    def follow(job: np.ndarray) -> list[FollowedCurve]:
-        rows = job[np.minimum(np.arange(size), len(job) - 1)]
-        mine = as_arrays(taken(balances, rows))
-        wanted = jnp.arange(size) < len(job)
-        if ramp:
-            starts, ready = _ramped(mine, ends, settings.steps, settings.max_points)
-            curve = _follow(
-                *(mine, ends, settings.steps, settings.max_points),
-                *(jnp.array(downward), wanted & ready, starts),
-            )
-        else:
-            curve = _follow(
-                mine, ends, settings.steps, settings.max_points, jnp.array(downward), wanted
-            )
-        points, tangents, n_points, status, n_solves = (np.asarray(a) for a in curve)
-        return [
-            FollowedCurve(
-                points[k, : n_points[k]].copy(),
-                tangents[k, : n_points[k]].copy(),
-                CurveStatus(int(status[k])),
-                int(n_solves[k]),
-            )
-            for k in range(len(job))
-        ]
-
-    return [curve for block in over_cores(follow, jobs) for curve in block]
-
-
-@eqx.filter_jit
-def _ramped(
-    balances: HarmonicBalance, ends: Array, steps: StepControl, max_points: int
-) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
-    """Starts found by following the response at the lower frequency to a rising force."""
-
-    def one(balance: HarmonicBalance) -> tuple[Array, Array]:
-        load = balance.force * balance.load()
-        frequency = ends[0] / balance.frequency_scale
-
-        def rising(point: Array) -> tuple[Array, Array]:
-            now = eqx.tree_at(lambda b: b.force, balance, balance.force * point[-1])
-            residual, jacobian = now.linearised(point.at[-1].set(frequency))
-            return residual, jacobian.at[:, -1].set(-load)
-
-        rest = jnp.zeros(balance.size + 1)
-        curve = follow_curve(
-            *(rising, rest, rest.at[-1].set(1.0), jnp.array(-1.0), jnp.array(1.0)),
-            *(jnp.array(jnp.inf), steps, max_points),
-        )
-        last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
-        return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
-
-    return mapped(one, balances)
-
-
-@eqx.filter_jit
-def _follow(
-    balances: HarmonicBalance,
-    ends: Float[Array, " end"],
-    steps: StepControl,
-    max_points: int,
-    downward: Bool[Array, ""],
-    wanted: Bool[Array, " member"],
-    starts: Float[Array, "member unknown"] | None = None,
-) -> Curve:
-    """Curves through the frequency range from `starts`, or from the linear response.
-
-    Those not wanted do not start.
-    """
-
-    def one(balance: HarmonicBalance, wanted: Array, start: Array | None = None) -> Curve:
-        if start is None:
-            begin = jnp.where(downward, ends[1], ends[0])
-            order = balance.harmonic_order
-            linear = linear_coefficients(balance.model, balance.force, begin, order)
-            start = balance.point(linear, begin)
-        direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
-        return follow_curve(
-            balance.linearised,
-            jnp.where(wanted, start, jnp.nan),
-            direction,
-            ends[0] / balance.frequency_scale,
-            ends[1] / balance.frequency_scale,
-            jnp.array(jnp.inf),
-            steps,
-            max_points,
-        )
-
-    return mapped(one, balances, wanted, *(() if starts is None else (starts,)))
-
-
 def solve_at_frequency(
     model: Structure,
     force: Float[Array, " state"],
     frequency: Float[Array, " state"],
     start: Float[Array, "state coefficient mode"],
+    *,
+    n_samples: int | None = None,
 ) -> tuple[Float[Array, "state coefficient mode"], Bool[Array, " state"]]:
     """Periodic motions at given forces (N) and frequencies (rad/s), each from its own guess.
 
     Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
     whether it did.
     """
-    coefficients, converged = _solve_batch(model, force, frequency, start)
+    coefficients, converged = _solve_batch(
+        simulated_structure(model), force, frequency, start, n_samples
+    )
     return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
 
 
 @eqx.filter_jit
-def _solve_batch(model: Structure, force: Array, frequency: Array, start: Array) -> tuple:
+def _solve_batch(
+    model: Structure, force: Array, frequency: Array, start: Array, n_samples: int | None
+) -> tuple:
     harmonic_order = (start.shape[1] - 1) // 2
 
     def one(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
         # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
         static = force * model.modes.participation / model.modes.natural_frequency**2
         scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
-        balance = harmonic_balance(model, force, scale, harmonic_order=harmonic_order)
+        balance = harmonic_balance(
+            model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
+        )
         guess = balance.point(start, frequency)
         fixed = jnp.zeros_like(guess).at[-1].set(1.0)
         found = correct(balance.linearised, guess, fixed, 1e-10, 30)
         return balance.coefficients(found.point), found.converged
 
-    return jax.lax.map(lambda args: one(*args), (force, frequency, start))
+    return mapped(one, force, frequency, start)

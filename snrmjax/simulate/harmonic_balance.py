@@ -143,7 +143,7 @@ class HarmonicBalance(eqx.Module):
             rates = rates * (omega * self.frequency_scale * self.displacement_scale)
             block = block + basis.analysis @ jax.vmap(along)(shapes, rates).T / unit
             change = change + along(jnp.zeros_like(q), v_omega)
-        return block, basis.analysis @ change / unit
+        return block, jnp.asarray(basis.analysis) @ change / unit
 
 
 def harmonic_balance(

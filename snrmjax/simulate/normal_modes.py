@@ -1,6 +1,7 @@
 """Nonlinear normal modes: periodic motions of the conservative structure."""
 
-from typing import NamedTuple
+import dataclasses
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,12 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.structure import Structure, displacement_scale
-from snrmjax.simulate.continuation import Curve, CurveStatus, StepControl, follow_curve
+from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.structure import Structure, displacement_scale, simulated_structure
+from snrmjax.simulate.blocks import by_blocks
+from snrmjax.simulate.continuation import (
+    Curve,
+    CurveStatus,
+    StepControl,
+    follow_curve,
+    traced,
+)
 from snrmjax.simulate.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.harmonics import velocity_phasors
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
+
+
+_TONGUE_SHARE = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
+
+
+class Tongue(NamedTuple):
+    """A stretch of a normal mode on which a harmonic of it drives another mode in resonance."""
+
+    mode: int  # the other mode, counted from zero
+    harmonic: int
+    from_frequency: float  # rad/s, lowest on the stretch
+    to_frequency: float  # rad/s, highest
+    energy_share: float  # largest share of the kinetic energy in that harmonic of that mode
+    first: int  # index of its first point on the branch; with "skip", of the first one behind it
+    last: int  # index of its last point; with "skip", of the last one before it
 
 
 class NormalModeBranch(NamedTuple):
@@ -25,6 +49,7 @@ class NormalModeBranch(NamedTuple):
     energy: Float[np.ndarray, " point"]  # J
     status: CurveStatus
     sensors: tuple[str, ...]
+    tongues: tuple[Tongue, ...] = ()
 
 
 def nonlinear_normal_mode(
@@ -36,11 +61,12 @@ def nonlinear_normal_mode(
     max_points: int = 4000,
     largest_amplitude: float | None = None,
     n_samples: int | None = None,
+    tongues: Literal["follow", "skip"] = "follow",
 ) -> NormalModeBranch:
     """Follow the nonlinear normal mode that starts at the linear mode of interest.
 
-    Solves q̈ + ω²q + ∂V/∂q = 0 (damping, and forces of effects that depend on velocity, left
-    out) for motions q = Σ a_h cos hΩt, which covers every motion that starts from rest; the
+    Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
+    for motions q = Σ a_h cos hΩt, which covers every motion that starts from rest; the
     curve is followed by arclength through folds and internal-resonance tongues.
 
     Arguments: `to_frequency` in rad/s, on either side of the linear frequency: the curve ends
@@ -48,7 +74,12 @@ def nonlinear_normal_mode(
     which the mode's own nonlinearity matters) ends a curve that never does. A curve that first
     moves away from `to_frequency` is followed as long as it stays above a tenth and below ten
     times the linear frequency.
+    Where a harmonic of the mode meets another mode, the curve runs out on a tongue and back: more
+    than a twentieth of the energy is then in that harmonic of that mode. Tongues are reported;
+    with `tongues="skip"` their points are left out, which leaves the backbone in pieces of one
+    curve.
     Returns a `NormalModeBranch` whose `status` says how it ended.
+    Raises `ValueError` for a frequency that is not positive or the linear one.
     Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
     doi:10.1016/j.ymssp.2008.04.002.
     """
@@ -59,6 +90,9 @@ def nonlinear_normal_mode(
             "`to_frequency` must be positive and differ from the linear frequency "
             f"{omega:g} rad/s, but is {to_frequency:g} rad/s."
         )
+    model = simulated_structure(model)
+    kept = tuple(e for e in model.effects if not isinstance(e, AbstractHysteresis))
+    model = dataclasses.replace(model, effects=kept)
     scale = float(displacement_scale(model)[j])
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples, cosine_only=True
@@ -67,8 +101,8 @@ def nonlinear_normal_mode(
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
     ends = jnp.asarray([lower, upper, limit])
-    curve = _follow(balance, ends, steps, max_points)
-    return _assemble(balance, curve)
+    branch = _assemble(balance, _follow(balance, ends, traced(steps), max_points))
+    return _without_tongues(branch) if tongues == "skip" else branch
 
 
 @eqx.filter_jit
@@ -98,9 +132,9 @@ def _follow(
 
 
 def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
-    n = int(curve.n_points)
-    frequency, coefficients, velocity, energy = (
-        np.asarray(a)[:n] for a in _motion(balance, curve.points)
+    points = np.asarray(curve.points)[: int(curve.n_points)]
+    frequency, coefficients, velocity, energy = by_blocks(
+        lambda block: _motion(balance, block), 128, points
     )
     return NormalModeBranch(
         frequency=frequency,
@@ -109,6 +143,57 @@ def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
         energy=energy,
         status=CurveStatus(int(curve.status)),
         sensors=balance.model.modes.sensors,
+        tongues=_tongues(balance, frequency, coefficients),
+    )
+
+
+def _tongues(
+    balance: HarmonicBalance, frequency: np.ndarray, coefficients: np.ndarray
+) -> tuple[Tongue, ...]:
+    """Stretches with more than `_TONGUE_SHARE` of the kinetic energy in one other pair."""
+    j, mass = balance.model.modes.mode_of_interest, np.asarray(balance.model.linear_terms().mass)
+    order = np.arange(coefficients.shape[1])[:, None]
+    energy = mass * (order * coefficients) ** 2  # twice the mean kinetic energy, over Ω²
+    share = energy / np.maximum(energy.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+    # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
+    share[:, :, j] = 0.0
+    share[:, :2] = 0.0
+    strongest = share.reshape(len(share), -1).max(axis=1, initial=0.0)
+    inside = np.concatenate([[False], strongest > _TONGUE_SHARE, [False]])
+    edges = np.flatnonzero(np.diff(inside.astype(int)))
+    found = []
+    for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        stretch = share[first:stop].max(axis=0)
+        harmonic, mode = np.unravel_index(np.argmax(stretch), stretch.shape)
+        found.append(
+            Tongue(
+                mode=int(mode),
+                harmonic=int(harmonic),
+                from_frequency=float(frequency[first:stop].min()),
+                to_frequency=float(frequency[first:stop].max()),
+                energy_share=float(stretch.max()),
+                first=first,
+                last=stop - 1,
+            )
+        )
+    return tuple(found)
+
+
+def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
+    """The branch without the points of its tongues, which say between which points they were."""
+    keep = np.ones(len(branch.frequency), dtype=bool)
+    for tongue in branch.tongues:
+        keep[tongue.first : tongue.last + 1] = False
+    place = np.cumsum(keep)  # points that are kept up to and with each
+    return branch._replace(
+        frequency=branch.frequency[keep],
+        coefficients=branch.coefficients[keep],
+        velocity=branch.velocity[keep],
+        energy=branch.energy[keep],
+        tongues=tuple(
+            tongue._replace(first=int(place[tongue.first]), last=int(place[tongue.first]) - 1)
+            for tongue in branch.tongues
+        ),
     )
 
 

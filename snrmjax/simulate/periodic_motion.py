@@ -102,8 +102,11 @@ def response_at_velocities(
     Their frequencies are differentiable functions of the model: the whole curve at fixed
     amplitudes. Call it once; then `motions_at_velocities` with other models.
     """
-    starts, values, which = _crossings(curve, np.asarray(velocities, dtype=np.float64))
-    return motions_at_velocities(model, curve.force, starts, values), which
+    starts, passed, which = _crossings(curve, np.asarray(velocities, dtype=np.float64))
+    coefficients, frequency = (jnp.asarray(part) for part in starts)
+    values = jnp.asarray(passed)
+    motions = motions_at_velocities(model, curve.force, (coefficients, frequency), values)
+    return motions, which
 
 
 def motions_at_velocities(
@@ -195,6 +198,6 @@ def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:
     return tangent / jnp.sqrt(tangent @ tangent)
 
 
-def _generic(size: int) -> Float[np.ndarray, " unknown"]:
+def _generic(size: int) -> Point:
     """A direction that no tangent is across, but by chance."""
-    return np.random.default_rng(size).normal(size=size) / np.sqrt(size)
+    return jnp.asarray(np.random.default_rng(size).normal(size=size) / np.sqrt(size))

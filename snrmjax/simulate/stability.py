@@ -64,8 +64,8 @@ def floquet_multipliers(
         here = slice(begin, begin + _BLOCK)
         rows = jnp.asarray(padded(values[here], _BLOCK))
         speed = jnp.asarray(padded(omega[here], _BLOCK))
-        maps = monodromy(model, rows, speed, steps_per_cycle)
-        maps = np.asarray(maps)[: len(values[here])]
+        found = monodromy(model, rows, speed, steps_per_cycle)
+        maps = np.asarray(found)[: len(values[here])]
         finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]
         return np.where(finite, np.linalg.eigvals(np.where(finite[:, :, None], maps, 0.0)), np.nan)
 
