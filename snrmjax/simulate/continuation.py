@@ -134,6 +134,7 @@ def follow_curve(
     control: StepControl,
     max_points: int,
     start_across: Point | None = None,
+    groups: tuple[int, int] | None = None,
 ) -> Curve:
     """Follow a curve of solutions of R(x, λ) = 0 from `start` until λ leaves [lower, upper].
 
@@ -143,6 +144,9 @@ def follow_curve(
     halved when Newton's method fails, when it ends far from the guess, or when the tangent turns
     by more than three times `control.angle` (but for a kink, which steps below `control.kink`
     may pass); otherwise it is chosen so that the next turn comes near `control.angle`.
+    With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
+    more than nine tenths of its norm in a step: across a light damped resonance the response turns
+    its sign, and on the scale of the peak the two flanks far below it are neighbours.
     The last point of a curve that left the range lies on its end; that of a closed one is the
     first again.
     Raises `ValueError` when `max_points` is below 2.
@@ -172,7 +176,7 @@ def follow_curve(
         miss = jnp.linalg.norm(new - guess)
         smooth = (miss < 0.3 * state.step) & (turn < 3 * control.angle)
         kinked = (state.step < control.kink) & (miss < 2 * state.step) & (turn < 0.5 * jnp.pi)
-        near = smooth | kinked
+        near = (smooth | kinked) & _steady(here, new, groups)
         good = found.converged & (is_first | is_end | near)
         beyond_upper, beyond_lower = new[-1] > upper, new[-1] < lower
         leaving = good & (beyond_upper | beyond_lower) & (state.aim == ordinary)
@@ -252,6 +256,19 @@ def follow_curve(
     started = walk.status != int(CurveStatus.NO_START)
     n_points = jnp.where(started, walk.n_points, 0)
     return Curve(walk.points, walk.tangents, n_points, walk.status, walk.n_solves)
+
+
+def _steady(here: Point, new: Point, groups: tuple[int, int] | None) -> Bool[Array, ""]:
+    """Whether no column of the unknowns changes by most of itself."""
+    if groups is None:
+        return jnp.array(True)
+    rows, columns = groups
+    old, now = (point[: rows * columns].reshape(rows, columns) for point in (here, new))
+    norms = [jnp.linalg.norm(part, axis=0) for part in (old, now, now - old)]
+    largest = jnp.maximum(norms[0], norms[1])
+    # What is small beside the motion as a whole may turn as it likes.
+    slight = 0.05 * jnp.linalg.norm(largest)
+    return jnp.all((norms[2] <= 0.9 * largest) | (largest <= slight))
 
 
 class _Walk(NamedTuple):

@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Complex, Float
 from snrmjax.simulate.blocks import as_arrays, by_blocks, mapped, taken
 from snrmjax.simulate.continuation import StepControl, correct, locate_event
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.stability import floquet_multipliers
+from snrmjax.simulate.stability import MARGIN, floquet_multipliers
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
 BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
 _BLOCK = 8  # intervals that one call works on
 _POINTS = 128  # points whose test functions one call evaluates
+_FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
@@ -322,19 +323,34 @@ def with_bifurcations(
     with the rows of the new points. `balance` is stacked, of one member.
     """
     regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
-    outside = np.sum(np.abs(multipliers) > 1.0, axis=1)
-    crossings = []
-    for k, following in itertools.pairwise(regular):
+    outside = _outside(multipliers)
+    crossings, quiet_folds = [], []
+    for k, following in itertools.pairwise(regular.tolist()):
         change = abs(int(outside[following]) - int(outside[k]))
-        across_fold = following > k + 1
-        if change == 0 or (across_fold and change == 1):
-            continue
-        if not np.all(np.isfinite(multipliers[[k, following]])):
-            continue
-        crossings.append(k if not across_fold else following - 1)
+        if following > k + 1:
+            if change == 0:
+                quiet_folds.append(k + 1)
+            if change <= 1:
+                continue
+        if change and np.all(np.isfinite(multipliers[[k, following]])):
+            crossings.append(following - 1)
+    # Truncated harmonics turn the curve a little beside the place where the motion loses its
+    # stability: a crossing of +1 next to a fold without one is the fold's own.
+    for fold in quiet_folds:
+        near = [k for k in crossings if abs(k - fold) <= _FOLDS_OWN and _real_plus(multipliers, k)]
+        if near:
+            crossings.remove(min(near, key=lambda k: abs(k - fold)))
     if not crossings:
         return curve, multipliers
     return _located_bifurcations(balance, curve, multipliers, crossings, steps)
+
+
+def _real_plus(multipliers: np.ndarray, k: int) -> bool:
+    """Whether the multiplier that crosses between a point and the next does so near +1."""
+    count = max(_outside(multipliers[k : k + 2]))
+    row = multipliers[k + 1] if _outside(multipliers[k + 1]) == count else multipliers[k]
+    last = row[np.argsort(-np.abs(row))[count - 1]]
+    return bool(abs(last.imag) < 1e-9 * abs(last) and last.real > 0)
 
 
 def _located_bifurcations(
@@ -347,7 +363,7 @@ def _located_bifurcations(
     """Divide the intervals until the crossing is known to a millionth of a step."""
     member = as_arrays(taken(balance, 0))
     low, high = np.zeros(len(crossings)), np.ones(len(crossings))
-    first = np.sum(np.abs(multipliers[crossings]) > 1.0, axis=1)
+    first = _outside(multipliers[crossings])
     for _ in range(7):
         shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
         owner = [0] * shares.size
@@ -356,9 +372,7 @@ def _located_bifurcations(
             balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
         )
         rows = _multipliers_of(member, found)
-        count = np.where(ok, np.sum(np.abs(rows) > 1.0, axis=1), np.repeat(first, _INSIDE)).reshape(
-            shares.shape
-        )
+        count = np.where(ok, _outside(rows), np.repeat(first, _INSIDE)).reshape(shares.shape)
         beyond = count != first[:, None]
         index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
         edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
@@ -375,6 +389,10 @@ def _located_bifurcations(
     for k, point in enumerate(new.points):
         merged[k] = added[tuple(point)] if tuple(point) in added else next(old)
     return new, merged
+
+
+def _outside(multipliers: np.ndarray) -> np.ndarray:
+    return np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1)
 
 
 def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:

@@ -164,6 +164,7 @@ def _follow(
             jnp.array(jnp.inf),
             steps,
             max_points,
+            groups=(balance.n_coefficients, balance.model.n_modes),
         )
 
     return mapped(one, balances, wanted, *(() if starts is None else (starts,)))

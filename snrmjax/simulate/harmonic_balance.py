@@ -197,6 +197,34 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
     return n_samples
 
 
+def truncation_error(
+    balance: HarmonicBalance,
+    coefficients: Float[Array, "coefficient mode"],
+    frequency: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Estimated share of the velocity that the harmonics left out, H + 1 to 2H, would have.
+
+    The forces that the motion exerts at those harmonics, over the linear dynamic stiffness there:
+    the first step of a Newton iteration with twice the harmonics. Root mean square over the
+    period and the modes, relative; frequency in rad/s.
+    """
+    model, order = balance.model, balance.harmonic_order
+    basis = harmonic_basis(2 * order, samples_for(model, 2 * order, None))
+    x = jnp.pad(coefficients, ((0, 2 * order), (0, 0)))
+    samples = jnp.asarray(basis.synthesis) @ x
+    rate = frequency * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
+    force = (jnp.asarray(basis.analysis) @ model.nonlinear_force(samples, rate))[2 * order + 1 :]
+    terms, h = model.linear_terms(), np.arange(order + 1, 2 * order + 1)[:, None]
+    stiffness = terms.stiffness - terms.mass * (h * frequency) ** 2
+    square = (force[0::2] ** 2 + force[1::2] ** 2) / (
+        stiffness**2 + (terms.damping * h * frequency) ** 2
+    )
+    left_out = jnp.sum(h**2 * square)
+    repeated = np.repeat(np.arange(1, order + 1), 2)[:, None]
+    kept = jnp.sum((repeated * coefficients[1:]) ** 2)
+    return jnp.sqrt(left_out / kept)
+
+
 def linear_coefficients(
     model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
 ) -> Float[Array, "coefficient mode"]:

@@ -16,7 +16,7 @@ from snrmjax.simulate.events import (
     with_bifurcations,
     with_events,
 )
-from snrmjax.simulate.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.harmonic_balance import HarmonicBalance, truncation_error
 from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.stability import (
     StabilityLoss,
@@ -40,6 +40,7 @@ class ResponseCurve(NamedTuple):
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
     n_solves: int = 0  # linear systems factorised to follow the curve
     branch: str = "main"  # "main", or how an isolated one was reached
+    truncation: Float[np.ndarray, " point"] | None = None  # see `truncation_error`
 
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
@@ -130,7 +131,7 @@ def _response(
     branch: str,
 ) -> ResponseCurve:
     model, n = balance.model, len(curve.points)
-    frequency, coefficients, velocity = by_blocks(
+    frequency, coefficients, velocity, truncation = by_blocks(
         lambda points: _motion(balance, points), 128, curve.points
     )
     stable = np.zeros(n, dtype=bool) if multipliers is None else is_stable(multipliers)
@@ -146,13 +147,15 @@ def _response(
         multipliers=multipliers,
         n_solves=followed.n_solves,
         branch=branch,
+        truncation=truncation,
     )
 
 
 @eqx.filter_jit
-def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array]:
-    """Frequency, coefficients and velocity along a curve."""
+def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Frequency, coefficients, velocity and truncation error along a curve."""
     coefficients = jax.vmap(balance.coefficients)(points)
     frequency = points[:, -1] * balance.frequency_scale
     velocity = velocity_phasors(coefficients, frequency, balance.model.modes.mode_shape)
-    return frequency, coefficients, velocity
+    truncation = jax.vmap(lambda x, w: truncation_error(balance, x, w))(coefficients, frequency)
+    return frequency, coefficients, velocity, truncation

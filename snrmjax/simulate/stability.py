@@ -15,6 +15,8 @@ from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import over_cores, padded
 
 _BLOCK = 32  # points whose linearised motions are integrated side by side
+_MOST_SEGMENTS = 256
+MARGIN = 1e-6  # beyond the unit circle: what the multipliers of a conservative motion may err by
 _SEGMENT = 32  # steps whose propagators are computed side by side
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
@@ -52,7 +54,7 @@ def floquet_multipliers(
     Arguments: Fourier coefficients (kg^1/2 m) of the structure as simulated, `frequency` in
     rad/s, `steps_per_cycle` of the fastest tangent frequency. Points are worked on in blocks of
     one size, so that neither their number nor that of the steps compiles anew.
-    Returns NaN for points that are not finite.
+    Returns NaN for points that are not finite, and where more than 8192 steps would be needed.
     Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
     """
     values = np.asarray(coefficients, dtype=np.float64)
@@ -75,8 +77,8 @@ def floquet_multipliers(
 def is_stable(
     multipliers: Complex[np.ndarray, "*batch multiplier"],
 ) -> Bool[np.ndarray, "*batch"]:
-    """Whether every multiplier lies inside the unit circle."""
-    return np.max(np.abs(multipliers), axis=-1) < 1.0
+    """Whether every multiplier lies inside the unit circle, or on it but for rounding."""
+    return np.max(np.abs(multipliers), axis=-1) < 1.0 + MARGIN
 
 
 def stability_loss(
@@ -85,7 +87,7 @@ def stability_loss(
     """By which kind of multiplier each point is unstable, the largest one deciding."""
     kinds = []
     for row in multipliers:
-        if np.any(np.isnan(row)) or np.max(np.abs(row)) < 1.0:
+        if np.any(np.isnan(row)) or np.max(np.abs(row)) < 1.0 + MARGIN:
             kinds.append(StabilityLoss.STABLE)
             continue
         largest = row[np.argmax(np.abs(row))]
@@ -159,7 +161,9 @@ def monodromy(
     cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(c)))
     least = 512 if model.effects else 6 * (coefficients.shape[1] // 2)
     n_steps = jnp.maximum(steps_per_cycle * cycles, least)
-    n_segments = jnp.clip(jnp.ceil(n_steps / _SEGMENT), 1, 1000).astype(int)
+    needed = jnp.ceil(n_steps / _SEGMENT)
+    # A motion that needs more is so far off that its tangents overflow anyway.
+    n_segments = jnp.where(needed <= _MOST_SEGMENTS, needed, 0).astype(int)
     step = 2 * jnp.pi / (n_segments * _SEGMENT)
     unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
     size = 2 * n + (memory is not None)
@@ -205,7 +209,8 @@ def monodromy(
     if memory is not None:
         slips = jnp.any(memory.dragged, axis=0)
         z = jnp.where(slips[:, :, None], y[:, j, None, :], 0.0)
-    return jax.lax.fori_loop(0, n_segments, segment, (y, z))[0]
+    y, _ = jax.lax.fori_loop(0, n_segments, segment, (y, z))
+    return jnp.where(n_segments > 0, y, jnp.nan)
 
 
 def _magnus(
