@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structure import structure
 from snrmjax.simulate.continuation import CurveStatus
 from snrmjax.simulate.forced_response import forced_response, solve_at_frequency
+from snrmjax.simulate.periodic_motion import periodic_motion
 
 HZ = 2 * np.pi
 
@@ -74,9 +76,10 @@ def test_a_linear_structure_gives_its_linear_response(small_curves):
     assert curve.status == CurveStatus.UPPER_END
     assert (curve.frequency[0], curve.frequency[-1]) == (1.0, 8.0)
     wanted = linear_response(model.modes, jnp.asarray(curve.frequency), jnp.array(0.2))
-    # Newton's last step is below 1e-8 and its matrix exact: rounding is left.
+    # The point is within the tolerance 1e-9 of the curve, and at its frequency by that times the
+    # steepest slope, 1/ζ = 50 over the peak.
     scale = np.abs(wanted).max()
-    np.testing.assert_allclose(curve.velocity[:, 1], wanted, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(curve.velocity[:, 1], wanted, rtol=0, atol=5e-8 * scale)
     np.testing.assert_allclose(curve.velocity[:, [0, 2, 3]], 0.0, atol=1e-12 * scale)
     assert np.all(curve.stable)
     # Events: the mode of interest is in phase at its own natural frequency.
@@ -170,10 +173,16 @@ def test_folds_have_a_multiplier_of_one(flat_curve, curved_curves, time_domain, 
         folds = curve.at_events("fold")
         assert len(folds) == 2
         for k in folds:
-            multipliers = time_domain(model, curve.force, curve.frequency[k]).multipliers(
-                state_of(curve.coefficients[k], curve.frequency[k])
+            # Its truncation: with 21 harmonics 4e-9 of the motion (flat) and 5e-7 (curved).
+            guess = padded(curve.coefficients[k : k + 1], 21)[0], curve.frequency[k]
+            fold = periodic_motion(model, curve.force, guess, condition="fold")
+            assert bool(fold.converged)
+            assert float(fold.frequency) == pytest.approx(curve.frequency[k], rel=1e-4)
+            omega = float(fold.frequency)
+            multipliers = time_domain(model, curve.force, omega).multipliers(
+                state_of(np.asarray(fold.coefficients), omega)
             )
-            # The map's slope by differences is good to 1e-7, the motion to 1e-7 there.
+            # The map's slope by differences is good to 1e-7.
             assert np.abs(multipliers - 1).min() < 1e-6
             # and the frequency turns: both neighbours lie on the same side of the fold.
             sides = np.sign(curve.frequency[[k - 1, k + 1]] - curve.frequency[k])
@@ -214,8 +223,9 @@ def test_peak_lies_where_a_dense_sweep_has_it(flat_curve):
     squared = omega**2 * (fundamental[:, 1] ** 2 + fundamental[:, 2] ** 2)
     fit = np.polynomial.Polynomial.fit(shift, squared / squared.max(), 6)
     top = min((r.real for r in fit.deriv().roots() if abs(r.imag) < 1e-12), key=abs)
-    # A sixth-degree fit over ±3e-4, 1/8 of the way to the fold: its top is good to 1e-8.
-    assert top == pytest.approx(0.0, abs=2e-8)
+    # The states are good to 1e-10 of the velocity, of which the parabola over ±3e-4 takes 1e-3:
+    # the top of a fit to them is good to 1e-7 of its width.
+    assert top == pytest.approx(0.0, abs=1e-7)
     assert np.abs(curve.velocity[k, 1, 0]) == pytest.approx(np.sqrt(squared.max()), rel=1e-9)
     assert np.abs(curve.velocity[:, 1, 0]).max() == np.abs(curve.velocity[k, 1, 0])
 
@@ -262,8 +272,9 @@ SETTLED = {
 }
 
 
-def test_all_effects_are_settled_below():
-    assert set(SETTLED) == set(EFFECTS)
+def test_all_effects_without_memory_are_settled_below():
+    memoryless = {k for k, effect in EFFECTS.items() if issubclass(effect, AbstractMemoryless)}
+    assert set(SETTLED) == memoryless
 
 
 @pytest.mark.parametrize("kind", SETTLED)
@@ -371,10 +382,10 @@ def with_drag(coefficient):
     return one_mode({}, (drag,), ratio=0.0)
 
 
-def test_a_structure_of_nan_has_no_start():
+def test_a_structure_of_nan_has_no_curve():
     broken = eqx.tree_at(lambda m: m.effects[0].coefficient, with_drag(0.1), jnp.array(jnp.nan))
     parts = forced_response(broken, [0.2], 1.0, 3.0, harmonic_order=3)
-    assert [part.status for part in parts] == [CurveStatus.NO_START] * 2
+    assert [part.status for part in parts] == [CurveStatus.INVALID]
     for part in parts:
         assert len(part.frequency) == len(part.event) == len(part.stable) == 0
         assert part.velocity.shape == (0, 4, 1)
@@ -384,9 +395,11 @@ def test_a_structure_of_nan_has_no_start():
 def test_an_undamped_resonance_is_not_crossed():
     """Both ends climb it until their points are used up, and both parts come back."""
     # From 1.1 on: at 1.0 the second harmonic would stand at the undamped resonance itself.
-    parts = forced_response(with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3)
+    parts = forced_response(with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3, max_points=400)
     assert [part.status for part in parts] == [CurveStatus.POINT_LIMIT] * 2
-    assert [len(part.frequency) for part in parts] == [4000, 4000]
+    # A step that may hide two events is divided by seven points.
+    assert all(len(part.frequency) in (400, 407) for part in parts)
+    assert set(parts[0].event + parts[1].event) == {""}  # neutral motions do not bifurcate
     assert parts[0].frequency[0] == 1.1
     assert parts[1].frequency[-1] == 3.0
     assert parts[0].frequency.max() < 2.0 < parts[1].frequency.min()

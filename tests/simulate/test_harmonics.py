@@ -10,6 +10,7 @@ from snrmjax.simulate.harmonics import (
     displacement_phasors,
     harmonic_basis,
     squared_orders,
+    tangent_blocks,
     velocity_phasors,
 )
 
@@ -48,17 +49,17 @@ def test_basis_samples_analyses_and_differentiates(order, n_samples):
     np.testing.assert_allclose(-twice, np.diag(squared_orders(order)), atol=ROUNDING)
 
 
-def test_products_are_the_tangent_of_sampling_multiplying_and_analysing():
-    order, n_samples = 3, 20
-    size = 2 * order + 1
-    basis = harmonic_basis(order, n_samples)
-    stiffness = np.random.default_rng(1).normal(size=n_samples)
-    product = (basis.product @ stiffness).reshape(size, size)
-    wanted = basis.analysis @ np.diag(stiffness) @ basis.synthesis
-    np.testing.assert_allclose(product, wanted, atol=ROUNDING)
-    product = (basis.product_rate @ stiffness).reshape(size, size)
-    wanted = basis.analysis @ np.diag(stiffness) @ basis.synthesis @ basis.derivative
-    np.testing.assert_allclose(product, wanted, atol=10 * ROUNDING)
+@pytest.mark.parametrize("cosine_only", [False, True])
+@pytest.mark.parametrize(("order", "n_samples"), [(1, 4), (3, 7), (5, 24), (6, 25)])
+def test_blocks_are_the_tangent_of_sampling_multiplying_and_analysing(
+    order, n_samples, cosine_only
+):
+    basis = harmonic_basis(order, n_samples, cosine_only=cosine_only)
+    entries = np.random.default_rng(1).normal(size=(n_samples, 2))
+    blocks = tangent_blocks(basis, jnp.asarray(entries))
+    for number in range(2):
+        wanted = basis.analysis @ np.diag(entries[:, number]) @ basis.synthesis
+        np.testing.assert_allclose(blocks[:, :, number], wanted, atol=ROUNDING)
 
 
 def test_cosines_are_the_even_part_of_the_basis():
