@@ -8,10 +8,11 @@ import pytest
 from scipy.optimize import brentq
 
 from snrmjax.model.beams import flat_beam
+from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structure import simulated_structure, structure
 from snrmjax.simulate.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
@@ -31,10 +32,32 @@ MODERATE = {
     "cubic_damping": {"coefficient": 0.5},
     "van_der_pol_damping": {"coefficient": 0.9},
     "static_preload": {"constant_force": -1.1},
+    "coulomb_friction": {"force": 0.7},
+    "jenkins_slider": {"stiffness": 1.5, "slip_displacement": 0.4},
+    "iwan_microslip": {"coefficient": 0.9, "exponent": 1.6},
+}
+STRENGTHS = {"coefficient", "stiffness", "constant_force", "force"}
+# What changes the balance in another way than by a force.
+OTHERS = {
+    "added_mass": {"mass": 0.15},
+    "linear_frequency_shift": {"relative_shift": -0.1},
+    "linear_damping_change": {"damping_ratio_change": 0.05},
+    "frequency_drift": {"relative_drift": 0.07},
+    "force_harmonics": {"second": 0.3, "third": -0.2},
+    "internal_resonance_1_3": {"coefficient": 0.4, "frequency_hz": 2.5, "damping_ratio": 0.02},
 }
 
 
 residual_of = eqx.filter_jit(HarmonicBalance.residual)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation():
+    """Nothing here runs long: compile as quickly as the tests of other rooms do."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.5):
@@ -42,58 +65,76 @@ def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.
     return structure(modes, polynomial_potential(potential or {}, 1), effects=effects)
 
 
-def two_modes_with_all_effects():
-    assert set(MODERATE) == set(EFFECTS)
+def two_modes_with_effects(forces=tuple(MODERATE), others=()):
+    """All forces are there, those not named with strength zero: one shape, which compiles once."""
     modes = linear_modes([2.0, 5.0], [0.03, 0.01], [[1.0, 2.0]], [1.5, -0.5], mode_of_interest=1)
-    return structure(
-        modes,
-        polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2),
-        effects=tuple(make_effect(k, p) for k, p in MODERATE.items()),
+    effects = [
+        make_effect(k, {n: v * (k in forces or n not in STRENGTHS) for n, v in p.items()})
+        for k, p in MODERATE.items()
+    ]
+    effects += [make_effect(k, OTHERS[k]) for k in others]
+    potential = polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2)
+    return simulated_structure(
+        structure(modes, potential, effects=tuple(effects), test_order=0.6 if others else 0.0)
     )
 
 
-CASES = {
-    "flat beam": (flat_beam, 1e-5, {"harmonic_order": 4}),
-    "flat beam, normal mode": (flat_beam, 1e-5, {"harmonic_order": 5, "cosine_only": True}),
-    "all effects": (two_modes_with_all_effects, 1.0, {"harmonic_order": 3}),
-    "all effects, at rest": (
-        two_modes_with_all_effects,
-        1.0,
-        {"harmonic_order": 3, "cosine_only": True},
-    ),
-}
+@eqx.filter_jit
+def everything(balance, point, step):
+    """Residual and Jacobian, the same by automatic differentiation and by central differences."""
+    shifts = step * jnp.eye(balance.size + 1)
+    after, before = (jax.vmap(balance.residual)(point + s * shifts) for s in (1, -1))
+    slope = (after - before).T / (2 * step)
+    automatic = jax.jacfwd(balance.residual)(point)
+    return *balance.linearised(point), balance.residual(point), automatic, slope
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_jacobian_against_differences_and_automatic_differentiation(name):
-    model, scale, options = CASES[name]
-    balance = harmonic_balance(model(), 1e-2, scale, **options)
+def assert_exact_jacobian(balance):
     point = 0.5 * np.random.default_rng(2).normal(size=balance.size + 1)
     point[-1] = 1.1
-    point = jnp.asarray(point)
-    step = 1e-5
-    shifts = step * jnp.eye(balance.size + 1)
-
-    @eqx.filter_jit
-    def everything(balance, point):
-        pairs = (jax.vmap(balance.residual)(point + s * shifts) for s in (1, -1))
-        return (
-            *balance.linearised(point),
-            balance.residual(point),
-            jax.jacfwd(balance.residual)(point),
-            *pairs,
-        )
-
-    residual, jacobian, slow, automatic, after, before = everything(balance, point)
+    residual, jacobian, slow, automatic, slope = everything(balance, jnp.asarray(point), 1e-5)
     assert jacobian.shape == (balance.size, balance.size + 1)
     size = float(jnp.abs(jacobian).max())
     np.testing.assert_allclose(residual, slow, rtol=0, atol=1e-13 * size)
     # The same sums in another order.
     np.testing.assert_allclose(jacobian, automatic, rtol=0, atol=1e-12 * size)
-    # h²/6·R''' ≤ 1e-10 of the largest entry and rounding 1e-16/1e-5 of the residual's terms; a
-    # sample that crosses a kink within the step (of 128: none here) would cost more.
-    slope = (after - before).T / (2 * step)
+    # A sixth of h² times the third derivative, 1e-10 of the largest entry, and rounding 1e-16/1e-5
+    # of the residual's terms.
     np.testing.assert_allclose(jacobian, slope, rtol=0, atol=1e-8 * size)
+    return jacobian
+
+
+@pytest.mark.parametrize(
+    "options", [{"harmonic_order": 4}, {"harmonic_order": 5, "cosine_only": True}]
+)
+def test_jacobian_of_the_flat_beam_is_exact(options):
+    assert_exact_jacobian(harmonic_balance(flat_beam(), 1e-2, 1e-5, **options))
+
+
+def test_every_force_is_among_those_below():
+    assert set(MODERATE) == {k for k, e in EFFECTS.items() if issubclass(e, AbstractForce)}
+
+
+@pytest.mark.parametrize("kind", MODERATE)
+def test_jacobian_of_every_force_is_exact(kind):
+    settings = {"harmonic_order": 3}
+    balance = harmonic_balance(two_modes_with_effects((kind,)), 1e-2, 1.0, **settings)
+    with_force = assert_exact_jacobian(balance)
+    without = harmonic_balance(two_modes_with_effects(()), 1e-2, 1.0, **settings)
+    change = np.abs(with_force - assert_exact_jacobian(without)).max()
+    assert change > 1e-2 if kind != "static_preload" else change == 0
+
+
+@pytest.mark.parametrize("cosine_only", [False, True])
+def test_jacobian_of_all_effects_together_is_exact(cosine_only):
+    model = two_modes_with_effects(others=tuple(OTHERS))
+    assert model.n_modes == 3  # with the mode of the internal resonance
+    balance = harmonic_balance(model, 1e-2, 1.0, harmonic_order=3, cosine_only=cosine_only)
+    assert_exact_jacobian(balance)
+    if not cosine_only:  # three harmonics of force, each on the participations of the modes
+        wanted = np.outer([0, 1, 0, 0.3, 0, -0.2, 0], [1.5, -0.5, 0.0])
+        load = np.asarray(balance.load()).reshape(7, 3)
+        np.testing.assert_allclose(load, wanted / 5.0**2, rtol=1e-14, atol=0)
 
 
 def test_residual_by_vmap_agrees_and_traces_once():
@@ -198,7 +239,13 @@ def test_samples_by_default_and_on_request():
     assert harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3).n_samples == 16
     assert harmonic_balance(one_mode({"1111": 1.0}), 1.0, 1.0, harmonic_order=9).n_samples == 40
     effect = (make_effect("gap_stiffness", {"stiffness": 1.0, "gap": 1.0}),)
+    # A kink is rounded over 0.02 of the amplitude: 512 samples resolve it at full speed.
+    assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 512
+    effect = (make_effect("jenkins_slider", {"stiffness": 1.0, "slip_displacement": 1.0}),)
+    assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 256
+    effect = (make_effect("cubic_damping", {"coefficient": 1.0}),)
     assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=3).n_samples == 128
+    assert harmonic_balance(one_mode({}, effect), 1.0, 1.0, harmonic_order=9).n_samples == 144
     assert harmonic_balance(one_mode(), 1.0, 1.0, harmonic_order=3, n_samples=7).n_samples == 7
 
 
