@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.simulate.blocks import as_arrays, by_blocks, mapped, taken
+from snrmjax.simulate.blocks import as_arrays, mapped, taken
 from snrmjax.simulate.continuation import StepControl, correct, locate_event
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.stability import MARGIN, floquet_multipliers
@@ -18,7 +18,6 @@ from snrmjax.simulate.stability import MARGIN, floquet_multipliers
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
 BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
 _BLOCK = 8  # intervals that one call works on
-_POINTS = 128  # points whose test functions one call evaluates
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
@@ -51,20 +50,6 @@ def test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Float
     """Functions that vanish at a fold, at a peak and at a phase resonance."""
     slope = jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
     return jnp.stack([tangent[-1], slope, mode_velocity(balance, point).imag])
-
-
-@eqx.filter_jit
-def _all_test_values(balance: HarmonicBalance, points: Array, tangents: Array) -> tuple:
-    """Values and slopes, along the curve, of what the test functions are made of."""
-
-    def one(point: Array, tangent: Array) -> tuple:
-        def heights(p: Array) -> Array:
-            velocity = mode_velocity(balance, p)
-            return jnp.stack([p[-1], sensor_velocity(balance, p), velocity.imag, velocity.real])
-
-        return jax.jvp(heights, (point,), (tangent,))
-
-    return jax.vmap(one)(points, tangents)
 
 
 @eqx.filter_jit
@@ -116,11 +101,10 @@ def compile_events_ahead(balances: HarmonicBalance, steps: StepControl) -> None:
     """Have the programs of `with_events` compiled, without a curve yet."""
     n = _BLOCK
     one = as_arrays(taken(balances, 0))
-    points = jnp.zeros((_POINTS, one.size + 1))
-    _all_test_values(one, points, points)
+    points = jnp.zeros((n, one.size + 1))
     rows = as_arrays(taken(balances, np.zeros(n, dtype=int)))
-    some, none = points[:n], jnp.zeros(n, dtype=bool)
-    _locate(rows, jnp.zeros(n, dtype=int), some, some, some, none, steps)
+    none = jnp.zeros(n, dtype=bool)
+    _locate(rows, jnp.zeros(n, dtype=int), points, points, points, none, steps)
 
 
 def _in_blocks(
@@ -184,12 +168,29 @@ def with_events(
 def _heights(
     balances: HarmonicBalance, number: int, curve: Walked
 ) -> tuple[np.ndarray, np.ndarray]:
-    """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength."""
-    one = as_arrays(taken(balances, number))
-    heights, slopes = by_blocks(
-        lambda *rows: _all_test_values(one, *rows), _POINTS, curve.points, curve.tangents
+    """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength.
+
+    What `sensor_velocity` and `mode_velocity` say, on the host: for a few hundred points that is
+    done before a program would have its arguments.
+    """
+    modes, j = balances.model.modes, balances.model.modes.mode_of_interest
+    shape = np.asarray(modes.mode_shape)[number, 0]
+    sign = np.sign(np.asarray(modes.participation)[number, j])
+    size = (len(curve.points), balances.n_coefficients, len(shape))
+    x, dx = (a[:, :-1].reshape(size) for a in (curve.points, curve.tangents))
+    omega, domega = curve.points[:, -1], curve.tangents[:, -1]
+    shape = shape / np.max(np.abs(shape))
+    (a, b), (da, db) = ((part[:, 1:3] @ shape).T for part in (x, dx))
+    own, down = sign * x[:, 1:3, j], sign * dx[:, 1:3, j]  # the velocity is Ω(sine + i cosine)
+    square = a**2 + b**2
+    heights = (omega, omega**2 * square, omega * own[:, 0], omega * own[:, 1])
+    slopes = (
+        domega,
+        2 * omega * domega * square + 2 * omega**2 * (a * da + b * db),
+        domega * own[:, 0] + omega * down[:, 0],
+        domega * own[:, 1] + omega * down[:, 1],
     )
-    return heights, slopes
+    return np.stack(heights, axis=1), np.stack(slopes, axis=1)
 
 
 def _divided(

@@ -17,7 +17,6 @@ from snrmjax.simulate.events import (
     with_events,
 )
 from snrmjax.simulate.harmonic_balance import HarmonicBalance, truncation_error
-from snrmjax.simulate.harmonics import velocity_phasors
 from snrmjax.simulate.stability import (
     StabilityLoss,
     floquet_multipliers,
@@ -27,7 +26,12 @@ from snrmjax.simulate.stability import (
 
 
 class ResponseCurve(NamedTuple):
-    """One forced response in order along the curve, unstable parts included."""
+    """One forced response in order along the curve, unstable parts included.
+
+    `truncation` estimates the share of the velocity that the harmonics left out would have: a
+    curve on which it exceeds a few per cent wants more harmonics. Without stability `stable` is
+    False everywhere and `multipliers` and `truncation` are None.
+    """
 
     force: float  # N
     frequency: Float[np.ndarray, " point"]  # rad/s
@@ -40,7 +44,7 @@ class ResponseCurve(NamedTuple):
     multipliers: Complex[np.ndarray, "point multiplier"] | None = None  # None: not asked for
     n_solves: int = 0  # linear systems factorised to follow the curve
     branch: str = "main"  # "main", or how an isolated one was reached
-    truncation: Float[np.ndarray, " point"] | None = None  # see `truncation_error`
+    truncation: Float[np.ndarray, " point"] | None = None  # estimated, like `multipliers`
 
     def at_events(self, kind: str) -> np.ndarray:
         """Indices of the points at which an event of this kind was located."""
@@ -111,9 +115,11 @@ def compile_ahead(balances: HarmonicBalance, steps: StepControl, *, stability: b
     points = np.full((2, one.size + 1), 1e-9)
     points[:, -1] = 1.0
     if stability:
-        _multipliers(one, Walked(points, points, ("", "")))
+        walked = Walked(points, points, ("", ""))
+        multipliers = _multipliers(one, walked)
+        no_end = FollowedCurve(points, points, CurveStatus.POINT_LIMIT, 0)
+        _response(one, walked, multipliers, no_end, "main")
     compile_events_ahead(balances, steps)
-    by_blocks(lambda points: _motion(one, points), 128, points)
 
 
 def _multipliers(balance: HarmonicBalance, curve: Walked) -> Complex[np.ndarray, "point _"]:
@@ -131,16 +137,20 @@ def _response(
     branch: str,
 ) -> ResponseCurve:
     model, n = balance.model, len(curve.points)
-    frequency, coefficients, velocity, truncation = by_blocks(
-        lambda points: _motion(balance, points), 128, curve.points
-    )
-    stable = np.zeros(n, dtype=bool) if multipliers is None else is_stable(multipliers)
+    x = curve.points[:, :-1].reshape(n, balance.n_coefficients, model.n_modes)
+    coefficients = x * np.asarray(balance.displacement_scale)
+    frequency = curve.points[:, -1] * np.asarray(balance.frequency_scale)
+    truncation = None
+    if multipliers is not None:
+        (truncation,) = by_blocks(
+            lambda x, w: (_truncation(balance, x, w),), 128, coefficients, frequency
+        )
     return ResponseCurve(
         force=float(balance.force),
         frequency=frequency,
         coefficients=coefficients,
-        velocity=velocity,
-        stable=stable,
+        velocity=_velocity(coefficients, frequency, np.asarray(model.modes.mode_shape)),
+        stable=np.zeros(len(frequency), bool) if multipliers is None else is_stable(multipliers),
         event=curve.labels,
         status=followed.status,
         sensors=model.modes.sensors,
@@ -151,11 +161,15 @@ def _response(
     )
 
 
+def _velocity(
+    coefficients: np.ndarray, frequency: np.ndarray, mode_shape: np.ndarray
+) -> np.ndarray:
+    """`velocity_phasors` on the host, where a curve is done before a program has its arguments."""
+    mean, pairs = coefficients[:, :1] + 0j, coefficients[:, 1::2] - 1j * coefficients[:, 2::2]
+    phasors = np.concatenate([mean, pairs], axis=1) @ mode_shape.T
+    return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors
+
+
 @eqx.filter_jit
-def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Frequency, coefficients, velocity and truncation error along a curve."""
-    coefficients = jax.vmap(balance.coefficients)(points)
-    frequency = points[:, -1] * balance.frequency_scale
-    velocity = velocity_phasors(coefficients, frequency, balance.model.modes.mode_shape)
-    truncation = jax.vmap(lambda x, w: truncation_error(balance, x, w))(coefficients, frequency)
-    return frequency, coefficients, velocity, truncation
+def _truncation(balance: HarmonicBalance, coefficients: Array, frequency: Array) -> Array:
+    return jax.vmap(lambda x, w: truncation_error(balance, x, w))(coefficients, frequency)
