@@ -66,6 +66,13 @@ class Family(StrEnum):
     piecewise_linear = "piecewise_linear"
 
 
+class Tongues(StrEnum):
+    """What to do where a normal mode runs out on an internal resonance and back."""
+
+    follow = "follow"
+    skip = "skip"
+
+
 ModelFile = Annotated[Path, typer.Argument(help="Model of the structure (TOML).", metavar="MODEL")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made when missing.")]
 Harmonics = Annotated[int, typer.Option(help="Number of harmonics.", min=1, max=99)]
@@ -115,6 +122,10 @@ def simulate(
     to_hz: Annotated[float, typer.Option(help="Highest frequency in Hz.")],
     out: Out,
     harmonics: Harmonics = 9,
+    isolated: Annotated[
+        bool,
+        typer.Option("--isolated", help="Also search for responses not connected to rest."),
+    ] = False,
 ) -> None:
     """Simulate forced responses by harmonic balance, unstable parts included.
 
@@ -123,15 +134,22 @@ def simulate(
     with _staged(out) as folder:
         structure = read_model(model)
         _report_equilibria(structure)
+        ends = (from_hz * HERTZ, to_hz * HERTZ)
         curves = []
         for number, one in enumerate(force):
             _say(f"force {one:g} N ({number + 1} of {len(force)})")
-            curves += sj.forced_response(
-                structure, [one], from_hz * HERTZ, to_hz * HERTZ, harmonic_order=harmonics
-            )
+            main_curves = sj.forced_response(structure, [one], *ends, harmonic_order=harmonics)
+            curves += main_curves
+            if isolated:
+                further = sj.isolated_responses(
+                    structure, one, *ends, known=main_curves, harmonic_order=harmonics
+                )
+                _say(f"  {len(further)} further branches found")
+                curves += further
         for curve in curves:
-            if curve.status != sj.CurveStatus.UPPER_END:
+            if curve.branch == "main" and curve.status != sj.CurveStatus.UPPER_END:
                 _warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
+        _report_truncation(curves, harmonics)
         if not any(len(curve.frequency) for curve in curves):
             raise ValueError("no response was found in this range; start farther from resonance.")
         results.write_response(folder / "response.csv", structure, curves)
@@ -146,6 +164,9 @@ def nnm(
     to_hz: Annotated[float, typer.Option(help="Follow the mode to this frequency in Hz.")],
     out: Out,
     harmonics: Harmonics = 9,
+    tongues: Annotated[
+        Tongues, typer.Option(help="Tongues of internal resonances: follow or skip them.")
+    ] = Tongues.follow,
 ) -> None:
     """Follow the nonlinear normal mode of interest from its linear frequency.
 
@@ -154,7 +175,14 @@ def nnm(
     with _staged(out) as folder:
         structure = read_model(model)
         _report_equilibria(structure)
-        branch = sj.nonlinear_normal_mode(structure, to_hz * HERTZ, harmonic_order=harmonics)
+        branch = sj.nonlinear_normal_mode(
+            structure, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues.value
+        )
+        for tongue in branch.tongues:
+            _say(
+                f"internal resonance: harmonic {tongue.harmonic} drives mode {tongue.mode + 1} "
+                f"from {tongue.from_frequency / HERTZ:.2f} to {tongue.to_frequency / HERTZ:.2f} Hz"
+            )
         if branch.status not in (sj.CurveStatus.UPPER_END, sj.CurveStatus.LOWER_END):
             _warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
         results.write_normal_mode(folder / "nnm.csv", structure, branch)
@@ -256,6 +284,19 @@ def _write_identification(
 
 def _sensor(structure: sj.Structure) -> str:
     return structure.modes.sensors[sj.reference_sensor(structure.modes)]
+
+
+def _report_truncation(curves: list[sj.ResponseCurve], harmonics: int) -> None:
+    """Say where the harmonics that are left out would matter."""
+    worst = max(
+        (float(np.max(c.truncation, initial=0.0)) for c in curves if c.truncation is not None),
+        default=0.0,
+    )
+    if worst > 0.02:
+        _warn(
+            f"the harmonics above {harmonics} would change the velocity by up to about "
+            f"{100 * worst:.0f} % somewhere; use more --harmonics."
+        )
 
 
 def _report_equilibria(structure: sj.Structure) -> None:
