@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
-from snrmjax.model.modes import linear_response
-from snrmjax.simulate.virtual_test import MeasurementErrors, phase_resonance_test
+from snrmjax.model.effects import make_effect
+from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.structure import structure
+from snrmjax.simulate.controlled_test import phase_controlled_test, response_controlled_test
+from snrmjax.simulate.recording import VisitedStates, recorded_states
+from snrmjax.simulate.virtual_test import NO_ERRORS, MeasurementErrors, phase_resonance_test
 
 HZ = 2 * np.pi
 RANGE = (30 * HZ, 110 * HZ)
@@ -209,6 +213,221 @@ def test_level_errors_are_shared_within_a_level():
     np.testing.assert_array_equal(noisy.force, truth.force)
 
 
+# ----------------------------------------------------------------------- the measurement chain
+
+
+def test_what_is_recorded_went_through_the_chain_in_order():
+    """Shape change, then far modes, then the instruments: by hand, harmonics included."""
+    parameters = {
+        "sensor_phase_error": {"phase_deg": 4.0},
+        "residual_mode": {"receptance": 2e-6},
+        "mode_shape_change": {"coefficient": 1e9},
+        "sensor_gain_error": {"gain": 0.03},
+        "force_gain_error": {"gain": 0.02},
+        "force_offset_error": {"offset": 1e-3},
+    }
+    effects = tuple(make_effect(kind, values) for kind, values in parameters.items())
+    modes = linear_modes([500.0], [0.01], [[2.0], [-1.0]], [3.0])
+    model = structure(modes, effects=effects)
+    omega, force = np.array([490.0, 505.0, 510.0]), np.array([0.1, 0.2, 0.2])
+    x = np.random.default_rng(3).normal(size=(3, 5, 1)) * 1e-5
+    states = VisitedStates(np.array([1, 2, 2]), np.array([0.0, 0.4, 1.0]), force, omega, x)
+    found = recorded_states(model, states, NO_ERRORS, 0, (2,))
+    one, two = (x[:, h, 0] - 1j * x[:, h + 1, 0] for h in (1, 3))
+    stretch = 1 + 1e9 * np.abs(one) ** 2
+    turn = np.exp(1j * np.deg2rad(4.0))
+    shape = np.array([2.0, -1.0])
+    first = (1j * omega * one * stretch)[:, None] * shape
+    first = (first + (1j * omega * 2e-6 * force)[:, None]) * 1.03 * turn
+    second = (2j * omega * two * stretch)[:, None] * shape * 1.03 * turn**2
+    np.testing.assert_allclose(found.velocity, first, rtol=1e-12)  # rounding
+    np.testing.assert_allclose(found.harmonics[:, :, 0], second, rtol=1e-12)
+    np.testing.assert_allclose(found.force, force / 1.02 - 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(found.order, [0.0, 0.4, 1.0])
+    np.testing.assert_array_equal(found.frequency, omega)
+
+
+def test_sensors_see_the_rigid_body_motion_too():
+    modes = linear_modes(
+        [500.0],
+        [0.02],
+        [[2.0]],
+        [3.0],
+        rigid_body_shape=np.array([[1.5]]),
+        rigid_body_participation=np.array([0.7]),
+    )
+    omega = np.array([480.0, 510.0])
+    receptance = 3.0 / (500.0**2 - omega**2 + 20j * omega)
+    x = np.stack([0 * omega, receptance.real, -receptance.imag], axis=1)[:, :, None]
+    states = VisitedStates(np.ones(2, dtype=int), np.zeros(2), np.ones(2), omega, x)
+    found = recorded_states(structure(modes), states, NO_ERRORS, 0)
+    wanted = linear_response(modes, omega, np.ones(2))
+    np.testing.assert_allclose(found.velocity, wanted, rtol=1e-12)  # rounding
+
+
+def drifting(drift):
+    modes = linear_modes([500.0], [0.02], [[2.0]], [3.0])
+    effect = make_effect("frequency_drift", {"relative_drift": drift})
+    return structure(modes, effects=(effect,))
+
+
+def response_of_drifting(drift, states):
+    own = 500.0 * (1 + drift * np.asarray(states.order))
+    omega = np.asarray(states.frequency)
+    dynamic = own**2 - omega**2 + 2j * 0.02 * own * omega
+    return 6j * omega * np.asarray(states.force) / dynamic
+
+
+def test_a_drifting_structure_is_recorded_as_it_is_at_the_time():
+    # 3 % of drift are one and a half half-widths of the resonance.
+    test = phase_resonance_test(drifting(0.03), [1.0, 2.0, 2.0], 400.0, 600.0)
+    states = test.steady_states
+    np.testing.assert_allclose(states.order, np.linspace(0, 1, 15), atol=1e-15)
+    assert states.level.tolist() == [1] * 5 + [2] * 5 + [3] * 5
+    wanted = response_of_drifting(0.03, states)
+    np.testing.assert_allclose(
+        states.velocity[:, 0], wanted, rtol=1e-8
+    )  # Newton's method ends at an estimated 1e-10
+    indicator = np.cos(phases(states)) ** 2
+    assert np.all((indicator > 0.5) & (indicator < 0.7))
+
+
+# ----------------------------------------------------------------------------------- in time
+
+
+def test_a_drifting_structure_is_stepped_through_in_time():
+    test = phase_resonance_test(
+        drifting(0.02),
+        [1.0, 2.0],
+        470.0,
+        540.0,
+        by="time_integration",
+        steps_per_sweep=71,
+    )
+    states = test.steady_states
+    assert test.jumps == ()
+    assert test.curves == ()
+    assert np.all(np.diff(states.order) > 0)
+    assert np.all(np.diff(states.level) >= 0)
+    # One step a rad/s, recorded at the time of the step.
+    assert np.all(np.asarray(states.frequency) % 1 < 1e-9)
+    np.testing.assert_allclose(
+        states.velocity[:, 0], response_of_drifting(0.02, states), rtol=3e-4
+    )  # `stepped_sine` settles to an estimated 1e-4
+    assert np.all(np.abs(np.cos(phases(states)) ** 2 - 0.6) < 0.1)
+
+
+def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
+    options = {"by": "time_integration", "steps_per_sweep": 81, "appropriation": (0.4, 0.8)}
+    test = run(**options)
+    states = test.steady_states
+    assert 10 <= states.n_states <= 16
+    # Every state lies on the exact curve, on a stable part, by interpolation to about 1e-2.
+    for k in range(states.n_states):
+        curve = exact.curves[int(states.level[k]) - 1]
+        away = np.abs(curve.frequency / states.frequency[k] - 1) + np.abs(
+            curve.velocity[:, 1, 0] / states.velocity[k, 0] - 1
+        )
+        assert away.min() < 0.06
+        assert curve.stable[int(np.argmin(away))]
+    # Finite steps and transients: jumps are within two steps of the folds, or earlier.
+    step = 80 * HZ / 80
+    assert {level for level, _ in test.jumps} == {1, 2}
+    for level, frequency in test.jumps:
+        curve = exact.curves[level - 1]
+        left = np.concatenate(
+            [curve.frequency[curve.at_events("fold")], curve.frequency[~curve.stable]]
+        )
+        assert np.abs(left - frequency).min() < 2 * step
+
+
+# ---------------------------------------------------------------------------- under a controller
+
+
+def test_a_phase_locked_loop_on_a_linear_structure_is_the_closed_form():
+    wanted = np.array([0.6, 0.0, -0.6])
+    test = phase_controlled_test(curved_beam(), TINY, wanted)
+    states, modes = test.steady_states, curved_beam().modes
+    assert states.level.tolist() == [1] * 3 + [2] * 3
+    # The nonlinear terms are 1e-7 of it, as above.
+    np.testing.assert_allclose(phases(states), np.tile(wanted, 2), atol=1e-9)
+    np.testing.assert_array_equal(states.force, np.repeat(TINY, 3))
+    own, ratio = float(modes.natural_frequency[0]), float(modes.damping_ratio[0])
+    # tan φ = (ω² − Ω²)/(2ζωΩ)
+    slope = ratio * own * np.tan(wanted)
+    np.testing.assert_allclose(
+        states.frequency, np.tile(np.sqrt(own**2 + slope**2) - slope, 2), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        states.velocity, linear_response(modes, states.frequency, states.force), rtol=1e-5
+    )
+
+
+def test_a_phase_locked_loop_records_what_jumps_leave_out(exact):
+    test = phase_controlled_test(curved_beam(), FORCES, [0.5, 0.0, -0.5])
+    states = test.steady_states
+    # The curve at +0.5 rad turns back at 0.26 mN: a rising force does not get to the second level.
+    rising = test.curves[0].force
+    assert rising[np.argmax(np.diff(rising) < 0)] < FORCES[1]
+    np.testing.assert_allclose(phases(states), [0.5, 0.0, -0.5, 0.0, -0.5], atol=1e-9)
+    assert states.level.tolist() == [1, 1, 1, 2, 2]
+    unstable = 0
+    for k in range(5):
+        # On the forced response, where the phase passes the one asked for.
+        curve = exact.curves[int(states.level[k]) - 1]
+        phase, target = np.angle(curve.velocity[:, 1, 0]), phases(states)[k]
+        passed = np.flatnonzero((phase[:-1] - target) * (phase[1:] - target) <= 0)
+        share = (target - phase[passed]) / (phase[passed + 1] - phase[passed])
+        on = curve.frequency[passed] * (1 - share) + curve.frequency[passed + 1] * share
+        place = passed[np.argmin(np.abs(on - states.frequency[k]))]
+        # Linear interpolation over a step.
+        assert np.abs(on / states.frequency[k] - 1).min() < 2e-3
+        unstable += not curve.stable[place]
+    assert unstable >= 1
+    assert test.jumps == ()
+    assert len(test.curves) == 3
+
+
+NARROW = (55 * HZ, 80 * HZ)
+
+
+def test_response_control_holds_the_velocity():
+    test = response_controlled_test(curved_beam(), [1e-3, 0.1], *NARROW, keep_harmonics=(2,))
+    states, modes = test.steady_states, curved_beam().modes
+    assert states.level.tolist() == [1] * 5 + [2] * 5
+    np.testing.assert_allclose(
+        np.abs(states.velocity[:, 0]), np.repeat([1e-3, 0.1], 5), rtol=1e-8
+    )  # Newton's method ends at an estimated 1e-10
+    assert np.all(np.cos(phases(states)) ** 2 >= 0.5)
+    assert np.any(phases(states) > 0)
+    assert np.any(phases(states) < 0)
+    # A small motion needs the linear structure's force.
+    small = np.asarray(states.level) == 1
+    per_newton = linear_response(modes, states.frequency[small], np.ones(5))[:, 0]
+    np.testing.assert_allclose(1e-3 / np.abs(per_newton), states.force[small], rtol=1e-3)
+    # At the other one the forced response to each state's force passes through it.
+    own, strong = float(modes.natural_frequency[0]), ~small
+    assert np.all(np.asarray(states.frequency)[strong] < 1.01 * own)
+    assert np.all(np.abs(states.harmonics[strong, 0, 0]) > 1e-4)
+
+
+def test_errors_and_chain_are_the_same_for_every_test():
+    errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
+    options = {"errors": errors, "seed": 3}
+    exact_one = phase_controlled_test(curved_beam(), TINY, [0.0]).steady_states
+    drawn = phase_controlled_test(curved_beam(), TINY, [0.0], **options).steady_states
+    same = VisitedStates(np.array([1, 2]), np.zeros(2), np.ones(2), np.ones(2), np.ones((2, 3, 1)))
+    by_hand = recorded_states(curved_beam(), same, errors, 3)
+    plain = recorded_states(curved_beam(), same, NO_ERRORS, 3)
+    np.testing.assert_allclose(
+        drawn.velocity / exact_one.velocity, by_hand.velocity / plain.velocity, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        drawn.force / exact_one.force, by_hand.force / plain.force, rtol=1e-12
+    )
+    np.testing.assert_array_equal(drawn.phase_std, 0.02)
+
+
 # -------------------------------------------------------------------------------- failing well
 
 
@@ -226,11 +445,44 @@ def test_level_errors_are_shared_within_a_level():
         ({"errors": MeasurementErrors(phase=-0.1)}, "the error `phase` must be zero or positive"),
         ({"errors": MeasurementErrors(force=np.nan)}, "the error `force`"),
         ({"forces": [0.0]}, "every force must be positive"),
+        ({"by": "magic"}, "`by` must be one of .*'time_integration'.*, but is 'magic'"),
+        ({"steps_per_sweep": 1}, "`steps_per_sweep` must be 2 or more, but is 1"),
+        ({"by": "time_integration", "cycles_per_step": 3}, "needs 8 cycles"),
     ],
 )
 def test_wrong_settings_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         run(**options)
+
+
+@pytest.mark.parametrize(
+    ("forces", "phases", "message"),
+    [
+        ([0.0], [0.0], "every force must be positive, but one is 0.0 N"),
+        ([], [0.0], "a test needs at least one force"),
+        ([1e-9], [], "`phases` must name at least one phase"),
+        ([1e-9], [2.0], "`phase` must lie between"),
+    ],
+)
+def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message):
+    with pytest.raises(ValueError, match=message):
+        phase_controlled_test(curved_beam(), forces, phases)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"velocities": [-1.0]}, "every velocity must be positive, but one is -1.0 m/s"),
+        ({"appropriation": (1.0, 1.0)}, "`appropriation`"),
+        ({"points_per_level": 0}, "`points_per_level`"),
+        ({"keep_harmonics": (1,)}, "`keep_harmonics`"),
+        ({"from_frequency": 1e4}, "`from_frequency` must be positive and below"),
+    ],
+)
+def test_wrong_settings_of_response_control_are_named(options, message):
+    given = {"velocities": [1e-3], "from_frequency": RANGE[0], "to_frequency": RANGE[1]}
+    with pytest.raises(ValueError, match=message):
+        response_controlled_test(curved_beam(), **(given | options))
 
 
 def test_a_range_without_resonance_has_no_states():
