@@ -324,17 +324,22 @@ def with_bifurcations(
     with the rows of the new points. `balance` is stacked, of one member.
     """
     regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
-    outside = _outside(multipliers)
-    crossings, quiet_folds = [], []
+    outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
+    rest = outside - beyond_one
+    crossings, beside_fold, quiet_folds = [], [], []
     for k, following in itertools.pairwise(regular.tolist()):
-        change = abs(int(outside[following]) - int(outside[k]))
-        if following > k + 1:
-            if change == 0:
-                quiet_folds.append(k + 1)
-            if change <= 1:
-                continue
-        if change and np.all(np.isfinite(multipliers[[k, following]])):
-            crossings.append(following - 1)
+        if not np.all(np.isfinite(multipliers[[k, following]])):
+            continue
+        if following == k + 1:
+            crossings += [k] if outside[k] != outside[following] else []
+            continue
+        # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
+        own = abs(int(beyond_one[following]) - int(beyond_one[k]))
+        if own == 0:
+            quiet_folds.append(k + 1)
+        beside = [m for m in range(k, following) if rest[m] != rest[m + 1]]
+        beside_fold += beside
+        crossings += beside or ([following - 1] if own > 1 else [])
     # Truncated harmonics turn the curve a little beside the place where the motion loses its
     # stability: a crossing of +1 next to a fold without one is the fold's own.
     for fold in quiet_folds:
@@ -343,7 +348,8 @@ def with_bifurcations(
             crossings.remove(min(near, key=lambda k: abs(k - fold)))
     if not crossings:
         return curve, multipliers
-    return _located_bifurcations(balance, curve, multipliers, crossings, steps)
+    without_one = np.isin(crossings, beside_fold)
+    return _located_bifurcations(balance, curve, multipliers, crossings, without_one, steps)
 
 
 def _real_plus(multipliers: np.ndarray, k: int) -> bool:
@@ -359,12 +365,20 @@ def _located_bifurcations(
     curve: Walked,
     multipliers: np.ndarray,
     crossings: list[int],
+    without_one: Bool[np.ndarray, " crossing"],
     steps: StepControl,
 ) -> tuple[Walked, np.ndarray]:
-    """Divide the intervals until the crossing is known to a millionth of a step."""
+    """Divide the intervals until the crossing is known to a millionth of a step.
+
+    Where it is to be found `without_one`, crossings of +1 do not count.
+    """
     member = as_arrays(taken(balance, 0))
     low, high = np.zeros(len(crossings)), np.ones(len(crossings))
-    first = _outside(multipliers[crossings])
+
+    def counted(rows: np.ndarray, without: np.ndarray) -> np.ndarray:
+        return _outside(rows) - np.where(without, _beyond_one(rows), 0)
+
+    first = counted(multipliers[crossings], without_one)
     for _ in range(7):
         shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
         owner = [0] * shares.size
@@ -373,7 +387,8 @@ def _located_bifurcations(
             balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
         )
         rows = _multipliers_of(member, found)
-        count = np.where(ok, _outside(rows), np.repeat(first, _INSIDE)).reshape(shares.shape)
+        count = counted(rows, np.repeat(without_one, _INSIDE))
+        count = np.where(ok, count, np.repeat(first, _INSIDE)).reshape(shares.shape)
         beyond = count != first[:, None]
         index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
         edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
@@ -394,6 +409,12 @@ def _located_bifurcations(
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:
     return np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1)
+
+
+def _beyond_one(multipliers: np.ndarray) -> np.ndarray:
+    """How many multipliers are real and beyond +1, where a fold sends one of them."""
+    real = np.abs(multipliers.imag) < 1e-9 * np.abs(multipliers)
+    return np.sum(real & (multipliers.real > 1.0 + MARGIN), axis=-1)
 
 
 def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:

@@ -59,7 +59,9 @@ def forced_response(
     Returns one `ResponseCurve` for every force; its `status` says how it ended. When the curve
     from the lower end does not reach the upper one, it is followed from the upper end instead,
     and when that does not reach the lower end either, both parts are returned, a part without a
-    start being empty. Isolated branches and second wells: `isolated_responses`.
+    start being empty. Where a resonance reaches beyond `to_frequency`, the branch that comes in
+    there from the linear response is returned too. Isolated branches and second wells:
+    `isolated_responses`.
     Raises `ValueError` for a force that is not positive and for an empty or endless frequency
     range.
 
@@ -215,17 +217,25 @@ def _chunk_of_curves(
         again = follow_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
         for k, curve in zip(lost, again, strict=True):
             upward[k] = curve
-    # Below a strong softening the lower end has several solutions; the upper end has one.
-    short = [k for k, c in enumerate(upward) if c.status != CurveStatus.UPPER_END]
-    downward = follow_from_rest(balances, np.array(short, dtype=int), *walk, downward=True)
+    # Below a strong softening the lower end has several solutions and the upper end has one; and
+    # where a resonance reaches beyond the upper end, another branch comes in there.
+    reached = [c.status == CurveStatus.UPPER_END for c in upward]
+    alone = [r and _ends_near_rest(balances, k, upward[k]) for k, r in enumerate(reached)]
+    doubtful = [k for k, known in enumerate(alone) if not known]
+    downward = follow_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
     ahead.result()
     owner: list[int] = []
     parts: list[FollowedCurve] = []
     for k, curve in enumerate(upward):
         pieces = [curve]
-        if k in short:
-            back = downward[short.index(k)].reversed()
-            pieces = [back] if back.status == CurveStatus.UPPER_END else [curve, back]
+        if k in doubtful:
+            back = downward[doubtful.index(k)]
+            if reached[k]:
+                known = len(back.points) and _same_point(back.points[0], curve.points[-1])
+                pieces = [curve] if known or not len(back.points) else [curve, back]
+            else:
+                whole = back.status == CurveStatus.LOWER_END
+                pieces = [back.reversed()] if whole else [curve, back.reversed()]
         owner += [k] * len(pieces)
         parts += pieces
     jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
@@ -239,6 +249,23 @@ def _chunk_of_curves(
         for e, response in zip(job, responses, strict=True):
             results[good[owner[e]]].append(response)
     return [tuple(curves) for curves in results]
+
+
+def _ends_near_rest(balances: HarmonicBalance, member: int, curve: FollowedCurve) -> bool:
+    """Whether a curve's last point is about the linear response there: then it is alone."""
+    model, j = balances.model, balances.model.modes.mode_of_interest
+    omega = float(curve.points[-1, -1])  # over the natural frequency
+    damping = float(np.asarray(model.modes.damping_ratio)[member, j])
+    own = float(np.asarray(model.modes.natural_frequency)[member, j])
+    load = float(balances.force[member]) * float(np.asarray(model.modes.participation)[member, j])
+    linear = load / (own**2 * (1 - omega**2 + 2j * damping * omega))
+    x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
+    last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
+    return abs(last - linear) < 0.5 * abs(linear)
+
+
+def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
+    return bool(np.max(np.abs(first - second)) < 1e-5)
 
 
 _COMPILED: set = set()
