@@ -1,9 +1,9 @@
-"""Truth from outside: time integration of equations of motion that are written here again."""
+"""Truth from outside: equations of motion written here again, integrated in time or balanced."""
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import brentq, linear_sum_assignment
 
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from snrmjax.simulate.forced_response import forced_response
@@ -96,6 +96,128 @@ class TimeDomain:
         return np.linalg.eigvals(slope / size[:, None])
 
 
+class NumpyBalance:
+    """Harmonic balance by sampling, in NumPy, of a structure with a polynomial potential.
+
+    Takes numbers from a model, none of its methods. Unknowns are the coefficients
+    (mean, cosine, sine, …) × mode over `scale`, flattened, and Ω over the first frequency.
+    """
+
+    def __init__(self, model, force, order, scale):
+        modes = model.modes
+        self.n, self.order, self.scale = modes.n_modes, order, scale
+        self.natural = np.asarray(modes.natural_frequency)
+        self.viscous = 2 * np.asarray(modes.damping_ratio) * self.natural
+        self.load = force * np.asarray(modes.participation)
+        self.shape = np.asarray(modes.mode_shape)[0]
+        self.unit = self.natural[0]
+        self.power = np.zeros((len(model.potential.monomials), self.n), dtype=int)
+        for row, monomial in enumerate(model.potential.monomials):
+            for mode in monomial:
+                self.power[row, mode] += 1
+        self.value = np.asarray(model.potential.coefficient)
+        samples = 2 ** int(np.ceil(np.log2((self.power.sum(axis=1).max(initial=1)) * order + 2)))
+        angle = 2 * np.pi * np.outer(np.arange(samples) / samples, np.arange(1, order + 1))
+        self.basis = np.ones((samples, 2 * order + 1))
+        self.basis[:, 1::2], self.basis[:, 2::2] = np.cos(angle), np.sin(angle)
+        self.inverse = np.linalg.pinv(self.basis)
+        self.orders = np.concatenate([[0], np.repeat(np.arange(1, order + 1), 2)])
+
+    def derivative(self, q, *by):
+        """∂V/∂q_m or ∂²V/∂q_m∂q_n at samples in rows."""
+        power, value = self.power.copy(), self.value.copy()
+        for mode in by:
+            value = value * power[:, mode]
+            power[:, mode] = np.maximum(power[:, mode] - 1, 0)
+        return np.prod(q[:, None, :] ** power, axis=2) @ value
+
+    def linearised(self, y):
+        """Residual (m/s² over scale·ω₁²) and Jacobian of a point (x, λ)."""
+        x, omega = y[:-1].reshape(-1, self.n) * self.scale, y[-1] * self.unit
+        size, n = len(x), self.n
+        q = self.basis @ x
+        force = self.inverse @ np.stack([self.derivative(q, m) for m in range(n)], axis=1)
+        turned = np.zeros_like(x)  # d/dτ
+        h = np.arange(1, self.order + 1)[:, None]
+        turned[1::2], turned[2::2] = h * x[2::2], -h * x[1::2]
+        inertia = self.natural**2 - (self.orders[:, None] * omega) ** 2
+        residual = inertia * x + omega * self.viscous * turned + force
+        residual[1] -= self.load
+        jacobian = np.zeros((size, n, size, n))
+        swap = np.zeros((size, size))
+        for k in range(1, self.order + 1):
+            swap[2 * k - 1, 2 * k], swap[2 * k, 2 * k - 1] = k, -k
+        for a in range(n):
+            for b in range(n):
+                tangent = self.derivative(q, a, b)[:, None] * self.basis
+                jacobian[:, a, :, b] = self.inverse @ tangent
+            jacobian[:, a, :, a] += np.diag(inertia[:, a]) + omega * self.viscous[a] * swap
+        by_omega = -2 * self.orders[:, None] ** 2 * omega * x + self.viscous * turned
+        unit = self.scale * self.unit**2
+        matrix = jacobian.reshape(size * n, size * n) * self.scale
+        matrix = np.column_stack([matrix, by_omega.ravel() * self.unit]) / unit
+        return residual.ravel() / unit, matrix
+
+    def solved(self, y, fixed):
+        """Newton's method with one unknown held; the residual is left at rounding."""
+        y = np.array(y)
+        free = np.arange(len(y)) != fixed
+        for _ in range(30):
+            residual, matrix = self.linearised(y)
+            step = np.linalg.solve(matrix[:, free], residual)
+            y[free] -= step
+            if np.abs(step).max() < 1e-13 * np.abs(y).max():
+                return y
+            if np.abs(step).max() < 1e-10 and np.abs(residual).max() < 1e-13:
+                return y
+        raise AssertionError("Newton's method of the reference did not converge")
+
+    def tangent(self, y, along):
+        """Unit tangent of the curve, in the direction `along`."""
+        tangent = np.linalg.svd(self.linearised(y)[1])[2][-1]
+        return tangent * np.sign(tangent @ along)
+
+    def height(self, y):
+        """|V₁|² of the first sensor, scaled, and its gradient."""
+        x = y[:-1].reshape(-1, self.n) @ self.shape
+        gradient = np.zeros((2 * self.order + 1, self.n))
+        gradient[1:3] = 2 * y[-1] ** 2 * x[1:3, None] * self.shape
+        square = x[1] ** 2 + x[2] ** 2
+        return y[-1] ** 2 * square, np.append(gradient.ravel(), 2 * y[-1] * square)
+
+    def test(self, kind, y, along):
+        """What vanishes at an event."""
+        if kind == "phase_resonance":  # V₁ ∝ i(a − ib): its imaginary part is that of i·a
+            return y[self.n]
+        tangent = self.tangent(y, along)
+        return tangent[-1] if kind == "fold" else self.height(y)[1] @ tangent
+
+    def event(self, kind, coefficients, frequency):
+        """Ω (rad/s) and the velocity amplitude (m/s) of the event near a point.
+
+        Along the unknown that changes fastest there, by brentq between points that bracket it.
+        """
+        start = np.append(coefficients.ravel() / self.scale, frequency / self.unit)
+        along = np.linalg.svd(self.linearised(start)[1])[2][-1]
+        fixed = int(np.argmax(np.abs(along)))
+
+        def at(parameter):
+            guess = start + along * (parameter - start[fixed]) / along[fixed]
+            return self.solved(guess, fixed)
+
+        def value(parameter):
+            return self.test(kind, at(parameter), along)
+
+        width = 1e-6
+        while value(start[fixed] - width) * value(start[fixed] + width) > 0:
+            width *= 2
+            assert width < 1e-2, "there is no such event near the point"
+        ends = start[fixed] - width, start[fixed] + width
+        y = at(brentq(value, *ends, xtol=1e-14, rtol=1e-14))
+        omega = y[-1] * self.unit
+        return omega, np.sqrt(self.height(y)[0]) * self.scale * self.unit
+
+
 def initial_state(coefficients, frequency):
     """(q, q̇) at t = 0 of q = X₀ + Σ a_h cos hΩt + b_h sin hΩt."""
     orders = np.arange(1, (len(coefficients) - 1) // 2 + 1)
@@ -112,6 +234,11 @@ def spectrum_distance(first, second):
 @pytest.fixture(scope="session")
 def time_domain():
     return TimeDomain
+
+
+@pytest.fixture(scope="session")
+def numpy_balance():
+    return NumpyBalance
 
 
 @pytest.fixture(scope="session")
