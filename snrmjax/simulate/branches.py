@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from snrmjax.model.structure import Structure, equilibria, simulated_structure
 from snrmjax.simulate.blocks import as_arrays, padded, taken
 from snrmjax.simulate.continuation import CurveStatus, StepControl, traced
+from snrmjax.simulate.controlled import phase_controlled
 from snrmjax.simulate.following import follow_responses, response_balances
 from snrmjax.simulate.forced_response import DEFAULT_STEPS, forced_response, solve_at_frequency
 from snrmjax.simulate.harmonic_balance import HarmonicBalance, linear_coefficients
@@ -37,9 +38,11 @@ def isolated_responses(
     """Search for response curves that are not connected to the one from rest, and follow them.
 
     Newton's method starts from the motions given (such as settled motions of a time integration,
-    from other initial states), from vibrations about every stable equilibrium, and from random
-    amplitudes and phases of the mode of interest across the frequency range. Each motion that
-    lies on no known curve is followed both ways, around if its curve is closed.
+    from other initial states), from every phase resonance that the force-appropriated backbone has
+    at this force (followed to twice the force: the tips of loops are among them), from vibrations
+    about every stable equilibrium, and from random amplitudes and phases of the mode of interest
+    across the frequency range. Each motion that lies on no known curve is followed both ways,
+    around if its curve is closed.
 
     Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, `forced_response`
     if not given; `starts` as (coefficients in kg^1/2 m, frequency in rad/s).
@@ -93,6 +96,7 @@ def _starts(
                 f"{x.shape}."
             )
         rows.append((x, float(frequency), "isolated, from a given start"))
+    rows += [(x, w, "isolated, from a phase resonance") for x, w in _phase_resonances(balance)]
     wells = [e for e in equilibria(model) if e.stable]
     rng = np.random.default_rng(seed)
     j, scale = model.modes.mode_of_interest, float(balance.displacement_scale)
@@ -115,6 +119,24 @@ def _starts(
         x[1, j], x[2, j] = amplitude * np.cos(angle), amplitude * np.sin(angle)
         rows.append((x, float(frequency), "isolated, from a random start"))
     return rows
+
+
+def _phase_resonances(balance: HarmonicBalance) -> list[Start]:
+    """Where the force-appropriated backbone passes this force, however often it turns."""
+    force = float(balance.force)
+    backbone = phase_controlled(
+        balance.model,
+        2 * force,
+        harmonic_order=balance.harmonic_order,
+        n_samples=balance.n_samples,
+    )
+    beyond = backbone.force > force
+    where = np.flatnonzero(beyond[1:] != beyond[:-1])
+    share = (force - backbone.force[where]) / np.diff(backbone.force)[where]
+    x, omega = backbone.coefficients, backbone.frequency
+    between = x[where] + share[:, None, None] * np.diff(x, axis=0)[where]
+    frequency = omega[where] + share * np.diff(omega)[where]
+    return list(zip(between, frequency.tolist(), strict=True))
 
 
 def _solutions(

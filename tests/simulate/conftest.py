@@ -47,9 +47,9 @@ class TimeDomain:
         return a
 
     def size(self, states):
-        """Largest displacement and velocity of the states, the latter at least ΩQ."""
+        """Largest displacement Q and velocity V of the states, at least V/Ω and ΩQ."""
         q, v = np.abs(states).reshape(-1, 2, self.n).max(axis=(0, 2))
-        return np.repeat([q, max(v, self.frequency * q)], self.n)
+        return np.repeat([max(q, v / self.frequency), max(v, self.frequency * q)], self.n)
 
     def integrate(self, states, duration, rtol=1e-12, **options):
         """States (rows) after `duration`, by the eighth-order Dormand-Prince method."""
