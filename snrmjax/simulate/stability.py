@@ -69,6 +69,7 @@ def floquet_multipliers(
         found = monodromy(model, rows, speed, steps_per_cycle)
         maps = np.asarray(found)[: len(values[here])]
         finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]
+        finite &= np.all(np.isfinite(values[here]), axis=(1, 2))[:, None]
         return np.where(finite, np.linalg.eigvals(np.where(finite[:, :, None], maps, 0.0)), np.nan)
 
     return np.concatenate(over_cores(block, range(0, len(values), _BLOCK)))
