@@ -158,7 +158,7 @@ def _tongues(
     # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
     share[:, :, j] = 0.0
     share[:, :2] = 0.0
-    strongest = share.reshape(len(share), -1).max(axis=1, initial=0.0)
+    strongest = share.max(axis=(1, 2))
     inside = np.concatenate([[False], strongest > _TONGUE_SHARE, [False]])
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     found = []

@@ -14,7 +14,7 @@ from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structure import structure
 from snrmjax.simulate.continuation import CurveStatus
-from snrmjax.simulate.normal_modes import nonlinear_normal_mode
+from snrmjax.simulate.normal_modes import DEFAULT_STEPS, nonlinear_normal_mode
 
 HZ = 2 * np.pi
 W, QUARTIC = 2.0, 0.3  # q̈ + 4q + 1.2q³ = 0
@@ -43,7 +43,8 @@ def exact_frequency(amplitude, quartic=QUARTIC):
 
 @pytest.fixture(scope="module")
 def duffing_branch():
-    return nonlinear_normal_mode(duffing(), 9.0)
+    # To rounding, so that only the harmonics that are left out make a difference.
+    return nonlinear_normal_mode(duffing(), 9.0, steps=DEFAULT_STEPS._replace(tolerance=1e-13))
 
 
 def test_duffing_oscillator_has_its_exact_frequency_and_energy(duffing_branch):
@@ -227,3 +228,42 @@ def test_a_structure_of_nan_has_no_start():
 def test_a_frequency_that_leads_nowhere_is_refused(frequency):
     with pytest.raises(ValueError, match="`to_frequency` must be positive and differ from"):
         nonlinear_normal_mode(duffing(), frequency)
+
+
+def test_the_tongue_is_reported_and_can_be_skipped(flat_branch):
+    model, branch = flat_beam(), flat_branch
+    (tongue,) = branch.tongues
+    assert (tongue.mode, tongue.harmonic) == (1, 5)
+    # DESIGN: between about 87.5 and 90.2 Hz, and at its tip the fifth harmonic has it all.
+    assert tongue.from_frequency / HZ == pytest.approx(87.5, abs=0.1)
+    assert tongue.to_frequency / HZ == pytest.approx(90.2, abs=0.1)
+    assert tongue.energy_share > 0.99
+    # Where five times the frequency is about that of the second mode, stiffened as it is.
+    assert 5 * tongue.from_frequency > float(model.modes.natural_frequency[1])
+    skipped = nonlinear_normal_mode(
+        model, float(branch.frequency[-1]), harmonic_order=15, tongues="skip"
+    )
+    (gap,) = skipped.tongues
+    assert gap[:5] == tongue[:5]
+    kept = np.r_[0 : tongue.first, tongue.last + 1 : len(branch.frequency)]
+    np.testing.assert_array_equal(skipped.frequency, branch.frequency[kept])
+    np.testing.assert_array_equal(skipped.energy, branch.energy[kept])
+    assert np.all(np.diff(skipped.frequency) > 0)  # a function of frequency again
+    assert (gap.first, gap.last) == (tongue.first, tongue.first - 1)
+    # The main branch passes the gap nearly straight: across it the amplitude rises as around it.
+    velocity = np.abs(skipped.velocity[:, 1, 0])
+    slopes = [
+        (velocity[gap.first + k] - velocity[gap.last - k])
+        / (skipped.frequency[gap.first + k] - skipped.frequency[gap.last - k])
+        for k in (0, 15)
+    ]
+    assert slopes[0] == pytest.approx(slopes[1], rel=0.25)
+
+
+def test_friction_is_left_out_of_a_conservative_mode(duffing_branch):
+    sliders = make_effect("jenkins_slider", {"stiffness": 1.0, "slip_displacement": 0.1})
+    rubbing = make_effect("coulomb_friction", {"force": 0.1})
+    fine = DEFAULT_STEPS._replace(tolerance=1e-13)
+    branch = nonlinear_normal_mode(duffing(effects=(sliders, rubbing)), 9.0, steps=fine)
+    np.testing.assert_array_equal(branch.frequency, duffing_branch.frequency)
+    np.testing.assert_array_equal(branch.energy, duffing_branch.energy)
