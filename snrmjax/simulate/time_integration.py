@@ -10,19 +10,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.effect_base import AbstractHysteresis
-from snrmjax.model.friction import AbstractSliders
 from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.cycles import (
+    CyclePoint,
+    integrated_cycle,
+    memory_at_rest,
+    scaled_friction,
+)
 from snrmjax.simulate.harmonics import harmonic_basis, velocity_phasors
-
-Memory = tuple[Float[Array, " state"], ...]
 
 _WINDOW = 4  # cycles over which the decay of a transient is judged
 LEAST_CYCLES = 2 * _WINDOW  # fewer cannot show that a motion has settled
-_STEPS_PER_SAMPLE = 1000  # beyond which the integration is given up
 _SLOWEST = 0.9995  # decay per cycle that a transient is credited with at least
 
 
@@ -207,22 +207,10 @@ def _start_state(model: Structure, start: Any) -> Float[Array, "2 mode"]:
     return jnp.pad(state, ((0, 0), (0, n - state.shape[1])))
 
 
-class _Point(NamedTuple):
-    """Where an integration is: the state, friction's memory and the length of a step."""
-
-    q: Float[Array, " mode"]
-    v: Float[Array, " mode"]
-    memory: Memory
-    step: Float[Array, ""]  # of the phase Ωt
-    size: Float[Array, ""]  # largest |q| over the last cycle, kg^1/2 m
-    range: Float[Array, ""]  # half the range of the mode of interest over it, kg^1/2 m
-    speed: Float[Array, ""]  # rms q̇ of the mode of interest over it, kg^1/2 m/s
-
-
 class _Settling(NamedTuple):
     """A settling motion: the last cycle's coefficients and how much they still change."""
 
-    point: _Point
+    point: CyclePoint
     coefficients: Float[Array, "coefficient mode"]
     changes: Float[Array, " cycle"]  # relative, the last ones, newest first
     marks: Float[Array, " mark"]  # the change when the cycles were the last two powers of two
@@ -242,10 +230,13 @@ def _stepped(
 ) -> IntegratedMotion:
     """The motions at all steps, of the structure as simulated."""
     q, v = start
-    memory = tuple(_rest(effect, q[model.modes.mode_of_interest]) for effect in _scaled(model, 1.0))
-    begin = _Point(q, v, memory, jnp.asarray(0.01), *jnp.zeros((3,)))
+    memory = tuple(
+        memory_at_rest(effect, q[model.modes.mode_of_interest])
+        for effect in scaled_friction(model, 1.0)
+    )
+    begin = CyclePoint(q, v, memory, jnp.asarray(0.01), *jnp.zeros((3,)))
 
-    def dwell(point: _Point, step: tuple[Array, Array]) -> tuple[_Point, IntegratedMotion]:
+    def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
         frequency, order = step
         now = eqx.tree_at(lambda m: m.test_order, model, order)
         settled = _settle(now, force, frequency, point, harmonic_order, settings)
@@ -269,7 +260,7 @@ def _settle(
     model: Structure,
     force: Array,
     frequency: Array,
-    point: _Point,
+    point: CyclePoint,
     harmonic_order: int,
     settings: _Settings,
 ) -> _Settling:
@@ -290,7 +281,9 @@ def _settle(
         return more & jnp.all(jnp.isfinite(now.coefficients))
 
     def cycle(now: _Settling) -> _Settling:
-        point, samples = _cycle(model, force, frequency, now.point, n_samples, settings.rtol)
+        point, samples = integrated_cycle(
+            model, force, frequency, now.point, n_samples, settings.rtol
+        )
         coefficients = analysis @ samples
         largest = jnp.maximum(jnp.max(jnp.abs(coefficients)), jnp.finfo(jnp.float64).tiny)
         change = jnp.max(jnp.abs(coefficients - now.coefficients)) / largest
@@ -329,156 +322,3 @@ def _status(
     status = jnp.where(done, int(MotionStatus.SETTLED), running)
     finite = jnp.all(jnp.isfinite(settled.coefficients))
     return jnp.where(finite, status, int(MotionStatus.FAILED))
-
-
-def _cycle(
-    model: Structure,
-    force: Array,
-    frequency: Array,
-    point: _Point,
-    n_samples: int,
-    rtol: Array,
-) -> tuple[_Point, Float[Array, "time mode"]]:
-    """One cycle of the force, and the displacements at equally spaced samples of it."""
-    diffrax = _diffrax()
-    solver = diffrax.Tsit5(scan_kind="lax")
-    j, terms = model.modes.mode_of_interest, model.linear_terms()
-    load, orders = force * model.modes.participation, model.load_orders()
-    # What the linear modes would do: the scale before the first cycle, and against rest.
-    receptance = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
-    linear = jnp.max(jnp.abs(load) / jnp.maximum(jnp.abs(receptance), 1e-3 * terms.stiffness))
-    static = jnp.max(jnp.abs(load) / terms.stiffness)
-    fresh = point.size == 0
-    start = jnp.maximum(jnp.max(jnp.abs(point.q)), jnp.max(jnp.abs(point.v)) / frequency)
-    first = jnp.maximum(linear, start)
-    size = jnp.maximum(jnp.where(fresh, first, point.size), 1e-2 * static)
-    reach = jnp.maximum(jnp.where(fresh, first, point.range), 1e-3 * static)
-    speed = jnp.where(fresh, first * frequency / np.sqrt(2), point.speed)
-    speed = jnp.maximum(speed, 1e-2 * static * frequency)
-    effects = _scaled(model, reach, speed)
-    memory = point.memory
-    if effects:
-        old = _scaled(model, jnp.where(fresh, reach, point.range), speed)
-        memory = tuple(map(_moved_memory, old, effects, point.memory))
-
-    flat, whole = ravel_pytree((point.q, point.v, memory))
-    n = model.n_modes
-
-    def slope(phase: Array, state: Array, _: None) -> Array:
-        q, v, memory = whole(state)
-        drive = load * (orders @ jnp.cos(jnp.arange(len(orders)) * phase))
-        inner = terms.stiffness * q + terms.damping * v
-        inner = inner + model.memoryless_force(q[None], v[None])[0]
-        for effect, own in zip(effects, memory, strict=True):
-            inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
-        rates = tuple(map(lambda e, own: _rate(e, q[j], v[j], own), effects, memory))
-        return ravel_pytree((v, (drive - inner) / terms.mass, rates))[0] / frequency
-
-    term, width = diffrax.ODETerm(slope), 2 * jnp.pi / n_samples
-
-    def sample(carry: tuple, number: Array) -> tuple[tuple, tuple[Array, Array]]:
-        begin, end = number * width, (number + 1) * width
-
-        def going(now: tuple) -> Array:
-            phase, _, _, count = now
-            return (phase < end) & (count < _STEPS_PER_SAMPLE)
-
-        def advance(now: tuple) -> tuple:
-            phase, state, step, count = now
-            last = phase + 1.01 * step >= end
-            to = jnp.where(last, end, phase + step)
-            held = solver.init(term, phase, to, state, None)
-            new, error, _, _, _ = solver.step(term, phase, to, state, None, held, made_jump=True)
-            miss = jnp.maximum(
-                jnp.max(jnp.abs(error[:n])), jnp.max(jnp.abs(error[n : 2 * n])) / frequency
-            ) / (rtol * size)
-            # A step that is no number is too long.
-            miss = jnp.where(jnp.isfinite(miss), miss, 1e6)
-            factor = jnp.clip(0.9 * jnp.maximum(miss, 1e-10) ** -0.2, 0.2, 4.0)
-            taken, good = to - phase, miss <= 1
-            longer = jnp.where(last, jnp.maximum(step, taken * factor), taken * factor)
-            step = jnp.where(good, longer, taken * factor)
-            if effects:
-                new = _with_memory(effects, j, whole(state), whole(new), taken / frequency)
-            return jnp.where(good, to, phase), jnp.where(good, new, state), step, count + 1
-
-        state, step = carry
-        phase, new, step, _ = jax.lax.while_loop(going, advance, (begin, state, step, 0))
-        new = jnp.where(phase >= end, new, jnp.nan)
-        step = jnp.where(jnp.isfinite(step), jnp.minimum(step, 1.0), 1e-3)
-        return (new, step), (state[:n], state[n + j])
-
-    (end, step), (samples, speeds) = jax.lax.scan(sample, (flat, point.step), jnp.arange(n_samples))
-    own, (q, v, memory) = samples[:, j], whole(end)
-    after = _Point(
-        q=q,
-        v=v,
-        memory=memory,
-        step=step,
-        size=jnp.max(jnp.abs(samples)),
-        range=jnp.maximum(0.5 * (jnp.max(own) - jnp.min(own)), 1e-3 * static),
-        speed=jnp.sqrt(jnp.mean(speeds**2)),
-    )
-    return after, samples
-
-
-def _scaled(
-    model: Structure, displacement: Array | float, velocity: Array | float = 1.0
-) -> tuple[AbstractHysteresis, ...]:
-    """The effects with a memory, set for integration in time."""
-    values = jnp.asarray(displacement), jnp.asarray(velocity)
-    return tuple(effect.scaled_for(*values) for effect in model.hysteretic)
-
-
-def _rest(effect: AbstractHysteresis, displacement: Array) -> Array:
-    """Memory of a structure that was brought to a displacement and held there."""
-    states = effect.initial_states()
-    if isinstance(effect, AbstractSliders):
-        return effect.moved_states(displacement, states)
-    return states
-
-
-def _moved_memory(old: AbstractHysteresis, new: AbstractHysteresis, states: Array) -> Array:
-    """Positions of sliders after their slip displacements were chosen anew.
-
-    A position is a function of the slip displacement, piecewise linear, whatever the history.
-    """
-    if not isinstance(old, AbstractSliders) or not isinstance(new, AbstractSliders):
-        return states
-    slip, wanted = old.sliders().slip_displacement, new.sliders().slip_displacement
-    return jnp.interp(wanted, slip, states)
-
-
-def _rate(effect: AbstractHysteresis, q: Array, v: Array, states: Array) -> Array:
-    """Rates of the memory during a step, through which sliders are held: see `_with_memory`."""
-    if isinstance(effect, AbstractSliders):
-        return jnp.zeros_like(states)
-    return effect.state_rate(q, v, states)
-
-
-def _with_memory(
-    effects: tuple[AbstractHysteresis, ...], j: int, old: tuple, new: tuple, time: Array
-) -> Float[Array, " unknown"]:
-    """The new state with the sliders moved along the way of q, its turning point included."""
-    (q0, v0), (q1, v1) = (old[0][j], old[1][j]), (new[0][j], new[1][j])
-    turns = v0 * v1 < 0
-    until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
-    turning = jnp.where(turns, q0 + 0.5 * v0 * until, q0)
-
-    def moved(effect: AbstractHysteresis, states: Array) -> Array:
-        if not isinstance(effect, AbstractSliders):
-            return states
-        return effect.moved_states(q1, effect.moved_states(turning, states))
-
-    return ravel_pytree((*new[:2], tuple(map(moved, effects, new[2]))))[0]
-
-
-def _diffrax() -> Any:
-    try:
-        import diffrax
-    except ImportError as error:
-        raise ImportError(
-            "time integration needs diffrax, which is not installed: "
-            "pip install 'snrmjax[integrate]'."
-        ) from error
-    return diffrax
