@@ -45,6 +45,7 @@ from snrmjax.simulate.controlled import (
     phase_controlled,
     response_controlled,
 )
+from snrmjax.simulate.controlled_test import phase_controlled_test, response_controlled_test
 from snrmjax.simulate.forced_response import (
     ResponseBatch,
     forced_response,
@@ -61,6 +62,12 @@ from snrmjax.simulate.periodic_motion import (
 )
 from snrmjax.simulate.response_curve import ResponseCurve
 from snrmjax.simulate.stability import StabilityLoss, floquet_multipliers
+from snrmjax.simulate.time_integration import (
+    IntegratedMotion,
+    MotionStatus,
+    settled_motion,
+    stepped_sine,
+)
 from snrmjax.simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
 
 __all__ = [
@@ -71,8 +78,10 @@ __all__ = [
     "CurveStatus",
     "DampedModeBranch",
     "Identification",
+    "IntegratedMotion",
     "LinearModes",
     "MeasurementErrors",
+    "MotionStatus",
     "NormalModeBranch",
     "PeriodicMotion",
     "PointStatus",
@@ -117,6 +126,7 @@ __all__ = [
     "nonlinear_normal_mode",
     "periodic_motion",
     "phase_controlled",
+    "phase_controlled_test",
     "phase_resonance_test",
     "polynomial_potential",
     "potential_from_force_table",
@@ -126,9 +136,12 @@ __all__ = [
     "resonances",
     "response_at_velocities",
     "response_controlled",
+    "response_controlled_test",
+    "settled_motion",
     "snrm_velocity",
     "solve_at_frequency",
     "steady_states",
+    "stepped_sine",
     "structure",
     "velocity_phasors",
 ]

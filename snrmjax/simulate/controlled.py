@@ -221,8 +221,8 @@ def response_controlled(
     folds where the open loop has them. Solves the harmonic balance with |V₁| = `velocity`.
 
     Arguments: `velocity` in m/s, frequencies in rad/s.
-    Returns a `ControlledCurve` from the lower to the upper frequency; its `status` says whether
-    it got there. Raises `ValueError` for a velocity that is not positive and an empty range.
+    Returns a `ControlledCurve` from the lower to the upper frequency, followed from the upper one
+    where the lower one gives no start; its `status` is UPPER_END when it spans the range. Raises `ValueError` for a velocity that is not positive and an empty range.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
     """
@@ -246,15 +246,27 @@ def response_controlled(
         model, unit, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
     ends = jnp.asarray([from_frequency, to_frequency])
-    curve = _follow_response(balance, jnp.asarray(float(velocity)), ends, traced(steps), max_points)
-    n = int(curve.n_points)
-    points = np.asarray(curve.points)[:n]
+    held = jnp.asarray(float(velocity))
+    settings = (traced(steps), max_points)
+    curve = _follow_response(balance, held, ends, jnp.array(False), *settings)
+    points = np.asarray(curve.points)[: int(curve.n_points)]
+    if int(curve.status) == CurveStatus.NO_START:
+        # Far below a resonance the linear response may be no start where far above it is one.
+        curve = _follow_response(balance, held, ends, jnp.array(True), *settings)
+        points = np.asarray(curve.points)[: int(curve.n_points)][::-1]
+        if int(curve.status) == CurveStatus.LOWER_END:
+            curve = curve._replace(status=jnp.array(int(CurveStatus.UPPER_END)))
     return _controlled(balance, np.delete(points, -2, axis=1), points[:, -2] * unit, curve)
 
 
 @eqx.filter_jit
 def _follow_response(
-    balance: HarmonicBalance, velocity: Array, ends: Array, steps: StepControl, max_points: int
+    balance: HarmonicBalance,
+    velocity: Array,
+    ends: Array,
+    downward: Array,
+    steps: StepControl,
+    max_points: int,
 ) -> Curve:
     model, n = balance.model, balance.model.n_modes
     shape = model.modes.mode_shape[0]
@@ -271,14 +283,15 @@ def _follow_response(
         value, slope = jax.value_and_grad(height)(point)
         return jnp.append(residual, value), jnp.concatenate([jacobian, slope[None]])
 
-    one = linear_coefficients(model, balance.force, ends[0], balance.harmonic_order)
-    linear = jnp.abs(velocity_phasors(one, ends[0], model.modes.mode_shape)[1, 0])
+    begin = jnp.where(downward, ends[1], ends[0])
+    one = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
+    linear = jnp.abs(velocity_phasors(one, begin, model.modes.mode_shape)[1, 0])
     share = velocity / linear
-    start = balance.point(share * one, ends[0])
+    start = balance.point(share * one, begin)
     start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
-    rising = jnp.zeros_like(start).at[-1].set(1.0)
+    onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
     return follow_curve(
-        *(linearised, start, rising, ends[0] / balance.frequency_scale),
+        *(linearised, start, onward, ends[0] / balance.frequency_scale),
         *(ends[1] / balance.frequency_scale, jnp.array(jnp.inf), steps, max_points),
     )
 

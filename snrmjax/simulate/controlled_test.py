@@ -98,7 +98,8 @@ def response_controlled_test(
 
     Arguments: `velocities` in m/s, peak amplitude of the fundamental of the flexible modes;
     frequencies in rad/s; the others as in `phase_resonance_test`.
-    Returns a `VirtualTest` with one `ControlledCurve` for each velocity.
+    Returns a `VirtualTest` with one `ControlledCurve` for each velocity; a level whose curve has no
+    start (its `status` says so) has no states.
     Raises `ValueError` as `phase_resonance_test` does.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
