@@ -222,7 +222,8 @@ def response_controlled(
 
     Arguments: `velocity` in m/s, frequencies in rad/s.
     Returns a `ControlledCurve` from the lower to the upper frequency, followed from the upper one
-    where the lower one gives no start; its `status` is UPPER_END when it spans the range. Raises `ValueError` for a velocity that is not positive and an empty range.
+    where the lower one gives no start; its `status` is UPPER_END when it spans the range.
+    Raises `ValueError` for a velocity that is not positive and an empty range.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
     doi:10.1016/j.ymssp.2020.107023.
     """
