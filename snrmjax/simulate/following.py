@@ -1,6 +1,7 @@
 """Following many response curves of one kind: stacked balances, starts, blocks over the cores."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,11 +32,15 @@ def response_balances(
     together = stacked(models)
     j = models[0].modes.mode_of_interest
     scales = [resonance_displacement(m, float(f)) for m, f in zip(models, forces, strict=True)]
+    # On the host: on the device another number of members would compile anew.
+    columns: dict[str, Any] = {
+        "force": np.asarray(forces),
+        "displacement_scale": np.asarray(scales),
+        "frequency_scale": np.asarray(together.modes.natural_frequency)[:, j],
+    }
     return HarmonicBalance(
         model=together,
-        force=jnp.asarray(forces),
-        displacement_scale=jnp.asarray(scales),
-        frequency_scale=jnp.asarray(np.asarray(together.modes.natural_frequency)[:, j]),
+        **columns,
         harmonic_order=harmonic_order,
         n_samples=samples_for(models[0], harmonic_order, n_samples),
     )
