@@ -49,7 +49,21 @@ def nothing(point):
     return jnp.array([x**2 + 1]), jnp.array([[2 * x, 0.0]])
 
 
-PROBLEMS = (s_curve, circle, pole, broken, nothing)
+def isola(point):
+    """A loop away from everything: an ellipse, x²/0.09 + (λ − 1)²/0.25 = 1."""
+    x, lam = point
+    value = x**2 / 0.09 + (lam - 1) ** 2 / 0.25 - 1
+    return jnp.array([value]), jnp.array([[2 * x / 0.09, 2 * (lam - 1) / 0.25]])
+
+
+def kink(point):
+    """x = ½|λ − 0.3|: the tangent turns by 2 atan ½ at once."""
+    x, lam = point
+    side = jnp.where(lam > 0.3, 0.5, -0.5)
+    return jnp.array([x - side * (lam - 0.3)]), jnp.stack([jnp.ones(()), -side])[None]
+
+
+PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, kink)
 
 
 @partial(jax.jit, static_argnames=("steps", "max_points"))
@@ -76,6 +90,7 @@ def followed(
     numbers = (jnp.asarray(part, dtype=float) for part in (start, direction, ends, limit, across))
     curve = compiled(PROBLEMS.index(problem), *numbers, steps=steps, max_points=max_points)
     n = int(curve.n_points)
+    followed.n_solves = int(curve.n_solves)
     assert np.all(np.isfinite(curve.points[:n]))
     assert np.all(np.isfinite(curve.tangents[:n]))
     assert np.all(np.isnan(curve.points[n:]))  # nothing plausible behind the last point
@@ -166,6 +181,77 @@ def test_a_curve_that_is_too_long_ends_at_the_point_limit():
     assert status == CurveStatus.POINT_LIMIT
     assert len(points) == 25
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=STEPS.tolerance)
+
+
+@pytest.mark.parametrize("largest", [0.01, 0.05, 0.3])
+@pytest.mark.parametrize("direction", [(0.0, 1.0), (0.0, -1.0)])
+@pytest.mark.parametrize(("problem", "start"), [(circle, (-0.8, -0.6)), (isola, (0.2, 1.1))])
+def test_a_loop_is_followed_once(problem, start, direction, largest):
+    points, _, status = followed(
+        problem, start, direction=direction, steps=StepControl(largest=largest)
+    )
+    assert status == CurveStatus.CLOSED
+    np.testing.assert_array_equal(points[-1], points[0])
+    centre, axes = ((0, 0), (1, 1)) if problem is circle else ((0, 1), (0.3, 0.5))
+    x, lam = ((points - centre) / axes).T
+    np.testing.assert_allclose(np.hypot(x, lam), 1.0, atol=1e-8)
+    angle = np.unwrap(np.arctan2(lam, x))
+    way = np.sign(angle[1] - angle[0])
+    # Once around, every point once and in order, the last step no longer than the others.
+    assert angle[-1] - angle[0] == pytest.approx(way * 2 * np.pi, abs=1e-6)
+    assert np.all(way * np.diff(angle) > 0)
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert length.max() < 1.1 * largest
+    assert len(np.unique(points[:-1].round(9), axis=0)) == len(points) - 1
+
+
+def test_a_kink_is_passed():
+    points, tangents, status = followed(kink, [0.65, -1.0], ends=(-1.0, 1.5))
+    assert status == CurveStatus.UPPER_END
+    np.testing.assert_allclose(points[:, 0], 0.5 * np.abs(points[:, 1] - 0.3), atol=1e-9)
+    assert np.all(np.diff(points[:, 1]) > 0)  # never back
+    # Only near the kink are the steps small, and they grow again behind it.
+    near = np.abs(points[:, 1] - 0.3) < 0.02
+    assert np.min(np.abs(points[near, 1] - 0.3)) < STEPS.kink
+    assert np.linalg.norm(np.diff(points[-5:-1], axis=0), axis=1).max() > 0.9 * STEPS.largest
+    np.testing.assert_allclose(tangents[-1], np.array([0.5, 1.0]) / np.hypot(0.5, 1.0), atol=1e-9)
+
+
+def test_tolerance_is_honoured_and_costs_solves():
+    errors, solves = [], []
+    for tolerance in (1e-3, 1e-6, 1e-9, 1e-13):
+        points, _, status = followed(
+            s_curve, [-1.0, -2.0], steps=StepControl(tolerance=tolerance, largest=0.2)
+        )
+        assert status == CurveStatus.UPPER_END
+        x, lam = points.T
+        # The residual over its slope is the distance from the curve.
+        distance = np.abs(x**3 - x - lam) / np.hypot(3 * x**2 - 1, 1)
+        errors.append(distance.max())
+        solves.append(followed.n_solves / len(points))
+        # The error that is left is judged by how far the last step reduced the residual.
+        assert errors[-1] <= 2 * tolerance
+    assert errors[0] > 1e-9  # nothing is done for nothing
+    assert solves[0] < solves[1] < solves[2] < solves[3]
+
+
+def test_solves_are_counted():
+    calls = []
+
+    def counted(point):
+        jax.debug.callback(lambda _: calls.append(1), point[0])
+        return circle(point)
+
+    @jax.jit
+    def run(start):
+        ends = (jnp.array(-2.0), jnp.array(2.0), jnp.array(jnp.inf))
+        return follow_curve(counted, start, jnp.array([0.0, 1.0]), *ends, STEPS, 800)
+
+    curve = run(jnp.array([-0.8, -0.6]))
+    jax.effects_barrier()
+    # Each factorisation has its matrix, and the residual after the step that it gave.
+    assert len(calls) == 2 * int(curve.n_solves)
+    assert int(curve.n_solves) >= int(curve.n_points) > 50
 
 
 def test_a_curve_that_turns_back_ends_at_the_lower_end():
