@@ -32,3 +32,5 @@ def quick_compilation(request: pytest.FixtureRequest):
     jax.config.update("jax_disable_most_optimizations", "simulate" not in request.path.parts)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    # The programs of all modules together would fill gigabytes; the store has them on disk.
+    jax.clear_caches()
