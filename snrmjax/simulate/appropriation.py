@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from snrmjax.model.structure import Structure, simulated_structure
 from snrmjax.simulate.blocks import padded
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import correct
 from snrmjax.simulate.harmonic_balance import harmonic_balance
 from snrmjax.simulate.recording import VisitedStates
@@ -107,7 +108,7 @@ def states_at_phases(
     return found.only(converged & (np.abs(size / was - 1) < 0.2) & (off.real > 0))
 
 
-@eqx.filter_jit
+@compiled
 def _at_phases(
     model: Structure,
     order: Array,

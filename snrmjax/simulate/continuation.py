@@ -324,44 +324,69 @@ def locate_event(
     length = tangent @ (there - here)
     trials = 40
 
-    def body(state: tuple) -> tuple:
-        count, low, high, f_low, f_high, side, share, *_ = state
-        # Interpolating between the neighbours keeps every guess near the curve.
-        guess = here + share * (there - here)
+    def trial(share: Array, guess: Point) -> tuple[_Known, Bool[Array, ""]]:
         guess = guess + (share * length - tangent @ (guess - here)) * tangent
         found = correct(
             linearised, guess, tangent, 1e-3 * control.tolerance, 2 * control.iterations
         )
+        # With the slope against the share of the way the curve between two trials is a cubic.
+        slope = found.tangent * (length / (tangent @ found.tangent))
         value = test(found.point, found.tangent)
-        is_low, is_high = count == 0, count == 1
-        inner = ~is_low & ~is_high
-        in_upper = inner & (jnp.sign(value) == jnp.sign(f_low))
-        in_lower = inner & ~in_upper
-        new_low = jnp.where(in_upper, share, low)
-        new_high = jnp.where(in_lower, share, high)
-        new_f_low = jnp.where(
-            in_upper | is_low, value, jnp.where(in_lower & (side == -1), 0.5 * f_low, f_low)
-        )
-        new_f_high = jnp.where(
-            in_lower | is_high, value, jnp.where(in_upper & (side == 1), 0.5 * f_high, f_high)
-        )
-        side = jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0))
-        secant = (new_low * new_f_high - new_high * new_f_low) / (new_f_high - new_f_low)
-        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (new_low + new_high))
-        next_share = jnp.where(is_low, 1.0, secant)
-        settled = (inner & (jnp.abs(next_share - share) < 1e-12)) | (inner & (value == 0))
-        return (
-            *(count + 1, new_low, new_high, new_f_low, new_f_high, side),
-            *(jnp.where(settled, share, next_share), found.point, found.tangent),
-            *(found.converged, settled),
-        )
+        return _Known(share, value, found.point, found.tangent, slope), found.converged
 
-    zero, one = jnp.array(0.0), jnp.array(1.0)
+    def body(state: tuple) -> tuple:
+        count, low, high, side, share, _, _, _ = state
+        is_low, is_high = count == 0, count == 1
+        guess = jnp.where(is_low, here, jnp.where(is_high, there, _cubic(low, high, share)))
+        found, converged = trial(share, guess)
+        inner = ~is_low & ~is_high
+        in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
+        in_lower = inner & ~in_upper
+        halved = jnp.where(in_lower & (side == -1), 0.5, 1.0)
+        low = low._replace(value=low.value * halved)
+        halved = jnp.where(in_upper & (side == 1), 0.5, 1.0)
+        high = high._replace(value=high.value * halved)
+        low = _chosen(in_upper | is_low, found, low)
+        high = _chosen(in_lower | is_high, found, high)
+        side = jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0))
+        secant = (low.share * high.value - high.share * low.value) / (high.value - low.value)
+        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (low.share + high.share))
+        next_share = jnp.where(is_low, 1.0, secant)
+        settled = (inner & (jnp.abs(next_share - share) < 1e-12)) | (inner & (found.value == 0))
+        share = jnp.where(settled, share, next_share)
+        return count + 1, low, high, side, share, found, converged, settled
+
+    zero = jnp.array(0.0)
+    nothing = _Known(zero, zero, here, tangent, tangent)
     state = (
-        *(jnp.array(0), zero, one, zero, zero, jnp.array(0), zero, here, tangent),
+        *(jnp.array(0), nothing, nothing, jnp.array(0), zero, nothing),
         *(jnp.array(True), ~jnp.asarray(wanted)),
     )
     state = jax.lax.while_loop(lambda s: ~s[-1] & (s[0] < trials), body, state)
-    _, _, _, f_low, f_high, _, share, point, direction, converged, _ = state
+    _, low, high, _, share, last, converged, _ = state
     inside = jnp.abs(share - 0.5) < 0.51
-    return point, direction, converged & inside & (f_low * f_high <= 0) & jnp.asarray(wanted)
+    resolved = converged & inside & (low.value * high.value <= 0) & jnp.asarray(wanted)
+    return last.point, last.tangent, resolved
+
+
+class _Known(NamedTuple):
+    """What a trial between two neighbours found."""
+
+    share: Array  # of the way
+    value: Array  # of the test function, halved where the other end keeps moving
+    point: Array
+    tangent: Array  # of unit length
+    slope: Array  # dpoint/dshare
+
+
+def _chosen(first: Bool[Array, ""], yes: _Known, no: _Known) -> _Known:
+    return _Known(*(jnp.where(first, a, b) for a, b in zip(yes, no, strict=True)))
+
+
+def _cubic(low: _Known, high: _Known, share: Array) -> Point:
+    """Where the cubic through two trials and their tangents is."""
+    width = high.share - low.share
+    s = (share - low.share) / width
+    chord = high.point - low.point
+    bend_low, bend_high = low.slope * width - chord, high.slope * width - chord
+    return low.point + s * chord + s * (1 - s) * ((1 - s) * bend_low - s * bend_high)

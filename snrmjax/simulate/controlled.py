@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import (
     Curve,
     CurveStatus,
@@ -96,7 +97,7 @@ def damped_normal_mode(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _follow_damped(balance: HarmonicBalance, steps: StepControl, max_points: int) -> Curve:
     model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
     terms, fs = model.linear_terms(), balance.frequency_scale
@@ -173,7 +174,7 @@ def phase_controlled(
     return _controlled(balance, points[:, :-1], points[:, -1] * largest_force, curve)
 
 
-@eqx.filter_jit
+@compiled
 def _follow_phase(
     balance: HarmonicBalance, phase: Array, steps: StepControl, max_points: int
 ) -> Curve:
@@ -260,7 +261,7 @@ def response_controlled(
     return _controlled(balance, np.delete(points, -2, axis=1), points[:, -2] * unit, curve)
 
 
-@eqx.filter_jit
+@compiled
 def _follow_response(
     balance: HarmonicBalance,
     velocity: Array,

@@ -4,13 +4,13 @@ import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.simulate.blocks import as_arrays, mapped, taken
+from snrmjax.simulate.blocks import mapped, taken
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import StepControl, correct, locate_event
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.stability import MARGIN, floquet_multipliers
@@ -52,7 +52,7 @@ def test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Float
     return jnp.stack([tangent[-1], slope, mode_velocity(balance, point).imag])
 
 
-@eqx.filter_jit
+@compiled
 def _locate(
     balances: HarmonicBalance,
     kind: Array,
@@ -73,7 +73,7 @@ def _locate(
     return mapped(one, balances, kind, here, tangent, there, wanted)
 
 
-@eqx.filter_jit
+@compiled
 def _between(
     balances: HarmonicBalance,
     here: Array,
@@ -100,11 +100,11 @@ def _between(
 def compile_events_ahead(balances: HarmonicBalance, steps: StepControl) -> None:
     """Have the programs of `with_events` compiled, without a curve yet."""
     n = _BLOCK
-    one = as_arrays(taken(balances, 0))
-    points = jnp.zeros((n, one.size + 1))
-    rows = as_arrays(taken(balances, np.zeros(n, dtype=int)))
-    none = jnp.zeros(n, dtype=bool)
-    _locate(rows, jnp.zeros(n, dtype=int), points, points, points, none, steps)
+    one = taken(balances, 0)
+    points = np.zeros((n, one.size + 1))
+    rows = taken(balances, np.zeros(n, dtype=int))
+    none = np.zeros(n, dtype=bool)
+    _locate(rows, np.zeros(n, dtype=int), points, points, points, none, steps)
 
 
 def _in_blocks(
@@ -119,9 +119,9 @@ def _in_blocks(
     parts = []
     for begin in range(0, n, _BLOCK):
         index = np.minimum(np.arange(begin, begin + _BLOCK), n - 1)
-        wanted = jnp.asarray(np.arange(begin, begin + _BLOCK) < n)
-        arguments = tuple(jnp.asarray(row[index]) for row in rows)
-        mine = as_arrays(taken(balances, owner[index]))
+        wanted = np.arange(begin, begin + _BLOCK) < n
+        arguments = tuple(row[index] for row in rows)
+        mine = taken(balances, owner[index])
         found = function(mine, *arguments, wanted, steps)
         parts.append([np.asarray(part)[: n - begin] for part in found])
     return [np.concatenate(column) for column in zip(*parts, strict=True)]
@@ -372,7 +372,7 @@ def _located_bifurcations(
 
     Where it is to be found `without_one`, crossings of +1 do not count.
     """
-    member = as_arrays(taken(balance, 0))
+    member = taken(balance, 0)
     low, high = np.zeros(len(crossings)), np.ones(len(crossings))
 
     def counted(rows: np.ndarray, without: np.ndarray) -> np.ndarray:

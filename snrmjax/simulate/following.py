@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.blocks import as_arrays, mapped, over_cores, stacked, taken
+from snrmjax.simulate.blocks import mapped, over_cores, stacked, taken
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import Curve, CurveStatus, StepControl, follow_curve
 from snrmjax.simulate.harmonic_balance import (
     HarmonicBalance,
@@ -66,16 +67,16 @@ def follow_from_rest(
 
     def follow(job: np.ndarray) -> list[FollowedCurve]:
         rows = job[np.minimum(np.arange(size), len(job) - 1)]
-        mine = as_arrays(taken(balances, rows))
-        wanted = jnp.arange(size) < len(job)
+        mine = taken(balances, rows)
+        wanted = np.arange(size) < len(job)
         if ramp:
             starts, ready = _ramped(mine, ends, steps, max_points)
             curve = _follow(
                 *(mine, ends, steps, max_points),
-                *(jnp.array(downward), wanted & ready, starts),
+                *(np.array(downward), wanted & ready, starts),
             )
         else:
-            curve = _follow(mine, ends, steps, max_points, jnp.array(downward), wanted)
+            curve = _follow(mine, ends, steps, max_points, np.array(downward), wanted)
         return _trimmed(curve, len(job))
 
     return [curve for block in over_cores(follow, jobs) for curve in block]
@@ -91,10 +92,8 @@ def follow_responses(
     starts: Float[Array, "member unknown"],
 ) -> list[FollowedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
-    wanted = jnp.ones(len(starts), dtype=bool)
-    curve = _follow(
-        *(as_arrays(balances), ends, steps, max_points, jnp.array(downward), wanted, starts)
-    )
+    wanted = np.ones(len(starts), dtype=bool)
+    curve = _follow(*(balances, ends, steps, max_points, np.array(downward), wanted, starts))
     return _trimmed(curve, len(starts))
 
 
@@ -112,7 +111,7 @@ def _trimmed(curve: Curve, count: int) -> list[FollowedCurve]:
     ]
 
 
-@eqx.filter_jit
+@compiled
 def _ramped(
     balances: HarmonicBalance, ends: Array, steps: StepControl, max_points: int
 ) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
@@ -138,7 +137,7 @@ def _ramped(
     return mapped(one, balances)
 
 
-@eqx.filter_jit
+@compiled
 def _follow(
     balances: HarmonicBalance,
     ends: Float[Array, " end"],

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.model.structure import Structure, simulated_structure
 from snrmjax.simulate.blocks import mapped, on_accelerator, over_cores, taken
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import (
     CurveStatus,
     StepControl,
@@ -318,7 +318,7 @@ def solve_at_frequency(
     return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
 
 
-@eqx.filter_jit
+@compiled
 def _solve_batch(
     model: Structure, force: Array, frequency: Array, start: Array, n_samples: int | None
 ) -> tuple:

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.structure import Structure, displacement_scale, simulated_structure
 from snrmjax.simulate.blocks import by_blocks
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import (
     Curve,
     CurveStatus,
@@ -105,7 +105,7 @@ def nonlinear_normal_mode(
     return _without_tongues(branch) if tongues == "skip" else branch
 
 
-@eqx.filter_jit
+@compiled
 def _follow(
     balance: HarmonicBalance,
     ends: Array,
@@ -197,7 +197,7 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
     """Frequency, coefficients, velocity and energy along a curve."""
     model = balance.model

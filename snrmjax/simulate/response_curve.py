@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.simulate.blocks import as_arrays, by_blocks, over_cores, taken
+from snrmjax.simulate.blocks import by_blocks, over_cores, taken
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import CurveStatus, StepControl
 from snrmjax.simulate.events import (
     Walked,
@@ -98,7 +99,7 @@ def assembled(
     walked = with_events(balances, walked, steps)
 
     def finished(number: int) -> ResponseCurve:
-        balance = as_arrays(taken(balances, number))
+        balance = taken(balances, number)
         curve, multipliers = walked[number], None
         if stability:
             multipliers = _multipliers(balance, curve)
@@ -111,7 +112,7 @@ def assembled(
 
 def compile_ahead(balances: HarmonicBalance, steps: StepControl, *, stability: bool) -> None:
     """Have the programs of `assembled` compiled while the first curve is being followed."""
-    one = as_arrays(taken(balances, 0))
+    one = taken(balances, 0)
     points = np.full((2, one.size + 1), 1e-9)
     points[:, -1] = 1.0
     if stability:
@@ -170,6 +171,6 @@ def _velocity(
     return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors
 
 
-@eqx.filter_jit
+@compiled
 def _truncation(balance: HarmonicBalance, coefficients: Array, frequency: Array) -> Array:
     return jax.vmap(lambda x, w: truncation_error(balance, x, w))(coefficients, frequency)

@@ -3,7 +3,6 @@
 from enum import Enum
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.friction import AbstractSliders
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import over_cores, padded
+from snrmjax.simulate.compiled import compiled
 
 _BLOCK = 32  # points whose linearised motions are integrated side by side
 _MOST_SEGMENTS = 256
@@ -141,7 +141,7 @@ def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array
     return q, frequency[:, None] * rate
 
 
-@eqx.filter_jit
+@compiled
 def monodromy(
     model: Structure,
     coefficients: Float[Array, "point coefficient mode"],
