@@ -7,7 +7,6 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 T = TypeVar("T")
@@ -31,7 +30,7 @@ def by_blocks(
         for row in rows:
             some = row[begin : begin + size]
             fill = ((0, size - len(some)), *((0, 0),) * (row.ndim - 1))
-            block.append(jnp.asarray(np.pad(some, fill)))
+            block.append(np.pad(some, fill))
         parts.append([np.asarray(a)[: n - begin] for a in function(*block)])
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 

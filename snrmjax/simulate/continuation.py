@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 Point = Float[Array, " unknown"]
+Number = float | Array | np.ndarray
 Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]]
 
 
@@ -46,21 +48,18 @@ STATUS_MESSAGE: dict[CurveStatus, str] = {
 class StepControl(NamedTuple):
     """Step sizes along the curve, in the scaled unknowns (order one)."""
 
-    first: float | Array = 0.01
-    smallest: float | Array = 1e-7
-    largest: float | Array = 0.05
-    angle: float | Array = 0.1  # rad, aimed at between neighbouring tangents
-    tolerance: float | Array = 1e-9  # on the error that is left after the last Newton step
-    iterations: int | Array = 8
-    kink: float | Array = (
-        2e-4  # steps below it may turn sharply: a force with a kink bends the curve
-    )
+    first: Number = 0.01
+    smallest: Number = 1e-7
+    largest: Number = 0.05
+    angle: Number = 0.1  # rad, aimed at between neighbouring tangents
+    tolerance: Number = 1e-9  # on the error that is left after the last Newton step
+    iterations: Number = 8
+    kink: Number = 2e-4  # steps below it may turn sharply: a kinked force bends the curve
 
 
 def traced(control: StepControl) -> StepControl:
     """The same settings as arrays, so that other numbers do not compile anew."""
-    arrays = {name: jnp.asarray(value) for name, value in control._asdict().items()}
-    return StepControl(**arrays)
+    return StepControl(*(np.asarray(value) for value in control))
 
 
 class Curve(NamedTuple):
@@ -86,8 +85,8 @@ def correct(
     linearised: Linearised,
     start: Point,
     direction: Point,
-    tolerance: float | Array,
-    iterations: int | Array,
+    tolerance: Number,
+    iterations: Number,
 ) -> Correction:
     """Newton's method in the hyperplane through `start` across `direction`.
 

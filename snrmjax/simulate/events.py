@@ -97,16 +97,6 @@ def _between(
     return mapped(one, balances, here, tangent, there, share, wanted)
 
 
-def compile_events_ahead(balances: HarmonicBalance, steps: StepControl) -> None:
-    """Have the programs of `with_events` compiled, without a curve yet."""
-    n = _BLOCK
-    one = taken(balances, 0)
-    points = np.zeros((n, one.size + 1))
-    rows = taken(balances, np.zeros(n, dtype=int))
-    none = np.zeros(n, dtype=bool)
-    _locate(rows, np.zeros(n, dtype=int), points, points, points, none, steps)
-
-
 def _in_blocks(
     function: Callable[..., tuple],
     balances: HarmonicBalance,

@@ -50,7 +50,7 @@ def response_balances(
 def follow_from_rest(
     balances: HarmonicBalance,
     index: np.ndarray,
-    ends: Float[Array, " end"],
+    ends: Float[np.ndarray, " end"],
     steps: StepControl,
     max_points: int,
     *,

@@ -1,7 +1,6 @@
 """Forced responses by harmonic balance: whole curves, folds and resonances included."""
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.model.structure import Structure, simulated_structure
-from snrmjax.simulate.blocks import mapped, on_accelerator, over_cores, taken
+from snrmjax.simulate.blocks import mapped, over_cores, taken
 from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import (
     CurveStatus,
@@ -27,7 +26,6 @@ from snrmjax.simulate.response_curve import (
     FollowedCurve,
     ResponseCurve,
     assembled,
-    compile_ahead,
 )
 
 DEFAULT_STEPS = StepControl()
@@ -137,7 +135,7 @@ def forced_response_batch(
     members, loads = _paired(models, forces)
     # Which rows of one object are many times the same model is known before it is expanded.
     expanded = {id(m): simulated_structure(m) for m in members}
-    ends = jnp.asarray([from_frequency, to_frequency])
+    ends = np.array([from_frequency, to_frequency])
     settings = _Settings(harmonic_order, n_samples, max_points, traced(steps), stability)
     rows: list[tuple[ResponseCurve, ...]] = []
     summaries = []
@@ -194,7 +192,7 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
 
 
 def _chunk_of_curves(
-    models: list[Structure], forces: np.ndarray, ends: Array, settings: _Settings
+    models: list[Structure], forces: np.ndarray, ends: np.ndarray, settings: _Settings
 ) -> list[tuple[ResponseCurve, ...]]:
     leaves = {id(m): jax.tree.leaves(m) for m in models}
     finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
@@ -209,7 +207,6 @@ def _chunk_of_curves(
         [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
     )
     walk = (ends, settings.steps, settings.max_points)
-    ahead = _compiling_ahead(balances, settings)
     upward = follow_from_rest(balances, np.arange(len(good)), *walk, downward=False)
     # Beside a superharmonic resonance the linear response is no start: let the force rise.
     lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
@@ -223,7 +220,6 @@ def _chunk_of_curves(
     alone = [r and _ends_near_rest(balances, k, upward[k]) for k, r in enumerate(reached)]
     doubtful = [k for k, known in enumerate(alone) if not known]
     downward = follow_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
-    ahead.result()
     owner: list[int] = []
     parts: list[FollowedCurve] = []
     for k, curve in enumerate(upward):
@@ -266,22 +262,6 @@ def _ends_near_rest(balances: HarmonicBalance, member: int, curve: FollowedCurve
 
 def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(np.max(np.abs(first - second)) < 1e-5)
-
-
-_COMPILED: set = set()
-_COMPILER = ThreadPoolExecutor(1, thread_name_prefix="snrmjax-compile")
-
-
-def _compiling_ahead(balances: HarmonicBalance, settings: _Settings) -> Future:
-    """Where this kind of structure is new, later programs compile beside the first one."""
-    leaves, kind = jax.tree.flatten(balances)
-    key = (kind, tuple(np.shape(leaf)[1:] for leaf in leaves), settings.stability)
-    if key in _COMPILED or on_accelerator():
-        done: Future = Future()
-        done.set_result(None)
-        return done
-    _COMPILED.add(key)
-    return _COMPILER.submit(compile_ahead, balances, settings.steps, stability=settings.stability)
 
 
 def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCurve:

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import AveragedForce, averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked
-from snrmjax.model.structure import Structure
+from snrmjax.model.structure import LinearTerms, Structure
+from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.harmonics import (
     alias_free_samples,
     harmonic_basis,
@@ -244,7 +245,7 @@ def resonance_displacement(model: Structure, force: float) -> float:
     at least the static displacement of every mode, so that no motion is small beside it.
     """
     modes, j = model.modes, model.modes.mode_of_interest
-    mass, damping, stiffness = (np.asarray(part) for part in model.linear_terms())
+    mass, damping, stiffness = (np.asarray(part) for part in _linear_terms(model))
     participation = np.asarray(modes.participation)
     omega = np.sqrt(stiffness[j] / mass[j])
     least_damping = 1e-4 * omega
@@ -267,7 +268,12 @@ def resonance_displacement(model: Structure, force: float) -> float:
     return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
 
 
-@eqx.filter_jit
+@compiled
+def _linear_terms(model: Structure) -> LinearTerms:
+    return model.linear_terms()
+
+
+@compiled
 def _averages(effects: tuple[AbstractForce, ...], amplitude: Array, omega: Array) -> AveragedForce:
     """What all effects together do to a mode, by averaging."""
     each = [averaged_effect(effect, amplitude, omega, n_samples=128) for effect in effects]

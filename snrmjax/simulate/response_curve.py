@@ -13,7 +13,6 @@ from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.continuation import CurveStatus, StepControl
 from snrmjax.simulate.events import (
     Walked,
-    compile_events_ahead,
     with_bifurcations,
     with_events,
 )
@@ -108,19 +107,6 @@ def assembled(
         return _response(balance, curve, multipliers, curves[number], branch)
 
     return over_cores(finished, range(len(curves)))
-
-
-def compile_ahead(balances: HarmonicBalance, steps: StepControl, *, stability: bool) -> None:
-    """Have the programs of `assembled` compiled while the first curve is being followed."""
-    one = taken(balances, 0)
-    points = np.full((2, one.size + 1), 1e-9)
-    points[:, -1] = 1.0
-    if stability:
-        walked = Walked(points, points, ("", ""))
-        multipliers = _multipliers(one, walked)
-        no_end = FollowedCurve(points, points, CurveStatus.POINT_LIMIT, 0)
-        _response(one, walked, multipliers, no_end, "main")
-    compile_events_ahead(balances, steps)
 
 
 def _multipliers(balance: HarmonicBalance, curve: Walked) -> Complex[np.ndarray, "point _"]:

@@ -64,8 +64,8 @@ def floquet_multipliers(
 
     def block(begin: int) -> np.ndarray:
         here = slice(begin, begin + _BLOCK)
-        rows = jnp.asarray(padded(values[here], _BLOCK))
-        speed = jnp.asarray(padded(omega[here], _BLOCK))
+        rows = padded(values[here], _BLOCK)
+        speed = padded(omega[here], _BLOCK)
         found = monodromy(model, rows, speed, steps_per_cycle)
         maps = np.asarray(found)[: len(values[here])]
         finite = np.all(np.isfinite(maps), axis=(1, 2))[:, None]

@@ -1,0 +1,140 @@
+# The public names and where they live; `__init__.py` imports each on first use.
+from .identify.backbone import Backbone, BackboneFit, fit_backbone
+from .identify.backbone_points import BackbonePoints, identify_points
+from .identify.identification import Identification, identify_backbone
+from .identify.points import (
+    PointStatus,
+    SnrmPoints,
+    closed_form,
+    invert_amplitude_phase,
+    invert_phasor,
+)
+from .identify.prediction import (
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonance_by_fixed_point,
+    resonances,
+)
+from .identify.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+from .measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
+from .measure.steady_states import SteadyStates, join_steady_states, steady_states
+from .model.averaging import averaged_effect, averaged_force, averaged_response
+from .model.beams import curved_beam, flat_beam
+from .model.effects import make_effect
+from .model.modes import LinearModes, linear_modes, linear_response
+from .model.potential import (
+    PolynomialPotential,
+    polynomial_potential,
+    potential_from_force_table,
+)
+from .model.structure import Structure, equilibria, structure
+from .simulate.branches import isolated_responses
+from .simulate.continuation import CurveStatus, StepControl
+from .simulate.controlled import (
+    ControlledCurve,
+    DampedModeBranch,
+    damped_normal_mode,
+    phase_controlled,
+    response_controlled,
+)
+from .simulate.controlled_test import phase_controlled_test, response_controlled_test
+from .simulate.forced_response import (
+    ResponseBatch,
+    forced_response,
+    forced_response_batch,
+    solve_at_frequency,
+)
+from .simulate.harmonics import velocity_phasors
+from .simulate.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
+from .simulate.periodic_motion import (
+    PeriodicMotion,
+    motions_at_velocities,
+    periodic_motion,
+    response_at_velocities,
+)
+from .simulate.response_curve import ResponseCurve
+from .simulate.stability import StabilityLoss, floquet_multipliers
+from .simulate.time_integration import (
+    IntegratedMotion,
+    MotionStatus,
+    settled_motion,
+    stepped_sine,
+)
+from .simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
+
+__all__ = [
+    "Backbone",
+    "BackboneFit",
+    "BackbonePoints",
+    "ControlledCurve",
+    "CurveStatus",
+    "DampedModeBranch",
+    "Identification",
+    "IntegratedMotion",
+    "LinearModes",
+    "MeasurementErrors",
+    "MotionStatus",
+    "NormalModeBranch",
+    "PeriodicMotion",
+    "PointStatus",
+    "PolynomialPotential",
+    "PredictedResponse",
+    "Resonance",
+    "ResponseBatch",
+    "ResponseCurve",
+    "SnrmPoints",
+    "StabilityLoss",
+    "SteadyStates",
+    "StepControl",
+    "Structure",
+    "Tongue",
+    "VirtualTest",
+    "appropriation_of",
+    "averaged_effect",
+    "averaged_force",
+    "averaged_response",
+    "closed_form",
+    "curved_beam",
+    "damped_normal_mode",
+    "equilibria",
+    "fit_backbone",
+    "flat_beam",
+    "floquet_multipliers",
+    "forced_response",
+    "forced_response_batch",
+    "identify_backbone",
+    "identify_points",
+    "invert_amplitude_phase",
+    "invert_phasor",
+    "isolated_responses",
+    "join_steady_states",
+    "linear_modes",
+    "linear_response",
+    "make_effect",
+    "mode_indicator",
+    "motions_at_velocities",
+    "nnm_appropriation",
+    "nonlinear_mode_velocity",
+    "nonlinear_normal_mode",
+    "periodic_motion",
+    "phase_controlled",
+    "phase_controlled_test",
+    "phase_resonance_test",
+    "polynomial_potential",
+    "potential_from_force_table",
+    "predict_response",
+    "reference_sensor",
+    "resonance_by_fixed_point",
+    "resonances",
+    "response_at_velocities",
+    "response_controlled",
+    "response_controlled_test",
+    "settled_motion",
+    "snrm_velocity",
+    "solve_at_frequency",
+    "steady_states",
+    "stepped_sine",
+    "structure",
+    "velocity_phasors",
+]
