@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.backbone_points import AmplitudeArgument, BackbonePoints
+from snrmjax.identify.backbone_points import AmplitudeArgument, BackbonePoints, mistrust
 from snrmjax.identify.curves import (
     AS_STATED,
     AbstractCurve,
@@ -25,9 +25,6 @@ from snrmjax.model.modes import LinearModes
 CurveFamily = Literal["spline", "piecewise_linear"]
 MOST_KNOTS = 60
 SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-12, 3))
-
-OFF_RESONANCE = 4.0
-"""How much more a point 90° off resonance is mistrusted than one at it, when no noise is stated."""
 
 
 class Anchor(NamedTuple):
@@ -213,7 +210,7 @@ def _fit_pair(
     linear = np.asarray(points.linear_variance)[use]
     # Nothing stated: one relative error for amplitude and phase alike, none for the force.
     errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
-    far = 1.0 if stated else mistrust(points)[use]
+    far = 1.0 if stated else mistrust(np.asarray(points.mode_velocity))[use]
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
@@ -239,15 +236,6 @@ def _fit_pair(
         return best, sizes
 
     return fit(0), fit(1)
-
-
-def mistrust(points: BackbonePoints) -> Float[np.ndarray, " state"]:
-    """Errors of points relative to one at resonance, where no noise is stated.
-
-    The method is exact at resonance and errs with the correction it makes from there.
-    """
-    sine = np.sin(np.angle(np.asarray(points.mode_velocity)))
-    return np.sqrt(1.0 + (OFF_RESONANCE * sine) ** 2)
 
 
 def _best_smoothing(

@@ -21,6 +21,9 @@ AmplitudeMeasure = Literal["fundamental", "peak"]
 INPUTS = ("log_force", "log_velocity", "phase")
 """The measured quantities whose errors are carried to the points."""
 
+OFF_RESONANCE = 4.0
+"""How much more a point 90° off resonance is mistrusted than one at it, when no noise is stated."""
+
 OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
 """The quantities whose derivatives `BackbonePoints.sensitivity` holds."""
 
@@ -118,10 +121,10 @@ def _identify(
     amplitude: AmplitudeArgument,
     measure: AmplitudeMeasure,
 ) -> BackbonePoints:
-    velocity, relative_std = data.velocity, _relative_std(data)
+    velocity, relative_std = data.velocity, relative_errors(data)
     if measure == "peak":
         velocity = velocity * _peak_ratio(data)
-    combined, share, filtered_std, filter_residual = _modal_filter(
+    combined, share, filtered_std, filter_residual = modal_filter(
         data, modes, r, velocity, relative_std
     )
     inputs = jnp.stack(
@@ -173,7 +176,7 @@ def _ratios_std(
     return natural_std, jnp.sqrt(variance)
 
 
-def _relative_std(data: SteadyStates) -> Float[Array, "state sensor input"]:
+def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
     """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
 
     A state for which nothing is stated has NaN throughout.
@@ -205,7 +208,8 @@ def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
     return peak.reshape(data.velocity.shape) / jnp.abs(data.velocity)
 
 
-def _modal_filter(
+@eqx.filter_jit
+def modal_filter(
     data: SteadyStates,
     modes: LinearModes,
     r: int,
@@ -300,3 +304,11 @@ def _solve(
     variance = jnp.where(solved[:, None], variance, jnp.nan)
     own = velocity - residual
     return points, own, argument_of(own, frequency), by_input, variance
+
+
+def mistrust(mode_velocity: Complex[np.ndarray, " state"]) -> Float[np.ndarray, " state"]:
+    """Errors of points relative to one at resonance, where no noise is stated.
+
+    The method is exact at resonance and errs with the correction it makes from there.
+    """
+    return np.sqrt(1.0 + (OFF_RESONANCE * np.sin(np.angle(mode_velocity))) ** 2)

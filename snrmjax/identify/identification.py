@@ -6,12 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.backbone import BackboneFit, CurveFamily, fit_backbone, mistrust
+from snrmjax.identify.backbone import BackboneFit, CurveFamily, fit_backbone
 from snrmjax.identify.backbone_points import (
     AmplitudeArgument,
     AmplitudeMeasure,
     BackbonePoints,
     identify_points,
+    mistrust,
 )
 from snrmjax.identify.points import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.steady_states import SteadyStates
@@ -54,7 +55,7 @@ def identify_backbone(
 def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not."""
     sensitivity = np.asarray(points.sensitivity)
-    scale = mistrust(points)[:, None] * np.array(fit.noise_scale)
+    scale = mistrust(np.asarray(points.mode_velocity))[:, None] * np.array(fit.noise_scale)
     spread = scale[:, :, None] * np.array([0.0, 1.0, 1.0])
     own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)

@@ -1,0 +1,310 @@
+"""Families of smooth curves of amplitude with a few parameters, for the joint fit.
+
+Every member is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitude) in 1/s. Its parameters are what its
+terms contribute at the largest measured amplitude, so that all have the unit of the value.
+"""
+
+from abc import abstractmethod
+from typing import ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import interpax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import CubicSpline
+
+Argument = Literal["displacement", "velocity"]
+
+
+class Coefficient(NamedTuple):
+    """A parameter as an engineer writes it: coefficient·amplitude^power, or a bare number."""
+
+    name: str
+    power: float  # of the amplitude that the coefficient multiplies
+    is_value: bool  # False: a number without unit, such as an exponent
+
+
+class AbstractFamily(eqx.Module):
+    """A curve of amplitude; `argument` says of which amplitude."""
+
+    kind: ClassVar[str]
+    orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
+    parameters: Float[Array, " parameter"]
+    scale: Float[Array, ""]  # the largest measured amplitude, m or m/s
+    argument: Argument = eqx.field(static=True)
+
+    @abstractmethod
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Value at an amplitude of `argument`'s kind, exact in the limit of zero."""
+
+    @abstractmethod
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """What the parameters are called and the power of amplitude that each belongs to."""
+
+    @classmethod
+    @abstractmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: Float[np.ndarray, " point"],
+        values: Float[np.ndarray, " point"],
+        weight: Float[np.ndarray, " point"],
+    ) -> list["AbstractFamily"]:
+        """Members near scattered points: one where the family is linear, several elsewhere."""
+
+
+def _linear_start(
+    columns: np.ndarray, values: np.ndarray, weight: np.ndarray
+) -> Float[np.ndarray, " parameter"]:
+    solution = np.linalg.lstsq(columns * weight[:, None], values * weight, rcond=1e-10)[0]
+    return np.asarray(solution)
+
+
+class _Sum(AbstractFamily):
+    """Σ p_k (amplitude/scale)^power_k: linear in its parameters."""
+
+    @classmethod
+    @abstractmethod
+    def powers(cls, order: int) -> tuple[float, ...]:
+        """Powers of the terms."""
+
+    @classmethod
+    @abstractmethod
+    def names(cls, order: int) -> tuple[str, ...]:
+        """Names of the terms."""
+
+    @property
+    def order(self) -> int:
+        """Number of terms beside the first."""
+        return self.parameters.shape[0] - 1
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractFamily`."""
+        x = jnp.asarray(amplitude) / self.scale
+        terms = [
+            p * _power(x, power)
+            for p, power in zip(self.parameters, self.powers(self.order), strict=True)
+        ]
+        return sum(terms[1:], terms[0])
+
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """See `AbstractFamily`."""
+        pairs = zip(self.names(self.order), self.powers(self.order), strict=True)
+        return tuple(Coefficient(name, power, True) for name, power in pairs)
+
+    @classmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: np.ndarray,
+        values: np.ndarray,
+        weight: np.ndarray,
+    ) -> list[AbstractFamily]:
+        """See `AbstractFamily`."""
+        scale = float(np.max(amplitude))
+        columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order)], axis=1)
+        start = _linear_start(columns, values, weight)
+        return [cls(jnp.asarray(start), jnp.asarray(scale), argument)]
+
+
+def _power(x: Array, power: float) -> Array:
+    if power == 0:
+        return jnp.ones_like(x)
+    if power < 0:
+        # Dry friction: its equivalent damping grows without bound towards rest.
+        return jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** power, jnp.inf)
+    return x ** (int(power) if float(power).is_integer() else power)
+
+
+class Polynomial(_Sum):
+    """An even polynomial: what any smooth force gives, in ascending powers of amplitude²."""
+
+    kind: ClassVar[str] = "polynomial"
+    orders: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4)
+
+    @classmethod
+    def powers(cls, order: int) -> tuple[float, ...]:
+        """See `_Sum`."""
+        return tuple(2.0 * k for k in range(order + 1))
+
+    @classmethod
+    def names(cls, order: int) -> tuple[str, ...]:
+        """See `_Sum`."""
+        return ("at_zero", *(f"power_{2 * k}" for k in range(1, order + 1)))
+
+
+class Constant(_Sum):
+    """The same at every amplitude: the constant modal damping C of linear theory."""
+
+    kind: ClassVar[str] = "constant"
+    orders: ClassVar[tuple[int, ...]] = (0,)
+
+    @classmethod
+    def powers(cls, order: int) -> tuple[float, ...]:
+        """See `_Sum`."""
+        return (0.0,)
+
+    @classmethod
+    def names(cls, order: int) -> tuple[str, ...]:
+        """See `_Sum`."""
+        return ("constant",)
+
+
+class ViscousQuadratic(_Sum):
+    """Viscous and quadratic damping: c|q̇|q̇ acts on the fundamental like 8cv/(3π)."""
+
+    kind: ClassVar[str] = "viscous_quadratic"
+    orders: ClassVar[tuple[int, ...]] = (1,)
+
+    @classmethod
+    def powers(cls, order: int) -> tuple[float, ...]:
+        """See `_Sum`."""
+        return (0.0, 1.0)
+
+    @classmethod
+    def names(cls, order: int) -> tuple[str, ...]:
+        """See `_Sum`."""
+        return ("viscous", "quadratic")
+
+
+class ViscousCoulomb(_Sum):
+    """Viscous damping and dry friction: μ sign(q̇) acts on the fundamental like 4μ/(πv)."""
+
+    kind: ClassVar[str] = "viscous_coulomb"
+    orders: ClassVar[tuple[int, ...]] = (1,)
+
+    @classmethod
+    def powers(cls, order: int) -> tuple[float, ...]:
+        """See `_Sum`."""
+        return (0.0, -1.0)
+
+    @classmethod
+    def names(cls, order: int) -> tuple[str, ...]:
+        """See `_Sum`."""
+        return ("viscous", "coulomb")
+
+
+class PowerLaw(AbstractFamily):
+    """A value at zero and a power of amplitude whose positive exponent is free."""
+
+    kind: ClassVar[str] = "power_law"
+    orders: ClassVar[tuple[int, ...]] = (1,)
+    largest_exponent: ClassVar[float] = 6.0
+    tried: ClassVar[tuple[float, ...]] = (0.5, 1.0, 2.0, 4.0)
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractFamily`."""
+        x = jnp.asarray(amplitude) / self.scale
+        known = x > 0
+        power = jnp.exp(self.exponent * jnp.log(jnp.where(known, x, 1.0)))
+        return self.parameters[0] + self.parameters[1] * jnp.where(known, power, 0.0)
+
+    @property
+    def exponent(self) -> Float[Array, ""]:
+        """Of the amplitude, between zero and `largest_exponent`."""
+        return self.largest_exponent * jax.nn.sigmoid(self.parameters[2])
+
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """See `AbstractFamily`; the coefficient is the contribution at the largest amplitude."""
+        return (
+            Coefficient("at_zero", 0.0, True),
+            Coefficient("at_largest", 0.0, True),
+            Coefficient("logit_exponent", 0.0, False),
+        )
+
+    @classmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: np.ndarray,
+        values: np.ndarray,
+        weight: np.ndarray,
+    ) -> list[AbstractFamily]:
+        """See `AbstractFamily`."""
+        scale = float(np.max(amplitude))
+        found: list[AbstractFamily] = []
+        for power in cls.tried:
+            columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
+            share = power / cls.largest_exponent
+            start = [*_linear_start(columns, values, weight), np.log(share / (1 - share))]
+            found.append(cls(jnp.asarray(start), jnp.asarray(scale), argument))
+        return found
+
+
+class ViscousMicroslip(PowerLaw):
+    """Viscous damping and microslip in joints, whose loss grows by a power between 2 and 3.
+
+    Iwan's joints dissipate amplitude^(3+χ) with −1 < χ < 0 in a cycle, so that 2ζ̃ω̃ grows with
+    the power 1 + χ, between zero and one. Reference: Segalman, J. Appl. Mech. 72 (2005) 752,
+    doi:10.1115/1.1989354.
+    """
+
+    kind: ClassVar[str] = "viscous_microslip"
+    largest_exponent: ClassVar[float] = 1.0
+    tried: ClassVar[tuple[float, ...]] = (0.2, 0.5, 0.8)
+
+
+class Spline(AbstractFamily):
+    """A natural cubic spline in amplitude², through values at knots; the first knot is at zero."""
+
+    kind: ClassVar[str] = "spline"
+    orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6, 8, 10)
+    knots: Float[Array, " knot"]  # of (amplitude/scale)²
+    slopes: Float[Array, "knot knot"]  # from values to slopes at the knots
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractFamily`; continued along its last slope in amplitude²."""
+        u = (jnp.asarray(amplitude) / self.scale) ** 2
+        slope = self.slopes @ self.parameters
+        inside = jnp.minimum(u, self.knots[-1]).reshape(-1)
+        value = interpax.interp1d(
+            inside, self.knots, self.parameters, method="cubic", fx=slope, extrap=True
+        ).reshape(u.shape)
+        return value + jnp.maximum(u - self.knots[-1], 0.0) * slope[-1]
+
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """See `AbstractFamily`."""
+        n = self.parameters.shape[0]
+        return tuple(Coefficient(f"knot_{k}", 0.0, True) for k in range(n))
+
+    @classmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: np.ndarray,
+        values: np.ndarray,
+        weight: np.ndarray,
+    ) -> list[AbstractFamily]:
+        """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
+        scale = float(np.max(amplitude))
+        shares = np.quantile(amplitude / scale, np.linspace(0, 1, order)[1:])
+        # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
+        knots = np.concatenate([[0.0], shares**2])
+        if np.min(np.diff(knots)) < 0.02 / order:
+            knots = np.linspace(0.0, 1.0, order) ** 2
+        cardinal = CubicSpline(knots, np.eye(order), bc_type="natural")
+        start = _linear_start(cardinal((amplitude / scale) ** 2), values, weight)
+        fixed = (jnp.asarray(knots), jnp.asarray(cardinal(knots, 1)))
+        return [cls(jnp.asarray(start), jnp.asarray(scale), argument, *fixed)]
+
+
+FAMILIES: dict[str, type[AbstractFamily]] = {
+    family.kind: family
+    for family in (
+        *(Polynomial, Spline, PowerLaw),
+        *(Constant, ViscousQuadratic, ViscousCoulomb, ViscousMicroslip),
+    )
+}
+"""Families by name."""
+
+BACKBONE_FAMILIES = ("polynomial", "power_law", "spline")
+DAMPING_FAMILIES = (
+    *("constant", "viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
+    *("polynomial", "power_law", "spline"),
+)

@@ -1,0 +1,197 @@
+"""The complex force balance of all measured states: what a joint fit makes small.
+
+With V the velocity of the nonlinear mode and X = V/(iΩ), a state balances when
+((ω̃² − Ω²) + iΩ·2ζ̃ω̃) X/A = F. Evaluated at the measured motion this has one value for every
+curve, however the response folds.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from snrmjax.identify.backbone_points import mistrust, modal_filter, relative_errors
+from snrmjax.identify.families import AbstractFamily
+from snrmjax.identify.snrm import reference_sensor
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.modes import LinearModes, residual_velocity
+
+LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
+"""What all states of a level may have in common, relative or in rad."""
+
+
+class BalanceData(eqx.Module):
+    """Measured states as the balance needs them: one velocity each."""
+
+    level: Int[Array, " state"]  # counted from zero
+    frequency: Float[Array, " state"]  # rad/s
+    force: Float[Array, " state"]  # N, or V where only the drive is known
+    velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
+    share: Float[Array, "state sensor"]  # of the sensors in it
+    std: Float[Array, "state input"]  # of log force, log velocity and phase
+    weight: Float[Array, " state"]  # 1, or less for what a robust loss mistrusts
+    n_levels: int = eqx.field(static=True)
+    sensor: int = eqx.field(static=True)  # the one whose motion is meant
+
+
+class Unknowns(eqx.Module):
+    """Everything that a joint fit may change.
+
+    Deviations of levels and linear parameters are in units of their own 1σ.
+    """
+
+    squared_frequency: AbstractFamily  # ω̃², rad²/s²
+    modal_damping: AbstractFamily  # 2ζ̃ω̃, 1/s
+    log_force_gain: Float[Array, ""]
+    force_offset: Float[Array, ""]  # N, relative to the smallest force
+    instrument_phase: Float[Array, ""]  # rad
+    level: Float[Array, "level error"]
+    linear: Float[Array, " deviation"]
+
+
+class Spread(eqx.Module):
+    """1σ of what the unknowns give in their own units."""
+
+    level: Float[Array, " error"]  # of `LEVEL_ERRORS`
+    linear: Float[Array, " deviation"]  # natural frequencies (rad/s), then damping ratios
+
+
+def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
+    """The states with a measured velocity, and whether their noise is stated.
+
+    Where nobody stated any noise, amplitude and phase get the same relative error, larger off
+    resonance (`mistrust`); the fit then finds its size.
+    """
+    r = reference_sensor(modes)
+    stated = relative_errors(data)
+    combined, share, std, _ = modal_filter(data, modes, r, data.velocity, stated)
+    velocity, errors = np.asarray(combined), np.asarray(std)
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    force = np.asarray(data.drive if driven else data.force)
+    keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
+    known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:] > 0))
+    if not known:
+        far = mistrust(velocity)
+        errors = np.stack([np.zeros_like(far), far, far], axis=1)
+    levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
+    return (
+        BalanceData(
+            level=jnp.asarray(index),
+            frequency=jnp.asarray(data.frequency)[keep],
+            force=jnp.asarray(force[keep]),
+            velocity=jnp.asarray(velocity[keep]),
+            share=jnp.asarray(share)[keep],
+            std=jnp.asarray(errors[keep]),
+            weight=jnp.ones(int(keep.sum())),
+            n_levels=len(levels),
+            sensor=r,
+        ),
+        known,
+    )
+
+
+def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
+    """The modes with the residual ones' frequencies and dampings changed by deviation·1σ."""
+    keep = np.asarray(modes.residual_modes, dtype=int)
+    change = deviation * spread
+    return eqx.tree_at(
+        lambda m: (m.natural_frequency, m.damping_ratio),
+        modes,
+        (
+            modes.natural_frequency.at[keep].add(change[: keep.size]),
+            modes.damping_ratio.at[keep].add(change[keep.size :]),
+        ),
+    )
+
+
+class Motion(eqx.Module):
+    """The nonlinear mode's motion in every state, and the force on it."""
+
+    velocity: Complex[Array, " state"]  # m/s at the reference sensor
+    displacement: Float[Array, " state"]  # m
+    force: Float[Array, " state"]  # N
+
+    def amplitude(self, curve: AbstractFamily) -> Float[Array, " state"]:
+        """The amplitude that a curve is a function of."""
+        return self.displacement if curve.argument == "displacement" else jnp.abs(self.velocity)
+
+
+def motion_of(
+    unknowns: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    error: Float[Array, "state input"],
+) -> Motion:
+    """What the record says of the mode when it is freed of its errors.
+
+    `error` adds to log force, log velocity and phase: for derivatives.
+    """
+    level = (unknowns.level * spread.level)[data.level]
+    gain = jnp.exp(unknowns.log_force_gain + error[:, 0])
+    force = data.force * gain + unknowns.force_offset * jnp.min(data.force)
+    phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
+    velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + 1j * phase)
+    linear = with_deviations(modes, unknowns.linear, spread.linear)
+    residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
+    own = velocity - jnp.sum(data.share * residual, axis=1)
+    return Motion(own, jnp.abs(own) / data.frequency, force)
+
+
+def force_balance(
+    unknowns: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    error: Float[Array, "state input"],
+) -> Float[Array, "state part"]:
+    """Force needed for the measured motion minus the force, over the force: real and imaginary."""
+    motion = motion_of(unknowns, data, modes, spread, error)
+    level = (unknowns.level * spread.level)[data.level]
+    squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
+    damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
+    squared = squared * (1 + level[:, 2])
+    damping = damping * (1 + level[:, 3])
+    r, j = data.sensor, modes.mode_of_interest
+    constant = modes.mode_shape[r, j] * modes.participation[j]
+    omega = data.frequency
+    stiffness = squared - omega**2 + 1j * omega * damping
+    needed = stiffness * motion.velocity / (1j * omega * constant)
+    excess = (needed - motion.force) / jax.lax.stop_gradient(motion.force)
+    return jnp.stack([excess.real, excess.imag], axis=1)
+
+
+def error_slopes(
+    balance: Callable[[Array], Array], n_states: int
+) -> Float[Array, "state part input"]:
+    """Derivatives of the balance with respect to log force, log velocity and phase.
+
+    Every state has its own: one push forward for each input gives them all.
+    """
+    zero = jnp.zeros((n_states, 3))
+    columns = [jax.jvp(balance, (zero,), (zero.at[:, k].set(1.0),))[1] for k in range(3)]
+    return jnp.stack(columns, axis=2)
+
+
+def whitener(
+    slopes: Float[Array, "state part input"], std: Float[Array, "state input"]
+) -> Float[Array, "state part part"]:
+    """The matrices that turn a balance into independent residuals of unit variance."""
+    scaled = slopes * std[:, None, :]
+    covariance = scaled @ scaled.transpose(0, 2, 1)
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # The inverse of Cholesky's factor of a 2×2 matrix; rounding must not make it singular.
+    floor = 1e-14 * (a + c)
+    first = jnp.sqrt(a + floor)
+    second = jnp.sqrt(jnp.maximum(c - b**2 / (a + floor), floor))
+    zero = jnp.zeros_like(a)
+    return jnp.stack(
+        [
+            jnp.stack([1 / first, zero], axis=1),
+            jnp.stack([-b / (first**2 * second), 1 / second], axis=1),
+        ],
+        axis=1,
+    )

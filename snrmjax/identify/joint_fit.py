@@ -1,0 +1,429 @@
+"""Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from snrmjax.identify.families import FAMILIES
+from snrmjax.identify.force_balance import (
+    LEVEL_ERRORS,
+    BalanceData,
+    Motion,
+    Spread,
+    Unknowns,
+    balance_data,
+    error_slopes,
+    force_balance,
+    motion_of,
+    whitener,
+)
+from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter
+from snrmjax.identify.selection import ARGUMENTS, Candidate, Choice, pilot_start, select_families
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.modes import LinearModes
+from snrmjax.simulate.compiled import compiled
+
+FREE = ("force_gain", "force_offset", "instrument_phase")
+"""Unknowns of the measurement that a fit may free."""
+
+_SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
+)
+_ROUNDS = 3  # of fitting and weighting anew
+_ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
+
+
+class JointFit(eqx.Module):
+    """Two curves, what else was unknown, and how well all of it is known.
+
+    `covariance` belongs to the free unknowns in the order of `names`; `level_std` to
+    `LEVEL_ERRORS`, stated or found.
+    """
+
+    unknowns: Unknowns
+    covariance: Float[np.ndarray, "unknown unknown"]
+    spread: Spread
+    data: BalanceData
+    modes: LinearModes
+    noise_scale: float  # by which residuals exceed the stated noise; the noise where none is
+    noise_scale_std: float
+    level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
+    residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
+    drive_known_only: bool = eqx.field(static=True)
+    noise_stated: bool = eqx.field(static=True)
+    free: tuple[str, ...] = eqx.field(static=True)
+    candidates: tuple[Candidate, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """Largest displacement (m) and velocity (m/s) that the fit has seen."""
+        motion = self.motion()
+        speed = np.abs(np.asarray(motion.velocity))
+        return float(np.max(np.asarray(motion.displacement))), float(np.max(speed))
+
+    def motion(self) -> Motion:
+        """The nonlinear mode's motion in the states as the fit sees it."""
+        zero = jnp.zeros((len(self.data.level), 3))
+        return motion_of(self.unknowns, self.data, self.modes, self.spread, zero)
+
+    def vector(self) -> tuple[Float[Array, " unknown"], "Restore"]:
+        """The free unknowns as a vector, and the way back to all of them."""
+        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
+        flat, unravel = ravel_pytree(moving)
+        return flat, Restore(unravel, fixed)
+
+    def names(self) -> tuple[str, ...]:
+        """What the free unknowns are called."""
+        return unknown_names(self.unknowns, self.data, self.free)
+
+
+class Restore(NamedTuple):
+    """From a vector of free unknowns to all of them."""
+
+    unravel: Callable[[Array], Unknowns]
+    fixed: Unknowns
+
+    def __call__(self, vector: Array) -> Unknowns:
+        """See the class."""
+        return eqx.combine(self.unravel(vector), self.fixed)
+
+
+def fit_jointly(
+    data: SteadyStates,
+    modes: LinearModes,
+    *,
+    backbone: str = "auto",
+    damping: str = "auto",
+    free: Sequence[str] = (),
+    level_gain_std: float = 0.0,
+    level_phase_std: float = 0.0,
+    robust: bool = False,
+) -> JointFit:
+    """Fit both curves to the complex force balance of all states at once.
+
+    Levenberg–Marquardt on residuals whitened with the stated noise. Gain and phase errors that a
+    level shares are unknowns with the stated 1σ; where levels scatter more than that allows, a
+    deviation of stiffness and damping from level to level is estimated too (restricted maximum
+    likelihood) and enters the bands. The other modes' frequencies and dampings stay inside their
+    stated errors.
+
+    Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
+    ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
+    chosen by predicting left-out levels, and so is the family itself for "auto". `free` may name
+    "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only the
+    drive is known. `level_gain_std` relative, `level_phase_std` in rad.
+    Returns a `JointFit`. Raises `ValueError` for too few states, an unknown family or name, and a
+    family with more parameters than there are data.
+    Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
+    """
+    unknown = [name for name in free if name not in FREE]
+    if unknown:
+        raise ValueError(f"`free` knows {', '.join(FREE)}, not {unknown[0]!r}.")
+    if data.sensors != modes.sensors:
+        raise ValueError(
+            f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
+        )
+    measured, stated = balance_data(data, modes)
+    n = len(measured.level)
+    if n < 3:
+        raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
+    keep = np.asarray(modes.residual_modes, dtype=int)
+    linear_std = np.concatenate(
+        [np.asarray(modes.natural_frequency_std)[keep], np.asarray(modes.damping_ratio_std)[keep]]
+    )
+    spread = Spread(jnp.array([level_gain_std, level_phase_std, 0.0, 0.0]), jnp.asarray(linear_std))
+    wanted = parse_family(backbone), parse_family(damping)
+    pilot = pilot_start(measured, modes, spread, released)
+    chosen = select_families(measured, modes, spread, pilot, *wanted, released)
+    if not stated:
+        measured = _noisier(measured, chosen.scatter.noise)
+    level = _with_scatter(spread, chosen.scatter)
+    pair = (chosen.squared_frequency, chosen.modal_damping)
+    start = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
+    settings = (measured, modes, level, released, spread.level)
+    best = _fitted(start, *settings, stated=stated, robust=robust)
+    notes = _notes(best, measured, spread.level, stated=stated)
+    return JointFit(
+        unknowns=best.unknowns,
+        covariance=best.covariance,
+        spread=best.spread,
+        data=best.data,
+        modes=modes,
+        noise_scale=best.scatter.noise,
+        noise_scale_std=best.scatter.noise_std,
+        level_std=np.asarray(best.spread.level),
+        residuals=best.residuals,
+        drive_known_only=driven,
+        noise_stated=stated,
+        free=released,
+        candidates=chosen.table,
+        notes=notes,
+        converged=best.converged,
+    )
+
+
+def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
+    """Which leaves a fit may change, as a filter of `equinox.partition`."""
+    frozen = jax.tree.map(lambda _: False, unknowns)
+    moving = [
+        *("force_gain" in free, "force_offset" in free, "instrument_phase" in free),
+        *(True, True, True, True),
+    ]
+
+    def where(u: Unknowns) -> tuple:
+        return (
+            *(u.log_force_gain, u.force_offset, u.instrument_phase),
+            *(u.level, u.linear, u.squared_frequency.parameters, u.modal_damping.parameters),
+        )
+
+    return eqx.tree_at(where, frozen, tuple(moving))
+
+
+def unknown_names(unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the free unknowns in the order of their vector."""
+    return (
+        *(f"backbone.{c.name}" for c in unknowns.squared_frequency.coefficients()),
+        *(f"damping.{c.name}" for c in unknowns.modal_damping.coefficients()),
+        *(name for name in FREE if name in free),
+        *(f"level_{k}.{e}" for k in range(data.n_levels) for e in LEVEL_ERRORS),
+        *(f"linear_{k}" for k in range(unknowns.linear.shape[0])),
+    )
+
+
+class _Fitted(NamedTuple):
+    unknowns: Unknowns
+    covariance: np.ndarray
+    spread: Spread
+    data: BalanceData
+    scatter: Scatter
+    residuals: np.ndarray
+    cost: float
+    converged: bool
+
+
+def _fitted(
+    start: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    free: tuple[str, ...],
+    stated_level: Array,
+    *,
+    stated: bool,
+    robust: bool,
+) -> _Fitted:
+    """Fit, estimate what levels scatter and how large the noise is, and fit again."""
+    mask = free_unknowns(start, free)
+    unknowns, stated_std = start, data.std
+    scatter = Scatter(1.0, 0.0, tuple(np.asarray(spread.level).tolist()))
+    given = np.asarray(stated_level)
+    for turn in range(_ROUNDS + 1):
+        moving, fixed = eqx.partition(unknowns, mask)
+        answer = _solve(moving, fixed, data, modes, spread)
+        unknowns = eqx.combine(answer.value, fixed)
+        if turn == _ROUNDS or not np.isfinite(float(answer.cost)):
+            break
+        if robust:
+            weight = np.sqrt(np.asarray(data.weight))
+            size = np.linalg.norm(np.asarray(answer.residuals), axis=1) / np.asarray(weight)
+            lower = np.minimum(1.0, _ROBUST / np.maximum(size, 1e-9))
+            data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(lower))
+        if turn > 0:
+            widened = float(data.std[0, 1] / stated_std[0, 1])
+            scatter = _scatter_of(answer, unknowns, data, spread, given)
+            scatter = scatter._replace(noise=scatter.noise * widened)
+            found = _with_scatter(spread, scatter)
+            rescaled = _rescaled(unknowns.level, spread.level, found.level)
+            unknowns, spread = eqx.tree_at(lambda u: u.level, unknowns, rescaled), found
+            wide = scatter.noise if not stated or scatter.contradicts_upward else 1.0
+            data = eqx.tree_at(lambda d: d.std, data, stated_std * wide)
+    return _Fitted(
+        unknowns=unknowns,
+        covariance=_inverse(np.asarray(answer.jacobian)),
+        spread=spread,
+        data=data,
+        scatter=scatter,
+        residuals=np.asarray(answer.residuals),
+        cost=float(answer.cost),
+        converged=bool(answer.good),
+    )
+
+
+def _noisier(data: BalanceData, factor: float) -> BalanceData:
+    return eqx.tree_at(lambda d: d.std, data, data.std * factor)
+
+
+def _scatter_of(
+    answer: "_Answer", unknowns: Unknowns, data: BalanceData, spread: Spread, given: np.ndarray
+) -> Scatter:
+    """Noise and deviations of levels, from the fit linearised where it ended."""
+    n_rows, n_levels, n_linear = 2 * len(data.level), data.n_levels, unknowns.linear.shape[0]
+    slopes = np.array(answer.jacobian)[:n_rows]
+    n_level = n_levels * len(LEVEL_ERRORS)
+    first = slopes.shape[1] - n_linear - n_level
+    # The solver's slopes are those of deviations in units of 1σ, zero where there is none yet.
+    slopes[:, first : first + n_level] = np.asarray(answer.level_slopes).reshape(n_rows, n_level)
+    std = np.concatenate([np.full(first, np.inf), np.tile(given, n_levels), np.ones(n_linear)])
+    level = np.asarray(unknowns.level) * np.asarray(spread.level)
+    deviation = [np.zeros(first), level.reshape(-1), np.asarray(unknowns.linear)]
+    index = first + np.arange(n_level).reshape(n_levels, -1)
+    problem = Linearised(
+        np.asarray(answer.residuals).reshape(-1), slopes, std, np.concatenate(deviation)
+    )
+    return estimated_scatter(problem, index)
+
+
+def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
+    return Spread(jnp.array(scatter.level), spread.linear)
+
+
+def _rescaled(level: Array, old: Array, new: Array) -> Array:
+    """Deviations in units of a new 1σ."""
+    return level * jnp.where(new > 0, old / jnp.where(new > 0, new, 1.0), 0.0)
+
+
+def _inverse(jacobian: np.ndarray) -> np.ndarray:
+    """(JᵀJ)⁻¹, by singular values of the scaled columns."""
+    size = np.linalg.norm(jacobian, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    _, values, rows = np.linalg.svd(jacobian / size, full_matrices=False)
+    root = (rows.T / values) / size[:, None]
+    return root @ root.T
+
+
+class _Answer(NamedTuple):
+    value: Unknowns
+    residuals: Array
+    jacobian: Array
+    level_slopes: Array  # of the states, by the levels' deviations in their own units
+    cost: Array
+    good: Array
+
+
+def whitened(
+    unknowns: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    whiten: Float[Array, "state part part"],
+) -> Float[Array, "state part"]:
+    """Residuals of the states, of unit variance where the noise is as stated."""
+    zero = jnp.zeros((len(data.level), 3))
+    balance = force_balance(unknowns, data, modes, spread, zero)
+    return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", whiten, balance)
+
+
+def whitener_at(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Float[Array, "state part part"]:
+    """What makes the balance's errors independent, at some unknowns."""
+    slopes = error_slopes(
+        lambda e: force_balance(unknowns, data, modes, spread, e), len(data.level)
+    )
+    return whitener(slopes, data.std)
+
+
+@compiled
+def _solve(
+    moving: Unknowns, fixed: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> _Answer:
+    whiten = whitener_at(eqx.combine(moving, fixed), data, modes, spread)
+    flat, unravel = ravel_pytree(moving)
+
+    def residuals(vector: Array, _: None = None) -> Array:
+        unknowns = eqx.combine(unravel(vector), fixed)
+        points = whitened(unknowns, data, modes, spread, whiten).reshape(-1)
+        return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
+
+    # Every unknown in its own unit: the solver's damping then treats them alike.
+    size = jnp.linalg.norm(jax.jacfwd(residuals)(flat), axis=0)
+    unit = 1.0 / jnp.where(size > 0, size, 1.0)
+    solution: optx.Solution = optx.least_squares(
+        lambda y, _: residuals(y * unit),
+        *(_SOLVER, flat / unit),
+        max_steps=200,
+        throw=False,
+    )
+    best = solution.value * unit
+    left, jacobian = residuals(best), jax.jacfwd(residuals)(best)
+    n = 2 * len(data.level)
+    found = eqx.combine(unravel(best), fixed)
+    raw = eqx.tree_at(lambda u: u.level, found, found.level * spread.level)
+    own_units = Spread(jnp.ones_like(spread.level), spread.linear)
+
+    def by_level(level: Array) -> Array:
+        moved = eqx.tree_at(lambda u: u.level, raw, level)
+        return whitened(moved, data, modes, own_units, whiten)
+
+    return _Answer(
+        value=unravel(best),
+        residuals=left[:n].reshape(-1, 2),
+        jacobian=jacobian,
+        level_slopes=jax.jacfwd(by_level)(raw.level).reshape(n, -1),
+        cost=jnp.sum(left**2),
+        good=jnp.asarray(solution.result == optx.RESULTS.successful),
+    )
+
+
+def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> tuple[str, ...]:
+    notes = []
+    scatter = found.scatter
+    if not found.converged:
+        notes.append("the fit did not converge: try a simpler family.")
+    if stated and scatter.contradicts_upward:
+        notes.append(
+            f"residuals are {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated noise: "
+            "the noise is understated or the model is wrong; the bands are widened accordingly."
+        )
+    if stated and scatter.noise + 3 * scatter.noise_std < 1:
+        notes.append(
+            f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
+            "noise: it is overstated, and the bands are wider than need be."
+        )
+    units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
+    found_only = np.where(np.asarray(given) > 0, 0.0, scatter.level)
+    shared = [
+        f"{factor * value:.2g} {name}"
+        for (factor, name), value in zip((*units, (100, "% in damping")), found_only, strict=True)
+        if value > 0
+    ]
+    if shared:
+        notes.append(
+            f"levels differ from one another by {', '.join(shared)} (1σ), which no stated error "
+            "explains; the bands include it."
+        )
+    if data.n_levels < 3:
+        notes.append(
+            f"{data.n_levels} level{'s' if data.n_levels > 1 else ''} only: nothing says how far "
+            "levels differ from one another, and the bands do not include it."
+        )
+    return tuple(notes)
+
+
+def parse_family(text: str) -> Choice:
+    """Family, size and amplitude of "spline:5@velocity"; what is not said is None.
+
+    Raises `ValueError` for what is no family.
+    """
+    head, _, argument = text.partition("@")
+    kind, _, size = head.partition(":")
+    if kind not in FAMILIES and kind != "auto":
+        raise ValueError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
+    if size and not size.isdigit():
+        raise ValueError(f"the size of a family must be a whole number, but is {size!r}.")
+    known = {"": None} | {name: name for name in ARGUMENTS}
+    if argument not in known:
+        raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
+    return Choice(kind, int(size) if size else None, known[argument])

@@ -1,0 +1,469 @@
+"""Which family of curves, of which size and amplitude: the one that predicts left-out levels."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.families import (
+    BACKBONE_FAMILIES,
+    DAMPING_FAMILIES,
+    FAMILIES,
+    AbstractFamily,
+    Argument,
+    Polynomial,
+    Spline,
+)
+from snrmjax.identify.force_balance import (
+    LEVEL_ERRORS,
+    BalanceData,
+    Spread,
+    Unknowns,
+    error_slopes,
+    force_balance,
+    motion_of,
+    whitener,
+)
+from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
+from snrmjax.model.modes import LinearModes
+from snrmjax.simulate.compiled import compiled
+
+_PILOT_SIZE = 5
+ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
+
+
+class Candidate(NamedTuple):
+    """One family tried, as the table of a report shows it."""
+
+    curve: str  # "backbone" or "damping"
+    family: str
+    size: int
+    argument: str
+    parameters: int
+    score: float  # log predictive density of left-out levels, relative to the best
+    score_std: float  # of the difference to the best, from level to level
+    prediction_error: float  # root mean square of left-out residuals over what was foretold
+    chosen: bool
+
+
+class Choice(NamedTuple):
+    """What the user fixed of a family."""
+
+    kind: str  # or "auto"
+    size: int | None
+    argument: Argument | None
+
+
+class _Point(NamedTuple):
+    """What one state says at the pilot's linear parameters."""
+
+    displacement: np.ndarray
+    speed: np.ndarray
+    squared: np.ndarray
+    damping: np.ndarray
+    weight: np.ndarray
+
+
+def pilot_start(
+    data: BalanceData, modes: LinearModes, spread: Spread, free: tuple[str, ...]
+) -> Unknowns:
+    """Rough unknowns from linear least squares: gain and phase first, then curves."""
+    gain, phase = 0.0, 0.0
+    if "force_gain" in free or "instrument_phase" in free:
+        factor = _complex_gain(data, modes, complex_too="instrument_phase" in free)
+        gain = float(np.log(abs(factor))) if "force_gain" in free else 0.0
+        phase = float(np.angle(factor)) if "instrument_phase" in free else 0.0
+    flat = Polynomial(jnp.ones(1), jnp.ones(()), "displacement")
+    start = Unknowns(
+        squared_frequency=flat,
+        modal_damping=flat,
+        log_force_gain=jnp.asarray(gain),
+        force_offset=jnp.asarray(0.0),
+        instrument_phase=jnp.asarray(phase),
+        level=jnp.zeros((data.n_levels, len(LEVEL_ERRORS))),
+        linear=jnp.zeros(spread.linear.shape[0]),
+    )
+    point = _points(start, data, modes, spread)
+    size = min(_PILOT_SIZE, max(1, len(point.speed) // 3))
+    spread_of_amplitude = point.speed.max() / point.speed.min()
+    kind = Spline if spread_of_amplitude > 1.5 and size > 2 else Polynomial
+    size = size if kind is Spline else min(1, size)
+
+    def curve(values: np.ndarray) -> AbstractFamily:
+        own = (values, point.weight)
+        return kind.starts(size, "displacement", point.displacement, *own)[0]
+
+    return eqx.tree_at(
+        lambda u: (u.squared_frequency, u.modal_damping),
+        start,
+        (curve(point.squared), curve(point.damping)),
+    )
+
+
+def _complex_gain(data: BalanceData, modes: LinearModes, *, complex_too: bool) -> complex:
+    """G of K X/A = G F with K polynomial in the amplitude, by linear least squares."""
+    j, r = modes.mode_of_interest, data.sensor
+    constant = float(modes.mode_shape[r, j] * modes.participation[j])
+    omega, velocity, force = (
+        np.asarray(part) for part in (data.frequency, data.velocity, data.force)
+    )
+    x = velocity / (1j * omega) / constant
+    a = np.abs(x) / np.abs(x).max()
+    columns = [x, x * a**2, x * a**4, 1j * omega * x, 1j * omega * x * a, 1j * omega * x * a**2]
+    columns += [-force + 0j, -1j * force][: 2 if complex_too else 1]
+    right = omega**2 * x
+    matrix = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
+    target = np.concatenate([right.real, right.imag])
+    weight = np.tile(1.0 / np.maximum(np.abs(x), 1e-300), 2)
+    size = np.linalg.norm(matrix * weight[:, None], axis=0)
+    answer = np.linalg.lstsq(matrix * weight[:, None] / size, target * weight, rcond=1e-13)[0]
+    gain = complex(*(answer / size)[6:]) if complex_too else complex((answer / size)[6])
+    return gain if gain != 0 else 1.0 + 0.0j
+
+
+def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> _Point:
+    motion = motion_of(start, data, modes, spread, jnp.zeros((len(data.level), 3)))
+    own, force = np.asarray(motion.velocity), np.asarray(motion.force)
+    j, r = modes.mode_of_interest, data.sensor
+    constant = float(modes.mode_shape[r, j] * modes.participation[j])
+    omega, std = np.asarray(data.frequency), np.asarray(data.std)
+    stiffness = constant * force * 1j * omega / own
+    return _Point(
+        displacement=np.asarray(motion.displacement),
+        speed=np.abs(own),
+        squared=omega**2 + stiffness.real,
+        damping=stiffness.imag / omega,
+        weight=1.0 / (np.abs(stiffness) * np.mean(std[:, 1:], axis=1)),
+    )
+
+
+class _Slopes(NamedTuple):
+    """The whitened balance at the pilot and its slopes, on the host."""
+
+    balance: np.ndarray  # (state, part)
+    by_squared: np.ndarray  # (state, part)
+    by_damping: np.ndarray
+    by_level: np.ndarray  # (state, part, error), in the errors' own units
+    by_other: np.ndarray  # (state, part, unknown): gain, offset, phase, linear deviations
+    displacement: np.ndarray
+    speed: np.ndarray
+    squared: np.ndarray
+    damping: np.ndarray
+
+
+@compiled
+def _slopes(unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> tuple:
+    n = len(data.level)
+    zero = jnp.zeros((n, 3))
+    whiten = whitener(
+        error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), n), data.std
+    )
+    ones = jnp.ones_like(spread.level)
+    raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)
+    unit = Spread(ones, spread.linear)
+
+    def balance(
+        squared: Array, damping: Array, level: Array, other: tuple[Array, Array, Array, Array]
+    ) -> Array:
+        each = eqx.tree_at(
+            lambda u: (
+                *(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),
+                *(u.squared_frequency, u.modal_damping),
+            ),
+            raw,
+            (
+                *(*other, raw.level + level),
+                *(_Shifted(raw.squared_frequency, squared), _Shifted(raw.modal_damping, damping)),
+            ),
+        )
+        own = force_balance(each, data, modes, unit, zero)
+        return jnp.einsum("sij,sj->si", whiten, own)
+
+    other = (raw.log_force_gain, raw.force_offset, raw.instrument_phase, raw.linear)
+    none = jnp.zeros(())
+
+    def by_level(k: int) -> Array:
+        # Every level's error moves its own states only: one push forward for all levels.
+        direction = jnp.zeros_like(raw.level).at[:, k].set(1.0)
+        at = jnp.zeros_like(raw.level)
+        return jax.jvp(lambda b: balance(none, none, b, other), (at,), (direction,))[1]
+
+    still = jnp.zeros_like(raw.level)
+    value = balance(none, none, still, other)
+    squared = jax.jvp(lambda s: balance(s, none, still, other), (none,), (jnp.ones(()),))[1]
+    damping = jax.jvp(lambda s: balance(none, s, still, other), (none,), (jnp.ones(()),))[1]
+    others = jax.jacfwd(lambda o: balance(none, none, still, o))(other)
+    columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
+    motion = motion_of(raw, data, modes, unit, zero)
+    return (
+        *(value, squared, damping),
+        jnp.stack([by_level(k) for k in range(len(LEVEL_ERRORS))], axis=2),
+        jnp.concatenate(columns, axis=2),
+        *(motion.displacement, jnp.abs(motion.velocity)),
+        raw.squared_frequency(motion.amplitude(raw.squared_frequency)),
+        raw.modal_damping(motion.amplitude(raw.modal_damping)),
+    )
+
+
+class _Shifted(eqx.Module):
+    """A curve with a constant added."""
+
+    curve: AbstractFamily
+    shift: Array
+
+    @property
+    def argument(self) -> Argument:
+        """Of the curve."""
+        return self.curve.argument
+
+    def __call__(self, amplitude: Array) -> Array:
+        """The curve's value and the constant."""
+        return self.curve(amplitude) + self.shift
+
+
+@compiled
+def _with_slopes(family: AbstractFamily, amplitude: np.ndarray) -> tuple[Array, Array]:
+    """Values of a curve and their derivatives with respect to its parameters."""
+
+    def at(parameters: Array) -> Array:
+        return eqx.tree_at(lambda f: f.parameters, family, parameters)(amplitude)
+
+    return at(family.parameters), jax.jacfwd(at)(family.parameters)
+
+
+class Selection(NamedTuple):
+    """Where the joint fit starts, and the table of what was tried."""
+
+    squared_frequency: AbstractFamily
+    modal_damping: AbstractFamily
+    scatter: Scatter
+    table: tuple[Candidate, ...]
+
+
+def select_families(
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    pilot: Unknowns,
+    backbone: Choice,
+    damping: Choice,
+    free: tuple[str, ...],
+) -> Selection:
+    """Try families on the balance linearised at the pilot, and take the simplest good one.
+
+    Levels are left out in turn (every third state where there are fewer than three levels) and
+    predicted with their own errors unknown; the score is the log density of what was measured
+    there. Of the candidates within one standard error of the best the one with the fewest
+    parameters is taken.
+    """
+    known = _Slopes(*(np.asarray(a) for a in _slopes(pilot, data, modes, spread)))
+    work = _Workbench(data, spread, known, free)
+    scatter = work.scatter(pilot)
+    work.use(scatter)
+    table: list[Candidate] = []
+    flexible = pilot.modal_damping
+    tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, flexible)
+    table += tried.table
+    other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
+    table += other.table
+    return Selection(tried.best, other.best, scatter, tuple(table))
+
+
+class _Compared(NamedTuple):
+    best: AbstractFamily
+    table: list[Candidate]
+
+
+class _Workbench:
+    """The linearised balance, on which families are tried one after the other."""
+
+    def __init__(self, data: BalanceData, spread: Spread, known: _Slopes, free: tuple[str, ...]):
+        self.data, self.known = data, known
+        names = ("force_gain", "force_offset", "instrument_phase")
+        keep = [k for k, name in enumerate(names) if name in free]
+        n_linear = spread.linear.shape[0]
+        keep += [3 + k for k in range(n_linear)]
+        n = len(data.level)
+        self.common = known.by_other[:, :, keep].reshape(2 * n, -1)
+        self.common_std = np.concatenate([np.full(len(keep) - n_linear, np.inf), np.ones(n_linear)])
+        self.levels = level_columns(known.by_level, np.asarray(data.level), data.n_levels)
+        self.level_std = np.asarray(spread.level).copy()
+        self.noise = 1.0
+        left_out = np.asarray(data.level)
+        if data.n_levels < 3:
+            left_out = np.argsort(np.argsort(known.speed)) % 3
+        self.folds = [np.repeat(left_out == k, 2) for k in np.unique(left_out)]
+
+    def amplitude(self, argument: Argument) -> np.ndarray:
+        return self.known.displacement if argument == "displacement" else self.known.speed
+
+    def evaluated(self, curve: AbstractFamily) -> list[np.ndarray]:
+        """Values of a curve in all states and their slopes."""
+        at = self.amplitude(curve.argument)
+        return [np.asarray(a) for a in _with_slopes(_of_displacement(curve), at)]
+
+    def problem(self, squared: AbstractFamily, damping: AbstractFamily) -> Linearised:
+        """The balance with these curves."""
+        n, known = len(self.data.level), self.known
+        f, df = self.evaluated(squared)
+        g, dg = self.evaluated(damping)
+        residuals = known.balance + known.by_squared * (f - known.squared)[:, None]
+        residuals = residuals + known.by_damping * (g - known.damping)[:, None]
+        by_f = (known.by_squared[:, :, None] * df[:, None, :]).reshape(2 * n, -1)
+        by_g = (known.by_damping[:, :, None] * dg[:, None, :]).reshape(2 * n, -1)
+        slopes = np.concatenate([by_f, by_g, self.common, self.levels], axis=1)
+        std = np.concatenate(
+            [
+                np.full(by_f.shape[1] + by_g.shape[1], np.inf),
+                self.common_std,
+                np.tile(self.level_std, self.data.n_levels),
+            ]
+        )
+        return Linearised(
+            residuals.reshape(-1) / self.noise, slopes / self.noise, std, np.zeros(len(std))
+        )
+
+    def scatter(self, pilot: Unknowns) -> Scatter:
+        problem = self.problem(pilot.squared_frequency, pilot.modal_damping)
+        first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
+        index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
+        return estimated_scatter(problem, index)
+
+    def use(self, scatter: Scatter) -> None:
+        self.level_std[:] = scatter.level
+        self.noise = scatter.noise
+
+    def improved(
+        self, squared: AbstractFamily, damping: AbstractFamily, steps: int
+    ) -> tuple[AbstractFamily, AbstractFamily, Linearised]:
+        """Gauss–Newton on the linearised balance; exact at once for linear families."""
+        for _ in range(steps):
+            problem = self.problem(squared, damping)
+            change = _solved(problem)
+            k = squared.parameters.shape[0]
+            m = k + damping.parameters.shape[0]
+            squared = _moved(squared, change[:k])
+            damping = _moved(damping, change[k:m])
+        problem = self.problem(squared, damping)
+        return squared, damping, problem
+
+    def compare(
+        self, name: str, choice: Choice, kinds: tuple[str, ...], other: AbstractFamily
+    ) -> _Compared:
+        known = self.known
+        values = known.squared if name == "backbone" else known.damping
+        weight = np.linalg.norm(
+            known.by_squared if name == "backbone" else known.by_damping, axis=1
+        )
+        # Where the pilot's curve was, corrected by what is left: the scattered points themselves.
+        rows = []
+        arguments = (choice.argument,) if choice.argument else ARGUMENTS
+        for kind in kinds if choice.kind == "auto" else (choice.kind,):
+            family = FAMILIES[kind]
+            for size in family.orders if choice.size is None else (choice.size,):
+                for argument in arguments:
+                    starts = family.starts(size, argument, self.amplitude(argument), values, weight)
+                    if 2 * len(values) <= starts[0].parameters.shape[0] + 3:
+                        continue
+                    rows.append((kind, size, argument, *self._tried(name, starts, other)))
+                    if starts[0].parameters.shape[0] == 1 and not choice.argument:
+                        break  # a constant has no amplitude
+        if not rows:
+            raise ValueError(
+                f"the {len(values)} states are too few for the {name} asked for: choose a "
+                "smaller family."
+            )
+        scores = np.array([row[4] for row in rows])
+        total = scores.sum(axis=1)
+        best = int(np.argmax(total))
+        apart = scores[best] - scores
+        spread = np.sqrt(len(self.folds)) * np.std(apart, axis=1, ddof=1)
+        sizes = np.array([row[3].parameters.shape[0] for row in rows])
+        as_good = (total[best] - total) <= spread
+        as_good[best] = True
+        order = np.lexsort((-total, sizes))
+        chosen = next(int(k) for k in order if as_good[k])
+        table = [
+            Candidate(
+                curve=name,
+                family=row[0],
+                size=int(row[1]),
+                argument=row[2],
+                parameters=int(sizes[k]),
+                score=float(total[k] - total[best]),
+                score_std=float(spread[k]),
+                prediction_error=float(row[5]),
+                chosen=k == chosen,
+            )
+            for k, row in enumerate(rows)
+        ]
+        return _Compared(rows[chosen][3], table)
+
+    def _tried(
+        self, name: str, starts: list[AbstractFamily], other: AbstractFamily
+    ) -> tuple[AbstractFamily, np.ndarray, float]:
+        """The best of the improved starts, its score by left-out level and its error."""
+        found = []
+        for start in starts:
+            pair = (start, other) if name == "backbone" else (other, start)
+            linear = len(starts) == 1
+            squared, damping, problem = self.improved(*pair, steps=1 if linear else 4)
+            cost = float(problem.residuals @ problem.residuals)
+            mine = squared if name == "backbone" else damping
+            found.append((cost if np.isfinite(cost) else np.inf, mine, problem))
+        _, best, problem = min(found, key=lambda row: row[0])
+        return best, *_left_out(problem, self.folds)
+
+
+def _of_displacement(family: AbstractFamily) -> AbstractFamily:
+    """The same curve with the other name: so that both arguments share one program."""
+    fields = {name: value for name, value in vars(family).items() if name != "argument"}
+    return type(family)(**fields, argument="displacement")
+
+
+def _moved(family: AbstractFamily, change: np.ndarray) -> AbstractFamily:
+    return eqx.tree_at(lambda f: f.parameters, family, family.parameters + jnp.asarray(change))
+
+
+def _normal(problem: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unknowns that may move, JᵀJ with priors, and their units."""
+    keep = problem.prior_std > 0
+    x = problem.slopes[:, keep]
+    size = np.linalg.norm(x, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    prior = np.where(np.isfinite(problem.prior_std[keep]), problem.prior_std[keep], np.inf)
+    matrix = (x / size).T @ (x / size) + np.diag(1.0 / (prior * size) ** 2)
+    return keep, matrix + 1e-12 * np.eye(len(matrix)), size
+
+
+def _solved(problem: Linearised) -> Float[np.ndarray, " unknown"]:
+    """The change of the unknowns that least squares with the priors asks for."""
+    keep, matrix, size = _normal(problem)
+    right = (problem.slopes[:, keep] / size).T @ problem.residuals
+    change = np.zeros(len(keep))
+    change[keep] = -np.linalg.solve(matrix, right) / size
+    return change
+
+
+def _left_out(problem: Linearised, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Log predictive density of every left-out part, and the error over what was foretold."""
+    keep, matrix, size = _normal(problem)
+    x = problem.slopes[:, keep] / size
+    change = -np.linalg.solve(matrix, x.T @ problem.residuals)
+    left = problem.residuals + x @ change
+    scores, squares, count = [], 0.0, 0
+    for rows in folds:
+        own = x[rows]
+        without = matrix - own.T @ own + 1e-10 * np.eye(len(matrix))
+        arms = np.linalg.solve(without, own.T)
+        error = left[rows] + own @ (arms @ left[rows])
+        covariance = np.eye(rows.sum()) + own @ arms
+        covariance = 0.5 * (covariance + covariance.T)
+        sign, logarithm = np.linalg.slogdet(covariance)
+        square = float(error @ np.linalg.solve(covariance, error))
+        scores.append(-0.5 * (square + logarithm) if sign > 0 else -np.inf)
+        squares, count = squares + square, count + len(error)
+    return np.array(scores), float(np.sqrt(squares / count))
