@@ -19,6 +19,9 @@ from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes, residual_velocity
 
+STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
+"""What every state may err in at random, relative or in rad; stiffness is never stated."""
+
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
 
@@ -31,7 +34,7 @@ class BalanceData(eqx.Module):
     force: Float[Array, " state"]  # N, or V where only the drive is known
     velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
     share: Float[Array, "state sensor"]  # of the sensors in it
-    std: Float[Array, "state input"]  # of log force, log velocity and phase
+    std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for what a robust loss mistrusts
     n_levels: int = eqx.field(static=True)
     sensor: int = eqx.field(static=True)  # the one whose motion is meant
@@ -72,7 +75,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     force = np.asarray(data.drive if driven else data.force)
     keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
-    known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:] > 0))
+    known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
         far = mistrust(velocity)
         errors = np.stack([np.zeros_like(far), far, far], axis=1)
@@ -84,7 +87,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             force=jnp.asarray(force[keep]),
             velocity=jnp.asarray(velocity[keep]),
             share=jnp.asarray(share)[keep],
-            std=jnp.asarray(errors[keep]),
+            std=jnp.asarray(np.pad(errors[keep], ((0, 0), (0, 1)))),
             weight=jnp.ones(int(keep.sum())),
             n_levels=len(levels),
             sensor=r,
@@ -128,7 +131,7 @@ def motion_of(
 ) -> Motion:
     """What the record says of the mode when it is freed of its errors.
 
-    `error` adds to log force, log velocity and phase: for derivatives.
+    `error` adds to the logarithms of force and velocity and to the phase: for derivatives.
     """
     level = (unknowns.level * spread.level)[data.level]
     gain = jnp.exp(unknowns.log_force_gain + error[:, 0])
@@ -153,7 +156,7 @@ def force_balance(
     level = (unknowns.level * spread.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
     damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
-    squared = squared * (1 + level[:, 2])
+    squared = squared * (1 + level[:, 2] + error[:, 3])
     damping = damping * (1 + level[:, 3])
     r, j = data.sensor, modes.mode_of_interest
     constant = modes.mode_shape[r, j] * modes.participation[j]
@@ -164,15 +167,21 @@ def force_balance(
     return jnp.stack([excess.real, excess.imag], axis=1)
 
 
+def no_errors(n_states: int) -> Float[Array, "state input"]:
+    """States as they were recorded."""
+    return jnp.zeros((n_states, len(STATE_ERRORS)))
+
+
 def error_slopes(
     balance: Callable[[Array], Array], n_states: int
 ) -> Float[Array, "state part input"]:
-    """Derivatives of the balance with respect to log force, log velocity and phase.
+    """Derivatives of the balance with respect to `STATE_ERRORS`.
 
     Every state has its own: one push forward for each input gives them all.
     """
-    zero = jnp.zeros((n_states, 3))
-    columns = [jax.jvp(balance, (zero,), (zero.at[:, k].set(1.0),))[1] for k in range(3)]
+    zero = no_errors(n_states)
+    kinds = range(len(STATE_ERRORS))
+    columns = [jax.jvp(balance, (zero,), (zero.at[:, k].set(1.0),))[1] for k in kinds]
     return jnp.stack(columns, axis=2)
 
 

@@ -23,6 +23,7 @@ from snrmjax.identify.force_balance import (
     error_slopes,
     force_balance,
     motion_of,
+    no_errors,
     whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter
@@ -73,8 +74,8 @@ class JointFit(eqx.Module):
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        zero = jnp.zeros((len(self.data.level), 3))
-        return motion_of(self.unknowns, self.data, self.modes, self.spread, zero)
+        none = no_errors(len(self.data.level))
+        return motion_of(self.unknowns, self.data, self.modes, self.spread, none)
 
     def vector(self) -> tuple[Float[Array, " unknown"], "Restore"]:
         """The free unknowns as a vector, and the way back to all of them."""
@@ -147,12 +148,11 @@ def fit_jointly(
     wanted = parse_family(backbone), parse_family(damping)
     pilot = pilot_start(measured, modes, spread, released)
     chosen = select_families(measured, modes, spread, pilot, *wanted, released)
-    if not stated:
-        measured = _noisier(measured, chosen.scatter.noise)
+    measured = eqx.tree_at(lambda d: d.std, measured, measured.std.at[:, 3].set(chosen.jitter))
     level = _with_scatter(spread, chosen.scatter)
     pair = (chosen.squared_frequency, chosen.modal_damping)
     start = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
-    settings = (measured, modes, level, released, spread.level)
+    settings = (measured, modes, level, released, spread.level, chosen.scatter)
     best = _fitted(start, *settings, stated=stated, robust=robust)
     notes = _notes(best, measured, spread.level, stated=stated)
     return JointFit(
@@ -220,6 +220,7 @@ def _fitted(
     spread: Spread,
     free: tuple[str, ...],
     stated_level: Array,
+    scatter: Scatter,
     *,
     stated: bool,
     robust: bool,
@@ -227,8 +228,13 @@ def _fitted(
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
     mask = free_unknowns(start, free)
     unknowns, stated_std = start, data.std
-    scatter = Scatter(1.0, 0.0, tuple(np.asarray(spread.level).tolist()))
     given = np.asarray(stated_level)
+
+    def as_noisy(scatter: Scatter) -> float:
+        return scatter.noise if not stated or scatter.contradicts_upward else 1.0
+
+    widened = as_noisy(scatter)
+    data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
     for turn in range(_ROUNDS + 1):
         moving, fixed = eqx.partition(unknowns, mask)
         answer = _solve(moving, fixed, data, modes, spread)
@@ -241,14 +247,13 @@ def _fitted(
             lower = np.minimum(1.0, _ROBUST / np.maximum(size, 1e-9))
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(lower))
         if turn > 0:
-            widened = float(data.std[0, 1] / stated_std[0, 1])
             scatter = _scatter_of(answer, unknowns, data, spread, given)
             scatter = scatter._replace(noise=scatter.noise * widened)
             found = _with_scatter(spread, scatter)
             rescaled = _rescaled(unknowns.level, spread.level, found.level)
             unknowns, spread = eqx.tree_at(lambda u: u.level, unknowns, rescaled), found
-            wide = scatter.noise if not stated or scatter.contradicts_upward else 1.0
-            data = eqx.tree_at(lambda d: d.std, data, stated_std * wide)
+            widened = as_noisy(scatter)
+            data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
     return _Fitted(
         unknowns=unknowns,
         covariance=_inverse(np.asarray(answer.jacobian)),
@@ -259,10 +264,6 @@ def _fitted(
         cost=float(answer.cost),
         converged=bool(answer.good),
     )
-
-
-def _noisier(data: BalanceData, factor: float) -> BalanceData:
-    return eqx.tree_at(lambda d: d.std, data, data.std * factor)
 
 
 def _scatter_of(
@@ -320,8 +321,8 @@ def whitened(
     whiten: Float[Array, "state part part"],
 ) -> Float[Array, "state part"]:
     """Residuals of the states, of unit variance where the noise is as stated."""
-    zero = jnp.zeros((len(data.level), 3))
-    balance = force_balance(unknowns, data, modes, spread, zero)
+    none = no_errors(len(data.level))
+    balance = force_balance(unknowns, data, modes, spread, none)
     return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", whiten, balance)
 
 
@@ -394,6 +395,12 @@ def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> 
         )
     units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
     found_only = np.where(np.asarray(given) > 0, 0.0, scatter.level)
+    jitter = 0.5 * float(data.std[0, 3]) * (1.0 if stated else scatter.noise)
+    if jitter > 0:
+        notes.append(
+            f"natural frequency wanders by {100 * jitter:.2g} % from state to state (1σ), which "
+            "no stated noise explains."
+        )
     shared = [
         f"{factor * value:.2g} {name}"
         for (factor, name), value in zip((*units, (100, "% in damping")), found_only, strict=True)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import minimize
 
 from snrmjax.identify.families import (
     BACKBONE_FAMILIES,
@@ -25,6 +26,7 @@ from snrmjax.identify.force_balance import (
     error_slopes,
     force_balance,
     motion_of,
+    no_errors,
     whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
@@ -32,6 +34,7 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
 _PILOT_SIZE = 5
+_CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
 
@@ -125,7 +128,7 @@ def _complex_gain(data: BalanceData, modes: LinearModes, *, complex_too: bool) -
 
 
 def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> _Point:
-    motion = motion_of(start, data, modes, spread, jnp.zeros((len(data.level), 3)))
+    motion = motion_of(start, data, modes, spread, no_errors(len(data.level)))
     own, force = np.asarray(motion.velocity), np.asarray(motion.force)
     j, r = modes.mode_of_interest, data.sensor
     constant = float(modes.mode_shape[r, j] * modes.participation[j])
@@ -136,7 +139,7 @@ def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spre
         speed=np.abs(own),
         squared=omega**2 + stiffness.real,
         damping=stiffness.imag / omega,
-        weight=1.0 / (np.abs(stiffness) * np.mean(std[:, 1:], axis=1)),
+        weight=1.0 / (np.abs(stiffness) * np.mean(std[:, 1:3], axis=1)),
     )
 
 
@@ -157,7 +160,7 @@ class _Slopes(NamedTuple):
 @compiled
 def _slopes(unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> tuple:
     n = len(data.level)
-    zero = jnp.zeros((n, 3))
+    zero = no_errors(n)
     whiten = whitener(
         error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), n), data.std
     )
@@ -240,6 +243,7 @@ class Selection(NamedTuple):
     squared_frequency: AbstractFamily
     modal_damping: AbstractFamily
     scatter: Scatter
+    jitter: float  # 1σ of relative stiffness from state to state that no stated noise explains
     table: tuple[Candidate, ...]
 
 
@@ -259,17 +263,25 @@ def select_families(
     there. Of the candidates within one standard error of the best the one with the fewest
     parameters is taken.
     """
-    known = _Slopes(*(np.asarray(a) for a in _slopes(pilot, data, modes, spread)))
-    work = _Workbench(data, spread, known, free)
-    scatter = work.scatter(pilot)
-    work.use(scatter)
+
+    def workbench(data: BalanceData) -> tuple[_Workbench, Scatter]:
+        known = _Slopes(*(np.asarray(a) for a in _slopes(pilot, data, modes, spread)))
+        work = _Workbench(data, spread, known, free)
+        scatter = work.scatter(pilot)
+        work.use(scatter)
+        return work, scatter
+
+    work, scatter = workbench(data)
+    jitter = work.jitter(pilot)
+    if jitter > 0:
+        work, scatter = workbench(eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(jitter)))
     table: list[Candidate] = []
     flexible = pilot.modal_damping
     tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, flexible)
     table += tried.table
     other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
     table += other.table
-    return Selection(tried.best, other.best, scatter, tuple(table))
+    return Selection(tried.best, other.best, scatter, jitter, tuple(table))
 
 
 class _Compared(NamedTuple):
@@ -331,6 +343,30 @@ class _Workbench:
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
         return estimated_scatter(problem, index)
+
+    def jitter(self, pilot: Unknowns) -> float:
+        """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
+
+        Errors of force and phase move the balance alike along a response; a natural frequency
+        that wanders moves it most where the mode is driven hardest.
+        """
+        problem = self.problem(pilot.squared_frequency, pilot.modal_damping)
+        left = (problem.residuals + problem.slopes @ _solved(problem)).reshape(-1, 2)
+        arm = self.known.by_squared * self.known.squared[:, None] / self.noise
+        length = np.sum(arm**2, axis=1)
+        along = np.sum(arm * left, axis=1) ** 2
+        size = np.sum(left**2, axis=1)
+
+        def criterion(point: np.ndarray) -> float:
+            noise, extra = np.exp(2 * point)
+            inner = noise + extra * length
+            squares = (size - along * extra / inner) / noise
+            return float(np.sum(squares + np.log(noise) + np.log(inner)))
+
+        start = np.log([0.5, 0.5 / np.sqrt(np.median(length))])
+        found = minimize(criterion, start, method="Nelder-Mead")
+        alone = 2 * len(left) * (np.log(np.sum(size) / (2 * len(left))) + 1)
+        return float(np.exp(found.x[1])) if found.fun < alone - _CLEARLY else 0.0
 
     def use(self, scatter: Scatter) -> None:
         self.level_std[:] = scatter.level
