@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 Argument = Literal["displacement", "velocity"]
 
@@ -308,3 +308,37 @@ DAMPING_FAMILIES = (
     *("constant", "viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
     *("polynomial", "power_law", "spline"),
 )
+
+
+def values_and_slopes(
+    family: AbstractFamily, amplitude: Float[np.ndarray, " point"]
+) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
+    """Values of a curve and their derivatives by its parameters, on the host.
+
+    What `jax.jacfwd` says, for the many families that a selection tries once each: their programs
+    would take longer to compile than all of the selection takes.
+    """
+    x, parameters = amplitude / float(family.scale), np.asarray(family.parameters)
+    if isinstance(family, _Sum):
+        columns = np.stack([x**power for power in family.powers(family.order)], axis=1)
+    elif isinstance(family, Spline):
+        knots, slopes = np.asarray(family.knots), np.asarray(family.slopes)
+        u = x**2
+        cardinal = CubicHermiteSpline(knots, np.eye(len(knots)), slopes)
+        columns = cardinal(np.minimum(u, knots[-1]))
+        columns = columns + np.maximum(u - knots[-1], 0.0)[:, None] * slopes[-1]
+    elif isinstance(family, PowerLaw):
+        exponent = float(family.exponent)
+        term, share = x**exponent, exponent / family.largest_exponent
+        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(x)
+        values = parameters[0] + parameters[1] * term
+        return values, np.stack([np.ones_like(x), term, by_logit], axis=1)
+    else:
+        at, direct = jnp.asarray(amplitude), _called_with
+        columns = np.asarray(jax.jacfwd(lambda p: direct(family, p, at))(family.parameters))
+        return np.asarray(family(at)), columns
+    return columns @ parameters, columns
+
+
+def _called_with(family: AbstractFamily, parameters: Array, amplitude: Array) -> Array:
+    return eqx.tree_at(lambda f: f.parameters, family, parameters)(amplitude)

@@ -18,6 +18,7 @@ from snrmjax.identify.families import AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.simulate.compiled import compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
@@ -122,6 +123,14 @@ class Motion(eqx.Module):
         return self.displacement if curve.argument == "displacement" else jnp.abs(self.velocity)
 
 
+@compiled
+def recorded_motion(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Motion:
+    """`motion_of` the states as they were recorded."""
+    return motion_of(unknowns, data, modes, spread, no_errors(data.level.shape[0]))
+
+
 def motion_of(
     unknowns: Unknowns,
     data: BalanceData,
@@ -179,10 +188,10 @@ def error_slopes(
 
     Every state has its own: one push forward for each input gives them all.
     """
-    zero = no_errors(n_states)
-    kinds = range(len(STATE_ERRORS))
-    columns = [jax.jvp(balance, (zero,), (zero.at[:, k].set(1.0),))[1] for k in kinds]
-    return jnp.stack(columns, axis=2)
+    zero, kinds = no_errors(n_states), len(STATE_ERRORS)
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
+    slopes = jax.vmap(lambda d: jax.jvp(balance, (zero,), (d,))[1])(directions)
+    return jnp.moveaxis(slopes, 0, 2)
 
 
 def whitener(

@@ -1,6 +1,6 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,8 +22,8 @@ from snrmjax.identify.force_balance import (
     balance_data,
     error_slopes,
     force_balance,
-    motion_of,
     no_errors,
+    recorded_motion,
     whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter
@@ -74,29 +74,28 @@ class JointFit(eqx.Module):
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        none = no_errors(len(self.data.level))
-        return motion_of(self.unknowns, self.data, self.modes, self.spread, none)
+        return recorded_motion(self.unknowns, self.data, self.modes, self.spread)
 
     def vector(self) -> tuple[Float[Array, " unknown"], "Restore"]:
         """The free unknowns as a vector, and the way back to all of them."""
-        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
-        flat, unravel = ravel_pytree(moving)
-        return flat, Restore(unravel, fixed)
+        moving, _ = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
+        return ravel_pytree(moving)[0], Restore(self.unknowns, self.free)
 
     def names(self) -> tuple[str, ...]:
         """What the free unknowns are called."""
         return unknown_names(self.unknowns, self.data, self.free)
 
 
-class Restore(NamedTuple):
+class Restore(eqx.Module):
     """From a vector of free unknowns to all of them."""
 
-    unravel: Callable[[Array], Unknowns]
-    fixed: Unknowns
+    unknowns: Unknowns
+    free: tuple[str, ...] = eqx.field(static=True)
 
-    def __call__(self, vector: Array) -> Unknowns:
-        """See the class."""
-        return eqx.combine(self.unravel(vector), self.fixed)
+    def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
+        """All unknowns, the free ones from the vector."""
+        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
+        return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
 
 
 def fit_jointly(

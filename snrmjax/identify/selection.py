@@ -16,7 +16,7 @@ from snrmjax.identify.families import (
     AbstractFamily,
     Argument,
     Polynomial,
-    Spline,
+    values_and_slopes,
 )
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
@@ -27,13 +27,14 @@ from snrmjax.identify.force_balance import (
     force_balance,
     motion_of,
     no_errors,
+    recorded_motion,
     whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
-_PILOT_SIZE = 5
+_PILOT_SIZE = 4
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
@@ -90,14 +91,12 @@ def pilot_start(
         linear=jnp.zeros(spread.linear.shape[0]),
     )
     point = _points(start, data, modes, spread)
-    size = min(_PILOT_SIZE, max(1, len(point.speed) // 3))
-    spread_of_amplitude = point.speed.max() / point.speed.min()
-    kind = Spline if spread_of_amplitude > 1.5 and size > 2 else Polynomial
-    size = size if kind is Spline else min(1, size)
+    ratio = point.speed.max() / point.speed.min()
+    size = min(_PILOT_SIZE, len(point.speed) // 4) if ratio > 1.5 else 0
 
     def curve(values: np.ndarray) -> AbstractFamily:
         own = (values, point.weight)
-        return kind.starts(size, "displacement", point.displacement, *own)[0]
+        return Polynomial.starts(size, "displacement", point.displacement, *own)[0]
 
     return eqx.tree_at(
         lambda u: (u.squared_frequency, u.modal_damping),
@@ -128,7 +127,7 @@ def _complex_gain(data: BalanceData, modes: LinearModes, *, complex_too: bool) -
 
 
 def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> _Point:
-    motion = motion_of(start, data, modes, spread, no_errors(len(data.level)))
+    motion = recorded_motion(start, data, modes, spread)
     own, force = np.asarray(motion.velocity), np.asarray(motion.force)
     j, r = modes.mode_of_interest, data.sensor
     constant = float(modes.mode_shape[r, j] * modes.participation[j])
@@ -168,73 +167,44 @@ def _slopes(unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: S
     raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)
     unit = Spread(ones, spread.linear)
 
-    def balance(
-        squared: Array, damping: Array, level: Array, other: tuple[Array, Array, Array, Array]
-    ) -> Array:
+    def balance(level: Array, other: tuple[Array, Array, Array, Array]) -> Array:
         each = eqx.tree_at(
-            lambda u: (
-                *(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),
-                *(u.squared_frequency, u.modal_damping),
-            ),
+            lambda u: (*(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),),
             raw,
-            (
-                *(*other, raw.level + level),
-                *(_Shifted(raw.squared_frequency, squared), _Shifted(raw.modal_damping, damping)),
-            ),
+            (*other, raw.level + level),
         )
         own = force_balance(each, data, modes, unit, zero)
         return jnp.einsum("sij,sj->si", whiten, own)
 
     other = (raw.log_force_gain, raw.force_offset, raw.instrument_phase, raw.linear)
-    none = jnp.zeros(())
-
-    def by_level(k: int) -> Array:
-        # Every level's error moves its own states only: one push forward for all levels.
-        direction = jnp.zeros_like(raw.level).at[:, k].set(1.0)
-        at = jnp.zeros_like(raw.level)
-        return jax.jvp(lambda b: balance(none, none, b, other), (at,), (direction,))[1]
-
     still = jnp.zeros_like(raw.level)
-    value = balance(none, none, still, other)
-    squared = jax.jvp(lambda s: balance(s, none, still, other), (none,), (jnp.ones(()),))[1]
-    damping = jax.jvp(lambda s: balance(none, s, still, other), (none,), (jnp.ones(()),))[1]
-    others = jax.jacfwd(lambda o: balance(none, none, still, o))(other)
+    # Every level's error moves its own states only: one push forward for all levels.
+    kinds = still.shape[1]
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *still.shape))
+    by_level = jax.vmap(lambda d: jax.jvp(lambda b: balance(b, other), (still,), (d,))[1])
+    others = jax.jacfwd(lambda o: balance(still, o))(other)
     columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
     motion = motion_of(raw, data, modes, unit, zero)
+    # The balance is linear in the values of both curves.
+    constant = modes.mode_shape[data.sensor, modes.mode_of_interest]
+    constant = constant * modes.participation[modes.mode_of_interest]
+    by_damping = motion.velocity / (constant * motion.force)
+    by_squared = by_damping / (1j * data.frequency)
+    level = raw.level[data.level]
+
+    def parts(slope: Array, share: Array) -> Array:
+        both = jnp.stack([slope.real, slope.imag], axis=1) * share[:, None]
+        return jnp.einsum("sij,sj->si", whiten, both)
+
     return (
-        *(value, squared, damping),
-        jnp.stack([by_level(k) for k in range(len(LEVEL_ERRORS))], axis=2),
+        *(balance(still, other), parts(by_squared, 1 + level[:, 2])),
+        parts(by_damping, 1 + level[:, 3]),
+        jnp.moveaxis(by_level(directions), 0, 2),
         jnp.concatenate(columns, axis=2),
         *(motion.displacement, jnp.abs(motion.velocity)),
         raw.squared_frequency(motion.amplitude(raw.squared_frequency)),
         raw.modal_damping(motion.amplitude(raw.modal_damping)),
     )
-
-
-class _Shifted(eqx.Module):
-    """A curve with a constant added."""
-
-    curve: AbstractFamily
-    shift: Array
-
-    @property
-    def argument(self) -> Argument:
-        """Of the curve."""
-        return self.curve.argument
-
-    def __call__(self, amplitude: Array) -> Array:
-        """The curve's value and the constant."""
-        return self.curve(amplitude) + self.shift
-
-
-@compiled
-def _with_slopes(family: AbstractFamily, amplitude: np.ndarray) -> tuple[Array, Array]:
-    """Values of a curve and their derivatives with respect to its parameters."""
-
-    def at(parameters: Array) -> Array:
-        return eqx.tree_at(lambda f: f.parameters, family, parameters)(amplitude)
-
-    return at(family.parameters), jax.jacfwd(at)(family.parameters)
 
 
 class Selection(NamedTuple):
@@ -312,10 +282,10 @@ class _Workbench:
     def amplitude(self, argument: Argument) -> np.ndarray:
         return self.known.displacement if argument == "displacement" else self.known.speed
 
-    def evaluated(self, curve: AbstractFamily) -> list[np.ndarray]:
+    def evaluated(self, curve: AbstractFamily) -> tuple[np.ndarray, np.ndarray]:
         """Values of a curve in all states and their slopes."""
         at = self.amplitude(curve.argument)
-        return [np.asarray(a) for a in _with_slopes(_of_displacement(curve), at)]
+        return values_and_slopes(curve, at)
 
     def problem(self, squared: AbstractFamily, damping: AbstractFamily) -> Linearised:
         """The balance with these curves."""
@@ -452,12 +422,6 @@ class _Workbench:
             found.append((cost if np.isfinite(cost) else np.inf, mine, problem))
         _, best, problem = min(found, key=lambda row: row[0])
         return best, *_left_out(problem, self.folds)
-
-
-def _of_displacement(family: AbstractFamily) -> AbstractFamily:
-    """The same curve with the other name: so that both arguments share one program."""
-    fields = {name: value for name, value in vars(family).items() if name != "argument"}
-    return type(family)(**fields, argument="displacement")
 
 
 def _moved(family: AbstractFamily, change: np.ndarray) -> AbstractFamily:

@@ -1,0 +1,368 @@
+"""What a joint fit says: curves with bands, and responses, resonances and folds with bands."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.identify.backbone import Backbone, BackboneValues
+from snrmjax.identify.curves import ShapePreservingSpline
+from snrmjax.identify.families import AbstractFamily
+from snrmjax.identify.force_balance import BalanceData, Spread, Unknowns, with_deviations
+from snrmjax.identify.joint_fit import JointFit, Restore
+from snrmjax.identify.prediction import CONTINUED, predict_response, resonances
+from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.simulate.compiled import compiled
+
+_KNOTS = 120
+_ITERATIONS = 12
+
+
+class FittedPoint(NamedTuple):
+    """A resonance or a fold, with 1σ."""
+
+    force: float  # N
+    frequency: float  # rad/s
+    frequency_std: float
+    velocity: float  # m/s at the fit's sensor, residual modes included
+    velocity_std: float
+    continued: bool  # beyond the measured amplitudes
+
+
+class FittedResponse(NamedTuple):
+    """A response curve along rising and falling amplitude, with 1σ at fixed frequency."""
+
+    force: float  # N
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    frequency_std: Float[np.ndarray, " point"]  # at fixed amplitude
+    velocity: Complex[np.ndarray, " point"]  # m/s
+    velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency; large at folds
+    stable: Bool[np.ndarray, " point"]
+    continued: Bool[np.ndarray, " point"]
+    resonances: tuple[FittedPoint, ...]
+    folds: tuple[FittedPoint, ...]
+
+
+def fitted_values(
+    fit: JointFit, velocity: Float[np.ndarray, " point"], *, of_a_new_level: bool = False
+) -> BackboneValues:
+    """ω̃ and ζ̃ at velocity amplitudes on the backbone, with 1σ.
+
+    Arguments: `velocity` in m/s, zero allowed. With `of_a_new_level` the bands are those of the
+    next test: they include by how much one level differs from another.
+    """
+    vector, restore = fit.vector()
+    at = jnp.asarray(velocity, dtype=jnp.float64)
+    found = _on_backbone_with_slopes(vector, restore, at)
+    values, slopes = np.asarray(found[0]), np.asarray(found[1])
+    covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
+    squared, damping = values.T
+    if of_a_new_level:
+        covariance[:, 0, 0] += (squared * fit.level_std[2]) ** 2
+        covariance[:, 1, 1] += (damping * fit.level_std[3]) ** 2
+    omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
+    # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
+    slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
+    zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
+    return BackboneValues(
+        velocity=at,
+        natural_frequency=jnp.asarray(omega),
+        natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
+        damping_ratio=jnp.asarray(zeta),
+        damping_ratio_std=jnp.asarray(zeta_std),
+        modal_damping=jnp.asarray(damping),
+        modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
+    )
+
+
+def curve_values(unknowns: Unknowns, velocity: Float[Array, " point"]) -> Float[Array, "point 2"]:
+    """ω̃² and 2ζ̃ω̃ where the backbone has a velocity amplitude; differentiable."""
+    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+    displacement = displacement_on_backbone(squared, velocity)
+    return jnp.stack(
+        [
+            squared(displacement if squared.argument == "displacement" else velocity),
+            damping(displacement if damping.argument == "displacement" else velocity),
+        ],
+        axis=1,
+    )
+
+
+def displacement_on_backbone(
+    squared: AbstractFamily, velocity: Float[Array, " point"]
+) -> Float[Array, " point"]:
+    """X with X ω̃ = v, by Newton's method; its derivative is that of the solution."""
+    if squared.argument == "velocity":
+        return velocity / jnp.sqrt(squared(velocity))
+
+    def excess(x: Array) -> Array:
+        return x * jnp.sqrt(squared(x)) - velocity
+
+    def step(_: int, x: Array) -> Array:
+        value, slope = jax.jvp(excess, (x,), (jnp.ones_like(x),))
+        return x - value / slope
+
+    start = velocity / jnp.sqrt(squared(jnp.zeros_like(velocity)))
+    fixed = jax.lax.stop_gradient
+    found = fixed(jax.lax.fori_loop(0, _ITERATIONS, step, fixed(start)))
+    slope = fixed(jax.jvp(excess, (found,), (jnp.ones_like(found),))[1])
+    return found - excess(found) / slope
+
+
+@compiled
+def _on_backbone_with_slopes(
+    vector: Array, restore: Restore, velocity: Array
+) -> tuple[Array, Array]:
+    def of(vector: Array) -> Array:
+        return curve_values(restore(vector), velocity)
+
+    return of(vector), jax.jacfwd(of)(vector)
+
+
+def as_backbone(fit: JointFit) -> Backbone:
+    """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
+
+    Damping that belongs to the velocity is taken where it lies on the backbone.
+    """
+    motion = fit.motion()
+    speed = np.abs(np.asarray(motion.velocity))
+    largest = CONTINUED * float(np.max(speed))
+    velocity = largest * np.linspace(0.0, 1.0, _KNOTS)
+    vector, restore = fit.vector()
+    values, slopes = _on_backbone_with_slopes(vector, restore, jnp.asarray(velocity))
+    displacement = jnp.asarray(velocity) / jnp.sqrt(values[:, 0])
+    covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
+    measured = np.asarray(motion.displacement)
+    j, r = fit.modes.mode_of_interest, fit.data.sensor
+    # Dry friction has no finite damping at rest: there the next knot's value stands.
+    damping = (
+        values[:, 1].at[0].set(jnp.where(jnp.isfinite(values[0, 1]), values[0, 1], values[1, 1]))
+    )
+    return Backbone(
+        squared_frequency=ShapePreservingSpline(displacement, values[:, 0]),
+        modal_damping=ShapePreservingSpline(displacement, damping),
+        squared_frequency_covariance=covariance[0],
+        modal_damping_covariance=jnp.nan_to_num(covariance[1]),
+        modal_constant=fit.modes.mode_shape[r, j] * fit.modes.participation[j],
+        smallest=jnp.asarray(measured.min()),
+        largest=jnp.asarray(measured.max()),
+        argument="displacement",
+        sensor=fit.modes.sensors[r],
+    )
+
+
+def fitted_response(
+    fit: JointFit,
+    force: float,
+    *,
+    from_frequency: float = 0.0,
+    to_frequency: float = np.inf,
+    points_per_side: int = 200,
+) -> list[FittedResponse]:
+    """Response curves under a force with bands, and its resonances and folds with theirs.
+
+    Bands come from the implicit function theorem on the curve's own equation
+    |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude for the frequency, at fixed frequency for the
+    velocity, along both equations of a resonance and of a fold.
+
+    Arguments: `force` in N, frequencies in rad/s. Returns the connected curves, the main one
+    first; resonances and folds with the first curve that has them.
+    Raises `ValueError` for a force that is not positive.
+    """
+    rough = as_backbone(fit)
+    load = abs(float(rough.modal_constant)) * force
+    settings = {"from_frequency": from_frequency, "to_frequency": to_frequency}
+    curves = predict_response(rough, fit.modes, force, points_per_side=points_per_side, **settings)
+    largest = fit.largest[0] * (1 + 1e-9)
+    tips = [
+        (r.amplitude, r.frequency)
+        for r in resonances(rough, fit.modes, force)
+        if from_frequency <= r.frequency <= to_frequency
+    ]
+    found = [_located(fit, force, load, "resonance", *tip, largest) for tip in tips]
+    answer = []
+    for number, curve in enumerate(curves):
+        moved = _banded(fit, force, load, curve.amplitude, curve.frequency)
+        turns = _turns(curve.frequency, curve.amplitude)
+        folds = [_located(fit, force, load, "fold", *turn, largest) for turn in turns]
+        answer.append(
+            FittedResponse(
+                force=force,
+                frequency=moved[0],
+                frequency_std=moved[1],
+                velocity=moved[2],
+                velocity_std=moved[3],
+                stable=curve.stable,
+                continued=curve.continued,
+                resonances=tuple(p for p in found if p is not None) if number == 0 else (),
+                folds=tuple(p for p in folds if p is not None),
+            )
+        )
+    return answer
+
+
+def _turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[tuple[float, float]]:
+    """Amplitude and frequency of the points where a curve turns back in frequency."""
+    steps = np.sign(np.diff(frequency))
+    at = np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
+    return [(float(amplitude[k]), float(frequency[k])) for k in at]
+
+
+def _excess(unknowns: Unknowns, load: Array, x: Array, omega: Array) -> Float[Array, "*batch"]:
+    """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
+    squared, damping = _curves_at(unknowns, x, omega)
+    return ((squared - omega**2) ** 2 + (omega * damping) ** 2) * (x / load) ** 2 - 1.0
+
+
+def _curves_at(unknowns: Unknowns, x: Array, omega: Array) -> tuple[Array, Array]:
+    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+    speed = x * omega
+    return (
+        squared(x if squared.argument == "displacement" else speed),
+        damping(x if damping.argument == "displacement" else speed),
+    )
+
+
+def _velocity_at(
+    unknowns: Unknowns,
+    modes: LinearModes,
+    spread: Spread,
+    data: BalanceData,
+    force: Array,
+    x: Array,
+    omega: Array,
+) -> Complex[Array, "*batch"]:
+    squared, damping = _curves_at(unknowns, x, omega)
+    j, r = modes.mode_of_interest, data.sensor
+    constant = modes.mode_shape[r, j] * modes.participation[j]
+    own = 1j * omega * constant * force / (squared - omega**2 + 1j * omega * damping)
+    linear = with_deviations(modes, unknowns.linear, spread.linear)
+    return own + residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))[..., r]
+
+
+def _banded(
+    fit: JointFit, force: float, load: float, amplitude: np.ndarray, frequency: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    vector, restore = fit.vector()
+    found = _bands(
+        *(vector, restore, fit.modes, fit.spread, fit.data),
+        *(jnp.asarray(fit.covariance), jnp.asarray(force), jnp.asarray(load)),
+        *(jnp.asarray(amplitude), jnp.asarray(frequency)),
+    )
+    omega, omega_std, velocity, velocity_std = (np.asarray(part) for part in found)
+    return omega, omega_std, velocity, velocity_std
+
+
+@compiled
+def _bands(
+    vector: Array,
+    restore: Restore,
+    modes: LinearModes,
+    spread: Spread,
+    data: BalanceData,
+    covariance: Array,
+    force: Array,
+    load: Array,
+    x: Array,
+    omega: Array,
+) -> tuple[Array, Array, Array, Array]:
+    ones = jnp.ones_like(x)
+
+    def excess(vector: Array, x: Array, omega: Array) -> Array:
+        return _excess(restore(vector), load, x, omega)
+
+    def by(position: int, x: Array, omega: Array) -> Array:
+        direction = [jnp.zeros_like(vector), 0 * ones, 0 * ones]
+        direction[position] = ones
+        return jax.jvp(excess, (vector, x, omega), tuple(direction))[1]
+
+    # The points come from curves drawn anew through knots: one step puts them on the fit's own.
+    first, second = by(1, x, omega), by(2, x, omega)
+    left = excess(vector, x, omega)
+    steepest = (first * x) ** 2 + (second * omega) ** 2
+    x, omega = x - left * first * x**2 / steepest, omega - left * second * omega**2 / steepest
+    by_x, by_omega = by(1, x, omega), by(2, x, omega)
+    by_vector = jax.jacfwd(excess)(vector, x, omega)
+
+    def speed(vector: Array, x: Array) -> Array:
+        return jnp.abs(_velocity_at(restore(vector), modes, spread, data, force, x, omega))
+
+    direct = jax.jacfwd(speed)(vector, x)
+    through = jax.jvp(lambda x: speed(vector, x), (x,), (ones,))[1]
+    moved = direct - (through / by_x)[:, None] * by_vector
+    frequency_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", by_vector, covariance, by_vector))
+    velocity_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", moved, covariance, moved))
+    velocity = _velocity_at(restore(vector), modes, spread, data, force, x, omega)
+    return omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std
+
+
+def _located(
+    fit: JointFit,
+    force: float,
+    load: float,
+    kind: str,
+    amplitude: float,
+    frequency: float,
+    largest: float,
+) -> FittedPoint | None:
+    """A resonance or a fold near a point, or None where Newton's method finds none."""
+    vector, restore = fit.vector()
+    settings = (fit.modes, fit.spread, fit.data, jnp.asarray(fit.covariance))
+    start = jnp.array([1.0, 1.0])
+    unit = jnp.array([amplitude, frequency])
+    found, covariance, good = _with_band(
+        vector, restore, *settings, jnp.asarray(force), jnp.asarray(load), start, unit, kind
+    )
+    if not bool(good):
+        return None
+    (omega, speed, x), std = np.asarray(found), np.sqrt(np.diag(np.asarray(covariance)))
+    return FittedPoint(
+        *(force, float(omega), float(std[0]), float(speed), float(std[1])), bool(x > largest)
+    )
+
+
+@compiled
+def _with_band(
+    vector: Array,
+    restore: Restore,
+    modes: LinearModes,
+    spread: Spread,
+    data: BalanceData,
+    covariance: Array,
+    force: Array,
+    load: Array,
+    start: Array,
+    unit: Array,
+    kind: str,
+) -> tuple[Array, Array, Array]:
+    def equations(point: Array, vector: Array) -> Array:
+        x, omega = point * unit
+        unknowns = restore(vector)
+        if kind == "fold":
+            excess, slope = jax.jvp(
+                lambda x: _excess(unknowns, load, x, omega), (x,), (jnp.ones_like(x),)
+            )
+            return jnp.stack([excess, slope * x])
+        squared, damping = _curves_at(unknowns, x, omega)
+        return jnp.stack([squared / omega**2 - 1, omega * damping * x / load - 1])
+
+    def step(_: int, point: Array) -> Array:
+        jacobian = jax.jacfwd(equations)(point, vector)
+        return point - jnp.linalg.solve(jacobian, equations(point, vector))
+
+    point = jax.lax.fori_loop(0, _ITERATIONS, step, start)
+    left = jnp.max(jnp.abs(equations(point, vector)))
+    good = (left < 1e-9) & jnp.all(jnp.abs(point - 1.0) < 0.2)
+    by_vector = jax.jacfwd(equations, argnums=1)(point, vector)
+    along = -jnp.linalg.solve(jax.jacfwd(equations)(point, vector), by_vector)
+
+    def outputs(point: Array, vector: Array) -> Array:
+        x, omega = point * unit
+        velocity = _velocity_at(restore(vector), modes, spread, data, force, x, omega)
+        return jnp.stack([omega, jnp.abs(velocity), x])
+
+    by_point, direct = jax.jacfwd(outputs, argnums=(0, 1))(point, vector)
+    total = by_point @ along + direct
+    return outputs(point, vector), total @ covariance @ total.T, good
