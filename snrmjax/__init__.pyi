@@ -1,7 +1,16 @@
 # The public names and where they live; `__init__.py` imports each on first use.
 from .identify.backbone import Backbone, BackboneFit, fit_backbone
 from .identify.backbone_points import BackbonePoints, identify_points
+from .identify.families import FAMILIES
+from .identify.fitted_response import (
+    FittedPoint,
+    FittedResponse,
+    fitted_response,
+    fitted_values,
+)
 from .identify.identification import Identification, identify_backbone
+from .identify.joint_fit import JointFit, fit_jointly
+from .identify.next_measurement import NextMeasurement, next_measurements
 from .identify.points import (
     PointStatus,
     SnrmPoints,
@@ -64,17 +73,22 @@ from .simulate.time_integration import (
 from .simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
 
 __all__ = [
+    "FAMILIES",
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
     "ControlledCurve",
     "CurveStatus",
     "DampedModeBranch",
+    "FittedPoint",
+    "FittedResponse",
     "Identification",
     "IntegratedMotion",
+    "JointFit",
     "LinearModes",
     "MeasurementErrors",
     "MotionStatus",
+    "NextMeasurement",
     "NormalModeBranch",
     "PeriodicMotion",
     "PointStatus",
@@ -99,6 +113,9 @@ __all__ = [
     "damped_normal_mode",
     "equilibria",
     "fit_backbone",
+    "fit_jointly",
+    "fitted_response",
+    "fitted_values",
     "flat_beam",
     "floquet_multipliers",
     "forced_response",
@@ -114,6 +131,7 @@ __all__ = [
     "make_effect",
     "mode_indicator",
     "motions_at_velocities",
+    "next_measurements",
     "nnm_appropriation",
     "nonlinear_mode_velocity",
     "nonlinear_normal_mode",

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 import snrmjax as sj
-from snrmjax.io import results
+from snrmjax.io import joint_results, results
 from snrmjax.io.models import read_model, write_model
 from snrmjax.io.tables import read_steady_states, write_steady_states
 from snrmjax.io.units import HERTZ
@@ -26,6 +26,7 @@ from snrmjax.model.beams import FLAT_BEAM_FORCES
 from snrmjax.plot import normal_mode_figure, save_figure, simulated_response_figure
 from snrmjax.presentation import (
     Presentation,
+    corrected,
     equilibria_notes,
     identification_figures,
     present_identification,
@@ -217,21 +218,47 @@ def identify(
     anchor: Annotated[
         bool, typer.Option("--anchor", help="Pin the curves at the linear mode at zero amplitude.")
     ] = False,
+    fit: Annotated[
+        str | None,
+        typer.Option(
+            help="Fit both curves jointly: BACKBONE[,DAMPING], each a family such as polynomial, "
+            "spline:5 or viscous_quadratic@velocity, or auto.",
+            metavar="FAMILY[,FAMILY]",
+        ),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Let the joint fit find force_gain, force_offset or instrument_phase; repeatable."
+        ),
+    ] = None,
+    advise: Annotated[
+        int | None,
+        typer.Option("--next", help="Advise this many next measurements (joint fit).", min=1),
+    ] = None,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Mistrust outlying states (joint fit).")
+    ] = False,
 ) -> None:
     """Identify backbone and damping from measured steady states, and predict responses.
 
     Writes points.csv, backbone.csv, summary.json, figures and report.html; with --predict-force
-    also prediction.csv.
+    also prediction.csv; with --fit the fitted curves, fit.json and with --next also next.csv.
     """
     with _staged(out) as folder:
         structure = read_model(model)
         reading = read_steady_states(data, sensors=structure.modes.sensors)
         for note in reading.notes:
             _warn(note)
+        measured, joint = reading.steady_states, None
+        if fit is not None or free or advise:
+            joint = _joint_fit(measured, structure, fit or "auto", free or [], robust=robust)
+            measured = corrected(measured, joint)
         told = present_identification(
-            reading.steady_states,
+            measured,
             structure,
             predict_force or [],
+            fit=joint,
             amplitude=amplitude.value,
             measure=measure.value,
             family=curve.value,
@@ -246,7 +273,42 @@ def identify(
             "amplitude": f"{amplitude.value}, {measure.value}",
             "curves": curve.value + (", anchored at the linear mode" if anchor else ""),
         }
-        _write_identification(folder, told, data.stem.replace("_", " "), done, reading.notes)
+        further: dict[str, object] = {}
+        if joint is not None:
+            pair = (joint.unknowns.squared_frequency, joint.unknowns.modal_damping)
+            done["curves"] = " and ".join(joint_results.described(curve) for curve in pair)
+            responses = [r for f in predict_force or [] for r in sj.fitted_response(joint, f)]
+            further["joint_fit"] = joint_results.summarise_fit(joint, responses)
+            joint_results.write_joint_fit(folder / "fit.json", joint)
+        if joint is not None and advise:
+            advice = sj.next_measurements(joint, advise)
+            joint_results.write_next(folder / "next.csv", advice)
+            for one in advice:
+                hertz = f"{one.frequency / HERTZ:.6g} Hz"
+                _say(f"{one.rank}. {one.force:.4g} N at {hertz}: {one.reason}")
+        _write_identification(
+            *(folder, told, data.stem.replace("_", " "), done, reading.notes), further
+        )
+        if joint is not None:
+            joint_results.write_fitted_backbone(folder / "backbone.csv", joint)
+
+
+def _joint_fit(
+    data: sj.SteadyStates, structure: sj.Structure, fit: str, free: list[str], *, robust: bool
+) -> sj.JointFit:
+    names = fit.split(",")
+    if len(names) > 2:
+        raise ValueError(f"--fit takes one or two families, but {fit!r} names {len(names)}.")
+    return sj.fit_jointly(
+        data,
+        structure.modes,
+        backbone=names[0],
+        damping=names[1] if len(names) == 2 else "auto",
+        free=free,
+        level_gain_std=float(structure.level_gain_std),
+        level_phase_std=float(structure.level_phase_std),
+        robust=robust,
+    )
 
 
 def main() -> None:
@@ -262,7 +324,12 @@ def main() -> None:
 
 
 def _write_identification(
-    folder: Path, told: Presentation, title: str, done: dict[str, str], notes: tuple[str, ...]
+    folder: Path,
+    told: Presentation,
+    title: str,
+    done: dict[str, str],
+    notes: tuple[str, ...],
+    further: dict[str, object] | None = None,
 ) -> None:
     identification = told.identification
     results.write_points(folder / "points.csv", identification)
@@ -273,7 +340,7 @@ def _write_identification(
     pairs = [(one.force, one.resonances) for one in told.predictions]
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     summary |= results.summarise(identification, pairs)
-    summary |= {"notes": [*notes, *told.notes]}
+    summary |= {"notes": [*notes, *told.notes], **(further or {})}
     results.write_summary(folder / "summary.json", summary)
     figures = identification_figures(told)
     for name, figure in figures.items():

@@ -3,11 +3,16 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax import plot
+from snrmjax.identify.backbone import BackboneFit
+from snrmjax.identify.fitted_response import as_backbone
 from snrmjax.identify.identification import Identification, identify_backbone
+from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.prediction import (
     CONTINUED,
     PredictedResponse,
@@ -49,13 +54,17 @@ def present_identification(
     *,
     truth: NormalModeBranch | None = None,
     simulated: Sequence[ResponseCurve] = (),
+    fit: JointFit | None = None,
     **options: Any,
 ) -> Presentation:
     """Identify the mode of interest and predict its responses to some forces (N).
 
-    `truth` and `simulated` are shown for comparison; `options` go to `identify_backbone`.
+    `truth` and `simulated` are shown for comparison; `fit` gives the curves where there is a
+    joint one; `options` go to `identify_backbone`.
     """
     identification = identify_backbone(data, model.modes, **options)
+    if fit is not None:
+        identification = with_joint_fit(identification, fit)
     backbone = identification.fit.backbone
     predictions, notes = [], list(identification.notes)
     for force in forces:
@@ -74,6 +83,37 @@ def present_identification(
     return Presentation(
         data, model, identification, tuple(predictions), tuple(notes), truth, tuple(simulated)
     )
+
+
+def corrected(data: SteadyStates, fit: JointFit) -> SteadyStates:
+    """The states with the force and the phase that a joint fit found for their instruments."""
+    unknowns = fit.unknowns
+    nominal = data.drive if fit.drive_known_only else data.force
+    offset = unknowns.force_offset * jnp.min(fit.data.force)
+    return eqx.tree_at(
+        lambda d: (d.force, d.velocity),
+        data,
+        (
+            nominal * jnp.exp(unknowns.log_force_gain) + offset,
+            data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
+        ),
+    )
+
+
+def with_joint_fit(identification: Identification, fit: JointFit) -> Identification:
+    """The identified points with the curves of a joint fit in place of their own."""
+    both = (fit.noise_scale, fit.noise_scale)
+    own = float(fit.modes.natural_frequency[fit.modes.mode_of_interest])
+    ratio = float(fit.modes.damping_ratio[fit.modes.mode_of_interest])
+    curves = BackboneFit(
+        backbone=as_backbone(fit),
+        noise_scale=both,
+        level_frequency_std=0.5 * float(fit.level_std[2]) * own,
+        level_damping_std=float(fit.level_std[3]) * ratio,
+        noise_stated=fit.noise_stated,
+        anchor=None,
+    )
+    return identification._replace(fit=curves, notes=fit.notes)
 
 
 def equilibria_notes(model: Structure) -> list[str]:

@@ -55,7 +55,7 @@ def fitted_values(
     """
     vector, restore = fit.vector()
     at = jnp.asarray(velocity, dtype=jnp.float64)
-    found = _on_backbone_with_slopes(vector, restore, at)
+    found = values_with_slopes(vector, restore, at)
     values, slopes = np.asarray(found[0]), np.asarray(found[1])
     covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
     squared, damping = values.T
@@ -112,9 +112,9 @@ def displacement_on_backbone(
 
 
 @compiled
-def _on_backbone_with_slopes(
-    vector: Array, restore: Restore, velocity: Array
-) -> tuple[Array, Array]:
+def values_with_slopes(vector: Array, restore: Restore, velocity: Array) -> tuple[Array, Array]:
+    """`curve_values` and their derivatives by the free unknowns."""
+
     def of(vector: Array) -> Array:
         return curve_values(restore(vector), velocity)
 
@@ -131,7 +131,7 @@ def as_backbone(fit: JointFit) -> Backbone:
     largest = CONTINUED * float(np.max(speed))
     velocity = largest * np.linspace(0.0, 1.0, _KNOTS)
     vector, restore = fit.vector()
-    values, slopes = _on_backbone_with_slopes(vector, restore, jnp.asarray(velocity))
+    values, slopes = values_with_slopes(vector, restore, jnp.asarray(velocity))
     displacement = jnp.asarray(velocity) / jnp.sqrt(values[:, 0])
     covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
     measured = np.asarray(motion.displacement)
@@ -308,29 +308,51 @@ def _located(
     largest: float,
 ) -> FittedPoint | None:
     """A resonance or a fold near a point, or None where Newton's method finds none."""
-    vector, restore = fit.vector()
-    settings = (fit.modes, fit.spread, fit.data, jnp.asarray(fit.covariance))
-    start = jnp.array([1.0, 1.0])
-    unit = jnp.array([amplitude, frequency])
-    found, covariance, good = _with_band(
-        vector, restore, *settings, jnp.asarray(force), jnp.asarray(load), start, unit, kind
-    )
-    if not bool(good):
+    found = _values_and_slopes(fit, force, load, kind, amplitude, frequency)
+    if found is None:
         return None
-    (omega, speed, x), std = np.asarray(found), np.sqrt(np.diag(np.asarray(covariance)))
+    (omega, speed, x), slopes = found
+    std = np.sqrt(np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes))
     return FittedPoint(
         *(force, float(omega), float(std[0]), float(speed), float(std[1])), bool(x > largest)
     )
 
 
+def point_slopes(
+    fit: JointFit, force: float, kind: str, point: FittedPoint
+) -> Float[np.ndarray, "output unknown"]:
+    """Derivatives of a resonance's or fold's frequency and velocity by the free unknowns.
+
+    Raises `ValueError` when there is no such point there.
+    """
+    j, r = fit.modes.mode_of_interest, fit.data.sensor
+    load = abs(float(fit.modes.mode_shape[r, j] * fit.modes.participation[j])) * force
+    start = point.velocity / point.frequency
+    found = _values_and_slopes(fit, force, load, kind, start, point.frequency)
+    if found is None:
+        raise ValueError(f"there is no {kind} near {point.frequency / (2 * np.pi):.4g} Hz.")
+    return found[1][:2]
+
+
+def _values_and_slopes(
+    fit: JointFit, force: float, load: float, kind: str, amplitude: float, frequency: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
+    vector, restore = fit.vector()
+    unit = jnp.array([amplitude, frequency])
+    given = (jnp.asarray(force), jnp.asarray(load), jnp.ones(2), unit)
+    settings = (vector, restore, fit.modes, fit.spread, fit.data)
+    values, slopes, good = _point_with_slopes(*settings, *given, kind)
+    return (np.asarray(values), np.asarray(slopes)) if bool(good) else None
+
+
 @compiled
-def _with_band(
+def _point_with_slopes(
     vector: Array,
     restore: Restore,
     modes: LinearModes,
     spread: Spread,
     data: BalanceData,
-    covariance: Array,
     force: Array,
     load: Array,
     start: Array,
@@ -364,5 +386,4 @@ def _with_band(
         return jnp.stack([omega, jnp.abs(velocity), x])
 
     by_point, direct = jax.jacfwd(outputs, argnums=(0, 1))(point, vector)
-    total = by_point @ along + direct
-    return outputs(point, vector), total @ covariance @ total.T, good
+    return outputs(point, vector), by_point @ along + direct, good

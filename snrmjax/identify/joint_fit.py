@@ -83,7 +83,11 @@ class JointFit(eqx.Module):
 
     def names(self) -> tuple[str, ...]:
         """What the free unknowns are called."""
-        return unknown_names(self.unknowns, self.data, self.free)
+        return tuple(name for name, _ in named_unknowns(self.unknowns, self.data, self.free))
+
+    def units(self) -> tuple[str, ...]:
+        """Units of the free unknowns; a curve's terms count at the largest amplitude."""
+        return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
 
 
 class Restore(eqx.Module):
@@ -190,14 +194,24 @@ def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
     return eqx.tree_at(where, frozen, tuple(moving))
 
 
-def unknown_names(unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the free unknowns in the order of their vector."""
+def named_unknowns(
+    unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
+    """Names and units of the free unknowns in the order of their vector."""
+    curves = (
+        ("backbone", "rad^2/s^2", unknowns.squared_frequency),
+        ("damping", "1/s", unknowns.modal_damping),
+    )
+    measurement = {"force_gain": "log", "force_offset": "smallest force", "instrument_phase": "rad"}
     return (
-        *(f"backbone.{c.name}" for c in unknowns.squared_frequency.coefficients()),
-        *(f"damping.{c.name}" for c in unknowns.modal_damping.coefficients()),
-        *(name for name in FREE if name in free),
-        *(f"level_{k}.{e}" for k in range(data.n_levels) for e in LEVEL_ERRORS),
-        *(f"linear_{k}" for k in range(unknowns.linear.shape[0])),
+        *(
+            (f"{name}.{c.name}", unit if c.is_value else "1")
+            for name, unit, family in curves
+            for c in family.coefficients()
+        ),
+        *((name, unit) for name, unit in measurement.items() if name in free),
+        *((f"level_{k}.{e}", "std") for k in range(data.n_levels) for e in LEVEL_ERRORS),
+        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
     )
 
 

@@ -1,0 +1,218 @@
+"""A joint fit as tables, as part of a summary, and as a file that gives it back."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.identify.families import FAMILIES, AbstractFamily
+from snrmjax.identify.fitted_response import FittedPoint, FittedResponse, fitted_values
+from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
+from snrmjax.identify.joint_fit import JointFit
+from snrmjax.identify.next_measurement import NextMeasurement
+from snrmjax.identify.selection import Candidate
+from snrmjax.io.files import FilePath, read_text, write_atomically
+from snrmjax.io.tables import write_table
+from snrmjax.io.units import HERTZ
+from snrmjax.model.modes import LinearModes, linear_modes
+
+BAND_POINTS = 200
+_FORMAT = 1
+
+
+def write_fitted_backbone(path: Path, fit: JointFit) -> None:
+    """Write both fitted curves with 1σ from zero to the largest measured velocity."""
+    values = fitted_values(fit, np.linspace(0.0, fit.largest[1], BAND_POINTS))
+    write_table(
+        path,
+        {
+            "velocity_m_s": values.velocity,
+            "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,
+            "natural_frequency_std_hz": np.asarray(values.natural_frequency_std) / HERTZ,
+            "damping_ratio": values.damping_ratio,
+            "damping_ratio_std": values.damping_ratio_std,
+        },
+    )
+
+
+def write_next(path: Path, advice: Sequence[NextMeasurement]) -> None:
+    """Write the advised measurements, the best first."""
+    write_table(
+        path,
+        {
+            "rank": [one.rank for one in advice],
+            "force_n": [one.force for one in advice],
+            "frequency_hz": [one.frequency / HERTZ for one in advice],
+            "expected_band_ratio": [one.expected_band_ratio for one in advice],
+            "reason": [one.reason for one in advice],
+        },
+    )
+
+
+def summarise_fit(fit: JointFit, responses: Sequence[FittedResponse]) -> dict:
+    """What a joint fit found, by name, in the units of the files."""
+    std = np.sqrt(np.diag(fit.covariance))
+    vector = np.asarray(fit.vector()[0])
+    linear = len(fit.unknowns.linear)
+    shown = len(vector) - fit.data.n_levels * len(LEVEL_ERRORS) - linear
+    level = dict(zip(LEVEL_ERRORS, np.asarray(fit.level_std).tolist(), strict=True))
+    return {
+        "converged": fit.converged,
+        "backbone": described(fit.unknowns.squared_frequency),
+        "damping": described(fit.unknowns.modal_damping),
+        "parameters": {
+            name: {"value": float(value), "std": float(spread), "unit": unit}
+            for name, value, spread, unit in list(
+                zip(fit.names(), vector, std, fit.units(), strict=True)
+            )[:shown]
+        },
+        "covariance": fit.covariance[:shown, :shown].tolist(),
+        "noise": {
+            "stated": fit.noise_stated,
+            "scale": fit.noise_scale,
+            "scale_std": fit.noise_scale_std,
+            "wandering_of_natural_frequency": 0.5 * float(fit.data.std[0, 3]),
+        },
+        "levels": {
+            "gain_std": level["gain"],
+            "phase_std_deg": float(np.degrees(level["phase"])),
+            "natural_frequency_std_relative": 0.5 * level["stiffness"],
+            "damping_std_relative": level["damping"],
+        },
+        "tried": [candidate._asdict() for candidate in fit.candidates],
+        "resonances": [_point(p) for r in responses for p in r.resonances],
+        "folds": [_point(p) for r in responses for p in r.folds],
+        "notes": list(fit.notes),
+    }
+
+
+def described(family: AbstractFamily) -> str:
+    """A family as the command takes it."""
+    size = getattr(family, "order", None)
+    if family.kind == "spline":
+        size = family.parameters.shape[0]
+    plain = family.kind in ("polynomial", "spline")
+    return f"{family.kind}{f':{size}' if plain else ''}@{family.argument}"
+
+
+def _point(point: FittedPoint) -> dict:
+    return {
+        "force_n": point.force,
+        "frequency_hz": point.frequency / HERTZ,
+        "frequency_std_hz": point.frequency_std / HERTZ,
+        "velocity_m_s": point.velocity,
+        "velocity_std_m_s": point.velocity_std,
+        "beyond_the_data": point.continued,
+    }
+
+
+def write_joint_fit(path: FilePath, fit: JointFit) -> None:
+    """Write a joint fit, its data and covariance included, as JSON that `read_joint_fit` reads."""
+    unknowns = fit.unknowns
+    content = {
+        "format": _FORMAT,
+        "names": list(fit.names()),
+        "units": list(fit.units()),
+        "covariance": fit.covariance,
+        "squared_frequency": _family_entry(unknowns.squared_frequency),
+        "modal_damping": _family_entry(unknowns.modal_damping),
+        "unknowns": {
+            name: getattr(unknowns, name)
+            for name in ("log_force_gain", "force_offset", "instrument_phase", "level", "linear")
+        },
+        "spread": {"level": fit.spread.level, "linear": fit.spread.linear},
+        "data": vars(fit.data),
+        "modes": vars(fit.modes),
+        "residuals": fit.residuals,
+        "level_std": fit.level_std,
+        "candidates": [candidate._asdict() for candidate in fit.candidates],
+        **{name: getattr(fit, name) for name in _PLAIN},
+    }
+    write_atomically(Path(path), json.dumps(_encoded(content), allow_nan=True) + "\n")
+
+
+_PLAIN = (
+    *("noise_scale", "noise_scale_std", "drive_known_only", "noise_stated"),
+    *("free", "notes", "converged"),
+)
+
+
+def read_joint_fit(path: FilePath) -> JointFit:
+    """Read a joint fit that `write_joint_fit` wrote.
+
+    Raises `ValueError` when the file is none, and what opening it raises.
+    """
+    try:
+        content = _decoded(json.loads(read_text(path)))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is no joint fit: {error}.") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
+    data, modes = content["data"], dict(content["modes"])
+    modes["sensors"] = tuple(modes["sensors"])
+    keys = ("natural_frequency", "damping_ratio", "mode_shape", "participation")
+    rebuilt: LinearModes = linear_modes(*(modes.pop(k) for k in keys), **modes)
+    squared, damping = (
+        _family(content["squared_frequency"]),
+        _family(content["modal_damping"]),
+    )
+    arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
+    plain = {name: content[name] for name in _PLAIN}
+    plain |= {"free": tuple(plain["free"]), "notes": tuple(plain["notes"])}
+    return JointFit(
+        unknowns=Unknowns(squared_frequency=squared, modal_damping=damping, **arrays),
+        covariance=np.asarray(content["covariance"]),
+        spread=Spread(*(jnp.asarray(content["spread"][k]) for k in ("level", "linear"))),
+        data=BalanceData(**_on_device(data)),
+        modes=rebuilt,
+        level_std=np.asarray(content["level_std"]),
+        residuals=np.asarray(content["residuals"]),
+        candidates=tuple(Candidate(**row) for row in content["candidates"]),
+        **plain,
+    )
+
+
+def _family_entry(family: AbstractFamily) -> dict:
+    return {"kind": family.kind, **vars(family)}
+
+
+def _family(entry: dict[str, Any]) -> AbstractFamily:
+    return FAMILIES[entry["kind"]](**_on_device({k: v for k, v in entry.items() if k != "kind"}))
+
+
+def _on_device(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: jnp.asarray(v) if isinstance(v, np.ndarray) else v for k, v in fields.items()}
+
+
+def _encoded(value: object) -> object:
+    """Arrays as objects that say their type and shape; everything else as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _encoded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_encoded(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if hasattr(value, "dtype"):
+        array = np.asarray(value)
+        parts = [array.real, array.imag] if np.iscomplexobj(array) else [array]
+        return {
+            "array": [part.reshape(-1).tolist() for part in parts],
+            "shape": list(array.shape),
+            "type": array.dtype.name,
+        }
+    return value
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_decoded(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if set(value) != {"array", "shape", "type"}:
+        return {key: _decoded(item) for key, item in value.items()}
+    parts = [np.asarray(part, dtype=np.float64) for part in value["array"]]
+    array = parts[0] + 1j * parts[1] if len(parts) == 2 else parts[0]
+    return array.astype(value["type"]).reshape(value["shape"])
