@@ -14,9 +14,11 @@ from snrmjax.identify.force_balance import BalanceData, Spread, Unknowns, with_d
 from snrmjax.identify.joint_fit import JointFit, Restore
 from snrmjax.identify.prediction import CONTINUED, predict_response, resonances
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.simulate.blocks import by_blocks
 from snrmjax.simulate.compiled import compiled
 
 _KNOTS = 120
+_BLOCK = 256  # amplitudes that one program works on
 _ITERATIONS = 12
 
 
@@ -53,10 +55,8 @@ def fitted_values(
     Arguments: `velocity` in m/s, zero allowed. With `of_a_new_level` the bands are those of the
     next test: they include by how much one level differs from another.
     """
-    vector, restore = fit.vector()
-    at = jnp.asarray(velocity, dtype=jnp.float64)
-    found = values_with_slopes(vector, restore, at)
-    values, slopes = np.asarray(found[0]), np.asarray(found[1])
+    at = np.asarray(velocity, dtype=np.float64)
+    values, slopes = values_with_slopes(fit, at)
     covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
     squared, damping = values.T
     if of_a_new_level:
@@ -67,7 +67,7 @@ def fitted_values(
     slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
     zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
     return BackboneValues(
-        velocity=at,
+        velocity=jnp.asarray(at),
         natural_frequency=jnp.asarray(omega),
         natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
         damping_ratio=jnp.asarray(zeta),
@@ -111,10 +111,17 @@ def displacement_on_backbone(
     return found - excess(found) / slope
 
 
-@compiled
-def values_with_slopes(vector: Array, restore: Restore, velocity: Array) -> tuple[Array, Array]:
-    """`curve_values` and their derivatives by the free unknowns."""
+def values_with_slopes(
+    fit: JointFit, velocity: Float[np.ndarray, " point"]
+) -> tuple[Float[np.ndarray, "point curve"], Float[np.ndarray, "point curve unknown"]]:
+    """`curve_values` and their derivatives by the free unknowns, in blocks of one size."""
+    vector, restore = fit.vector()
+    found = by_blocks(lambda v: _values_with_slopes(vector, restore, v), _BLOCK, velocity)
+    return found[0], found[1]
 
+
+@compiled
+def _values_with_slopes(vector: Array, restore: Restore, velocity: Array) -> tuple[Array, Array]:
     def of(vector: Array) -> Array:
         return curve_values(restore(vector), velocity)
 
@@ -130,8 +137,7 @@ def as_backbone(fit: JointFit) -> Backbone:
     speed = np.abs(np.asarray(motion.velocity))
     largest = CONTINUED * float(np.max(speed))
     velocity = largest * np.linspace(0.0, 1.0, _KNOTS)
-    vector, restore = fit.vector()
-    values, slopes = values_with_slopes(vector, restore, jnp.asarray(velocity))
+    values, slopes = (jnp.asarray(part) for part in values_with_slopes(fit, velocity))
     displacement = jnp.asarray(velocity) / jnp.sqrt(values[:, 0])
     covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
     measured = np.asarray(motion.displacement)
@@ -342,7 +348,7 @@ def _values_and_slopes(
     unit = jnp.array([amplitude, frequency])
     given = (jnp.asarray(force), jnp.asarray(load), jnp.ones(2), unit)
     settings = (vector, restore, fit.modes, fit.spread, fit.data)
-    values, slopes, good = _point_with_slopes(*settings, *given, kind)
+    values, slopes, good = _point_with_slopes(*settings, *given, np.array(kind == "fold"))
     return (np.asarray(values), np.asarray(slopes)) if bool(good) else None
 
 
@@ -357,18 +363,17 @@ def _point_with_slopes(
     load: Array,
     start: Array,
     unit: Array,
-    kind: str,
+    is_fold: Array,
 ) -> tuple[Array, Array, Array]:
     def equations(point: Array, vector: Array) -> Array:
         x, omega = point * unit
         unknowns = restore(vector)
-        if kind == "fold":
-            excess, slope = jax.jvp(
-                lambda x: _excess(unknowns, load, x, omega), (x,), (jnp.ones_like(x),)
-            )
-            return jnp.stack([excess, slope * x])
+        excess, slope = jax.jvp(
+            lambda x: _excess(unknowns, load, x, omega), (x,), (jnp.ones_like(x),)
+        )
         squared, damping = _curves_at(unknowns, x, omega)
-        return jnp.stack([squared / omega**2 - 1, omega * damping * x / load - 1])
+        resonance = [squared / omega**2 - 1, omega * damping * x / load - 1]
+        return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
 
     def step(_: int, point: Array) -> Array:
         jacobian = jax.jacfwd(equations)(point, vector)

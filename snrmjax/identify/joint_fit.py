@@ -26,7 +26,12 @@ from snrmjax.identify.force_balance import (
     recorded_motion,
     whitener,
 )
-from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter
+from snrmjax.identify.level_scatter import (
+    Linearised,
+    Scatter,
+    estimated_scatter,
+    level_columns,
+)
 from snrmjax.identify.selection import ARGUMENTS, Candidate, Choice, pilot_start, select_families
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -78,8 +83,8 @@ class JointFit(eqx.Module):
 
     def vector(self) -> tuple[Float[Array, " unknown"], "Restore"]:
         """The free unknowns as a vector, and the way back to all of them."""
-        moving, _ = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
-        return ravel_pytree(moving)[0], Restore(self.unknowns, self.free)
+        restore = Restore(self.unknowns, self.free)
+        return restore.vector(), restore
 
     def names(self) -> tuple[str, ...]:
         """What the free unknowns are called."""
@@ -95,6 +100,10 @@ class Restore(eqx.Module):
 
     unknowns: Unknowns
     free: tuple[str, ...] = eqx.field(static=True)
+
+    def vector(self) -> Float[Array, " unknown"]:
+        """The free unknowns."""
+        return ravel_pytree(eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free)))[0]
 
     def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
         """All unknowns, the free ones from the vector."""
@@ -239,7 +248,6 @@ def _fitted(
     robust: bool,
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
-    mask = free_unknowns(start, free)
     unknowns, stated_std = start, data.std
     given = np.asarray(stated_level)
 
@@ -248,10 +256,16 @@ def _fitted(
 
     widened = as_noisy(scatter)
     data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
+    converged, none = False, np.zeros((len(data.level), 2, 2))
     for turn in range(_ROUNDS + 1):
-        moving, fixed = eqx.partition(unknowns, mask)
-        answer = _solve(moving, fixed, data, modes, spread)
-        unknowns = eqx.combine(answer.value, fixed)
+        linear = _linearised(Restore(unknowns, free), data, modes, spread, none, np.array(True))
+        size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
+        unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
+        restore = Restore(unknowns, free)
+        vector, good = _solve(restore, data, modes, spread, linear.whiten, unit)
+        unknowns, converged = restore(vector), bool(good)
+        weights = (linear.whiten, np.array(False))
+        answer = _linearised(Restore(unknowns, free), data, modes, spread, *weights)
         if turn == _ROUNDS or not np.isfinite(float(answer.cost)):
             break
         if robust:
@@ -275,12 +289,12 @@ def _fitted(
         scatter=scatter,
         residuals=np.asarray(answer.residuals),
         cost=float(answer.cost),
-        converged=bool(answer.good),
+        converged=converged,
     )
 
 
 def _scatter_of(
-    answer: "_Answer", unknowns: Unknowns, data: BalanceData, spread: Spread, given: np.ndarray
+    answer: "_Linear", unknowns: Unknowns, data: BalanceData, spread: Spread, given: np.ndarray
 ) -> Scatter:
     """Noise and deviations of levels, from the fit linearised where it ended."""
     n_rows, n_levels, n_linear = 2 * len(data.level), data.n_levels, unknowns.linear.shape[0]
@@ -288,7 +302,8 @@ def _scatter_of(
     n_level = n_levels * len(LEVEL_ERRORS)
     first = slopes.shape[1] - n_linear - n_level
     # The solver's slopes are those of deviations in units of 1σ, zero where there is none yet.
-    slopes[:, first : first + n_level] = np.asarray(answer.level_slopes).reshape(n_rows, n_level)
+    by_level = level_columns(np.asarray(answer.level_slopes), np.asarray(data.level), n_levels)
+    slopes[:, first : first + n_level] = by_level
     std = np.concatenate([np.full(first, np.inf), np.tile(given, n_levels), np.ones(n_linear)])
     level = np.asarray(unknowns.level) * np.asarray(spread.level)
     deviation = [np.zeros(first), level.reshape(-1), np.asarray(unknowns.linear)]
@@ -317,13 +332,14 @@ def _inverse(jacobian: np.ndarray) -> np.ndarray:
     return root @ root.T
 
 
-class _Answer(NamedTuple):
-    value: Unknowns
-    residuals: Array
-    jacobian: Array
+class _Linear(NamedTuple):
+    """The whitened problem at some unknowns."""
+
+    whiten: Array
+    residuals: Array  # of the states
+    jacobian: Array  # of all residuals, priors included
     level_slopes: Array  # of the states, by the levels' deviations in their own units
     cost: Array
-    good: Array
 
 
 def whitened(
@@ -349,46 +365,78 @@ def whitener_at(
     return whitener(slopes, data.std)
 
 
+def _all_residuals(
+    vector: Array,
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    whiten: Array,
+) -> Float[Array, " residual"]:
+    unknowns = restore(vector)
+    points = whitened(unknowns, data, modes, spread, whiten).reshape(-1)
+    return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
+
+
 @compiled
-def _solve(
-    moving: Unknowns, fixed: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> _Answer:
-    whiten = whitener_at(eqx.combine(moving, fixed), data, modes, spread)
-    flat, unravel = ravel_pytree(moving)
+def _linearised(
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    whiten: Array,
+    anew: Array,
+) -> _Linear:
+    """Residuals and slopes, with the whitening given or `anew` with that of these unknowns."""
+    unknowns = restore.unknowns
+    whiten = jnp.where(anew, whitener_at(unknowns, data, modes, spread), whiten)
+    vector = restore.vector()
 
-    def residuals(vector: Array, _: None = None) -> Array:
-        unknowns = eqx.combine(unravel(vector), fixed)
-        points = whitened(unknowns, data, modes, spread, whiten).reshape(-1)
-        return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
+    def residuals(vector: Array) -> Array:
+        return _all_residuals(vector, restore, data, modes, spread, whiten)
 
-    # Every unknown in its own unit: the solver's damping then treats them alike.
-    size = jnp.linalg.norm(jax.jacfwd(residuals)(flat), axis=0)
-    unit = 1.0 / jnp.where(size > 0, size, 1.0)
-    solution: optx.Solution = optx.least_squares(
-        lambda y, _: residuals(y * unit),
-        *(_SOLVER, flat / unit),
-        max_steps=200,
-        throw=False,
-    )
-    best = solution.value * unit
-    left, jacobian = residuals(best), jax.jacfwd(residuals)(best)
+    left, push = jax.linearize(residuals, vector)
     n = 2 * len(data.level)
-    found = eqx.combine(unravel(best), fixed)
-    raw = eqx.tree_at(lambda u: u.level, found, found.level * spread.level)
+    raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)
     own_units = Spread(jnp.ones_like(spread.level), spread.linear)
 
-    def by_level(level: Array) -> Array:
+    def at_level(level: Array) -> Array:
         moved = eqx.tree_at(lambda u: u.level, raw, level)
         return whitened(moved, data, modes, own_units, whiten)
 
-    return _Answer(
-        value=unravel(best),
+    # Every level's error moves its own states only: one push forward for all levels.
+    kinds = raw.level.shape[1]
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *raw.level.shape))
+    along = jax.linearize(at_level, raw.level)[1]
+    return _Linear(
+        whiten=whiten,
         residuals=left[:n].reshape(-1, 2),
-        jacobian=jacobian,
-        level_slopes=jax.jacfwd(by_level)(raw.level).reshape(n, -1),
+        jacobian=jax.vmap(push)(jnp.eye(vector.size)).T,
+        level_slopes=jnp.moveaxis(jax.vmap(along)(directions), 0, 2),
         cost=jnp.sum(left**2),
-        good=jnp.asarray(solution.result == optx.RESULTS.successful),
     )
+
+
+@compiled
+def _solve(
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    whiten: Array,
+    unit: Array,
+) -> tuple[Array, Array]:
+    """Levenberg–Marquardt from the present unknowns; the vector found and whether it is one.
+
+    Every unknown counts in its own `unit`, so that the solver's damping treats all alike.
+    """
+    solution: optx.Solution = optx.least_squares(
+        lambda y, _: _all_residuals(y * unit, restore, data, modes, spread, whiten),
+        *(_SOLVER, restore.vector() / unit),
+        max_steps=200,
+        throw=False,
+    )
+    return solution.value * unit, jnp.asarray(solution.result == optx.RESULTS.successful)
 
 
 def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> tuple[str, ...]:

@@ -146,10 +146,7 @@ def _target(
     if target in ("curves", "frequency", "damping"):
         speed = np.abs(np.asarray(fit.motion().velocity))
         at = np.linspace(speed.min(), speed.max(), _TARGETS)
-        vector, restore = fit.vector()
-        values, slopes = (
-            np.asarray(part) for part in values_with_slopes(vector, restore, jnp.asarray(at))
-        )
+        values, slopes = values_with_slopes(fit, at)
         parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
         each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
         return np.concatenate(each), np.concatenate([values[:, k] for k in parts])

@@ -35,6 +35,8 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
 _PILOT_SIZE = 4
+_UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
+_APART = 1.5  # ratio of amplitudes that tells one more term of a curve
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
@@ -91,8 +93,7 @@ def pilot_start(
         linear=jnp.zeros(spread.linear.shape[0]),
     )
     point = _points(start, data, modes, spread)
-    ratio = point.speed.max() / point.speed.min()
-    size = min(_PILOT_SIZE, len(point.speed) // 4) if ratio > 1.5 else 0
+    size = min(_PILOT_SIZE, most_parameters(point.speed) - 1)
 
     def curve(values: np.ndarray) -> AbstractFamily:
         own = (values, point.weight)
@@ -140,6 +141,12 @@ def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spre
         damping=stiffness.imag / omega,
         weight=1.0 / (np.abs(stiffness) * np.mean(std[:, 1:3], axis=1)),
     )
+
+
+def most_parameters(amplitude: Float[np.ndarray, " state"]) -> int:
+    """How many parameters of a curve the spread of amplitudes can tell apart."""
+    apart = np.log(np.max(amplitude) / np.min(amplitude)) / np.log(_APART)
+    return int(np.clip(apart, 1, max(len(amplitude) // 4, 1)))
 
 
 class _Slopes(NamedTuple):
@@ -372,7 +379,8 @@ class _Workbench:
             for size in family.orders if choice.size is None else (choice.size,):
                 for argument in arguments:
                     starts = family.starts(size, argument, self.amplitude(argument), values, weight)
-                    if 2 * len(values) <= starts[0].parameters.shape[0] + 3:
+                    too_many = starts[0].parameters.shape[0] > most_parameters(known.speed)
+                    if too_many and choice.size is None and (family.orders[0] != size):
                         continue
                     rows.append((kind, size, argument, *self._tried(name, starts, other)))
                     if starts[0].parameters.shape[0] == 1 and not choice.argument:
@@ -392,6 +400,15 @@ class _Workbench:
         as_good[best] = True
         order = np.lexsort((-total, sizes))
         chosen = next(int(k) for k in order if as_good[k])
+        # Bands know a curve's spread, not the bias of a term too few: one more if data allow.
+        fair = (total[best] - total) <= 2 * spread + _UNDECIDED
+        mine = rows[chosen]
+        larger = [
+            k
+            for k in np.flatnonzero(fair)
+            if (rows[k][0], rows[k][2]) == (mine[0], mine[2]) and sizes[k] > sizes[chosen]
+        ]
+        chosen = int(min(larger, key=lambda k: sizes[k], default=chosen))
         table = [
             Candidate(
                 curve=name,
