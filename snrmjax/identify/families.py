@@ -106,7 +106,7 @@ class _Sum(AbstractFamily):
         scale = float(np.max(amplitude))
         columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order)], axis=1)
         start = _linear_start(columns, values, weight)
-        return [cls(jnp.asarray(start), jnp.asarray(scale), argument)]
+        return [cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument)]
 
 
 def _power(x: Array, power: float) -> Array:
@@ -230,7 +230,7 @@ class PowerLaw(AbstractFamily):
             columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
             share = power / cls.largest_exponent
             start = [*_linear_start(columns, values, weight), np.log(share / (1 - share))]
-            found.append(cls(jnp.asarray(start), jnp.asarray(scale), argument))
+            found.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
         return found
 
 
@@ -287,7 +287,7 @@ class Spline(AbstractFamily):
         knots = jnp.asarray(np.concatenate([[0.0], shares**2]))
         if np.min(np.diff(knots)) < 0.02 / order:
             knots = jnp.linspace(0.0, 1.0, order) ** 2
-        given = (jnp.asarray(scale), argument, knots)
+        given = (jnp.asarray(scale, dtype=jnp.float64), argument, knots)
         columns = knots[:, None]
         basis = _natural_basis(_truncated(columns, knots), columns, knots)
         blank = cls(jnp.zeros(order), *given, jnp.linalg.inv(basis))

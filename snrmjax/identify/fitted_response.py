@@ -284,11 +284,14 @@ def _bands(
         direction[position] = ones
         return jax.jvp(excess, (vector, x, omega), tuple(direction))[1]
 
-    # The points come from curves drawn anew through knots: one step puts them on the fit's own.
-    first, second = by(1, x, omega), by(2, x, omega)
-    left = excess(vector, x, omega)
-    steepest = (first * x) ** 2 + (second * omega) ** 2
-    x, omega = x - left * first * x**2 / steepest, omega - left * second * omega**2 / steepest
+    def step(_: int, point: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, omega = point
+        first, second = by(1, x, omega) * x, by(2, x, omega) * omega
+        share = excess(vector, x, omega) / (first**2 + second**2)
+        return x - share * first * x, omega - share * second * omega
+
+    # The points come from curves drawn anew through knots: these steps put them on the fit's own.
+    x, omega = jax.lax.fori_loop(0, 4, step, (x, omega))
     by_x, by_omega = by(1, x, omega), by(2, x, omega)
     by_vector = jax.jacfwd(excess)(vector, x, omega)
 

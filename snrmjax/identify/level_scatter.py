@@ -126,7 +126,7 @@ class _Likelihood(NamedTuple):
         def unpacked(point: np.ndarray) -> tuple[float, np.ndarray]:
             level = stated.copy()
             level[chosen] = np.clip(np.exp(point[1:]), _NOTHING, _LARGEST)
-            return float(np.exp(point[0])), level
+            return float(np.exp(np.clip(point[0], -40.0, 40.0))), level
 
         start = np.log([max(np.sqrt(self.total / self.dof), 1e-12), *np.full(chosen.sum(), 0.01)])
         corners = np.concatenate([start[None], start + np.eye(len(start))])

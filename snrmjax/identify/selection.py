@@ -379,6 +379,11 @@ class _Workbench:
             for size in family.orders if choice.size is None else (choice.size,):
                 for argument in arguments:
                     starts = family.starts(size, argument, self.amplitude(argument), values, weight)
+                    if choice.size is not None and starts[0].parameters.shape[0] >= len(values):
+                        raise ValueError(
+                            f"{kind}:{size} has {starts[0].parameters.shape[0]} parameters, but "
+                            f"there are {len(values)} states only: choose a smaller family."
+                        )
                     too_many = starts[0].parameters.shape[0] > most_parameters(known.speed)
                     if too_many and choice.size is None and (family.orders[0] != size):
                         continue

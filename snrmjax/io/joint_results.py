@@ -154,7 +154,8 @@ def read_joint_fit(path: FilePath) -> JointFit:
     data, modes = content["data"], dict(content["modes"])
     modes["sensors"] = tuple(modes["sensors"])
     keys = ("natural_frequency", "damping_ratio", "mode_shape", "participation")
-    rebuilt: LinearModes = linear_modes(*(modes.pop(k) for k in keys), **modes)
+    first = [modes.pop(key) for key in keys]
+    rebuilt: LinearModes = linear_modes(*first, **modes)
     squared, damping = (
         _family(content["squared_frequency"]),
         _family(content["modal_damping"]),

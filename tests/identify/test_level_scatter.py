@@ -1,0 +1,54 @@
+"""Noise and scatter of levels by restricted likelihood, against drawn samples and closed forms."""
+
+import numpy as np
+import pytest
+
+from snrmjax.identify.level_scatter import Linearised, estimated_scatter, level_columns
+
+N_LEVELS, PER_LEVEL = 12, 20
+
+
+def sample(seed, noise=1.0, shared=0.0):
+    """A mean, a slope and two kinds of level error on rows of unit noise."""
+    rng = np.random.default_rng(seed)
+    level = np.repeat(np.arange(N_LEVELS), PER_LEVEL)
+    n = len(level)
+    curve = np.column_stack([np.ones(n), level / N_LEVELS])
+    by_state = np.zeros((n, 1, 2))
+    by_state[:, 0, 0] = 50.0
+    by_state[:, 0, 1] = 5.0 * rng.normal(size=n)
+    levels = level_columns(by_state, level, N_LEVELS)
+    own = shared * rng.normal(size=N_LEVELS)
+    residuals = noise * rng.normal(size=n) + 50.0 * own[level] + curve @ [3.0, -2.0]
+    std = np.concatenate([np.full(2, np.inf), np.zeros(2 * N_LEVELS)])
+    problem = Linearised(residuals, np.column_stack([curve, levels]), std, np.zeros(len(std)))
+    return problem, 2 + np.arange(2 * N_LEVELS).reshape(N_LEVELS, 2)
+
+
+def test_noise_without_scatter_is_the_residual_of_least_squares():
+    problem, index = sample(0, noise=0.3)
+    found = estimated_scatter(problem, index)
+    curve = problem.slopes[:, :2]
+    left = problem.residuals - curve @ np.linalg.lstsq(curve, problem.residuals, rcond=None)[0]
+    # Restricted likelihood without scatter is the unbiased estimate; its search ends at 1e-2.
+    assert found.noise == pytest.approx(np.sqrt(left @ left / (len(left) - 2)), rel=1e-2)
+    assert found.level == (0.0, 0.0)
+    assert found.noise_std == pytest.approx(found.noise / np.sqrt(2 * (len(left) - 2)), rel=1e-12)
+
+
+def test_scatter_that_is_there_is_found_without_bias():
+    found = [estimated_scatter(*sample(seed, shared=0.02)) for seed in range(1, 25)]
+    first = np.array([f.level[0] for f in found])
+    # 12 levels, noise of a mean 1/sqrt(20)/50 = 0.0045: each is known to a quarter.
+    assert abs(np.mean(first) / 0.02 - 1) < 3 * 0.25 / np.sqrt(24)
+    # The other kind moves nothing: at 5 % each, four of 24 would be a rare draw.
+    assert sum(f.level[1] > 0 for f in found) <= 4
+    assert np.mean([f.noise for f in found]) == pytest.approx(1.0, abs=0.03)
+
+
+def test_stated_scatter_is_kept_and_two_levels_say_nothing():
+    problem, index = sample(3, shared=0.02)
+    problem.prior_std[index[:, 0]] = 0.05
+    assert estimated_scatter(problem, index).level[0] == 0.05
+    problem, index = sample(3, shared=0.02)
+    assert estimated_scatter(problem, index[:2]).level == (0.0, 0.0)
