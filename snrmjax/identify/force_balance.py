@@ -172,7 +172,9 @@ def force_balance(
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
     needed = stiffness * motion.velocity / (1j * omega * constant)
-    excess = (needed - motion.force) / jax.lax.stop_gradient(motion.force)
+    # Relative to the recorded force, but with no advantage from a larger gain.
+    unit = jax.lax.stop_gradient(motion.force) * jnp.exp(error[:, 0])
+    excess = (needed - motion.force) / unit
     return jnp.stack([excess.real, excess.imag], axis=1)
 
 

@@ -40,7 +40,7 @@ from snrmjax.simulate.compiled import compiled
 FREE = ("force_gain", "force_offset", "instrument_phase")
 """Unknowns of the measurement that a fit may free."""
 
-_SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
 _ROUNDS = 3  # of fitting and weighting anew
@@ -365,7 +365,7 @@ def whitener_at(
     return whitener(slopes, data.std)
 
 
-def _all_residuals(
+def all_residuals(
     vector: Array,
     restore: Restore,
     data: BalanceData,
@@ -373,6 +373,7 @@ def _all_residuals(
     spread: Spread,
     whiten: Array,
 ) -> Float[Array, " residual"]:
+    """Whitened residuals of the states, then the priors of levels and linear parameters."""
     unknowns = restore(vector)
     points = whitened(unknowns, data, modes, spread, whiten).reshape(-1)
     return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
@@ -393,7 +394,7 @@ def _linearised(
     vector = restore.vector()
 
     def residuals(vector: Array) -> Array:
-        return _all_residuals(vector, restore, data, modes, spread, whiten)
+        return all_residuals(vector, restore, data, modes, spread, whiten)
 
     left, push = jax.linearize(residuals, vector)
     n = 2 * len(data.level)
@@ -431,8 +432,8 @@ def _solve(
     Every unknown counts in its own `unit`, so that the solver's damping treats all alike.
     """
     solution: optx.Solution = optx.least_squares(
-        lambda y, _: _all_residuals(y * unit, restore, data, modes, spread, whiten),
-        *(_SOLVER, restore.vector() / unit),
+        lambda y, _: all_residuals(y * unit, restore, data, modes, spread, whiten),
+        *(SOLVER, restore.vector() / unit),
         max_steps=200,
         throw=False,
     )

@@ -24,15 +24,15 @@ def modes():
     return sj.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION])
 
 
-def exact(per_level=9):
-    """Level, Ω, force and velocity of states within 60° of resonance.
+def exact(per_level=9, widest=60):
+    """Level, Ω, force and velocity of states within some degrees of resonance.
 
     For a displacement X and a frequency Ω the force that holds them is |(ω̃² − Ω²) + iΩδ| X/A, and
     the velocity's phase follows: nothing is solved.
     """
     rows = []
     for level, tip in enumerate(np.linspace(3e-4, 2e-3, LEVELS)):
-        for phase in np.radians(np.linspace(-60, 60, per_level)):
+        for phase in np.radians(np.linspace(-widest, widest, per_level)):
             x = tip * np.cos(phase)
             omega = np.sqrt(squared(x))
             for _ in range(200):  # Ω at which the phase is wanted: (ω̃² − Ω²) = Ωδ tan φ
@@ -48,9 +48,9 @@ def exact(per_level=9):
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003}
 
 
-def noisy(seed=None, gain=0.0, scale=1.0, per_level=9):
+def noisy(seed=None, gain=0.0, scale=1.0, per_level=9, widest=60):
     """The states with stated noise, which seed None leaves out."""
-    level, omega, force, velocity = exact(per_level)
+    level, omega, force, velocity = exact(per_level, widest)
     n = len(level)
     if seed is not None:
         rng = np.random.default_rng(seed)

@@ -1,0 +1,336 @@
+"""How sure a joint fit is: by implicit derivatives, profiles, resampling and sampling."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from snrmjax.identify.fitted_response import curve_values, values_with_slopes
+from snrmjax.identify.force_balance import (
+    LEVEL_ERRORS,
+    STATE_ERRORS,
+    BalanceData,
+    Spread,
+    force_balance,
+)
+from snrmjax.identify.joint_fit import (
+    SOLVER,
+    JointFit,
+    Restore,
+    all_residuals,
+    whitener_at,
+)
+from snrmjax.model.modes import LinearModes
+from snrmjax.simulate.compiled import compiled
+
+_PIN = 1e4  # weight, in its own 1σ, with which a profile holds an unknown
+_HALF = 1.96
+
+
+class Sensitivity(NamedTuple):
+    """Derivatives of the free unknowns by everything that was measured or stated."""
+
+    by_measurement: Float[np.ndarray, "unknown state error"]  # of `STATE_ERRORS`, relative or rad
+    by_prior: Float[np.ndarray, "unknown prior"]  # of levels and linear parameters, per 1σ
+    covariance: Float[np.ndarray, "unknown unknown"]  # what follows from both
+
+
+class Contribution(NamedTuple):
+    """What one source of error contributes to the band of a curve."""
+
+    source: str
+    frequency_share: float  # of the variance of ω̃, mean over amplitudes
+    damping_share: float  # of the variance of 2ζ̃ω̃
+
+
+class Profile(NamedTuple):
+    """The best fit's cost against one unknown, the others fitted anew."""
+
+    name: str
+    values: Float[np.ndarray, " point"]
+    rise: Float[np.ndarray, " point"]  # of χ² over its least value
+    lower: float  # 95 %, where the rise is 3.84; NaN where it does not get there
+    upper: float
+
+
+def sensitivity(fit: JointFit) -> Sensitivity:
+    """Derivatives of the fit by every measured force, velocity and phase, second order included.
+
+    At the minimum of χ²(θ, data) the implicit function theorem gives dθ/dy = −H⁻¹ ∂²χ²/∂θ∂y with
+    the whole Hessian H, where Gauss and Newton leave out the residuals' curvature; the covariance
+    of independent errors of the stated size follows. Weights count as given.
+
+    Returns a `Sensitivity`. One call costs about as much as a fit.
+    """
+    vector, restore = fit.vector()
+    hessian, mixed = _second_order(vector, restore, fit.data, fit.modes, fit.spread)
+    inverse = np.linalg.pinv(np.asarray(hessian), rcond=1e-13, hermitian=True)
+    p, n = len(vector), len(fit.data.level)
+    by_state = -inverse @ np.asarray(mixed).reshape(p, -1)
+    n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
+    by_prior = inverse[:, p - n_priors :]
+    spread = by_state * np.asarray(fit.data.std).reshape(-1)
+    return Sensitivity(
+        by_measurement=by_state.reshape(p, n, len(STATE_ERRORS)),
+        by_prior=by_prior,
+        covariance=spread @ spread.T + by_prior @ by_prior.T,
+    )
+
+
+@compiled
+def _second_order(
+    vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
+) -> tuple[Array, Array]:
+    whiten = whitener_at(restore(vector), data, modes, spread)
+
+    def gradient(vector: Array, error: Array) -> Array:
+        def cost(vector: Array) -> Array:
+            unknowns = restore(vector)
+            balance = force_balance(unknowns, data, modes, spread, error)
+            points = jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", whiten, balance)
+            priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
+            return 0.5 * (jnp.sum(points**2) + priors)
+
+        return jax.grad(cost)(vector)
+
+    none = jnp.zeros((len(data.level), len(STATE_ERRORS)))
+    hessian = jax.jacfwd(gradient)(vector, none)
+    # Every state's errors enter its own residuals: one pull back for each unknown.
+    mixed = jax.jacrev(gradient, argnums=1)(vector, none)
+    return hessian, mixed
+
+
+def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution]:
+    """What noise, every level's errors and every linear parameter add to the bands of both curves.
+
+    Shares of the variance between the smallest and the largest measured velocity, largest first;
+    they sum to one but for rounding.
+    """
+    found = sensitivity(fit)
+    speed = np.abs(np.asarray(fit.motion().velocity))
+    _, slopes = values_with_slopes(fit, np.linspace(speed.min(), speed.max(), n_amplitudes))
+    total = np.einsum("acp,pq,acq->ac", slopes, found.covariance, slopes)
+    std = np.asarray(fit.data.std)
+
+    def shares(columns: Float[np.ndarray, "unknown column"]) -> tuple[float, float]:
+        variance = np.sum((slopes @ columns) ** 2, axis=2)
+        return tuple(np.mean(variance / total, axis=0).tolist())
+
+    rows = []
+    for k, kind in enumerate(STATE_ERRORS):
+        if np.any(std[:, k] > 0):
+            rows.append((f"random error of {kind}", found.by_measurement[:, :, k] * std[:, k]))
+    n_levels = fit.data.n_levels
+    levels = found.by_prior[:, : n_levels * len(LEVEL_ERRORS)]
+    levels = levels.reshape(len(levels), n_levels, len(LEVEL_ERRORS))
+    for k, kind in enumerate(LEVEL_ERRORS):
+        if fit.level_std[k] > 0:
+            rows += [(f"{kind} of level {m + 1}", levels[:, m, k : k + 1]) for m in range(n_levels)]
+    linear = found.by_prior[:, n_levels * len(LEVEL_ERRORS) :]
+    rows += [(f"linear parameter {k + 1}", linear[:, k : k + 1]) for k in range(linear.shape[1])]
+    listed = [Contribution(name, *shares(columns)) for name, columns in rows]
+    return sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
+
+
+def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
+    """χ² against one unknown, everything else fitted anew at each of its values.
+
+    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile.
+
+    Arguments: `name` one of `fit.names()`; `reach` in standard deviations on either side.
+    Raises `ValueError` for a name that the fit does not have.
+    """
+    names = fit.names()
+    if name not in names:
+        raise ValueError(f"the fit has no unknown {name!r}; it has {', '.join(names[:6])}, …")
+    index, (vector, restore) = names.index(name), fit.vector()
+    std = np.sqrt(np.diag(fit.covariance))
+    offsets = np.linspace(-reach, reach, n_points | 1)
+    values = float(vector[index]) + std[index] * offsets
+    cost = np.asarray(
+        _pinned(
+            *(vector, restore, fit.data, fit.modes, fit.spread),
+            *(jnp.asarray(std), np.array(index), jnp.asarray(values)),
+        )
+    )
+    rise = cost - cost[len(cost) // 2]
+    middle = len(rise) // 2
+    below = np.interp(-3.84, -rise[: middle + 1], values[: middle + 1], left=np.nan)
+    above = np.interp(3.84, rise[middle:], values[middle:], right=np.nan)
+    return Profile(name, values, rise, float(below), float(above))
+
+
+@compiled
+def _pinned(
+    vector: Array,
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    std: Array,
+    index: Array,
+    values: Array,
+) -> Float[Array, " value"]:
+    whiten = whitener_at(restore(vector), data, modes, spread)
+    unit = jnp.where(std > 0, std, 1.0)
+
+    def one(value: Array) -> Array:
+        def residuals(y: Array, _: None = None) -> Array:
+            point = vector + y * unit
+            free = all_residuals(point, restore, data, modes, spread, whiten)
+            held = _PIN * (point[index] - value) / unit[index]
+            return jnp.append(free, held)
+
+        start = jnp.zeros_like(vector).at[index].set((value - vector[index]) / unit[index])
+        found: optx.Solution = optx.least_squares(
+            residuals, SOLVER, start, max_steps=200, throw=False
+        )
+        good = found.result == optx.RESULTS.successful
+        return jnp.where(good, jnp.sum(residuals(found.value)[:-1] ** 2), jnp.nan)
+
+    return jax.lax.map(one, values)
+
+
+def bootstrap(
+    fit: JointFit, n_samples: int = 200, *, seed: int = 0, levels: bool = False
+) -> Float[np.ndarray, "sample unknown"]:
+    """Unknowns of refits to states drawn with replacement, within every level.
+
+    With `levels` whole levels are drawn instead, which needs more of them than a curve has
+    parameters. A refit that fails is NaN.
+    """
+    rng = np.random.default_rng(seed)
+    level = np.asarray(fit.data.level)
+    weights = np.zeros((n_samples, len(level)))
+    for row in weights:
+        if levels:
+            drawn = rng.integers(fit.data.n_levels, size=fit.data.n_levels)
+            row += np.bincount(drawn, minlength=fit.data.n_levels)[level]
+        else:
+            for number in range(fit.data.n_levels):
+                mine = np.flatnonzero(level == number)
+                np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
+    vector, restore = fit.vector()
+    std = jnp.asarray(np.sqrt(np.diag(fit.covariance)))
+    weights = weights * np.asarray(fit.data.weight)
+    settings = (vector, restore, fit.data, fit.modes, fit.spread, std)
+    return np.asarray(_resampled(*settings, jnp.asarray(weights)))
+
+
+@compiled
+def _resampled(
+    vector: Array,
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    std: Array,
+    weights: Array,
+) -> Float[Array, "sample unknown"]:
+    whiten = whitener_at(restore(vector), data, modes, spread)
+    unit = jnp.where(std > 0, std, 1.0)
+
+    def one(weight: Array) -> Array:
+        drawn = eqx.tree_at(lambda d: d.weight, data, weight)
+        found: optx.Solution = optx.least_squares(
+            lambda y, _: all_residuals(vector + y * unit, restore, drawn, modes, spread, whiten),
+            *(SOLVER, jnp.zeros_like(vector)),
+            max_steps=200,
+            throw=False,
+        )
+        good = found.result == optx.RESULTS.successful
+        return jnp.where(good, vector + found.value * unit, jnp.nan)
+
+    return jax.lax.map(one, weights)
+
+
+def sample_posterior(
+    fit: JointFit, n_samples: int = 500, *, warmup: int = 300, seed: int = 0
+) -> Float[np.ndarray, "sample unknown"]:
+    """Unknowns drawn from exp(−χ²/2) by NUTS (numpyro, an extra: `pip install snrmjax[posterior]`).
+
+    The chain runs in the coordinates in which the fit's covariance is one. Raises `ImportError`
+    that says how to install numpyro where it is missing.
+    """
+    try:
+        from numpyro.infer import MCMC, NUTS
+    except ImportError as error:
+        raise ImportError("sampling needs numpyro: pip install 'snrmjax[posterior]'.") from error
+    vector, restore = fit.vector()
+    values, directions = np.linalg.eigh(fit.covariance)
+    root = jnp.asarray(directions * np.sqrt(np.maximum(values, 0.0)))
+    whiten = whitener_at(restore(vector), fit.data, fit.modes, fit.spread)
+
+    def potential(z: Array) -> Array:
+        point = vector + root @ z
+        residuals = all_residuals(point, restore, fit.data, fit.modes, fit.spread, whiten)
+        return 0.5 * jnp.sum(residuals**2)
+
+    chain = MCMC(
+        NUTS(potential_fn=potential), num_warmup=warmup, num_samples=n_samples, progress_bar=False
+    )
+    chain.run(jax.random.key(seed), init_params=jnp.zeros(len(vector)))
+    return np.asarray(vector + chain.get_samples() @ root.T)
+
+
+class ComparedBand(NamedTuple):
+    """1σ of a curve at one velocity by several ways; NaN for a way that was not gone."""
+
+    velocity: float  # m/s
+    quantity: str  # "natural_frequency" (rad/s) or "modal_damping" (1/s)
+    gauss_newton: float
+    implicit: float
+    bootstrap: float
+    posterior: float
+
+
+def compare_bands(
+    fit: JointFit,
+    velocity: Float[np.ndarray, " point"],
+    *,
+    n_samples: int = 200,
+    posterior: bool = False,
+    seed: int = 0,
+) -> list[ComparedBand]:
+    """The band of both curves by covariance, implicit derivatives, bootstrap and NUTS.
+
+    The bootstrap knows nothing of errors that a level shares: where those rule, it is narrower.
+    """
+    at = np.asarray(velocity, dtype=np.float64)
+    values, slopes = values_with_slopes(fit, at)
+    restore = fit.vector()[1]
+
+    def spread_of(samples: np.ndarray) -> np.ndarray:
+        drawn = np.array(_curves_of(restore, jnp.asarray(samples), jnp.asarray(at)))
+        with np.errstate(invalid="ignore"):
+            drawn[:, :, 0] = np.sqrt(drawn[:, :, 0])
+        return np.nanstd(drawn, axis=0)
+
+    def linear(covariance: np.ndarray) -> np.ndarray:
+        std = np.sqrt(np.einsum("acp,pq,acq->ac", slopes, covariance, slopes))
+        std[:, 0] /= 2 * np.sqrt(values[:, 0])
+        return std
+
+    ways = [
+        linear(fit.covariance),
+        linear(sensitivity(fit).covariance),
+        spread_of(bootstrap(fit, n_samples, seed=seed)),
+        spread_of(sample_posterior(fit, n_samples, seed=seed))
+        if posterior
+        else np.full((len(at), 2), np.nan),
+    ]
+    names = ("natural_frequency", "modal_damping")
+    return [
+        ComparedBand(float(at[a]), names[c], *(float(way[a, c]) for way in ways))
+        for c in range(2)
+        for a in range(len(at))
+    ]
+
+
+@compiled
+def _curves_of(restore: Restore, samples: Array, velocity: Array) -> Array:
+    return jax.lax.map(lambda v: curve_values(restore(v), velocity), samples)
