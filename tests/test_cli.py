@@ -197,3 +197,54 @@ def test_a_wrong_range_ends_with_two(files, tmp_path):
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert not out.exists()
+
+
+def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
+    model, data = files
+    out = tmp_path / "out"
+    done = run(
+        *("identify", str(data), "--model", str(model), "--out", str(out)),
+        *("--fit", "polynomial:1,constant", "--next", "2", "--predict-force", "1.5e-5"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert columns(out / "next.csv") == [
+        "rank",
+        "force_n",
+        "frequency_hz",
+        "expected_band_ratio",
+        "reason",
+    ]
+    with (out / "backbone.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 200
+    assert float(rows[0]["velocity_m_s"]) == 0
+    # The states are exact and linear; what is left is the end of the solver.
+    assert float(rows[-1]["natural_frequency_hz"]) == pytest.approx(64.78, rel=1e-6)
+    assert float(rows[-1]["damping_ratio"]) == pytest.approx(0.05, rel=1e-6)
+    fit = json.loads((out / "summary.json").read_text())["joint_fit"]
+    assert set(fit["parameters"]) == {"backbone.at_zero", "backbone.power_2", "damping.constant"}
+    assert fit["parameters"]["damping.constant"]["value"] == pytest.approx(40.706, rel=1e-4)
+    assert len(fit["covariance"]) == 3
+    (resonance,) = fit["resonances"]
+    assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
+    assert (out / "fit.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "named"),
+    [
+        (("--fit", "cubic"), "cubic"),
+        (("--fit", "spline,spline,spline"), "3"),
+        (("--free", "phase"), "instrument_phase"),
+    ],
+)
+def test_a_wrong_joint_fit_ends_with_two(files, tmp_path, run_here, option, named):
+    model, data = files
+    out = tmp_path / "out"
+    code, stderr = run_here(
+        "identify", str(data), "--model", str(model), "--out", str(out), *option
+    )
+    assert code == 2
+    assert "Traceback" not in stderr
+    assert named in stderr
+    assert not out.exists()

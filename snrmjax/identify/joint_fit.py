@@ -27,10 +27,7 @@ from snrmjax.identify.force_balance import (
     whitener,
 )
 from snrmjax.identify.level_scatter import (
-    Linearised,
     Scatter,
-    estimated_scatter,
-    level_columns,
 )
 from snrmjax.identify.selection import ARGUMENTS, Candidate, Choice, pilot_start, select_families
 from snrmjax.measure.steady_states import SteadyStates
@@ -164,7 +161,7 @@ def fit_jointly(
     level = _with_scatter(spread, chosen.scatter)
     pair = (chosen.squared_frequency, chosen.modal_damping)
     start = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
-    settings = (measured, modes, level, released, spread.level, chosen.scatter)
+    settings = (measured, modes, level, released, chosen.scatter)
     best = _fitted(start, *settings, stated=stated, robust=robust)
     notes = _notes(best, measured, spread.level, stated=stated)
     return JointFit(
@@ -231,7 +228,6 @@ class _Fitted(NamedTuple):
     data: BalanceData
     scatter: Scatter
     residuals: np.ndarray
-    cost: float
     converged: bool
 
 
@@ -241,7 +237,6 @@ def _fitted(
     modes: LinearModes,
     spread: Spread,
     free: tuple[str, ...],
-    stated_level: Array,
     scatter: Scatter,
     *,
     stated: bool,
@@ -249,15 +244,14 @@ def _fitted(
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
     unknowns, stated_std = start, data.std
-    given = np.asarray(stated_level)
 
     def as_noisy(scatter: Scatter) -> float:
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
-    widened = as_noisy(scatter)
-    data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
     converged, none = False, np.zeros((len(data.level), 2, 2))
-    for turn in range(_ROUNDS + 1):
+    for turn in range(_ROUNDS):
+        widened = as_noisy(scatter)
+        data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
         linear = _linearised(Restore(unknowns, free), data, modes, spread, none, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
@@ -266,61 +260,33 @@ def _fitted(
         unknowns, converged = restore(vector), bool(good)
         weights = (linear.whiten, np.array(False))
         answer = _linearised(Restore(unknowns, free), data, modes, spread, *weights)
-        if turn == _ROUNDS or not np.isfinite(float(answer.cost)):
-            break
+        residuals = np.asarray(answer.residuals)
+        if not np.isfinite(float(answer.cost)):
+            raise ValueError("the fit ran into numbers that are not finite: try other families.")
+        covariance = _inverse(np.asarray(answer.jacobian))
         if robust:
             weight = np.sqrt(np.asarray(data.weight))
-            size = np.linalg.norm(np.asarray(answer.residuals), axis=1) / np.asarray(weight)
-            lower = np.minimum(1.0, _ROBUST / np.maximum(size, 1e-9))
-            data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(lower))
-        if turn > 0:
-            scatter = _scatter_of(answer, unknowns, data, spread, given)
-            scatter = scatter._replace(noise=scatter.noise * widened)
-            found = _with_scatter(spread, scatter)
-            rescaled = _rescaled(unknowns.level, spread.level, found.level)
-            unknowns, spread = eqx.tree_at(lambda u: u.level, unknowns, rescaled), found
-            widened = as_noisy(scatter)
-            data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
+            lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
+            data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
+        if turn < _ROUNDS - 1:
+            rows = np.asarray(answer.jacobian)[: residuals.size]
+            spent = float(np.sum((rows @ covariance) * rows))
+            dof = max(residuals.size - spent, 1.0)
+            noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
+            scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
     return _Fitted(
         unknowns=unknowns,
-        covariance=_inverse(np.asarray(answer.jacobian)),
+        covariance=covariance,
         spread=spread,
         data=data,
         scatter=scatter,
-        residuals=np.asarray(answer.residuals),
-        cost=float(answer.cost),
+        residuals=residuals,
         converged=converged,
     )
 
 
-def _scatter_of(
-    answer: "_Linear", unknowns: Unknowns, data: BalanceData, spread: Spread, given: np.ndarray
-) -> Scatter:
-    """Noise and deviations of levels, from the fit linearised where it ended."""
-    n_rows, n_levels, n_linear = 2 * len(data.level), data.n_levels, unknowns.linear.shape[0]
-    slopes = np.array(answer.jacobian)[:n_rows]
-    n_level = n_levels * len(LEVEL_ERRORS)
-    first = slopes.shape[1] - n_linear - n_level
-    # The solver's slopes are those of deviations in units of 1σ, zero where there is none yet.
-    by_level = level_columns(np.asarray(answer.level_slopes), np.asarray(data.level), n_levels)
-    slopes[:, first : first + n_level] = by_level
-    std = np.concatenate([np.full(first, np.inf), np.tile(given, n_levels), np.ones(n_linear)])
-    level = np.asarray(unknowns.level) * np.asarray(spread.level)
-    deviation = [np.zeros(first), level.reshape(-1), np.asarray(unknowns.linear)]
-    index = first + np.arange(n_level).reshape(n_levels, -1)
-    problem = Linearised(
-        np.asarray(answer.residuals).reshape(-1), slopes, std, np.concatenate(deviation)
-    )
-    return estimated_scatter(problem, index)
-
-
 def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
     return Spread(jnp.array(scatter.level), spread.linear)
-
-
-def _rescaled(level: Array, old: Array, new: Array) -> Array:
-    """Deviations in units of a new 1σ."""
-    return level * jnp.where(new > 0, old / jnp.where(new > 0, new, 1.0), 0.0)
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
@@ -338,7 +304,6 @@ class _Linear(NamedTuple):
     whiten: Array
     residuals: Array  # of the states
     jacobian: Array  # of all residuals, priors included
-    level_slopes: Array  # of the states, by the levels' deviations in their own units
     cost: Array
 
 
@@ -398,22 +363,10 @@ def _linearised(
 
     left, push = jax.linearize(residuals, vector)
     n = 2 * len(data.level)
-    raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)
-    own_units = Spread(jnp.ones_like(spread.level), spread.linear)
-
-    def at_level(level: Array) -> Array:
-        moved = eqx.tree_at(lambda u: u.level, raw, level)
-        return whitened(moved, data, modes, own_units, whiten)
-
-    # Every level's error moves its own states only: one push forward for all levels.
-    kinds = raw.level.shape[1]
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *raw.level.shape))
-    along = jax.linearize(at_level, raw.level)[1]
     return _Linear(
         whiten=whiten,
         residuals=left[:n].reshape(-1, 2),
         jacobian=jax.vmap(push)(jnp.eye(vector.size)).T,
-        level_slopes=jnp.moveaxis(jax.vmap(along)(directions), 0, 2),
         cost=jnp.sum(left**2),
     )
 

@@ -16,6 +16,7 @@ from snrmjax.identify.families import (
     AbstractFamily,
     Argument,
     Polynomial,
+    Spline,
     values_and_slopes,
 )
 from snrmjax.identify.force_balance import (
@@ -34,7 +35,7 @@ from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatte
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
-_PILOT_SIZE = 4
+_PILOT_SIZE, _PILOT_KNOTS = 4, 6
 _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _APART = 1.5  # ratio of amplitudes that tells one more term of a curve
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
@@ -93,11 +94,21 @@ def pilot_start(
         linear=jnp.zeros(spread.linear.shape[0]),
     )
     point = _points(start, data, modes, spread)
-    size = min(_PILOT_SIZE, most_parameters(point.speed) - 1)
+    most = most_parameters(point.speed, data.n_levels)
+    sizes: list[tuple[type[AbstractFamily], int]] = []
+    sizes += [(Polynomial, k) for k in range(min(_PILOT_SIZE, most - 1) + 1)]
+    sizes += [(Spline, k) for k in range(3, min(_PILOT_KNOTS, most) + 1)]
+    n = len(point.speed)
 
     def curve(values: np.ndarray) -> AbstractFamily:
-        own = (values, point.weight)
-        return Polynomial.starts(size, "displacement", point.displacement, *own)[0]
+        tried = []
+        for kind, size in sizes:
+            own = (point.displacement, values, point.weight)
+            family = kind.starts(size, "displacement", *own)[0]
+            left = (values_and_slopes(family, point.displacement)[0] - values) * point.weight
+            parameters = family.parameters.shape[0]
+            tried.append((n * np.log(np.sum(left**2)) + parameters * np.log(n), family))
+        return min(tried, key=lambda pair: pair[0])[1]
 
     return eqx.tree_at(
         lambda u: (u.squared_frequency, u.modal_damping),
@@ -143,10 +154,10 @@ def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spre
     )
 
 
-def most_parameters(amplitude: Float[np.ndarray, " state"]) -> int:
-    """How many parameters of a curve the spread of amplitudes can tell apart."""
+def most_parameters(amplitude: Float[np.ndarray, " state"], n_levels: int) -> int:
+    """How many parameters of a curve the spread of amplitudes, or the levels, can tell apart."""
     apart = np.log(np.max(amplitude) / np.min(amplitude)) / np.log(_APART)
-    return int(np.clip(apart, 1, max(len(amplitude) // 4, 1)))
+    return int(np.clip(max(apart, n_levels - 2), 1, max(len(amplitude) // 4, 1)))
 
 
 class _Slopes(NamedTuple):
@@ -374,6 +385,7 @@ class _Workbench:
         # Where the pilot's curve was, corrected by what is left: the scattered points themselves.
         rows = []
         arguments = (choice.argument,) if choice.argument else ARGUMENTS
+        most = most_parameters(known.speed, self.data.n_levels)
         for kind in kinds if choice.kind == "auto" else (choice.kind,):
             family = FAMILIES[kind]
             for size in family.orders if choice.size is None else (choice.size,):
@@ -384,7 +396,7 @@ class _Workbench:
                             f"{kind}:{size} has {starts[0].parameters.shape[0]} parameters, but "
                             f"there are {len(values)} states only: choose a smaller family."
                         )
-                    too_many = starts[0].parameters.shape[0] > most_parameters(known.speed)
+                    too_many = starts[0].parameters.shape[0] > most
                     if too_many and choice.size is None and (family.orders[0] != size):
                         continue
                     rows.append((kind, size, argument, *self._tried(name, starts, other)))

@@ -1,0 +1,238 @@
+"""Joint fits of the two measured beams, judged by levels that they have not seen.
+
+Run: python benchmarks/joint_fit_measured.py --data FOLDER [--out FOLDER]
+
+FOLDER holds `brake_reuss_beam` and `suspended_beam` with a CSV and a `model.toml` each.
+
+Brake-Reuss beam: fitted to six of its eight levels, every pair of levels foretold in turn; the
+velocity at phase resonance under the force of the held-out level and its resonance frequency
+against what that level's own states say (its points nearest to resonance). Suspended beam: force
+gain and phase free; frequency and damping from zero to the largest velocity; two halves of the
+levels fitted apart, compared in units of their bands. Both: whitened residuals, and what the
+program says. Then the speed of a fit of all 328 points against `scipy.optimize.least_squares`
+with finite differences on the same residuals, and of the derivative of the fitted curves by every
+measurement. One JSON line each.
+"""
+
+import argparse
+import itertools
+import json
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import least_squares
+
+import snrmjax as sj
+from snrmjax.identify.fitted_response import values_with_slopes
+from snrmjax.identify.joint_fit import JointFit, all_residuals, whitener_at
+from snrmjax.identify.uncertainty import sensitivity
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.simulate.compiled import compiled
+
+HERTZ = 2 * np.pi
+
+
+def tell(**fields: object) -> None:
+    """One JSON line."""
+    print(json.dumps({"benchmark": "joint_fit_measured", **fields}, default=_plain), flush=True)
+
+
+def _plain(value: object) -> object:
+    array = np.asarray(value)
+    return [float(f"{x:.4g}") for x in array.reshape(-1)] if array.ndim else float(f"{array:.4g}")
+
+
+def load(folder: Path) -> tuple[sj.SteadyStates, sj.Structure]:
+    """Data and model of one beam."""
+    model = read_model(folder / "model.toml")
+    (table,) = folder.glob("*.csv")
+    return read_steady_states(table, sensors=model.modes.sensors).steady_states, model
+
+
+def only(data: sj.SteadyStates, rows: np.ndarray) -> sj.SteadyStates:
+    """Some of the states."""
+    index = np.flatnonzero(rows)
+    plain = {"harmonic_order", "sensors"}
+    parts = {k: v if k in plain else np.asarray(v)[index] for k, v in vars(data).items()}
+    return sj.SteadyStates(**{k: v if k in plain else jnp.asarray(v) for k, v in parts.items()})
+
+
+def at_resonance(data: sj.SteadyStates, level: int) -> tuple[float, float, float]:
+    """Frequency, velocity and force of a level where the phase passes zero, by interpolation."""
+    mine = np.asarray(data.level) == level
+    velocity = np.asarray(data.velocity)[mine, 0]
+    phase, order = np.angle(velocity), np.argsort(-np.angle(velocity))
+    columns = (np.asarray(data.frequency)[mine], np.abs(velocity), np.asarray(data.force)[mine])
+    return tuple(float(np.interp(0.0, -phase[order], c[order])) for c in columns)
+
+
+def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
+    """Every pair of levels foretold by the other six."""
+    levels = np.unique(np.asarray(data.level)).tolist()
+    rows, times = [], []
+    for pair in itertools.combinations(levels, 2):
+        keep = ~np.isin(np.asarray(data.level), pair)
+        begin = time.perf_counter()
+        fit = sj.fit_jointly(only(data, keep), model.modes)
+        times.append(time.perf_counter() - begin)
+        inside = set(levels[1:-1])
+        for level in pair:
+            frequency, velocity, force = at_resonance(data, level)
+            found = [p for c in sj.fitted_response(fit, force) for p in c.resonances]
+            if not found:
+                rows.append((level, level in inside, np.nan, np.nan, np.nan, np.nan))
+                continue
+            best = min(found, key=lambda p: abs(p.velocity - velocity))
+            rows.append(
+                (
+                    *(level, level in inside, best.velocity / velocity - 1),
+                    (best.frequency - frequency) / HERTZ,
+                    best.velocity_std / velocity,
+                    best.frequency_std / HERTZ,
+                )
+            )
+    table = np.array(rows, dtype=float)
+    for name, chosen in (("inside", table[:, 1] == 1), ("ends", table[:, 1] == 0)):
+        part = table[chosen]
+        tell(
+            measurement="held-out levels",
+            beam="brake_reuss",
+            levels=name,
+            foretold=len(part),
+            velocity_error_median=np.nanmedian(np.abs(part[:, 2])),
+            velocity_error_largest=np.nanmax(np.abs(part[:, 2])),
+            within_5_per_cent=np.mean(np.abs(part[:, 2]) < 0.05),
+            frequency_error_median_hz=np.nanmedian(np.abs(part[:, 3])),
+            frequency_error_largest_hz=np.nanmax(np.abs(part[:, 3])),
+            within_0_15_hz=np.mean(np.abs(part[:, 3]) < 0.15),
+            not_found=int(np.isnan(part[:, 2]).sum()),
+        )
+
+
+def describe(name: str, fit: JointFit, seconds: float) -> None:
+    """What a fit of all levels says."""
+    at = np.linspace(0.0, fit.largest[1], 6)
+    values = sj.fitted_values(fit, at)
+    tell(
+        measurement="fit",
+        beam=name,
+        seconds=seconds,
+        families=[f"{c.family}:{c.size}@{c.argument}" for c in fit.candidates if c.chosen],
+        velocity=at,
+        natural_frequency_hz=np.asarray(values.natural_frequency) / HERTZ,
+        natural_frequency_std_hz=np.asarray(values.natural_frequency_std) / HERTZ,
+        damping_per_cent=100 * np.asarray(values.damping_ratio),
+        damping_std_per_cent=100 * np.asarray(values.damping_ratio_std),
+        noise_scale=fit.noise_scale,
+        level_std=fit.level_std,
+        whitened_rms=np.sqrt(np.mean(fit.residuals**2)),
+        notes=fit.notes,
+    )
+
+
+def halves(data: sj.SteadyStates, model: sj.Structure, free: tuple[str, ...]) -> None:
+    """Odd and even levels fitted apart, where both have amplitudes."""
+    fits, ends = [], []
+    for odd in (True, False):
+        part = only(data, (np.asarray(data.level) % 2 == 1) == odd)
+        fit = sj.fit_jointly(part, model.modes, free=free)
+        fits.append(fit)
+        ends.append((np.abs(np.asarray(fit.motion().velocity)).min(), fit.largest[1]))
+    at = np.linspace(max(e[0] for e in ends), min(e[1] for e in ends), 12)
+    one, two = (sj.fitted_values(fit, at) for fit in fits)
+    gaps = {
+        "frequency": (one.natural_frequency - two.natural_frequency)
+        / np.hypot(one.natural_frequency_std, two.natural_frequency_std),
+        "damping": (one.modal_damping - two.modal_damping)
+        / np.hypot(one.modal_damping_std, two.modal_damping_std),
+    }
+    tell(
+        measurement="two halves of the levels",
+        beam="suspended",
+        velocity=at,
+        **{f"{k}_gap_in_std": v for k, v in gaps.items()},
+        **{f"{k}_within_2_std": np.mean(np.abs(np.asarray(v)) < 2) for k, v in gaps.items()},
+        frequency_gap_hz=np.max(np.abs(one.natural_frequency - two.natural_frequency)) / HERTZ,
+        damping_gap_relative=np.max(np.abs(one.modal_damping / two.modal_damping - 1)),
+        notes=[fit.notes for fit in fits],
+    )
+
+
+@compiled
+def _residuals(vector, restore, data, modes, spread, whiten):
+    return all_residuals(vector, restore, data, modes, spread, whiten)
+
+
+def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
+    """A fit with given families, SciPy on the same residuals, and all derivatives."""
+    settings = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
+
+    def fit_once() -> JointFit:
+        return sj.fit_jointly(data, model.modes, **settings)
+
+    fit = fit_once()
+    vector, restore = fit.vector()
+    whiten = whitener_at(restore(vector), fit.data, fit.modes, fit.spread)
+    given = (restore, fit.data, fit.modes, fit.spread, whiten)
+    unit = np.sqrt(np.diag(fit.covariance))
+
+    def residuals(y: np.ndarray) -> np.ndarray:
+        return np.asarray(_residuals(jnp.asarray(vector + y * unit), *given))
+
+    start = np.zeros(len(vector))
+    start[:11] = 5.0  # standard deviations away in every parameter of both curves
+    residuals(start)
+    at = np.linspace(0.01, fit.largest[1], 25)
+
+    def derivatives() -> np.ndarray:
+        slopes = values_with_slopes(fit, at)[1]
+        return np.einsum("acp,pse->acse", slopes, sensitivity(fit).by_measurement)
+
+    derivatives()
+    times: dict[str, list[float]] = {"fit": [], "scipy": [], "derivatives": []}
+    for _ in range(5):
+        for name, work in (
+            ("fit", fit_once),
+            ("scipy", lambda: least_squares(residuals, start, x_scale=1.0, method="trf")),
+            ("derivatives", derivatives),
+        ):
+            begin = time.perf_counter()
+            work()
+            times[name].append(time.perf_counter() - begin)
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    tell(
+        measurement="speed",
+        points=len(fit.data.level),
+        unknowns=len(vector),
+        of_curves=11,
+        **{f"{k}_seconds": v for k, v in medians.items()},
+        scipy_over_fit=medians["scipy"] / medians["fit"],
+        derivatives_over_fit=medians["derivatives"] / medians["fit"],
+    )
+
+
+def main() -> None:
+    """Both beams, then the speed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    chosen = parser.parse_args()
+    brake, brake_model = load(chosen.data / "brake_reuss_beam")
+    hung, hung_model = load(chosen.data / "suspended_beam")
+    free = ("force_gain", "instrument_phase")
+    for name, data, model, freed in (
+        ("brake_reuss", brake, brake_model, ()),
+        ("suspended", hung, hung_model, free),
+    ):
+        begin = time.perf_counter()
+        fit = sj.fit_jointly(data, model.modes, free=freed)
+        describe(name, fit, time.perf_counter() - begin)
+    speed(brake, brake_model)
+    held_out(brake, brake_model)
+    halves(hung, hung_model, free)
+
+
+if __name__ == "__main__":
+    main()
