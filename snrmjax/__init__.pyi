@@ -1,6 +1,7 @@
 # The public names and where they live; `__init__.py` imports each on first use.
 from .identify.backbone import Backbone, BackboneFit, fit_backbone
 from .identify.backbone_points import BackbonePoints, identify_points
+from .identify.calibration import CalibratedModel, calibrate_model
 from .identify.families import FAMILIES
 from .identify.fitted_response import (
     FittedPoint,
@@ -26,6 +27,14 @@ from .identify.prediction import (
     resonances,
 )
 from .identify.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+from .identify.uncertainty import (
+    bootstrap,
+    compare_bands,
+    contributions,
+    profile,
+    sample_posterior,
+    sensitivity,
+)
 from .measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .measure.steady_states import SteadyStates, join_steady_states, steady_states
 from .model.averaging import averaged_effect, averaged_force, averaged_response
@@ -77,6 +86,7 @@ __all__ = [
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
+    "CalibratedModel",
     "ControlledCurve",
     "CurveStatus",
     "DampedModeBranch",
@@ -108,7 +118,11 @@ __all__ = [
     "averaged_effect",
     "averaged_force",
     "averaged_response",
+    "bootstrap",
+    "calibrate_model",
     "closed_form",
+    "compare_bands",
+    "contributions",
     "curved_beam",
     "damped_normal_mode",
     "equilibria",
@@ -142,12 +156,15 @@ __all__ = [
     "polynomial_potential",
     "potential_from_force_table",
     "predict_response",
+    "profile",
     "reference_sensor",
     "resonance_by_fixed_point",
     "resonances",
     "response_at_velocities",
     "response_controlled",
     "response_controlled_test",
+    "sample_posterior",
+    "sensitivity",
     "settled_motion",
     "snrm_velocity",
     "solve_at_frequency",

@@ -12,7 +12,6 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from snrmjax.identify.families import FAMILIES
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
@@ -29,7 +28,12 @@ from snrmjax.identify.force_balance import (
 from snrmjax.identify.level_scatter import (
     Scatter,
 )
-from snrmjax.identify.selection import ARGUMENTS, Candidate, Choice, pilot_start, select_families
+from snrmjax.identify.pilot import pilot_start
+from snrmjax.identify.selection import (
+    Candidate,
+    parse_family,
+    select_families,
+)
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
@@ -432,20 +436,3 @@ def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> 
             "levels differ from one another, and the bands do not include it."
         )
     return tuple(notes)
-
-
-def parse_family(text: str) -> Choice:
-    """Family, size and amplitude of "spline:5@velocity"; what is not said is None.
-
-    Raises `ValueError` for what is no family.
-    """
-    head, _, argument = text.partition("@")
-    kind, _, size = head.partition(":")
-    if kind not in FAMILIES and kind != "auto":
-        raise ValueError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
-    if size and not size.isdigit():
-        raise ValueError(f"the size of a family must be a whole number, but is {size!r}.")
-    known = {"": None} | {name: name for name in ARGUMENTS}
-    if argument not in known:
-        raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
-    return Choice(kind, int(size) if size else None, known[argument])

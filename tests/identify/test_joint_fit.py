@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.identify.joint_fit import fit_jointly, parse_family
+from snrmjax.identify.joint_fit import fit_jointly
+from snrmjax.identify.selection import parse_family
 from snrmjax.io.joint_results import (
     read_joint_fit,
     summarise_fit,

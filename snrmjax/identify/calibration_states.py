@@ -1,0 +1,142 @@
+"""Measured states as a calibration compares them with a model."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from snrmjax.identify.backbone_points import relative_errors
+from snrmjax.identify.snrm import reference_sensor
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.structure import Structure
+from snrmjax.simulate.compiled import compiled
+
+ASSUMED_ERROR = 0.01
+"""Relative and rad, of velocities where nobody stated any noise: a fit then finds its size."""
+
+
+class CalibrationStates(NamedTuple):
+    """Measured states; the reference sensor comes first.
+
+    A column is the real or the imaginary part of the force, of another sensor's fundamental or of
+    a harmonic, the latter two over the reference velocity.
+    """
+
+    level: Int[Array, " state"]  # counted from zero
+    frequency: Float[Array, " state"]  # rad/s
+    force: Float[Array, " state"]  # N
+    order: Float[Array, " state"]  # of the test, 0…1
+    velocity: Complex[Array, "state sensor"]  # m/s
+    harmonics: Complex[Array, "state sensor harmonic"]  # m/s
+    error: Float[Array, "state input"]  # 1σ of log force, of log velocities and of phases
+    own_std: Float[Array, "state column"]  # 1σ of what a column alone has: noise of harmonics
+    known: Bool[Array, "state column"]  # what was measured
+
+
+class Selection(NamedTuple):
+    """What of the data is used."""
+
+    states: CalibrationStates
+    rows: Int[np.ndarray, " state"]  # of the data
+    n_levels: int
+    sensors: tuple[int, ...]  # in the order of the states' sensors
+    orders: tuple[int, ...]  # harmonics that are compared
+    noise_stated: bool
+    notes: tuple[str, ...]
+
+
+def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int) -> Selection:
+    """The states that the reference sensor measured under a known force.
+
+    Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
+    compared where their error is stated.
+    Raises `ValueError` for sensors other than the model's and where no force is known.
+    """
+    if data.sensors != model.modes.sensors:
+        raise ValueError(
+            f"`data` has the sensors {list(data.sensors)}, but `model` has "
+            f"{list(model.modes.sensors)}."
+        )
+    if not np.any(np.isfinite(np.asarray(data.force))):
+        raise ValueError(
+            "the force is unknown (only a drive voltage is given): calibrate it first, with "
+            "`calibrate_force` and `apply_calibration`."
+        )
+    notes: list[str] = []
+    r = reference_sensor(model.modes)
+    sensors = [r, *(s for s in range(len(data.sensors)) if s != r)]
+    velocity = np.asarray(data.velocity)[:, sensors]
+    size = np.abs(velocity)
+    measured = np.asarray(data.measured)[:, sensors] & np.isfinite(size) & (size > 0)
+    force, frequency = np.asarray(data.force), np.asarray(data.frequency)
+    rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
+    velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
+    errors = np.asarray(relative_errors(data))[rows][:, sensors]
+    stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
+    if not stated:
+        errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
+        notes.append("some errors are not stated: equal relative errors are taken for all states.")
+    errors = np.where(measured[..., None], errors, 0.0)
+    places = [k for k, h in enumerate(data.harmonic_order) if 1 < h <= harmonic_order]
+    harmonics = np.asarray(data.harmonics)[rows][:, sensors][..., places]
+    std = np.asarray(data.harmonic_std)[rows][:, sensors] / np.abs(velocity[:, :1])
+    there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
+    if places and not there.any():
+        notes.append("harmonics are left out: no error is stated for them.")
+        harmonics, there, places = harmonics[..., :0], there[..., :0], []
+    n = len(rows)
+    known = [np.ones((n, 1), dtype=bool), measured[:, 1:], there.reshape(n, -1)]
+    # Each part of a complex error has half its square.
+    own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
+    order = np.asarray(data.order)[rows]
+    levels, level = np.unique(np.asarray(data.level)[rows], return_inverse=True)
+    parts = CalibrationStates(
+        level=jnp.asarray(level),
+        frequency=jnp.asarray(frequency[rows]),
+        force=jnp.asarray(force[rows]),
+        order=jnp.asarray(np.where(np.isfinite(order), order, np.asarray(model.test_order))),
+        velocity=jnp.asarray(velocity),
+        harmonics=jnp.asarray(np.where(there, harmonics, 0.0)),
+        error=jnp.asarray(np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1)),
+        own_std=jnp.asarray(np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1)),
+        known=jnp.asarray(np.repeat(np.concatenate(known, axis=1), 2, axis=1)),
+    )
+    orders = tuple(data.harmonic_order[k] for k in places)
+    return Selection(parts, rows, len(levels), tuple(sensors), orders, stated, tuple(notes))
+
+
+@compiled
+def state_whitener(
+    states: CalibrationStates,
+    by_error: Float[Array, "state column input"],
+    doubt: Float[Array, ""],
+) -> Float[Array, "state column column"]:
+    """The matrices that make a state's columns independent and of unit variance.
+
+    Arguments: derivatives of the columns with respect to the errors in `states.error`; `doubt`
+    is a further error of the harmonics, relative to their own size. Zero for
+    states whose derivatives are not finite: they have no weight.
+    """
+    good = jnp.all(jnp.isfinite(by_error), axis=(1, 2))[:, None, None]
+    scaled = jnp.where(good, by_error, 1.0) * states.error[:, None, :]
+    size = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
+    wide = jnp.pad(size, ((0, 0), (states.velocity.shape[1], 0)))
+    own = states.own_std**2 + doubt**2 * jnp.repeat(wide, 2, axis=1) ** 2
+    own = jnp.where(states.known, own, 1.0)
+    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(own)
+    # Rounding must not make it singular.
+    floor = 1e-14 * jnp.trace(covariance, axis1=1, axis2=2)[:, None, None]
+    eye = jnp.eye(covariance.shape[1])
+    root = jnp.linalg.cholesky(covariance + floor * eye)
+    inverse = jax.vmap(lambda low: jax.scipy.linalg.solve_triangular(low, eye, lower=True))(root)
+    return jnp.where(good, inverse, 0.0)
+
+
+def whitened(
+    whitener: Float[Array, "state column column"], columns: Float[Array, "state column *entry"]
+) -> Float[Array, "state column *entry"]:
+    """Columns of all states, or their derivatives, made independent; zero without weight."""
+    used = jnp.any(whitener != 0, axis=(1, 2)).reshape(-1, *(1,) * (columns.ndim - 1))
+    return jnp.einsum("sij,sj...->si...", whitener, jnp.where(used, columns, 0.0))

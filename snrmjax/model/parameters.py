@@ -1,0 +1,123 @@
+"""The numbers of a model by name: what can be fitted, varied or held near a stated value."""
+
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from snrmjax.model.effects import effect_parameters
+from snrmjax.model.potential import monomial_key
+from snrmjax.model.structure import Structure
+
+_MODE_FIELDS = ("natural_frequency", "damping_ratio", "participation")
+
+
+def parameter_names(model: Structure) -> tuple[str, ...]:
+    """Names of the numbers of a model: of its potential, its modes and its effects.
+
+    Names such as "potential.1111", "mode_1.natural_frequency" (rad/s), "mode_1.damping_ratio",
+    "mode_1.participation" (kg^-1/2) and "quadratic_damping.coefficient"; of several effects of a
+    kind the second is "quadratic_damping_2". Parameters of effects that are no single numbers
+    have no name.
+
+    >>> from snrmjax import curved_beam
+    >>> parameter_names(curved_beam())[:3]
+    ('potential.111', 'potential.1111', 'mode_1.natural_frequency')
+    """
+    return tuple(_places(model))
+
+
+def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
+    """The names as a tuple; `ValueError` where one is unknown, with what is near it, or twice."""
+    known = parameter_names(model)
+    if isinstance(names, str) or not names:
+        raise ValueError(f"`parameters` must be a sequence of names, but is {names!r}.")
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=5, cutoff=0.5) or known[:5]
+            raise ValueError(
+                f"`parameters` names {name!r}, which the model does not have; near it are "
+                f"{', '.join(near)}."
+            )
+        if list(names).count(name) > 1:
+            raise ValueError(f"`parameters` names {name!r} twice.")
+    return tuple(names)
+
+
+def parameter_value(model: Structure, name: str) -> Float[Array, ""]:
+    """The number that a name of `parameter_names` stands for."""
+    part, entry, field = _places(model)[name]
+    if part == "effects":
+        return jnp.asarray(getattr(model.effects[entry], field))
+    return getattr(getattr(model, part), field)[entry]
+
+
+def stated_std(model: Structure, name: str) -> float:
+    """1σ that the model states for a number, 0 where it states none."""
+    part, entry, field = _places(model)[name]
+    std = getattr(getattr(model, part), f"{field}_std", None)
+    return 0.0 if std is None else float(std[entry])
+
+
+def with_parameters(
+    model: Structure, names: Sequence[str], values: Float[Array, " parameter"]
+) -> Structure:
+    """The model with other numbers under some names."""
+    places = _places(model)
+    for k, name in enumerate(names):
+        model = _replaced(model, places[name], values[k])
+    return model
+
+
+def with_stated_std(
+    model: Structure, names: Sequence[str], std: Float[Array, " parameter"]
+) -> Structure:
+    """The model with other stated 1σ of named numbers, where it has a place for them."""
+    places = _places(model)
+    for k, name in enumerate(names):
+        place = places[name]
+        of_std = place._replace(field=f"{place.field}_std")
+        if hasattr(getattr(model, place.part), of_std.field):
+            model = _replaced(model, of_std, std[k])
+    return model
+
+
+class _Place(NamedTuple):
+    """Where a number is: an entry of an array of a part, or a field of an effect."""
+
+    part: str
+    entry: int
+    field: str
+
+
+def _places(model: Structure) -> dict[str, _Place]:
+    places = {
+        f"potential.{monomial_key(monomial)}": _Place("potential", k, "coefficient")
+        for k, monomial in enumerate(model.potential.monomials)
+    }
+    for k in range(model.n_modes):
+        places |= {f"mode_{k + 1}.{field}": _Place("modes", k, field) for field in _MODE_FIELDS}
+    kinds: list[str] = []
+    for k, effect in enumerate(model.effects):
+        kinds.append(effect.kind)
+        number = kinds.count(effect.kind)
+        head = effect.kind if number == 1 else f"{effect.kind}_{number}"
+        for field in effect_parameters(effect.kind):
+            if jnp.ndim(getattr(effect, field)) == 0:
+                places[f"{head}.{field}"] = _Place("effects", k, field)
+    return places
+
+
+def _replaced(model: Structure, place: _Place, value: Float[Array, ""]) -> Structure:
+    part, entry, field = place
+    if part == "effects":
+        effect = dataclasses.replace(model.effects[entry], **{field: jnp.asarray(value)})
+        effects = (*model.effects[:entry], effect, *model.effects[entry + 1 :])
+        return dataclasses.replace(model, effects=effects)
+    owner = getattr(model, part)
+    array = jnp.asarray(getattr(owner, field)).at[entry].set(value)
+    changed = {part: dataclasses.replace(owner, **{field: array})}
+    return dataclasses.replace(model, **changed)

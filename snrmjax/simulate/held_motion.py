@@ -1,0 +1,162 @@
+"""Motions whose fundamental is held at one sensor, and the force that they need.
+
+At a given frequency a force may have several motions or, beyond a fold, none; a motion has one
+force. So a measured motion is put into the harmonic balance, and the force is solved for.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.harmonics import displacement_phasors, velocity_phasors
+
+# Growth of a motion, in shares of the velocity that was measured.
+_SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
+_NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
+
+
+class HeldMotion(eqx.Module):
+    """The equations of one state: its balance, and the fundamental held at what was measured.
+
+    A point holds the balance's scaled displacements and the cosine and the sine of the force over
+    `force`; phases are relative to the measured force.
+    """
+
+    balance: HarmonicBalance  # without a force
+    model: Structure
+    frequency: Float[Array, ""]  # rad/s
+    force: Float[Array, ""]  # N, measured
+    velocity: Complex[Array, ""]  # m/s, of the reference sensor
+    sensor: int = eqx.field(static=True)
+
+    def equations(self, point: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """What is left of the balance and of the fundamental."""
+        residual = self.balance.residual(self._balance_point(point))
+        return jnp.concatenate([residual - point[-2:] @ self._loads(), self._miss(point)])
+
+    def linearised(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """The equations and their exact Jacobian."""
+        residual, jacobian = self.balance.linearised(self._balance_point(point))
+        loads = self._loads()
+        left = jnp.concatenate([residual - point[-2:] @ loads, self._miss(point)])
+        wide = jnp.concatenate([jacobian[:, :-1], -loads.T], axis=1)
+        return left, jnp.concatenate([wide, jax.jacrev(self._miss)(point)])
+
+    def recorded(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """Complex force (N) and velocity (harmonic, sensor) that the instruments would record."""
+        modes = simulated_structure(self.model).modes
+        coefficients = self.balance.coefficients(self._balance_point(point))
+        velocity = velocity_phasors(coefficients, self.frequency, modes.mode_shape)
+        force = self.force * (point[-2] - 1j * point[-1])
+        # In phase with its own force, as the instruments see it.
+        order = jnp.arange(velocity.shape[0])[:, None]
+        phase = force / jnp.abs(force)
+        velocity = velocity * phase.conj() ** order
+        if modes.rigid_body_shape.shape[1]:
+            spectrum = self.model.load_orders()[1 : velocity.shape[0]]
+            rows = np.arange(1, 1 + spectrum.shape[0])
+            share = jnp.zeros(velocity.shape[0]).at[rows].set(spectrum / rows)
+            per_force = modes.rigid_body_shape @ modes.rigid_body_participation
+            rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
+            velocity = velocity + rigid
+        size, seen = jnp.abs(force)[None], velocity[None]
+        own = displacement_phasors(coefficients)[1, modes.mode_of_interest]
+        for effect in self.model.measurement_effects:
+            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(own)[None])
+        return size[0] * phase, seen[0] * phase**order
+
+    def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """The solution near `start` by Newton's method, NaN where it did not converge.
+
+        The last step is taken with what the equations depend on: it carries the derivatives.
+        """
+        fixed = jax.lax.stop_gradient(self)
+
+        def step(state: tuple) -> tuple:
+            point, left, jacobian, count, _ = state
+            move = jnp.linalg.solve(jacobian, left)
+            left, jacobian = fixed.linearised(point - move)
+            return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
+
+        def going(state: tuple) -> Array:
+            *_, count, size = state
+            return (count < 2) | ((count < 20) & (size > _NEAR))  # false for NaN
+
+        # The first step goes nowhere: the equations are then compiled once.
+        nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
+        first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
+        point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
+        last = jnp.linalg.solve(jacobian, self.equations(point))
+        left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
+        return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan)
+
+    def grown(self) -> Float[Array, " unknown"]:
+        """The solution that grows from small amplitudes, as a start for `solved`; else NaN.
+
+        Steps are halved where Newton's method fails.
+        """
+        fixed = jax.lax.stop_gradient(self)
+        first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
+
+        def larger(state: tuple) -> tuple:
+            point, share, step = state
+            aim = jnp.minimum(share + step, 1.0)
+            held = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
+            found = held.solved(point * (aim / share))
+            good = jnp.all(jnp.isfinite(found))
+            point, share = (jnp.where(good, *pair) for pair in ((found, point), (aim, share)))
+            return point, share, jnp.where(good, 1.5 * step, 0.5 * step)
+
+        def going(state: tuple) -> Array:
+            _, share, step = state
+            return (share < 1.0) & (step > _SHORTEST)
+
+        point, share, _ = jax.lax.while_loop(
+            going, larger, (first, jnp.array(_SMALL), jnp.array(_FIRST))
+        )
+        return jnp.where(share >= 1.0, point, jnp.nan)
+
+    def _balance_point(self, point: Array) -> Array:
+        return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)
+
+    def _loads(self) -> Float[Array, "part equation"]:
+        """Scaled loads of the measured force's cosine and sine.
+
+        A force of another phase turns its harmonics h times as far, to first order.
+        """
+        cosine = self.balance.load().reshape(self.balance.n_coefficients, -1)
+        order = jnp.arange(1, self.balance.harmonic_order + 1)[:, None]
+        sine = jnp.zeros_like(cosine).at[2::2].set(order * cosine[1::2])
+        return self.force * jnp.stack([cosine.reshape(-1), sine.reshape(-1)])
+
+    def _miss(self, point: Array) -> Float[Array, " part"]:
+        velocity = self.recorded(point)[1][1, self.sensor]
+        size = jax.lax.stop_gradient(jnp.abs(self.velocity))
+        miss = (velocity - self.velocity) / size
+        return jnp.stack([miss.real, miss.imag])
+
+
+def held_motion(
+    model: Structure,
+    frequency: Float[Array, ""],
+    force: Float[Array, ""],
+    velocity: Complex[Array, ""],
+    *,
+    sensor: int,
+    harmonic_order: int,
+    scale: Float[Array, ""],
+) -> HeldMotion:
+    """The equations of a motion with a given fundamental at one sensor.
+
+    Arguments: `frequency` in rad/s; `force` in N only scales; `velocity` as it is recorded, in
+    m/s; `scale` a typical velocity in m/s, for a point to mean the same when `velocity` changes.
+    """
+    shape = model.modes.mode_shape[sensor, model.modes.mode_of_interest]
+    displacement = jax.lax.stop_gradient(jnp.abs(scale / (frequency * shape)))
+    simulated = simulated_structure(model)
+    balance = harmonic_balance(simulated, 0.0, displacement, harmonic_order=harmonic_order)
+    return HeldMotion(balance, model, frequency, force, velocity, sensor)
