@@ -1,0 +1,163 @@
+"""Does the advice on the next measurements pay?
+
+Run: python benchmarks/next_measurement.py [--tests 100] [--seed 0]
+
+One mode with stiffening and with damping that rises with velocity, known exactly. Four levels of
+five noisy states are fitted jointly; then ten more states are measured, once where the fit advises
+and once spread evenly (ten forces between the smallest and the largest, phases from 45° lead to
+45° lag in turn), with the same noise, and the fit repeated. The mean relative band of both curves
+after over before says what each ten are worth. One JSON line.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+
+import numpy as np
+
+import snrmjax as sj
+
+OMEGA, CONSTANT = 500.0, 6.0
+NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
+FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "polynomial:1@velocity"}
+FORCES = (0.3, 0.8, 1.6, 2.6)
+MODES = sj.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
+
+
+def squared(x: np.ndarray) -> np.ndarray:
+    """ω̃² against displacement (m)."""
+    return OMEGA**2 * (1 + 0.3 * (x / 2e-3) ** 2)
+
+
+def damping(v: np.ndarray) -> np.ndarray:
+    """2ζ̃ω̃ against velocity (m/s)."""
+    return 12.0 + 6.0 * v
+
+
+def needed(x: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Complex force over displacement times A."""
+    return squared(x) - omega**2 + 1j * omega * damping(x * omega)
+
+
+def at_phase(force: float, phase: float) -> tuple[float, complex]:
+    """Frequency and velocity under a force where the velocity has a phase, by bisection."""
+    low, high, omega = 1e-6, 1e-2, OMEGA
+    for _ in range(200):
+        x = 0.5 * (low + high)
+        omega = np.sqrt(squared(x))
+        for _ in range(60):
+            omega = np.sqrt(squared(x) - omega * damping(x * omega) * np.tan(phase))
+        below = abs(needed(x, omega)) * x < CONSTANT * force
+        low, high = (x, high) if below else (low, x)
+    return float(omega), 1j * omega * CONSTANT * force / needed(x, omega)
+
+
+def at_frequency(force: float, omega: float, expected: float) -> complex:
+    """The motion under a force at a frequency whose velocity is nearest to the expected one."""
+    x = np.linspace(1e-6, 4e-3, 40001)
+    excess = np.abs(needed(x, omega)) * x - CONSTANT * force
+    at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
+    roots = x[at] - excess[at] * (x[1] - x[0]) / (excess[at + 1] - excess[at])
+    best = roots[np.argmin(np.abs(roots * omega - expected))]
+    return 1j * omega * CONSTANT * force / needed(best, omega)
+
+
+Row = tuple[int, float, float, complex]  # level, force, frequency, velocity
+
+
+def measured(rows: list[Row], rng: np.random.Generator, gains: dict[int, float]) -> sj.SteadyStates:
+    """Rows with noise; every level has its own gain."""
+    level, force, omega, velocity = (np.array(column) for column in zip(*rows, strict=True))
+    for number in level:
+        gains.setdefault(int(number), NOISE["gain"] * rng.normal())
+    n, shared = len(level), np.array([gains[int(k)] for k in level])
+    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
+    velocity = velocity * np.exp(shared + own)
+    force = force * np.exp(NOISE["force"] * rng.normal(size=n))
+    return sj.steady_states(
+        level,
+        omega,
+        force,
+        velocity,
+        velocity_std=NOISE["velocity"] * np.abs(velocity),
+        phase_std=np.full((n, 1), NOISE["phase"]),
+        force_std=NOISE["force"] * force,
+    )
+
+
+def fitted(data: sj.SteadyStates) -> sj.JointFit:
+    """The joint fit of all these tests."""
+    return sj.fit_jointly(data, MODES, level_gain_std=NOISE["gain"], **FAMILIES)
+
+
+def band(fit: sj.JointFit, at: np.ndarray) -> float:
+    """Mean relative 1σ of both curves."""
+    values = sj.fitted_values(fit, at)
+    return float(
+        np.mean(values.natural_frequency_std / values.natural_frequency)
+        + np.mean(values.modal_damping_std / values.modal_damping)
+    )
+
+
+def numbered(forces: list[float], first: int) -> Callable[[float], int]:
+    """Equal forces are one level."""
+    known = {force: first + k for k, force in enumerate(dict.fromkeys(forces))}
+    return known.__getitem__
+
+
+def one_test(seed: int) -> tuple[float, float]:
+    """Band ratios after ten advised and after ten even states."""
+    rng, gains = np.random.default_rng(seed), {}
+    rows = [
+        (k, force, *at_phase(force, phase))
+        for k, force in enumerate(FORCES)
+        for phase in np.radians(np.linspace(-40, 40, 5))
+    ]
+    data = measured(rows, rng, gains)
+    fit = fitted(data)
+    speed = np.abs(np.asarray(fit.motion().velocity))
+    at = np.linspace(speed.min(), speed.max(), 25)
+    advice = sj.next_measurements(fit, 10)
+    level = numbered([one.force for one in advice], 10)
+    advised = [
+        (
+            *(level(one.force), one.force, one.frequency),
+            at_frequency(one.force, one.frequency, one.velocity),
+        )
+        for one in advice
+    ]
+    spread = np.linspace(FORCES[0], FORCES[-1], 10)
+    phases = np.radians(np.linspace(45, -45, 10))[[0, 5, 1, 6, 2, 7, 3, 8, 4, 9]]
+    even = [
+        (40 + k, f, *at_phase(f, p)) for k, (f, p) in enumerate(zip(spread, phases, strict=True))
+    ]
+    before = band(fit, at)
+    ratios = []
+    for more in (advised, even):
+        joined = sj.join_steady_states(data, measured(more, rng, gains))
+        ratios.append(band(fitted(joined), at) / before)
+    return ratios[0], ratios[1]
+
+
+def main() -> None:
+    """All tests and one line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tests", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    ratios = np.array([one_test(chosen.seed + k) for k in range(chosen.tests)])
+    gain = (1 - ratios[:, 0]) / (1 - ratios[:, 1])
+    line = {
+        "benchmark": "next_measurement",
+        "tests": len(ratios),
+        "band_after_advised": round(float(np.median(ratios[:, 0])), 3),
+        "band_after_even": round(float(np.median(ratios[:, 1])), 3),
+        "shrinks_more_by_median": round(float(np.median(gain)), 2),
+        "share_at_least_1_5": round(float(np.mean(gain >= 1.5)), 2),
+        "share_better": round(float(np.mean(gain > 1)), 2),
+    }
+    print(json.dumps(line), flush=True)
+
+
+if __name__ == "__main__":
+    main()
