@@ -15,6 +15,7 @@ from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.selection import Candidate
 from snrmjax.io.files import FilePath, read_text, write_atomically
+from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, linear_modes
@@ -25,17 +26,7 @@ _FORMAT = 1
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:
     """Write both fitted curves with 1σ from zero to the largest measured velocity."""
-    values = fitted_values(fit, np.linspace(0.0, fit.largest[1], BAND_POINTS))
-    write_table(
-        path,
-        {
-            "velocity_m_s": values.velocity,
-            "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,
-            "natural_frequency_std_hz": np.asarray(values.natural_frequency_std) / HERTZ,
-            "damping_ratio": values.damping_ratio,
-            "damping_ratio_std": values.damping_ratio_std,
-        },
-    )
+    write_values(path, fitted_values(fit, np.linspace(0.0, fit.largest[1], BAND_POINTS)))
 
 
 def write_next(path: Path, advice: Sequence[NextMeasurement]) -> None:

@@ -88,7 +88,11 @@ def write_backbone(path: Path, identification: Identification) -> None:
     """
     backbone = identification.fit.backbone
     start = 0.0 if identification.fit.anchor is not None else float(backbone.smallest)
-    values = _sampled(backbone, start)
+    write_values(path, _sampled(backbone, start))
+
+
+def write_values(path: Path, values: BackboneValues) -> None:
+    """Write natural frequency and damping against velocity, with 1σ."""
     write_table(
         path,
         {
