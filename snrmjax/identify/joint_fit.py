@@ -253,7 +253,9 @@ def _fitted(
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
     converged, none = False, np.zeros((len(data.level), 2, 2))
-    for turn in range(_ROUNDS):
+    # An outlier has widened the noise at first: its weight falls round by round.
+    rounds = 2 * _ROUNDS if robust else _ROUNDS
+    for turn in range(rounds):
         widened = as_noisy(scatter)
         data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
         linear = _linearised(Restore(unknowns, free), data, modes, spread, none, np.array(True))
@@ -272,7 +274,7 @@ def _fitted(
             weight = np.sqrt(np.asarray(data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
-        if turn < _ROUNDS - 1:
+        if turn < rounds - 1:
             rows = np.asarray(answer.jacobian)[: residuals.size]
             spent = float(np.sum((rows @ covariance) * rows))
             dof = max(residuals.size - spent, 1.0)

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
-_WORTH = 2.71  # of −2 log likelihood: 5 %, one-sided, for a variance that may be zero
+_WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 
 
 class Scatter(NamedTuple):
