@@ -34,3 +34,9 @@ def quick_compilation(request: pytest.FixtureRequest):
     jax.config.update("jax_disable_most_optimizations", before)
     # The programs of all modules together would fill gigabytes; the store has them on disk.
     jax.clear_caches()
+
+
+def pytest_collection_modifyitems(items):
+    # What runs longest starts first: no worker then waits at the end for the other's last file.
+    long = ("test_notebooks.py", "test_cli.py", "test_calibration.py")
+    items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(long))
