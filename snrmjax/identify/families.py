@@ -24,18 +24,31 @@ class Coefficient(NamedTuple):
     is_value: bool  # False: a number without unit, such as an exponent
 
 
-class AbstractFamily(eqx.Module):
-    """A curve of amplitude; `argument` says of which amplitude."""
+class AbstractCurve(eqx.Module):
+    """A curve of amplitude with parameters that a fit may move."""
 
-    kind: ClassVar[str]
-    orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
     parameters: Float[Array, " parameter"]
     scale: Float[Array, ""]  # the largest measured amplitude, m or m/s
-    argument: Argument = eqx.field(static=True)
 
     @abstractmethod
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Value at an amplitude of `argument`'s kind, exact in the limit of zero."""
+        """Value at the amplitude that is its own, exact in the limit of zero."""
+
+    @abstractmethod
+    def amplitude(self, displacement: Array, velocity: Array) -> Array:
+        """The one of the two amplitudes that this curve is a function of."""
+
+
+class AbstractFamily(AbstractCurve):
+    """A curve of amplitude by name; `argument` says of which amplitude."""
+
+    kind: ClassVar[str]
+    orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
+    argument: Argument = eqx.field(static=True)
+
+    def amplitude(self, displacement: Array, velocity: Array) -> Array:
+        """See `AbstractCurve`."""
+        return displacement if self.argument == "displacement" else velocity
 
     @abstractmethod
     def coefficients(self) -> tuple[Coefficient, ...]:
@@ -61,7 +74,7 @@ def _linear_start(
     return np.asarray(solution)
 
 
-class _Sum(AbstractFamily):
+class SumOfPowers(AbstractFamily):
     """Σ p_k (amplitude/scale)^power_k: linear in its parameters."""
 
     @classmethod
@@ -118,7 +131,7 @@ def _power(x: Array, power: float) -> Array:
     return x ** (int(power) if float(power).is_integer() else power)
 
 
-class Polynomial(_Sum):
+class Polynomial(SumOfPowers):
     """An even polynomial: what any smooth force gives, in ascending powers of amplitude²."""
 
     kind: ClassVar[str] = "polynomial"
@@ -126,16 +139,16 @@ class Polynomial(_Sum):
 
     @classmethod
     def powers(cls, order: int) -> tuple[float, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return tuple(2.0 * k for k in range(order + 1))
 
     @classmethod
     def names(cls, order: int) -> tuple[str, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return ("at_zero", *(f"power_{2 * k}" for k in range(1, order + 1)))
 
 
-class Constant(_Sum):
+class Constant(SumOfPowers):
     """The same at every amplitude: the constant modal damping C of linear theory."""
 
     kind: ClassVar[str] = "constant"
@@ -143,16 +156,16 @@ class Constant(_Sum):
 
     @classmethod
     def powers(cls, order: int) -> tuple[float, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return (0.0,)
 
     @classmethod
     def names(cls, order: int) -> tuple[str, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return ("constant",)
 
 
-class ViscousQuadratic(_Sum):
+class ViscousQuadratic(SumOfPowers):
     """Viscous and quadratic damping: c|q̇|q̇ acts on the fundamental like 8cv/(3π)."""
 
     kind: ClassVar[str] = "viscous_quadratic"
@@ -160,16 +173,16 @@ class ViscousQuadratic(_Sum):
 
     @classmethod
     def powers(cls, order: int) -> tuple[float, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return (0.0, 1.0)
 
     @classmethod
     def names(cls, order: int) -> tuple[str, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return ("viscous", "quadratic")
 
 
-class ViscousCoulomb(_Sum):
+class ViscousCoulomb(SumOfPowers):
     """Viscous damping and dry friction: μ sign(q̇) acts on the fundamental like 4μ/(πv)."""
 
     kind: ClassVar[str] = "viscous_coulomb"
@@ -177,12 +190,12 @@ class ViscousCoulomb(_Sum):
 
     @classmethod
     def powers(cls, order: int) -> tuple[float, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return (0.0, -1.0)
 
     @classmethod
     def names(cls, order: int) -> tuple[str, ...]:
-        """See `_Sum`."""
+        """See `SumOfPowers`."""
         return ("viscous", "coulomb")
 
 
@@ -258,13 +271,14 @@ class Spline(AbstractFamily):
     kind: ClassVar[str] = "spline"
     orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6, 8, 10)
     knots: Float[Array, " knot"]  # of (amplitude/scale)²
-    to_basis: Float[Array, "knot knot"]  # from values at the knots to coefficients of the basis
+    mix: Float[Array, "term knot"]  # from values at the knots to coefficients of 1, u and the cubes
 
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractFamily`."""
-        u = (jnp.asarray(amplitude) / self.scale) ** 2
-        powers = _truncated(u[..., None], self.knots)
-        return _natural_basis(powers, u[..., None], self.knots) @ (self.to_basis @ self.parameters)
+        u = (jnp.asarray(amplitude)[..., None] / self.scale) ** 2
+        cubes = jnp.maximum(u - self.knots, 0.0) ** 3
+        terms = jnp.concatenate([jnp.ones_like(u), u, cubes], axis=-1)
+        return terms @ (self.mix @ self.parameters)
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
@@ -284,26 +298,49 @@ class Spline(AbstractFamily):
         scale = float(np.max(amplitude))
         shares = np.quantile(amplitude / scale, np.linspace(0, 1, order)[1:])
         # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
-        knots = jnp.asarray(np.concatenate([[0.0], shares**2]))
+        knots = np.concatenate([[0.0], shares**2])
         if np.min(np.diff(knots)) < 0.02 / order:
-            knots = jnp.linspace(0.0, 1.0, order) ** 2
-        given = (jnp.asarray(scale, dtype=jnp.float64), argument, knots)
-        columns = knots[:, None]
-        basis = _natural_basis(_truncated(columns, knots), columns, knots)
-        blank = cls(jnp.zeros(order), *given, jnp.linalg.inv(basis))
-        start = _linear_start(values_and_slopes(blank, amplitude)[1], values, weight)
+            knots = np.linspace(0.0, 1.0, order) ** 2
+        unit = jnp.asarray(scale, dtype=jnp.float64)
+        blank = cls.through(knots, np.zeros(order), unit, argument)
+        columns = values_and_slopes(blank, amplitude)[1]
+        start = _linear_start(columns, values, weight)
         return [eqx.tree_at(lambda f: f.parameters, blank, jnp.asarray(start))]
 
+    @classmethod
+    def through(
+        cls,
+        knots: Float[np.ndarray, " knot"],
+        values: Float[np.ndarray, " knot"],
+        scale: Float[Array, ""],
+        argument: Argument,
+    ) -> "Spline":
+        """The spline through values at knots, which are squares of amplitude/scale."""
+        mix = jnp.asarray(_natural_mix(knots))
+        return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
 
-def _truncated(u: Array, knots: Array) -> Array:
-    return jnp.maximum(u - knots, 0.0) ** 3
+
+def _terms(
+    u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
+) -> Float[np.ndarray, "point term"]:
+    cubes = np.maximum(u[:, None] - knots, 0.0) ** 3
+    return np.column_stack([np.ones_like(u), u, cubes])
 
 
-def _natural_basis(powers: Array, u: Array, knots: Array) -> Array:
-    """1, u, and the differences of truncated cubes that are straight beyond the last knot."""
-    cubes = (powers[..., :-1] - powers[..., -1:]) / (knots[-1] - knots[:-1])
-    straight = [jnp.ones_like(u), u]
-    return jnp.concatenate([*straight, cubes[..., :-1] - cubes[..., -1:]], axis=-1)
+def _natural_mix(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "term knot"]:
+    """Coefficients of the truncated powers of every cardinal spline, straight at both ends.
+
+    The natural basis is 1, u and differences of (cube_k − last cube)/(last knot − knot_k).
+    """
+    n = len(knots)
+    span = knots[-1] - knots[:-1]
+    natural = np.zeros((n + 2, n))
+    natural[:2, :2] = np.eye(2)
+    for k in range(n - 2):
+        natural[2 + k, 2 + k] = 1 / span[k]
+        natural[n, 2 + k] = -1 / span[-1]
+        natural[n + 1, 2 + k] = 1 / span[-1] - 1 / span[k]
+    return natural @ np.linalg.inv(_terms(knots, knots) @ natural)
 
 
 FAMILIES: dict[str, type[AbstractFamily]] = {
@@ -332,12 +369,10 @@ def values_and_slopes(
     would take longer to compile than all of the selection takes.
     """
     x, parameters = amplitude / float(family.scale), np.asarray(family.parameters)
-    if isinstance(family, _Sum):
+    if isinstance(family, SumOfPowers):
         columns = np.stack([x**power for power in family.powers(family.order)], axis=1)
     elif isinstance(family, Spline):
-        u = jnp.asarray(x[:, None]) ** 2
-        basis = _natural_basis(_truncated(u, family.knots), u, family.knots)
-        columns = np.asarray(basis @ family.to_basis)
+        columns = _terms(x**2, np.asarray(family.knots)) @ np.asarray(family.mix)
     elif isinstance(family, PowerLaw):
         exponent = float(family.exponent)
         term, share = x**exponent, exponent / family.largest_exponent

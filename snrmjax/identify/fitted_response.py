@@ -9,9 +9,10 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.backbone import Backbone, BackboneValues
 from snrmjax.identify.curves import ShapePreservingSpline
-from snrmjax.identify.families import AbstractFamily
+from snrmjax.identify.families import AbstractCurve
 from snrmjax.identify.force_balance import BalanceData, Spread, Unknowns, with_deviations
-from snrmjax.identify.joint_fit import JointFit, Restore
+from snrmjax.identify.free_unknowns import Restore
+from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.prediction import CONTINUED, predict_response, resonances
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.simulate.blocks import by_blocks
@@ -83,22 +84,20 @@ def curve_values(unknowns: Unknowns, velocity: Float[Array, " point"]) -> Float[
     displacement = displacement_on_backbone(squared, velocity)
     return jnp.stack(
         [
-            squared(displacement if squared.argument == "displacement" else velocity),
-            damping(displacement if damping.argument == "displacement" else velocity),
+            squared(squared.amplitude(displacement, velocity)),
+            damping(damping.amplitude(displacement, velocity)),
         ],
         axis=1,
     )
 
 
 def displacement_on_backbone(
-    squared: AbstractFamily, velocity: Float[Array, " point"]
+    squared: AbstractCurve, velocity: Float[Array, " point"]
 ) -> Float[Array, " point"]:
     """X with X ω̃ = v, by Newton's method; its derivative is that of the solution."""
-    if squared.argument == "velocity":
-        return velocity / jnp.sqrt(squared(velocity))
 
     def excess(x: Array) -> Array:
-        return x * jnp.sqrt(squared(x)) - velocity
+        return x * jnp.sqrt(squared(squared.amplitude(x, velocity))) - velocity
 
     def step(_: int, x: Array) -> Array:
         value, slope = jax.jvp(excess, (x,), (jnp.ones_like(x),))
@@ -115,9 +114,9 @@ def values_with_slopes(
     fit: JointFit, velocity: Float[np.ndarray, " point"]
 ) -> tuple[Float[np.ndarray, "point curve"], Float[np.ndarray, "point curve unknown"]]:
     """`curve_values` and their derivatives by the free unknowns, in blocks of one size."""
-    vector, restore = fit.vector()
+    vector, restore, own = fit.programmed()
     found = by_blocks(lambda v: _values_with_slopes(vector, restore, v), _BLOCK, velocity)
-    return found[0], found[1]
+    return found[0], found[1][:, :, own]
 
 
 @compiled
@@ -226,8 +225,8 @@ def _curves_at(unknowns: Unknowns, x: Array, omega: Array) -> tuple[Array, Array
     squared, damping = unknowns.squared_frequency, unknowns.modal_damping
     speed = x * omega
     return (
-        squared(x if squared.argument == "displacement" else speed),
-        damping(x if damping.argument == "displacement" else speed),
+        squared(squared.amplitude(x, speed)),
+        damping(damping.amplitude(x, speed)),
     )
 
 
@@ -251,10 +250,11 @@ def _velocity_at(
 def _banded(
     fit: JointFit, force: float, load: float, amplitude: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    vector, restore = fit.vector()
+    program = fit.programmed()
+    covariance = program.spread_out(fit.covariance)
     found = _bands(
-        *(vector, restore, fit.modes, fit.spread, fit.data),
-        *(jnp.asarray(fit.covariance), jnp.asarray(force), jnp.asarray(load)),
+        *(program.vector, program.restore, fit.modes, fit.spread, fit.data),
+        *(jnp.asarray(covariance), jnp.asarray(force), jnp.asarray(load)),
         *(jnp.asarray(amplitude), jnp.asarray(frequency)),
     )
     omega, omega_std, velocity, velocity_std = (np.asarray(part) for part in found)
@@ -347,12 +347,12 @@ def _values_and_slopes(
     fit: JointFit, force: float, load: float, kind: str, amplitude: float, frequency: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
-    vector, restore = fit.vector()
+    vector, restore, own = fit.programmed()
     unit = jnp.array([amplitude, frequency])
     given = (jnp.asarray(force), jnp.asarray(load), jnp.ones(2), unit)
     settings = (vector, restore, fit.modes, fit.spread, fit.data)
     values, slopes, good = _point_with_slopes(*settings, *given, np.array(kind == "fold"))
-    return (np.asarray(values), np.asarray(slopes)) if bool(good) else None
+    return (np.asarray(values), np.asarray(slopes)[:, own]) if bool(good) else None
 
 
 @compiled

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.backbone_points import mistrust, modal_filter, relative_errors
-from snrmjax.identify.families import AbstractFamily
+from snrmjax.identify.families import AbstractCurve, AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -118,9 +118,9 @@ class Motion(eqx.Module):
     displacement: Float[Array, " state"]  # m
     force: Float[Array, " state"]  # N
 
-    def amplitude(self, curve: AbstractFamily) -> Float[Array, " state"]:
+    def amplitude(self, curve: AbstractCurve) -> Float[Array, " state"]:
         """The amplitude that a curve is a function of."""
-        return self.displacement if curve.argument == "displacement" else jnp.abs(self.velocity)
+        return curve.amplitude(self.displacement, jnp.abs(self.velocity))
 
 
 @compiled

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from snrmjax.identify.any_family import in_one_form
 from snrmjax.identify.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     Motion,
     Spread,
@@ -25,9 +24,14 @@ from snrmjax.identify.force_balance import (
     recorded_motion,
     whitener,
 )
-from snrmjax.identify.level_scatter import (
-    Scatter,
+from snrmjax.identify.free_unknowns import (
+    FREE,
+    Programmed,
+    Restore,
+    named_unknowns,
+    programmed,
 )
+from snrmjax.identify.level_scatter import Scatter
 from snrmjax.identify.pilot import pilot_start
 from snrmjax.identify.selection import (
     Candidate,
@@ -37,9 +41,6 @@ from snrmjax.identify.selection import (
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
-
-FREE = ("force_gain", "force_offset", "instrument_phase")
-"""Unknowns of the measurement that a fit may free."""
 
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
@@ -80,12 +81,16 @@ class JointFit(eqx.Module):
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        return recorded_motion(self.unknowns, self.data, self.modes, self.spread)
+        return recorded_motion(in_one_form(self.unknowns), self.data, self.modes, self.spread)
 
-    def vector(self) -> tuple[Float[Array, " unknown"], "Restore"]:
+    def vector(self) -> tuple[Float[Array, " unknown"], Restore]:
         """The free unknowns as a vector, and the way back to all of them."""
         restore = Restore(self.unknowns, self.free)
         return restore.vector(), restore
+
+    def programmed(self) -> Programmed:
+        """The free unknowns as compiled programs take them."""
+        return programmed(self.unknowns, self.free)
 
     def names(self) -> tuple[str, ...]:
         """What the free unknowns are called."""
@@ -94,22 +99,6 @@ class JointFit(eqx.Module):
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
-
-
-class Restore(eqx.Module):
-    """From a vector of free unknowns to all of them."""
-
-    unknowns: Unknowns
-    free: tuple[str, ...] = eqx.field(static=True)
-
-    def vector(self) -> Float[Array, " unknown"]:
-        """The free unknowns."""
-        return ravel_pytree(eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free)))[0]
-
-    def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
-        """All unknowns, the free ones from the vector."""
-        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
-        return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
 
 
 def fit_jointly(
@@ -187,44 +176,6 @@ def fit_jointly(
     )
 
 
-def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
-    """Which leaves a fit may change, as a filter of `equinox.partition`."""
-    frozen = jax.tree.map(lambda _: False, unknowns)
-    moving = [
-        *("force_gain" in free, "force_offset" in free, "instrument_phase" in free),
-        *(True, True, True, True),
-    ]
-
-    def where(u: Unknowns) -> tuple:
-        return (
-            *(u.log_force_gain, u.force_offset, u.instrument_phase),
-            *(u.level, u.linear, u.squared_frequency.parameters, u.modal_damping.parameters),
-        )
-
-    return eqx.tree_at(where, frozen, tuple(moving))
-
-
-def named_unknowns(
-    unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]
-) -> tuple[tuple[str, str], ...]:
-    """Names and units of the free unknowns in the order of their vector."""
-    curves = (
-        ("backbone", "rad^2/s^2", unknowns.squared_frequency),
-        ("damping", "1/s", unknowns.modal_damping),
-    )
-    measurement = {"force_gain": "log", "force_offset": "smallest force", "instrument_phase": "rad"}
-    return (
-        *(
-            (f"{name}.{c.name}", unit if c.is_value else "1")
-            for name, unit, family in curves
-            for c in family.coefficients()
-        ),
-        *((name, unit) for name, unit in measurement.items() if name in free),
-        *((f"level_{k}.{e}", "std") for k in range(data.n_levels) for e in LEVEL_ERRORS),
-        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
-    )
-
-
 class _Fitted(NamedTuple):
     unknowns: Unknowns
     covariance: np.ndarray
@@ -247,7 +198,7 @@ def _fitted(
     robust: bool,
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
-    unknowns, stated_std = start, data.std
+    program, stated_std = programmed(start, free), data.std
 
     def as_noisy(scatter: Scatter) -> float:
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
@@ -258,30 +209,30 @@ def _fitted(
     for turn in range(rounds):
         widened = as_noisy(scatter)
         data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
-        linear = _linearised(Restore(unknowns, free), data, modes, spread, none, np.array(True))
+        settings = (program.restore, data, modes, spread)
+        linear = _linearised(program.vector, *settings, none, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
-        restore = Restore(unknowns, free)
-        vector, good = _solve(restore, data, modes, spread, linear.whiten, unit)
-        unknowns, converged = restore(vector), bool(good)
-        weights = (linear.whiten, np.array(False))
-        answer = _linearised(Restore(unknowns, free), data, modes, spread, *weights)
+        vector, good = _solve(program.vector, *settings, linear.whiten, unit)
+        program, converged = program._replace(vector=vector), bool(good)
+        answer = _linearised(vector, *settings, linear.whiten, np.array(False))
         residuals = np.asarray(answer.residuals)
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
-        covariance = _inverse(np.asarray(answer.jacobian))
+        jacobian = np.asarray(answer.jacobian)[:, program.own]
+        covariance = _inverse(jacobian)
         if robust:
             weight = np.sqrt(np.asarray(data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
         if turn < rounds - 1:
-            rows = np.asarray(answer.jacobian)[: residuals.size]
+            rows = jacobian[: residuals.size]
             spent = float(np.sum((rows @ covariance) * rows))
             dof = max(residuals.size - spent, 1.0)
             noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
             scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
     return _Fitted(
-        unknowns=unknowns,
+        unknowns=Restore(start, free)(program.vector[program.own]),
         covariance=covariance,
         spread=spread,
         data=data,
@@ -352,6 +303,7 @@ def all_residuals(
 
 @compiled
 def _linearised(
+    vector: Array,
     restore: Restore,
     data: BalanceData,
     modes: LinearModes,
@@ -360,9 +312,7 @@ def _linearised(
     anew: Array,
 ) -> _Linear:
     """Residuals and slopes, with the whitening given or `anew` with that of these unknowns."""
-    unknowns = restore.unknowns
-    whiten = jnp.where(anew, whitener_at(unknowns, data, modes, spread), whiten)
-    vector = restore.vector()
+    whiten = jnp.where(anew, whitener_at(restore(vector), data, modes, spread), whiten)
 
     def residuals(vector: Array) -> Array:
         return all_residuals(vector, restore, data, modes, spread, whiten)
@@ -379,6 +329,7 @@ def _linearised(
 
 @compiled
 def _solve(
+    vector: Array,
     restore: Restore,
     data: BalanceData,
     modes: LinearModes,
@@ -392,7 +343,7 @@ def _solve(
     """
     solution: optx.Solution = optx.least_squares(
         lambda y, _: all_residuals(y * unit, restore, data, modes, spread, whiten),
-        *(SOLVER, restore.vector() / unit),
+        *(SOLVER, vector / unit),
         max_steps=200,
         throw=False,
     )

@@ -16,7 +16,8 @@ from snrmjax.identify.fitted_response import (
     values_with_slopes,
 )
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
-from snrmjax.identify.joint_fit import JointFit, Restore, whitened, whitener_at
+from snrmjax.identify.free_unknowns import Restore
+from snrmjax.identify.joint_fit import JointFit, whitened, whitener_at
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -179,10 +180,10 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
-    vector, restore = fit.vector()
+    vector, restore, own = fit.programmed()
     by_vector, by_level = _slopes(vector, restore, data, fit.modes, fit.spread)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
-    rows[:, :, : fit.covariance.shape[0]] = by_vector
+    rows[:, :, : fit.covariance.shape[0]] = np.asarray(by_vector)[:, :, own]
     for k in range(len(LEVEL_ERRORS)):
         place = fit.covariance.shape[0] + states.level * len(LEVEL_ERRORS) + k
         rows[np.arange(n)[:, None], np.arange(2), place[:, None]] = np.asarray(by_level)[:, :, k]

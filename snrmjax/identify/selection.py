@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
+from snrmjax.identify.any_family import in_one_form
 from snrmjax.identify.families import (
     BACKBONE_FAMILIES,
     DAMPING_FAMILIES,
@@ -35,6 +36,7 @@ from snrmjax.simulate.compiled import compiled
 
 _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
+_ROUNDS = 3  # of choosing families and estimating what levels scatter
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
 
@@ -169,24 +171,28 @@ def select_families(
     parameters is taken.
     """
 
-    def workbench(data: BalanceData) -> tuple[_Workbench, Scatter]:
-        known = _Slopes(*(np.asarray(a) for a in _slopes(pilot, data, modes, spread)))
+    def workbench(data: BalanceData) -> _Workbench:
+        slopes = _slopes(in_one_form(pilot), data, modes, spread)
+        known = _Slopes(*(np.asarray(a) for a in slopes))
         work = _Workbench(data, spread, known, free)
-        scatter = work.scatter(pilot)
-        work.use(scatter)
-        return work, scatter
+        work.use(work.scatter(pilot.squared_frequency, pilot.modal_damping))
+        return work
 
-    work, scatter = workbench(data)
+    work = workbench(data)
     jitter = work.jitter(pilot)
     if jitter > 0:
-        work, scatter = workbench(eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(jitter)))
-    table: list[Candidate] = []
-    flexible = pilot.modal_damping
-    tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, flexible)
-    table += tried.table
-    other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
-    table += other.table
-    return Selection(tried.best, other.best, scatter, jitter, tuple(table))
+        work = workbench(eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(jitter)))
+    # What the rough pilot misses looks like levels that differ: its scatter serves to choose
+    # families, theirs to choose again, until both belong together.
+    for _ in range(_ROUNDS):
+        tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, pilot.modal_damping)
+        other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
+        scatter = work.scatter(tried.best, other.best)
+        settled = np.array_equal(np.array(scatter.level) > 0, work.level_std > 0)
+        work.use(scatter)
+        if settled:
+            break
+    return Selection(tried.best, other.best, scatter, jitter, (*tried.table, *other.table))
 
 
 class _Compared(NamedTuple):
@@ -207,7 +213,8 @@ class _Workbench:
         self.common = known.by_other[:, :, keep].reshape(2 * n, -1)
         self.common_std = np.concatenate([np.full(len(keep) - n_linear, np.inf), np.ones(n_linear)])
         self.levels = level_columns(known.by_level, np.asarray(data.level), data.n_levels)
-        self.level_std = np.asarray(spread.level).copy()
+        self.stated_std = np.asarray(spread.level)
+        self.level_std = self.stated_std.copy()
         self.noise = 1.0
         left_out = np.asarray(data.level)
         if data.n_levels < 3:
@@ -243,11 +250,17 @@ class _Workbench:
             residuals.reshape(-1) / self.noise, slopes / self.noise, std, np.zeros(len(std))
         )
 
-    def scatter(self, pilot: Unknowns) -> Scatter:
-        problem = self.problem(pilot.squared_frequency, pilot.modal_damping)
+    def scatter(self, squared: AbstractFamily, damping: AbstractFamily) -> Scatter:
+        """What noise and levels say beyond these curves, with nothing but the stated known."""
+        problem = self.problem(squared, damping)
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
+        std = problem.prior_std.copy()
+        std[first:] = np.tile(self.stated_std, self.data.n_levels)
+        raw = Linearised(
+            problem.residuals * self.noise, problem.slopes * self.noise, std, problem.deviation
+        )
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
-        return estimated_scatter(problem, index)
+        return estimated_scatter(raw, index)
 
     def jitter(self, pilot: Unknowns) -> float:
         """1σ of relative stiffness from state to state, zero unless the residuals ask for it.

@@ -17,10 +17,10 @@ from snrmjax.identify.force_balance import (
     Spread,
     force_balance,
 )
+from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import (
     SOLVER,
     JointFit,
-    Restore,
     all_residuals,
     whitener_at,
 )

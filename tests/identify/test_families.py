@@ -1,11 +1,13 @@
 """Curve families: values, exact limits, derivatives, and starts that reproduce their own kind."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from snrmjax.identify.any_family import as_any_family
 from snrmjax.identify.families import (
     DAMPING_FAMILIES,
     FAMILIES,
@@ -40,6 +42,38 @@ def test_host_values_and_slopes_are_those_of_the_program(kind):
     np.testing.assert_allclose(slopes, jax.jacfwd(of)(curve.parameters), rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.parametrize(
+    ("kind", "argument"),
+    [(kind, ("displacement", "velocity")[k % 2]) for k, kind in enumerate(FAMILIES)],
+)
+def test_the_form_for_programs_is_the_same_curve_in_every_derivative(kind, argument):
+    curve = member(kind, argument=argument)
+    general, n = as_any_family(curve), curve.parameters.shape[0]
+    at = jnp.asarray([0.02, 0.3, 1.1, 1.5])  # beyond the data too
+    other = jnp.full(4, 7.0)
+    pair = (at, other) if argument == "displacement" else (other, at)
+    np.testing.assert_array_equal(general.amplitude(*pair), at)
+
+    def of(family):
+        return lambda p, a: eqx.tree_at(lambda f: f.parameters, family, p)(a)
+
+    for order in (
+        lambda f: f,
+        lambda f: jax.jacfwd(f, argnums=1),
+        jax.jacfwd,
+        jax.jacrev,
+        lambda f: jax.jacfwd(jax.jacfwd(f), argnums=1),
+    ):
+        wanted = np.asarray(order(of(curve))(curve.parameters, at))
+        found = np.asarray(order(of(general))(general.parameters, at))
+        if found.ndim > 1 and found.shape != wanted.shape:
+            assert np.all(found[:, n:] == 0)  # what the family does not have moves nothing
+            found = found[:, :n]
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    at_rest = float(general(jnp.zeros(())))
+    assert at_rest == pytest.approx(float(curve(jnp.zeros(()))), rel=1e-12)
+
+
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_every_parameter_has_a_name_and_the_limit_at_zero_is_exact(kind):
     curve = member(kind)
@@ -58,9 +92,9 @@ def test_the_spline_is_the_natural_cubic_spline_of_the_square():
     knots = np.array([0.0, 0.1, 0.35, 0.7, 1.0])
     values = np.array([2.0, 2.4, 1.7, 3.1, 2.2])
     start = Spline.starts(5, "velocity", AMPLITUDE, np.ones(40), np.ones(40))[0]
-    curve = Spline(
-        jnp.asarray(values), jnp.asarray(1.3), "velocity", jnp.asarray(knots), _basis(knots)
-    )
+    at, unit = 1.3 * np.sqrt(knots), jnp.asarray(1.3)
+    curve = Spline.through(knots, values, unit, "velocity")
+    np.testing.assert_allclose(curve(jnp.asarray(at)), values, rtol=1e-12)
     assert start.knots[0] == 0.0
     truth = CubicSpline(knots, values, bc_type="natural")
     inside = np.linspace(0, 1, 57)
@@ -68,14 +102,6 @@ def test_the_spline_is_the_natural_cubic_spline_of_the_square():
     # Beyond the last knot it goes on straight in the squared amplitude.
     beyond = float(curve(jnp.asarray(1.3 * np.sqrt(1.4))))
     assert beyond == pytest.approx(values[-1] + 0.4 * float(truth(1.0, 1)), rel=1e-11)
-
-
-def _basis(knots):
-    """The inverse of the natural basis at the knots, from its definition."""
-    last = np.maximum(knots[:, None] - knots[-1], 0.0) ** 3
-    cubes = (np.maximum(knots[:, None] - knots[:-1], 0.0) ** 3 - last) / (knots[-1] - knots[:-1])
-    full = np.column_stack([np.ones(5), knots, cubes[:, :-1] - cubes[:, -1:]])
-    return jnp.asarray(np.linalg.inv(full))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,100 @@
+"""The unknowns that a fit may change as one vector, in the order that their names have."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from snrmjax.identify.any_family import in_one_form
+from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Unknowns
+
+FREE = ("force_gain", "force_offset", "instrument_phase")
+"""Unknowns of the measurement that a fit may free."""
+
+
+class Restore(eqx.Module):
+    """From a vector of free unknowns to all of them."""
+
+    unknowns: Unknowns
+    free: tuple[str, ...] = eqx.field(static=True)
+
+    def vector(self) -> Float[Array, " unknown"]:
+        """The free unknowns."""
+        return ravel_pytree(eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free)))[0]
+
+    def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
+        """All unknowns, the free ones from the vector."""
+        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
+        return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
+
+
+class Programmed(NamedTuple):
+    """The free unknowns as compiled programs take them: with curves of one form and size.
+
+    `own` says where in the longer vector the fit's own unknowns are; the others move nothing.
+    """
+
+    vector: Float[Array, " entry"]
+    restore: Restore
+    own: Int[np.ndarray, " unknown"]
+
+    def spread_out(
+        self, covariance: Float[np.ndarray, "unknown unknown"]
+    ) -> Float[np.ndarray, "entry entry"]:
+        """A covariance of the fit's unknowns among all entries of the vector."""
+        full = np.zeros((len(self.vector), len(self.vector)))
+        full[np.ix_(self.own, self.own)] = covariance
+        return full
+
+
+def programmed(unknowns: Unknowns, free: tuple[str, ...]) -> Programmed:
+    """Unknowns for a program that serves every family."""
+    whole = in_one_form(unknowns)
+    vector = Restore(whole, free).vector()
+    (n, m), (size, other) = (
+        (u.squared_frequency.parameters.shape[0], u.modal_damping.parameters.shape[0])
+        for u in (unknowns, whole)
+    )
+    own = [*range(n), *range(size, size + m), *range(size + other, len(vector))]
+    return Programmed(vector, Restore(whole, free), np.array(own))
+
+
+def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
+    """Which leaves a fit may change, as a filter of `equinox.partition`."""
+    frozen = jax.tree.map(lambda _: False, unknowns)
+    moving = [
+        *("force_gain" in free, "force_offset" in free, "instrument_phase" in free),
+        *(True, True, True, True),
+    ]
+
+    def where(u: Unknowns) -> tuple:
+        return (
+            *(u.log_force_gain, u.force_offset, u.instrument_phase),
+            *(u.level, u.linear, u.squared_frequency.parameters, u.modal_damping.parameters),
+        )
+
+    return eqx.tree_at(where, frozen, tuple(moving))
+
+
+def named_unknowns(
+    unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
+    """Names and units of the free unknowns in the order of their vector."""
+    curves = (
+        ("backbone", "rad^2/s^2", unknowns.squared_frequency),
+        ("damping", "1/s", unknowns.modal_damping),
+    )
+    measurement = {"force_gain": "log", "force_offset": "smallest force", "instrument_phase": "rad"}
+    return (
+        *(
+            (f"{name}.{c.name}", unit if c.is_value else "1")
+            for name, unit, family in curves
+            for c in family.coefficients()
+        ),
+        *((name, unit) for name, unit in measurement.items() if name in free),
+        *((f"level_{k}.{e}", "std") for k in range(data.n_levels) for e in LEVEL_ERRORS),
+        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
+    )
