@@ -21,7 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.identify.fitted_response import fitted_response, fitted_values
+from snrmjax.identify.fitted_curves import fitted_values
+from snrmjax.identify.fitted_response import fitted_response
 from snrmjax.identify.joint_fit import fit_jointly
 from snrmjax.model.modes import residual_velocity
 
@@ -48,9 +49,18 @@ CASES = {
         sj.flat_beam(), (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2), 60, 120, 1.1e-2, 0.5, 12
     ),
     # Far into softening and stiffening the method wants states near resonance: harmonics are large.
+    # Around the softest amplitude velocity rises steeply with force, so that levels lie closer.
     "curved": Case(
         sj.curved_beam("monostable"),
-        tuple(np.geomspace(3e-5, 7e-4, 12).tolist()),
+        tuple(
+            np.concatenate(
+                [
+                    np.geomspace(3e-5, 1.7e-4, 6),
+                    np.linspace(1.85e-4, 2.2e-4, 8),
+                    np.geomspace(2.6e-4, 7e-4, 4),
+                ]
+            ).tolist()
+        ),
         *(20, 140, 3.8e-4, 0.99, 6),
     ),
 }
@@ -63,7 +73,7 @@ class Truth(NamedTuple):
     force: np.ndarray
     frequency: np.ndarray
     velocity: np.ndarray
-    at: np.ndarray  # velocities on the backbone
+    at: np.ndarray  # displacements on the backbone, m
     natural_frequency: np.ndarray
     damping: np.ndarray
     resonance: tuple[float, float]  # rad/s, m/s
@@ -87,9 +97,11 @@ def truth_of(case: Case) -> Truth:
     others = residual_velocity(modes, locked.frequency, locked.force)
     speed = np.abs(np.asarray(locked.velocity)[:, 1, 0] - np.asarray(others)[:, 0])
     damping = constant * np.asarray(locked.force) / speed
-    own = np.abs(np.asarray(test.velocity)[:, 0])
+    # By displacement: a softening backbone can have a velocity more than once.
+    own = np.abs(np.asarray(test.velocity)[:, 0]) / np.asarray(test.frequency)
     peak = [own[np.asarray(test.level) == k].max() for k in np.unique(np.asarray(test.level))]
-    at = np.linspace(peak[0], peak[-1], 25)
+    at = np.linspace(min(peak), max(peak), 25)
+    displacement = speed / np.asarray(locked.frequency)
     response = sj.forced_response(
         case.model, [case.foretold], *ends, harmonic_order=HARMONICS, stability=False
     )[0]
@@ -103,8 +115,8 @@ def truth_of(case: Case) -> Truth:
         frequency=np.asarray(test.frequency),
         velocity=np.asarray(test.velocity)[:, 0],
         at=at,
-        natural_frequency=np.interp(at, speed, np.asarray(locked.frequency)),
-        damping=np.interp(at, speed, damping),
+        natural_frequency=np.interp(at, displacement, np.asarray(locked.frequency)),
+        damping=np.interp(at, displacement, damping),
         resonance=(float(response.frequency[tip]), float(np.abs(response.velocity[tip, 1, 0]))),
         fold=float(fold),
     )
@@ -134,7 +146,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
         level_gain_std=ERRORS["gain"] if level_known else 1e-9,
         **FAMILY,
     )
-    values = fitted_values(fit, truth.at)
+    values = fitted_values(fit, displacement=truth.at)
     frequency = (values.natural_frequency - truth.natural_frequency) / values.natural_frequency_std
     damping = (values.modal_damping - truth.damping) / values.modal_damping_std
     row = {

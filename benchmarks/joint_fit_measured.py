@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import snrmjax as sj
-from snrmjax.identify.fitted_response import values_with_slopes
+from snrmjax.identify.fitted_curves import values_with_slopes
 from snrmjax.identify.joint_fit import JointFit, all_residuals, whitener_at
 from snrmjax.identify.uncertainty import sensitivity
 from snrmjax.io.models import read_model

@@ -3,12 +3,8 @@ from .identify.backbone import Backbone, BackboneFit, fit_backbone
 from .identify.backbone_points import BackbonePoints, identify_points
 from .identify.calibration import CalibratedModel, calibrate_model
 from .identify.families import FAMILIES
-from .identify.fitted_response import (
-    FittedPoint,
-    FittedResponse,
-    fitted_response,
-    fitted_values,
-)
+from .identify.fitted_curves import fitted_values
+from .identify.fitted_response import FittedPoint, FittedResponse, fitted_response
 from .identify.identification import Identification, identify_backbone
 from .identify.joint_fit import JointFit, fit_jointly
 from .identify.next_measurement import NextMeasurement, next_measurements

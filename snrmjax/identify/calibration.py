@@ -24,7 +24,7 @@ from snrmjax.identify.calibration_states import (
     state_whitener,
     whitened,
 )
-from snrmjax.identify.needed_force import held_state
+from snrmjax.identify.needed_force import held_state, missed_columns
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.parameters import (
     checked_names,
@@ -206,22 +206,13 @@ def _columns(
 
     `error` adds to the logarithms of force and velocities and to the phases: for derivatives.
     """
-    p, n = len(settings.names), len(settings.sensors)
+    p = len(settings.names)
     model = with_parameters(model, settings.names, aim.parameters(unknowns))
     level = unknowns[p:].reshape(settings.n_levels, len(settings.shared))[state.level]
     shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
-    own = error[1 : n + 1] + 1j * error[n + 1 :]
-    factor = jnp.exp(own - shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
-    velocity, harmonics = state.velocity * factor, state.harmonics * factor[:, None]
-    held = held_state(model, state, velocity[0], *settings.held)
-    point = held.solved(near)
-    force, seen = held.recorded(point)
-    seen = seen[:, np.array(settings.sensors)]
-    higher = seen[np.array(settings.orders, dtype=int)].T - harmonics
-    missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
-    each = jnp.append((force - state.force * jnp.exp(error[0])) / state.force, missed)
-    parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
-    return jnp.where(state.known, parts, 0.0), point
+    factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
+    held = (settings.sensors, settings.orders, settings.harmonic_order)
+    return missed_columns(model, state, held, factor, error, near)
 
 
 @compiled

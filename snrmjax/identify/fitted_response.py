@@ -7,19 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.identify.backbone import Backbone, BackboneValues
+from snrmjax.identify.backbone import Backbone
 from snrmjax.identify.curves import ShapePreservingSpline
-from snrmjax.identify.families import AbstractCurve
+from snrmjax.identify.fitted_curves import values_at_displacement
 from snrmjax.identify.force_balance import BalanceData, Spread, Unknowns, with_deviations
 from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.prediction import CONTINUED, predict_response, resonances
 from snrmjax.model.modes import LinearModes, residual_velocity
-from snrmjax.simulate.blocks import by_blocks
 from snrmjax.simulate.compiled import compiled
 
 _KNOTS = 120
-_BLOCK = 256  # amplitudes that one program works on
 _ITERATIONS = 12
 
 
@@ -48,98 +46,17 @@ class FittedResponse(NamedTuple):
     folds: tuple[FittedPoint, ...]
 
 
-def fitted_values(
-    fit: JointFit, velocity: Float[np.ndarray, " point"], *, of_a_new_level: bool = False
-) -> BackboneValues:
-    """ω̃ and ζ̃ at velocity amplitudes on the backbone, with 1σ.
-
-    Arguments: `velocity` in m/s, zero allowed. With `of_a_new_level` the bands are those of the
-    next test: they include by how much one level differs from another.
-    """
-    at = np.asarray(velocity, dtype=np.float64)
-    values, slopes = values_with_slopes(fit, at)
-    covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
-    squared, damping = values.T
-    if of_a_new_level:
-        covariance[:, 0, 0] += (squared * fit.level_std[2]) ** 2
-        covariance[:, 1, 1] += (damping * fit.level_std[3]) ** 2
-    omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
-    # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
-    slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
-    zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
-    return BackboneValues(
-        velocity=jnp.asarray(at),
-        natural_frequency=jnp.asarray(omega),
-        natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
-        damping_ratio=jnp.asarray(zeta),
-        damping_ratio_std=jnp.asarray(zeta_std),
-        modal_damping=jnp.asarray(damping),
-        modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
-    )
-
-
-def curve_values(unknowns: Unknowns, velocity: Float[Array, " point"]) -> Float[Array, "point 2"]:
-    """ω̃² and 2ζ̃ω̃ where the backbone has a velocity amplitude; differentiable."""
-    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
-    displacement = displacement_on_backbone(squared, velocity)
-    return jnp.stack(
-        [
-            squared(squared.amplitude(displacement, velocity)),
-            damping(damping.amplitude(displacement, velocity)),
-        ],
-        axis=1,
-    )
-
-
-def displacement_on_backbone(
-    squared: AbstractCurve, velocity: Float[Array, " point"]
-) -> Float[Array, " point"]:
-    """X with X ω̃ = v, by Newton's method; its derivative is that of the solution."""
-
-    def excess(x: Array) -> Array:
-        return x * jnp.sqrt(squared(squared.amplitude(x, velocity))) - velocity
-
-    def step(_: int, x: Array) -> Array:
-        value, slope = jax.jvp(excess, (x,), (jnp.ones_like(x),))
-        return x - value / slope
-
-    start = velocity / jnp.sqrt(squared(jnp.zeros_like(velocity)))
-    fixed = jax.lax.stop_gradient
-    found = fixed(jax.lax.fori_loop(0, _ITERATIONS, step, fixed(start)))
-    slope = fixed(jax.jvp(excess, (found,), (jnp.ones_like(found),))[1])
-    return found - excess(found) / slope
-
-
-def values_with_slopes(
-    fit: JointFit, velocity: Float[np.ndarray, " point"]
-) -> tuple[Float[np.ndarray, "point curve"], Float[np.ndarray, "point curve unknown"]]:
-    """`curve_values` and their derivatives by the free unknowns, in blocks of one size."""
-    vector, restore, own = fit.programmed()
-    found = by_blocks(lambda v: _values_with_slopes(vector, restore, v), _BLOCK, velocity)
-    return found[0], found[1][:, :, own]
-
-
-@compiled
-def _values_with_slopes(vector: Array, restore: Restore, velocity: Array) -> tuple[Array, Array]:
-    def of(vector: Array) -> Array:
-        return curve_values(restore(vector), velocity)
-
-    return of(vector), jax.jacfwd(of)(vector)
-
-
 def as_backbone(fit: JointFit) -> Backbone:
     """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
 
     Damping that belongs to the velocity is taken where it lies on the backbone.
     """
-    motion = fit.motion()
-    speed = np.abs(np.asarray(motion.velocity))
-    largest = CONTINUED * float(np.max(speed))
-    velocity = largest * np.linspace(0.0, 1.0, _KNOTS)
-    values, slopes = (jnp.asarray(part) for part in values_with_slopes(fit, velocity))
-    displacement = jnp.asarray(velocity) / jnp.sqrt(values[:, 0])
+    largest = CONTINUED * fit.largest[0]
+    displacement = jnp.linspace(0.0, largest, _KNOTS)
+    found = values_at_displacement(fit, np.asarray(displacement))
+    values, slopes = (jnp.asarray(part) for part in found[:2])
     covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
-    measured = np.asarray(motion.displacement)
+    measured = np.asarray(fit.motion().displacement)
     j, r = fit.modes.mode_of_interest, fit.data.sensor
     # Dry friction has no finite damping at rest: there the next knot's value stands.
     damping = (

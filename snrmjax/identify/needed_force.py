@@ -3,7 +3,8 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibration_states import CalibrationStates, calibration_states
 from snrmjax.measure.steady_states import SteadyStates
@@ -65,6 +66,37 @@ def held_state(
         harmonic_order=harmonic_order,
         scale=jnp.abs(state.velocity[0]),
     )
+
+
+def missed_columns(
+    model: Structure,
+    state: CalibrationStates,
+    held: tuple[tuple[int, ...], tuple[int, ...], int],
+    factor: Complex[Array, ""] | float,
+    error: Float[Array, " input"],
+    near: Float[Array, " entry"],
+) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
+    """What a model misses of one state's force, other sensors and harmonics.
+
+    Arguments: `held` has the sensors (the reference first), the harmonics that are compared and
+    the harmonic order; all velocities are taken times `factor`; `error` adds to the logarithms of
+    force and velocities and to the phases, for derivatives; the motion is looked for `near` one.
+    Returns real and imaginary parts, of the force over the measured one and of the rest over the
+    measured velocity, and the motion.
+    """
+    sensors, orders, harmonic_order = held
+    n = len(sensors)
+    own = factor * jnp.exp(error[1 : n + 1] + 1j * error[n + 1 :])
+    velocity, harmonics = state.velocity * own, state.harmonics * own[:, None]
+    motion = held_state(model, state, velocity[0], sensors[0], harmonic_order)
+    point = motion.solved(near)
+    force, seen = motion.recorded(point)
+    seen = seen[:, np.array(sensors)]
+    higher = seen[np.array(orders, dtype=int)].T - harmonics
+    missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
+    each = jnp.append((force - state.force * jnp.exp(error[0])) / state.force, missed)
+    parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
+    return jnp.where(state.known, parts, 0.0), point
 
 
 @compiled

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.identify.fitted_curves import values_at_displacement
 from snrmjax.identify.fitted_response import (
     FittedResponse,
     fitted_response,
     point_slopes,
-    values_with_slopes,
 )
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.free_unknowns import Restore
@@ -145,9 +145,9 @@ def _target(
 ) -> tuple[Float[np.ndarray, "output unknown"], Float[np.ndarray, " output"]]:
     """Slopes of what shall become better known, and the values that its bands are relative to."""
     if target in ("curves", "frequency", "damping"):
-        speed = np.abs(np.asarray(fit.motion().velocity))
-        at = np.linspace(speed.min(), speed.max(), _TARGETS)
-        values, slopes = values_with_slopes(fit, at)
+        measured = np.asarray(fit.motion().displacement)
+        at = np.linspace(measured.min(), measured.max(), _TARGETS)
+        values, slopes, _ = values_at_displacement(fit, at)
         parts = {"frequency": [0], "damping": [1]}.get(target, [0, 1])
         each = [slopes[:, k] / (2.0 if k == 0 else 1.0) for k in parts]
         return np.concatenate(each), np.concatenate([values[:, k] for k in parts])

@@ -22,7 +22,7 @@ from snrmjax.identify.force_balance import (
 )
 from snrmjax.model.modes import LinearModes
 
-_PILOT_SIZE, _PILOT_KNOTS = 4, 6
+_PILOT_SIZE, _PILOT_KNOTS = 4, 10
 _APART = 1.5  # ratio of amplitudes that tells one more term of a curve
 
 

@@ -35,6 +35,7 @@ from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
 _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
+_DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating what levels scatter
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
@@ -167,8 +168,8 @@ def select_families(
 
     Levels are left out in turn (every third state where there are fewer than three levels) and
     predicted with their own errors unknown; the score is the log density of what was measured
-    there. Of the candidates within one standard error of the best the one with the fewest
-    parameters is taken.
+    there. Of the candidates within one standard error of the best, and not clearly worse, the one
+    with the fewest parameters is taken.
     """
 
     def workbench(data: BalanceData) -> _Workbench:
@@ -343,7 +344,8 @@ class _Workbench:
         apart = scores[best] - scores
         spread = np.sqrt(len(self.folds)) * np.std(apart, axis=1, ddof=1)
         sizes = np.array([row[3].parameters.shape[0] for row in rows])
-        as_good = (total[best] - total) <= spread
+        # A level that one curve misses by far makes that spread large: it must not excuse it.
+        as_good = (total[best] - total) <= np.minimum(spread, _DECISIVE)
         as_good[best] = True
         order = np.lexsort((-total, sizes))
         chosen = next(int(k) for k in order if as_good[k])

@@ -9,7 +9,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from snrmjax.identify.fitted_response import curve_values, values_with_slopes
+from snrmjax.identify.fitted_curves import (
+    curve_values,
+    displacement_near,
+    values_at_displacement,
+    values_with_slopes,
+)
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
     STATE_ERRORS,
@@ -107,12 +112,13 @@ def _second_order(
 def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution]:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
-    Shares of the variance between the smallest and the largest measured velocity, largest first;
-    they sum to one but for rounding.
+    Shares of the variance between the smallest and the largest measured displacement, largest
+    first; they sum to one but for rounding.
     """
     found = sensitivity(fit)
-    speed = np.abs(np.asarray(fit.motion().velocity))
-    _, slopes = values_with_slopes(fit, np.linspace(speed.min(), speed.max(), n_amplitudes))
+    measured = np.asarray(fit.motion().displacement)
+    at = np.linspace(measured.min(), measured.max(), n_amplitudes)
+    slopes = values_at_displacement(fit, at)[1]
     total = np.einsum("acp,pq,acq->ac", slopes, found.covariance, slopes)
     std = np.asarray(fit.data.std)
 
@@ -302,10 +308,10 @@ def compare_bands(
     """
     at = np.asarray(velocity, dtype=np.float64)
     values, slopes = values_with_slopes(fit, at)
-    restore = fit.vector()[1]
+    restore, near = fit.vector()[1], jnp.asarray(displacement_near(fit, at))
 
     def spread_of(samples: np.ndarray) -> np.ndarray:
-        drawn = np.array(_curves_of(restore, jnp.asarray(samples), jnp.asarray(at)))
+        drawn = np.array(_curves_of(restore, jnp.asarray(samples), jnp.asarray(at), near))
         with np.errstate(invalid="ignore"):
             drawn[:, :, 0] = np.sqrt(drawn[:, :, 0])
         return np.nanstd(drawn, axis=0)
@@ -332,5 +338,5 @@ def compare_bands(
 
 
 @compiled
-def _curves_of(restore: Restore, samples: Array, velocity: Array) -> Array:
-    return jax.lax.map(lambda v: curve_values(restore(v), velocity), samples)
+def _curves_of(restore: Restore, samples: Array, velocity: Array, near: Array) -> Array:
+    return jax.lax.map(lambda v: curve_values(restore(v), velocity, near), samples)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.families import FAMILIES, AbstractFamily
-from snrmjax.identify.fitted_response import FittedPoint, FittedResponse, fitted_values
+from snrmjax.identify.fitted_curves import values_to_the_largest
+from snrmjax.identify.fitted_response import FittedPoint, FittedResponse
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.next_measurement import NextMeasurement
@@ -26,7 +27,7 @@ _FORMAT = 1
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:
     """Write both fitted curves with 1σ from zero to the largest measured velocity."""
-    write_values(path, fitted_values(fit, np.linspace(0.0, fit.largest[1], BAND_POINTS)))
+    write_values(path, values_to_the_largest(fit, BAND_POINTS))
 
 
 def write_next(path: Path, advice: Sequence[NextMeasurement]) -> None:
