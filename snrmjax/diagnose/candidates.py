@@ -1,0 +1,190 @@
+"""Every effect as a candidate: where its fit starts, and what tells it from the others."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.model.effects import EFFECTS, effect_parameters
+
+_CHANGE = 0.05  # of the dynamic stiffness near resonance, that a start makes
+
+
+class Scales(NamedTuple):
+    """What is typical of the measured motions."""
+
+    amplitude: float  # median Q of the mode of interest, kg^1/2 m
+    largest: float
+    frequency: float  # rad/s
+    stiffness: float  # median |modal force|/Q, 1/s²
+    receptance: float  # median |X/F| at the sensor, m/N
+    smallest_force: float  # N
+    damping_ratio: float
+
+    @property
+    def change(self) -> float:
+        """A change of the dynamic stiffness that is plainly seen, 1/s²."""
+        return _CHANGE * self.stiffness
+
+
+class Candidate(NamedTuple):
+    """Starts of one kind of effect; parameters in the order of its constructor."""
+
+    kind: str
+    starts: tuple[tuple[float, ...], ...]
+    unit: tuple[float, ...]  # a step that is plainly seen
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+
+_Start = Callable[[Scales], list[tuple[float, ...]]]
+_INF = np.inf
+
+
+def _one(size: Callable[[Scales], float]) -> _Start:
+    return lambda s: [(size(s),)]
+
+
+def _threshold(s: Scales, share: float) -> list[tuple[float, ...]]:
+    return [(share * s.change, g * s.largest) for g in (0.3, 0.55, 0.75, 0.9)]
+
+
+def _softening(s: Scales) -> float:
+    """a₂ that softens by the change: Δω̃² = −(5/6)a₂²Q²/ω₀²."""
+    return float(np.sqrt(1.2 * s.change) * s.frequency / s.amplitude)
+
+
+def _resonance(s: Scales, order: int) -> list[tuple[float, ...]]:
+    # q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²) where it resonates, and acts back like n b Qⁿ⁻² q_new.
+    hz = s.frequency / (2 * np.pi)
+    size = np.sqrt(s.change * 0.02 * (order * s.frequency) ** 2) / s.amplitude ** (order - 1)
+    return [
+        (size, order * hz * share, s.damping_ratio) for share in (0.95, 0.985, 1.0, 1.015, 1.05)
+    ]
+
+
+_STARTS: Mapping[str, _Start] = {
+    "linear_frequency_shift": _one(lambda s: 0.5 * s.change / s.frequency**2),
+    "linear_damping_change": _one(lambda s: 0.5 * s.change / s.frequency**2),
+    "cubic_stiffness": _one(lambda s: s.change / (0.75 * s.amplitude**2)),
+    "quadratic_stiffness": lambda s: [(_softening(s),), (-_softening(s),)],
+    "quintic_stiffness": _one(lambda s: s.change / (0.625 * s.amplitude**4)),
+    "bilinear_stiffness": lambda s: [(0.05 * s.frequency**2,), (-0.05 * s.frequency**2,)],
+    "gap_stiffness": lambda s: _threshold(s, 3.0),
+    "one_sided_stop": lambda s: _threshold(s, 6.0),
+    "coulomb_friction": _one(lambda s: s.change * np.pi * s.amplitude / 4),
+    "jenkins_slider": lambda s: [
+        (3.0 * s.change, share * s.largest) for share in (0.05, 0.15, 0.3, 0.5, 0.75)
+    ],
+    "iwan_microslip": lambda s: [
+        (s.change / s.amplitude ** (p - 1), p) for p in (1.2, 1.5, 2.0, 2.6)
+    ],
+    "quadratic_damping": _one(lambda s: s.change * 3 * np.pi / (8 * s.frequency**2 * s.amplitude)),
+    "cubic_damping": _one(lambda s: s.change / (0.75 * s.frequency**3 * s.amplitude**2)),
+    "van_der_pol_damping": _one(lambda s: 4 * s.change / (s.frequency * s.amplitude**2)),
+    "frequency_drift": _one(lambda s: s.change / s.frequency**2),
+    "added_mass": _one(lambda s: s.change / s.frequency**2),
+    "force_gain_error": _one(lambda s: _CHANGE),
+    "force_offset_error": _one(lambda s: _CHANGE * s.smallest_force),
+    "sensor_gain_error": _one(lambda s: _CHANGE),
+    "sensor_phase_error": _one(lambda s: float(np.degrees(_CHANGE))),
+    "internal_resonance_1_3": lambda s: _resonance(s, 3),
+    "internal_resonance_1_2": lambda s: _resonance(s, 2),
+    "residual_mode": _one(lambda s: _CHANGE * s.receptance),
+    "mode_shape_change": _one(lambda s: _CHANGE / s.amplitude**2),
+    "force_harmonics": lambda s: [(0.02, 0.02)],
+    "static_preload": lambda s: [
+        (sign * 0.2 * s.frequency**2 * s.amplitude,) for sign in (1.0, -1.0)
+    ],
+}
+
+_NOT_NEGATIVE = ("coulomb_friction", "jenkins_slider", "iwan_microslip", "quadratic_damping")
+_NOT_NEGATIVE += ("gap_stiffness", "one_sided_stop")
+
+
+def candidate(kind: str, scales: Scales) -> Candidate:
+    """Starts, units and bounds of a kind of effect."""
+    starts = tuple(tuple(float(v) for v in start) for start in _STARTS[kind](scales))
+    n = len(effect_parameters(kind))
+    lower, upper = [-_INF] * n, [_INF] * n
+    if kind in _NOT_NEGATIVE:
+        lower[0] = 0.0
+    if kind in ("gap_stiffness", "one_sided_stop"):
+        lower[1], upper[1] = 0.0, 1.2 * scales.largest
+    if kind == "jenkins_slider":
+        lower[1], upper[1] = 1e-3 * scales.largest, 1.2 * scales.largest
+    if kind == "iwan_microslip":
+        lower[1], upper[1] = 1.02, 2.98
+    if kind.startswith("internal_resonance"):
+        order = 3 if kind.endswith("3") else 2
+        hz = order * scales.frequency / (2 * np.pi)
+        lower[1:], upper[1:] = [0.8 * hz, 1e-5], [1.2 * hz, 0.2]
+    unit = tuple(abs(v) if v else 1.0 for v in starts[0])
+    if kind.startswith("internal_resonance"):
+        unit = (unit[0], 0.01 * unit[1], 0.5 * unit[2])
+    return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
+
+
+def parameter_labels(kind: str) -> tuple[str, ...]:
+    """Names of a candidate's parameters as a diagnosis gives them."""
+    return tuple(f"{kind}.{name}" for name in effect_parameters(kind))
+
+
+KINDS = tuple(EFFECTS)
+
+# What would settle which of two effects it is.
+_HARMONICS = "the second and third harmonics of the velocity (with their noise floor)"
+_DECIDES: tuple[tuple[frozenset[str], str], ...] = (
+    (
+        frozenset({"quadratic_stiffness", "cubic_stiffness", "static_preload"}),
+        "record harmonic 2 or the mean displacement at the largest level",
+    ),
+    (
+        frozenset({"gap_stiffness", "one_sided_stop"}),
+        "record harmonic 2 at the largest level: only a one-sided contact makes it",
+    ),
+    (
+        frozenset({"cubic_damping", "van_der_pol_damping", "quadratic_damping"}),
+        "record harmonic 3 at the largest level, whose sign and size differ, and widen the range "
+        "of levels",
+    ),
+    (
+        frozenset({"bilinear_stiffness", "force_harmonics"}),
+        "record harmonic 2 against level and the force's own spectrum",
+    ),
+    (
+        frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change"}),
+        "calibrate force and velocity statically, or repeat a level with a known added mass",
+    ),
+    (
+        frozenset({"linear_frequency_shift", "added_mass"}),
+        "add a known mass, or measure a second mode",
+    ),
+    (
+        frozenset({"coulomb_friction", "force_offset_error"}),
+        "measure at the smallest level 30° and more off resonance, on both sides",
+    ),
+    (
+        frozenset({"frequency_drift"}),
+        "repeat the first level last",
+    ),
+    (
+        frozenset({"residual_mode", "sensor_phase_error"}),
+        "measure 60° and more off resonance on both sides, or with a second sensor",
+    ),
+    (
+        frozenset({"internal_resonance_1_3", "internal_resonance_1_2"}),
+        f"step through the frequency of the disturbance and record {_HARMONICS}",
+    ),
+)
+
+
+def decide_by(kinds: set[str], *, harmonics: bool) -> str:
+    """A sentence: the measurement that would settle which of several kinds it is."""
+    fitting = [sentence for group, sentence in _DECIDES if len(group & kinds) > 1 or group <= kinds]
+    if not harmonics and not any("harmonic" in sentence for sentence in fitting):
+        fitting.append(f"record {_HARMONICS} at the largest level")
+    if not fitting:
+        fitting.append("widen the range of levels and measure farther off resonance on both sides")
+    text = "; ".join(fitting[:2])
+    return f"{text[0].upper()}{text[1:]}."

@@ -1,0 +1,218 @@
+"""Misfits in units of noise, with everything shared or stated marginalised, and fits to them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from snrmjax.diagnose.candidates import Candidate, parameter_labels
+from snrmjax.diagnose.predictions import Measured, Predictions
+from snrmjax.identify.calibration_states import whitened
+from snrmjax.model.parameters import parameter_names, stated_std
+
+_STEPS = 8  # of a fit
+_SETTLED = 0.02  # of χ²: a smaller change ends a fit
+
+
+class Weighing(NamedTuple):
+    """How misfits are weighed: noise by itself, and with all that states have in common.
+
+    A row is a known column of a state; `lower` is Cholesky's factor of the whitened misfits'
+    covariance: one for the noise, and what the levels' errors and the baseline's own uncertainty
+    add.
+    """
+
+    whiten: Float[np.ndarray, "state column column"]
+    known: Bool[np.ndarray, "state column"]
+    shared: Float[np.ndarray, "row shared"]  # slopes times 1σ
+    lower: Float[np.ndarray, "row row"]
+    state: Int[np.ndarray, " row"]
+    column: Int[np.ndarray, " row"]
+
+    def noise_units(
+        self, columns: Float[np.ndarray, "trial state column"]
+    ) -> Float[np.ndarray, "trial row"]:
+        """Known columns in units of their own noise; NaN stays."""
+        return np.einsum("sij,...sj->...si", self.whiten, columns)[..., self.known]
+
+    def decorrelated(
+        self, rows: Float[np.ndarray, "*entry row"]
+    ) -> Float[np.ndarray, "*entry row"]:
+        """Rows of unit variance when baseline and noise are as stated."""
+        good = np.all(np.isfinite(rows), axis=-1, keepdims=True)
+        flat = np.where(good, rows, 0.0).reshape(-1, rows.shape[-1])
+        found = solve_triangular(self.lower, flat.T, lower=True).T.reshape(rows.shape)
+        return np.where(good, found, np.nan)
+
+    def of_rows(self, keep: Bool[np.ndarray, " row"]) -> Float[np.ndarray, "kept kept"]:
+        """Cholesky's factor for some of the rows by themselves."""
+        shared = self.shared[keep]
+        return np.linalg.cholesky(np.eye(int(keep.sum())) + shared @ shared.T)
+
+
+def weighing(measured: Measured, baseline: Float[np.ndarray, "state column prior"]) -> Weighing:
+    """Arguments: `baseline` are slopes by the baseline's own parameters, times their 1σ."""
+    states, levels = measured.states, measured.chosen.n_levels
+    known = measured.known
+    n_sensors = np.asarray(states.velocity).shape[1]
+    gain = measured.by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
+    phase = measured.by_error[:, :, n_sensors + 1 :].sum(axis=2)
+    member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
+    parts = [baseline]
+    for slope in (gain, phase):
+        parts.append(slope[:, :, None] * member[:, None, :])
+    every = np.concatenate(parts, axis=2)
+    own = np.asarray(whitened(measured.whiten, every))[known]
+    state, column = np.nonzero(known)
+    return Weighing(measured.whiten, known, own, np.eye(len(own)), state, column)
+
+
+class Fit(NamedTuple):
+    """One candidate, or several together, fitted."""
+
+    kinds: tuple[str, ...]
+    labels: tuple[str, ...]
+    values: Float[np.ndarray, " parameter"]
+    chi_square: float
+    rows: Float[np.ndarray, " row"]  # in units of noise
+    slopes: Float[np.ndarray, "row parameter"]
+
+    def criterion(self, n_rows: int) -> float:
+        """Schwarz's."""
+        return self.chi_square + len(self.values) * float(np.log(n_rows))
+
+
+class Bench:
+    """All fits to one set of data."""
+
+    def __init__(self, predictions: Predictions):
+        self.predictions = predictions
+        self.model = predictions.model
+        group = predictions.group("cubic_stiffness")
+        measured = predictions.measured(group, group.values)
+        self.measured = measured
+        names = _baseline_names(self.model)
+        directions = np.zeros((1, len(group.names), len(names)))
+        for k, name in enumerate(names):
+            directions[0, group.index(name), k] = stated_std(self.model, name)
+        j = self.model.modes.mode_of_interest + 1
+        linear = np.zeros((1, len(group.names), 2))
+        linear[0, group.index(f"mode_{j}.natural_frequency"), 0] = 1.0
+        linear[0, group.index(f"mode_{j}.damping_ratio"), 1] = 1.0
+        found = predictions.of(group, group.values[None], np.concatenate([directions, linear], 2))
+        raw = weighing(measured, found.slopes[0][:, :, : len(names)])
+        std = [float(self.model.level_gain_std), float(self.model.level_phase_std)]
+        levels = measured.chosen.n_levels
+        scale = np.concatenate([np.ones(len(names)), np.repeat(std, levels)])
+        shared = (raw.shared * scale)[:, scale > 0]
+        lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
+        self.weighing = raw._replace(shared=shared, lower=lower)
+        self.base = self.weighing.noise_units(found.columns)[0]
+        self.by_linear = np.moveaxis(
+            self.weighing.noise_units(np.moveaxis(found.slopes[0][:, :, len(names) :], 2, 0)), 0, 1
+        )
+
+    @property
+    def n_rows(self) -> int:
+        """Known numbers."""
+        return len(self.base)
+
+    def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
+        """Of misfits in units of noise."""
+        return float(np.sum(self.weighing.decorrelated(rows) ** 2))
+
+    def nothing(self) -> Fit:
+        """The baseline by itself."""
+        empty = np.zeros((self.n_rows, 0))
+        return Fit((), (), np.zeros(0), self.chi_square(self.base), self.base, empty)
+
+    def fitted(self, candidate: Candidate, beside: Fit | None = None) -> Fit:
+        """The best fit of a candidate from all its starts, on top of what is found already.
+
+        Levenberg–Marquardt in all parameters. Several effects add up: what one changes in what
+        the other does is of second order in both.
+        """
+        before = beside or self.nothing()
+        starts = np.array(candidate.starts) / np.array(candidate.unit)
+        trials, n = starts.shape
+        unit = np.array(candidate.unit)
+        own = starts.copy()
+        rows, slopes = self._evaluated(candidate, own * unit)
+        offset = before.rows - self.base
+        m = len(before.values)
+        old = np.zeros((trials, m))
+        damping = np.full(trials, 1e-2)
+        cost = np.array([self._cost(r + offset) for r in rows])
+        active = np.isfinite(cost)
+        lower, upper = np.array(candidate.lower) / unit, np.array(candidate.upper) / unit
+        for _ in range(_STEPS):
+            at = np.flatnonzero(active)
+            if not at.size:
+                break
+            moved, others = own.copy(), old.copy()
+            for t in at:
+                left = self.weighing.decorrelated(rows[t] + offset + before.slopes @ old[t])
+                jacobian = np.concatenate([slopes[t] * unit, before.slopes], axis=1)
+                arms = self.weighing.decorrelated(jacobian.T).T
+                step = _damped(arms, left, damping[t])
+                moved[t] = np.clip(own[t] + step[:n], lower, upper)
+                others[t] = old[t] + step[n:]
+            new_rows, new_slopes = self._evaluated(candidate, moved[at] * unit)
+            for place, t in enumerate(at):
+                new = self._cost(new_rows[place] + offset + before.slopes @ others[t])
+                if new < cost[t]:
+                    active[t] = cost[t] - new > _SETTLED
+                    own[t], old[t], cost[t] = moved[t], others[t], new
+                    rows[t], slopes[t] = new_rows[place], new_slopes[place]
+                    damping[t] *= 0.1
+                else:
+                    damping[t] *= 20.0
+                    active[t] = damping[t] < 1e4
+        best = int(np.nanargmin(np.where(np.isfinite(cost), cost, np.inf)))
+        return Fit(
+            (*before.kinds, candidate.kind),
+            (*before.labels, *parameter_labels(candidate.kind)),
+            np.concatenate([before.values + old[best], own[best] * unit]),
+            float(cost[best]),
+            rows[best] + offset + before.slopes @ old[best],
+            np.concatenate([before.slopes, slopes[best]], axis=1),
+        )
+
+    def _cost(self, rows: np.ndarray) -> float:
+        value = self.chi_square(rows)
+        return value if np.isfinite(value) else np.inf
+
+    def _evaluated(
+        self, candidate: Candidate, values: Float[np.ndarray, "trial parameter"]
+    ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
+        group = self.predictions.group(candidate.kind)
+        trials, n = values.shape
+        every = np.tile(group.values, (trials, 1))
+        directions = np.zeros((trials, len(group.names), n))
+        for k, label in enumerate(parameter_labels(candidate.kind)):
+            every[:, group.index(label)] = values[:, k]
+            directions[:, group.index(label), k] = 1.0
+        found = self.predictions.of(group, every, directions)
+        rows = self.weighing.noise_units(found.columns)
+        slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
+        return rows, np.moveaxis(slopes, 0, 2)
+
+
+def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:
+    size = np.linalg.norm(arms, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    scaled = arms / size
+    matrix = scaled.T @ scaled + damping * np.eye(len(size))
+    return -np.linalg.solve(matrix, scaled.T @ left) / size
+
+
+def _baseline_names(model: object) -> list[str]:
+    """The baseline's parameters that have a stated error."""
+    return [name for name in parameter_names(model) if stated_std(model, name) > 0]
+
+
+def unlikely(chi_square: float, freedom: int) -> float:
+    """Probability of at least this χ²."""
+    return float(chi2.sf(chi_square, max(freedom, 1)))
