@@ -281,7 +281,8 @@ def identify(
             pair = (joint.unknowns.squared_frequency, joint.unknowns.modal_damping)
             done["curves"] = " and ".join(joint_results.described(curve) for curve in pair)
             responses = [r for f in predict_force or [] for r in sj.fitted_response(joint, f)]
-            further["joint_fit"] = joint_results.summarise_fit(joint, responses)
+            shares = told.fitted.shares if told.fitted else ()
+            further["joint_fit"] = joint_results.summarise_fit(joint, responses, shares)
             joint_results.write_joint_fit(folder / "fit.json", joint)
         if advise:
             joint_results.write_next(folder / "next.csv", advice)

@@ -1,7 +1,7 @@
 """Figures of joint fits: curves with bands, residuals, what bands are made of, and advice."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -72,7 +72,11 @@ def fitted_curves_figure(
         raise ValueError("there is no fit to show: `series` is empty.")
     curves = [sample_fit(one.fit) for one in series]
     unit = unit_for(np.concatenate([curve.velocity for curve in curves]), "m/s")
-    top = 1.04 * max(curve.velocity[-1] for curve in curves) / unit.size
+    reach = [curve.velocity[-1] for curve in curves]
+    for one in series:
+        if one.points is not None:
+            reach += [*np.asarray(one.points.backbone_velocity)[np.asarray(one.points.usable)]]
+    top = 1.04 * max(reach) / unit.size
     figure, ((natural, damping),) = panels(11.0, 5.2, 1, 2)
     seen: tuple[list[float], list[float]] = ([], [])
     dots: tuple[list[float], list[float]] = ([], [])
@@ -94,7 +98,7 @@ def fitted_curves_figure(
         if len(series) == 1 and np.any(one.fit.level_std[2:] > 0):
             wide = sample_fit(one.fit, of_a_new_level=True)
             _bands(natural, damping, wide, unit, colour, "95 % band of a further level", 0.5)
-        _bands(natural, damping, curve, unit, colour, f"{name}, 95 % band")
+        _bands(natural, damping, curve, unit, colour, "95 % band")
         for axes, y in ((natural, curve.frequency), (damping, curve.damping)):
             axes.plot(curve.velocity / unit.size, y, color=colour, zorder=4, label=name)
         for kept, y, error in (
@@ -236,11 +240,15 @@ def advice_figure(
             pieces = (curve.stable[near], name, colour, 1.5, curve.continued[near])
             response_line(axes, x, y, *pieces)
     for one in advice:
+        marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
         turn = np.angle(sign * np.exp(1j * one.phase)) / DEGREE
-        for axes, y in ((speeds, one.velocity / unit.size), (phases, turn)):
-            at = (one.frequency / HERTZ, y)
-            marks(axes, *at, {**HOLLOW, "markersize": 14.0})
-            axes.annotate(str(one.rank), at, ha="center", va="center", fontsize=9, zorder=6)
+        marks(phases, one.frequency / HERTZ, turn, HOLLOW)
+    for ranks, first in _together(advice):
+        at = (first.frequency / HERTZ, first.velocity / unit.size)
+        text = ", ".join(map(str, ranks))
+        offset: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
+        speeds.annotate(text, at, **offset, fontsize=10.5, zorder=6, bbox=box)
     if forces[-1] > 8 * forces[0]:
         speeds.set_yscale("log")
     else:
@@ -252,3 +260,17 @@ def advice_figure(
     explain_lines(figure)
     legend(figure)
     return figure
+
+
+def _together(advice: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
+    """Ranks whose marks would hide one another, with the first of them."""
+    groups: list[tuple[list[int], NextMeasurement]] = []
+    for one in advice:
+        for ranks, first in groups:
+            near = abs(one.frequency / first.frequency - 1) < 0.005
+            if near and abs(one.velocity / first.velocity - 1) < 0.03:
+                ranks.append(one.rank)
+                break
+        else:
+            groups.append(([one.rank], one))
+    return groups

@@ -186,7 +186,7 @@ def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
     rows = [
         (
             *(f"{one.rank}", f"{one.force / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
-            *(f"{one.velocity / unit.size:.3g}", minus(f"{one.phase / DEGREE:+.0f}")),
+            *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
             *(f"{100 * one.expected_band_ratio:.1f}", one.reason),
         )
         for one in advice
@@ -216,7 +216,7 @@ def family_table(summary: dict) -> ReportTable:
         )
         for one in tried
     ]
-    header = ("curve", "family", "parameters", "score", "error of prediction", "")
+    header = ("curve", "family", "parameters", "score", "error of prediction", "choice")
     caption = (
         "How well levels are predicted that were left out. Score: log predictive density relative "
         "to the best, ± 1σ of the difference; a family within 2 of the best is as good. Error of "

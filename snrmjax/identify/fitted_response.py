@@ -135,9 +135,13 @@ def as_backbone(fit: JointFit) -> Backbone:
     """
     motion = fit.motion()
     speed = np.abs(np.asarray(motion.velocity))
-    largest = CONTINUED * float(np.max(speed))
-    velocity = largest * np.linspace(0.0, 1.0, _KNOTS)
-    values, slopes = (jnp.asarray(part) for part in values_with_slopes(fit, velocity))
+    velocity = CONTINUED * float(np.max(speed)) * np.linspace(0.0, 1.0, _KNOTS)
+    sampled = values_with_slopes(fit, velocity)
+    good = _rising(velocity, sampled[0][:, 0])
+    if good < _KNOTS:
+        velocity = velocity[good - 1] * np.linspace(0.0, 1.0, _KNOTS)
+        sampled = values_with_slopes(fit, velocity)
+    values, slopes = (jnp.asarray(part) for part in sampled)
     displacement = jnp.asarray(velocity) / jnp.sqrt(values[:, 0])
     covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
     measured = np.asarray(motion.displacement)
@@ -157,6 +161,16 @@ def as_backbone(fit: JointFit) -> Backbone:
         argument="displacement",
         sensor=fit.modes.sensors[r],
     )
+
+
+def _rising(velocity: np.ndarray, squared: np.ndarray) -> int:
+    """How many knots from zero on the backbone has before a continued ω̃² ends it.
+
+    Beyond the data a polynomial may fall so fast that no displacement has a larger velocity.
+    """
+    ratio = np.where(squared > 0, squared, np.nan)
+    rising = np.diff(velocity / np.sqrt(ratio)) > 0
+    return len(velocity) if rising.all() else 1 + int(np.argmin(rising))
 
 
 def fitted_response(

@@ -143,7 +143,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
             ]
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]
-        rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
+        if fit.spread.linear[k] > 0:
+            rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
     parts = np.stack([np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows])
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [

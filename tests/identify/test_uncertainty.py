@@ -84,6 +84,17 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     assert far < 0.5 * gains
 
 
+def test_contributions_near_resonance_are_those_of_force_over_velocity():
+    near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), **TRUE))
+    shares = {row.source: row for row in near}
+    # There 2ζω = A F/v: shares as the squares of 0.3 and 1 %; the phase's 4° leave its share small.
+    force, velocity = (shares[f"random error of {k}"].damping_share for k in ("force", "velocity"))
+    assert force / velocity == pytest.approx(0.09, rel=0.02)
+    assert force + velocity > 0.95
+    # And tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase alone.
+    assert shares["random error of phase"].frequency_share > 0.95
+
+
 def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
     found = profile(fit, "damping.viscous")
     std = np.sqrt(fit.covariance[2, 2])
