@@ -337,7 +337,7 @@ if MEASURED is None:
 else:
     out = np.isin(np.asarray(data.level), (4, 7))
     six = sj.fit_jointly(jax.tree.map(lambda column: column[~out], data), model.modes)
-    unseen = sj.identify_points(jax.tree.map(lambda column: column[out], data), model.modes)
+    unseen = jax.tree.map(lambda column: column[out], points)
     series = [joint_plot.FitSeries("fit of the other six levels", six, unseen)]
     show(joint_plot.fitted_curves_figure(series), "levels_held_out")
     close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
