@@ -243,22 +243,25 @@ def identify(
     """Identify backbone and damping from measured steady states, and predict responses.
 
     Writes points.csv, backbone.csv, summary.json, figures and report.html; with --predict-force
-    also prediction.csv; with --fit the fitted curves, fit.json and with --next also next.csv.
+    also prediction.csv; with --fit the fitted curves, their residuals, what their bands are made of
+    and fit.json, and with --next also next.csv.
     """
     with _staged(out) as folder:
         structure = read_model(model)
         reading = read_steady_states(data, sensors=structure.modes.sensors)
         for note in reading.notes:
             _warn(note)
-        measured, joint = reading.steady_states, None
+        measured, joint, advice = reading.steady_states, None, []
         if fit is not None or free or advise:
             joint = _joint_fit(measured, structure, fit or "auto", free or [], robust=robust)
             measured = corrected(measured, joint)
+            advice = sj.next_measurements(joint, advise) if advise else []
         told = present_identification(
             measured,
             structure,
             predict_force or [],
             fit=joint,
+            advice=advice,
             amplitude=amplitude.value,
             measure=measure.value,
             family=curve.value,
@@ -278,10 +281,10 @@ def identify(
             pair = (joint.unknowns.squared_frequency, joint.unknowns.modal_damping)
             done["curves"] = " and ".join(joint_results.described(curve) for curve in pair)
             responses = [r for f in predict_force or [] for r in sj.fitted_response(joint, f)]
-            further["joint_fit"] = joint_results.summarise_fit(joint, responses)
+            shares = told.fitted.shares if told.fitted else ()
+            further["joint_fit"] = joint_results.summarise_fit(joint, responses, shares)
             joint_results.write_joint_fit(folder / "fit.json", joint)
-        if joint is not None and advise:
-            advice = sj.next_measurements(joint, advise)
+        if advise:
             joint_results.write_next(folder / "next.csv", advice)
             for one in advice:
                 hertz = f"{one.frequency / HERTZ:.6g} Hz"

@@ -1,15 +1,20 @@
-"""What figures read off results: sampled backbones, phasors and phases, in the figures' units."""
+"""What figures read off results: sampled curves, phasors and phases, in the figures' units."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.backbone import Backbone
+from snrmjax.identify.backbone import Backbone, BackboneValues
 from snrmjax.identify.backbone_points import BackbonePoints
+from snrmjax.identify.fitted_curves import fitted_values
+from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.prediction import PredictedResponse
+from snrmjax.identify.uncertainty import Contribution
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.simulate.controlled import DampedModeBranch
 from snrmjax.simulate.forced_response import ResponseCurve
 from snrmjax.simulate.normal_modes import NormalModeBranch
 
@@ -36,7 +41,21 @@ def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSample
     """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
     start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
     amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
-    values = backbone.values(amplitude)
+    beyond = np.asarray(amplitude) > float(backbone.largest)
+    return _in_units(backbone.values(amplitude), beyond)
+
+
+def sample_fit(
+    fit: JointFit, *, of_a_new_level: bool = False, reach: float = 1.0
+) -> BackboneSamples:
+    """The curves of a joint fit from zero to `reach` times the largest measured velocity."""
+    largest = fit.largest[1]
+    velocity = np.linspace(0.0, reach * largest, _CURVE_POINTS)
+    values = fitted_values(fit, velocity, of_a_new_level=of_a_new_level)
+    return _in_units(values, velocity > largest)
+
+
+def _in_units(values: BackboneValues, beyond: np.ndarray) -> BackboneSamples:
     omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
     return BackboneSamples(
         velocity=np.asarray(values.velocity),
@@ -46,12 +65,56 @@ def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSample
         damping_error=100 * BAND * damping_std,
         modal_damping=modal,
         modal_damping_error=BAND * modal_std,
-        beyond=np.asarray(amplitude) > float(backbone.largest),
+        beyond=beyond,
     )
 
 
+class FitResiduals(NamedTuple):
+    """What a joint fit leaves of its states, whitened: of unit variance if all is right."""
+
+    level: np.ndarray  # counted from one
+    velocity: np.ndarray  # m/s
+    phase: np.ndarray  # degrees, 0 at resonance
+    parts: np.ndarray  # (state, 2)
+    rms: float
+
+
+def fit_residuals(fit: JointFit) -> FitResiduals:
+    """The residuals of a joint fit, with the place of their states."""
+    modes, velocity = fit.modes, np.asarray(fit.motion().velocity)
+    j, r = modes.mode_of_interest, fit.data.sensor
+    sign = np.sign(float(modes.mode_shape[r, j] * modes.participation[j]))
+    return FitResiduals(
+        level=np.asarray(fit.data.level) + 1,
+        velocity=np.abs(velocity),
+        phase=np.angle(sign * velocity) / DEGREE,
+        parts=fit.residuals,
+        rms=float(np.sqrt(np.mean(fit.residuals**2))),
+    )
+
+
+def contributions_by_kind(rows: Sequence[Contribution]) -> list[Contribution]:
+    """Contributions to a band with those of one kind together, largest first.
+
+    >>> row = Contribution("gain of level 1", 0.2, 0.1, "gain of levels")
+    >>> contributions_by_kind([row, row._replace(source="gain of level 2")])[0][:3]
+    ('gain of levels', 0.4, 0.2)
+    """
+    kinds = list(dict.fromkeys(row.kind for row in rows))
+    together = [
+        Contribution(
+            kind,
+            sum(row.frequency_share for row in rows if row.kind == kind),
+            sum(row.damping_share for row in rows if row.kind == kind),
+            kind,
+        )
+        for kind in kinds
+    ]
+    return sorted(together, key=lambda row: -row.frequency_share - row.damping_share)
+
+
 def velocity_of(
-    curve: PredictedResponse | ResponseCurve | NormalModeBranch, sensor: str
+    curve: PredictedResponse | ResponseCurve | NormalModeBranch | DampedModeBranch, sensor: str
 ) -> np.ndarray:
     """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
 

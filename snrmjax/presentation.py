@@ -13,6 +13,7 @@ from snrmjax.identify.backbone import BackboneFit
 from snrmjax.identify.fitted_response import as_backbone
 from snrmjax.identify.identification import Identification, identify_backbone
 from snrmjax.identify.joint_fit import JointFit
+from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.prediction import (
     CONTINUED,
     PredictedResponse,
@@ -20,6 +21,7 @@ from snrmjax.identify.prediction import (
     predict_response,
     resonances,
 )
+from snrmjax.joint_report import ToldFit, joint_figures, joint_sections, tell_fit
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure, equilibria
 from snrmjax.report import Report, ReportFigure, Section, identification_report
@@ -45,6 +47,7 @@ class Presentation(NamedTuple):
     notes: tuple[str, ...]
     truth: NormalModeBranch | None
     simulated: tuple[ResponseCurve, ...]
+    fitted: ToldFit | None = None
 
 
 def present_identification(
@@ -55,12 +58,13 @@ def present_identification(
     truth: NormalModeBranch | None = None,
     simulated: Sequence[ResponseCurve] = (),
     fit: JointFit | None = None,
+    advice: Sequence[NextMeasurement] = (),
     **options: Any,
 ) -> Presentation:
     """Identify the mode of interest and predict its responses to some forces (N).
 
     `truth` and `simulated` are shown for comparison; `fit` gives the curves where there is a
-    joint one; `options` go to `identify_backbone`.
+    joint one, and `advice` what to measure next; `options` go to `identify_backbone`.
     """
     identification = identify_backbone(data, model.modes, **options)
     if fit is not None:
@@ -81,7 +85,8 @@ def present_identification(
             notes.append(f"{len(found)} resonances at {force:g} N: the damping allows several.")
         predictions.append(Prediction(force, found, responses))
     return Presentation(
-        data, model, identification, tuple(predictions), tuple(notes), truth, tuple(simulated)
+        *(data, model, identification, tuple(predictions), tuple(notes), truth, tuple(simulated)),
+        fitted=None if fit is None else tell_fit(fit, advice),
     )
 
 
@@ -152,6 +157,8 @@ def identification_figures(told: Presentation) -> dict[str, Figure]:
             simulated=told.simulated,
             measured=told.data,
         )
+    if told.fitted is not None:
+        figures |= joint_figures(told.fitted, points)
     if told.truth is not None:
         figures["nnm"] = plot.normal_mode_figure(told.truth, sensor=points.sensor)
     return figures
@@ -196,7 +203,8 @@ def presentation_report(
     figures: dict[str, Figure],
 ) -> Report:
     """The report of an identification; `notes` are those of the reader, before its own."""
-    further = [
+    further = [] if told.fitted is None else joint_sections(told.fitted, figures)
+    further.append(
         Section(
             "What was measured, and its damping",
             (),
@@ -205,7 +213,7 @@ def presentation_report(
                 ReportFigure(figures["modal_damping"], DAMPING_CAPTION),
             ],
         )
-    ]
+    )
     if "nnm" in figures:
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))

@@ -176,7 +176,7 @@ def identification_summary(identification: Identification, modes: LinearModes) -
     at = [f"at {one / unit.size:.3g} {unit.name}" for one in curve.velocity]
 
     def ends(values: np.ndarray, spread: np.ndarray, name: str) -> str:
-        first, last = (f"{_with_error(values[k], spread[k])} {name} {at[k]}" for k in (0, -1))
+        first, last = (f"{with_error(values[k], spread[k])} {name} {at[k]}" for k in (0, -1))
         return f"{first}, {last}"
 
     def extremes(values: np.ndarray, name: str) -> str:
@@ -210,12 +210,12 @@ def identification_summary(identification: Identification, modes: LinearModes) -
         ("linear mode", f"{linear:.5g} Hz, {100 * float(modes.damping_ratio[j]):.3g} % damping"),
         ("natural frequency (± 95 %)", ends(curve.frequency, curve.frequency_error, "Hz")),
         ("lowest to highest frequency", extremes(curve.frequency, "Hz")),
-        ("change over the range", _minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
+        ("change over the range", minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
         ("damping ratio (± 95 %)", ends(curve.damping, curve.damping_error, "%")),
         ("lowest to highest damping", extremes(curve.damping, "%")),
         ("points used", f"{used} of {len(status)} at sensor {points.sensor}"),
         ("left out", ", ".join(left_out) or "none"),
-        ("phases measured", _minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")),
+        ("phases measured", minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")),
         ("noise", noise),
         ("scatter from level to level", levels),
         ("argument of the curves", f"{points.argument} amplitude"),
@@ -278,8 +278,8 @@ def _beside(
     return [
         f"{velocity / unit.size:.4g}",
         f"{frequency / HERTZ:.5g}",
-        _minus(f"{100 * (one.velocity / velocity - 1):+.2g}"),
-        _minus(f"{(one.frequency - frequency) / HERTZ:+.2g}"),
+        minus(f"{100 * (one.velocity / velocity - 1):+.2g}"),
+        minus(f"{(one.frequency - frequency) / HERTZ:+.2g}"),
     ]
 
 
@@ -289,7 +289,7 @@ def _embedded(one: ReportFigure) -> dict[str, str]:
     return {"png": png, "width": width, "alt": one.caption.split(". ")[0], "caption": one.caption}
 
 
-def _with_error(value: float, spread: float) -> str:
+def with_error(value: float, spread: float) -> str:
     """A value with its error, to two digits of the error."""
     if not spread >= 1e-6 or not np.isfinite(spread):
         return f"{value:.4g}"
@@ -297,7 +297,8 @@ def _with_error(value: float, spread: float) -> str:
     return f"{value:.{digits}f} ± {spread:.{digits}f}"
 
 
-def _minus(text: str) -> str:
+def minus(text: str) -> str:
+    """The text with true minus signs."""
     return text.replace("-", "−")
 
 

@@ -228,6 +228,15 @@ def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
     (resonance,) = fit["resonances"]
     assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
     assert (out / "fit.json").exists()
+    for name in ("joint_fit", "residuals", "contributions", "next"):
+        assert (out / f"{name}.png").stat().st_size > 10_000
+    for share in ("frequency_share", "damping_share"):
+        assert sum(row[share] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
+    html = (out / "report.html").read_text()
+    for heading in ("Joint fit", "What the bands are made of", "What to measure next"):
+        assert f"<h2>{heading}</h2>" in html
+    with (out / "next.csv").open() as file:
+        assert all(row["reason"] in html for row in csv.DictReader(file))
 
 
 @pytest.mark.parametrize(

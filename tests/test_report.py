@@ -315,7 +315,7 @@ def test_curves_that_start_at_zero_are_told_from_there(identification, modes):
     ],
 )
 def test_errors_have_two_digits(value, spread, text):
-    assert reports._with_error(value, spread) == text
+    assert reports.with_error(value, spread) == text
 
 
 def test_reports_are_written_whole_or_not_at_all(tmp_path, report, html, monkeypatch):

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solve_triangular
@@ -11,6 +12,7 @@ from snrmjax.diagnose.candidates import Candidate, parameter_labels
 from snrmjax.diagnose.predictions import Measured, Predictions
 from snrmjax.identify.calibration_states import whitened
 from snrmjax.model.parameters import parameter_names, stated_std
+from snrmjax.model.structure import Structure
 
 _STEPS = 8  # of a fit
 _SETTLED = 0.02  # of χ²: a smaller change ends a fit
@@ -64,7 +66,7 @@ def weighing(measured: Measured, baseline: Float[np.ndarray, "state column prior
     for slope in (gain, phase):
         parts.append(slope[:, :, None] * member[:, None, :])
     every = np.concatenate(parts, axis=2)
-    own = np.asarray(whitened(measured.whiten, every))[known]
+    own = np.asarray(whitened(jnp.asarray(measured.whiten), jnp.asarray(every)))[known]
     state, column = np.nonzero(known)
     return Weighing(measured.whiten, known, own, np.eye(len(own)), state, column)
 
@@ -96,11 +98,11 @@ class Bench:
         names = _baseline_names(self.model)
         directions = np.zeros((1, len(group.names), len(names)))
         for k, name in enumerate(names):
-            directions[0, group.index(name), k] = stated_std(self.model, name)
+            directions[0, group.place(name), k] = stated_std(self.model, name)
         j = self.model.modes.mode_of_interest + 1
         linear = np.zeros((1, len(group.names), 2))
-        linear[0, group.index(f"mode_{j}.natural_frequency"), 0] = 1.0
-        linear[0, group.index(f"mode_{j}.damping_ratio"), 1] = 1.0
+        linear[0, group.place(f"mode_{j}.natural_frequency"), 0] = 1.0
+        linear[0, group.place(f"mode_{j}.damping_ratio"), 1] = 1.0
         found = predictions.of(group, group.values[None], np.concatenate([directions, linear], 2))
         raw = weighing(measured, found.slopes[0][:, :, : len(names)])
         std = [float(self.model.level_gain_std), float(self.model.level_phase_std)]
@@ -192,8 +194,8 @@ class Bench:
         every = np.tile(group.values, (trials, 1))
         directions = np.zeros((trials, len(group.names), n))
         for k, label in enumerate(parameter_labels(candidate.kind)):
-            every[:, group.index(label)] = values[:, k]
-            directions[:, group.index(label), k] = 1.0
+            every[:, group.place(label)] = values[:, k]
+            directions[:, group.place(label), k] = 1.0
         found = self.predictions.of(group, every, directions)
         rows = self.weighing.noise_units(found.columns)
         slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
@@ -208,7 +210,7 @@ def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:
     return -np.linalg.solve(matrix, scaled.T @ left) / size
 
 
-def _baseline_names(model: object) -> list[str]:
+def _baseline_names(model: Structure) -> list[str]:
     """The baseline's parameters that have a stated error."""
     return [name for name in parameter_names(model) if stated_std(model, name) > 0]
 

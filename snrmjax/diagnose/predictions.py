@@ -47,7 +47,7 @@ class Group(NamedTuple):
     values: Float[np.ndarray, " parameter"]
     near: Float[np.ndarray, "state entry"]
 
-    def index(self, name: str) -> int:
+    def place(self, name: str) -> int:
         """Where a parameter is."""
         return self.names.index(name)
 
@@ -109,7 +109,8 @@ class Predictions:
             return Group(model, names, values, self.group(_PLAIN).near)
         near = by_blocks(
             lambda *rows: (_grown(model, CalibrationStates(*rows), self.held),),
-            *(_BLOCK, *self.states),
+            _BLOCK,
+            *self.states,
         )[0]
         return Group(model, names, values, near)
 
@@ -144,7 +145,10 @@ class Predictions:
         each = np.tile(values, (len(self.chosen.rows), 1))
         by_error = by_blocks(
             lambda *block: (_by_error(group.model, group.names, self.held, *block),),
-            *(_BLOCK, *self.states, each, group.near),
+            _BLOCK,
+            *self.states,
+            each,
+            group.near,
         )[0]
         whiten = np.asarray(
             state_whitener(self.chosen.states, jnp.asarray(by_error), jnp.zeros(()))

@@ -51,10 +51,14 @@ def as_backbone(fit: JointFit) -> Backbone:
 
     Damping that belongs to the velocity is taken where it lies on the backbone.
     """
-    largest = CONTINUED * fit.largest[0]
-    displacement = jnp.linspace(0.0, largest, _KNOTS)
-    found = values_at_displacement(fit, np.asarray(displacement))
-    values, slopes = (jnp.asarray(part) for part in found[:2])
+    displacement = CONTINUED * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+    sampled = values_at_displacement(fit, displacement)
+    # A polynomial may fall below zero beyond the data: there is no motion there.
+    sound = np.append(sampled[0][:, 0] > 0, False).argmin()
+    if sound < _KNOTS:
+        displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
+        sampled = values_at_displacement(fit, displacement)
+    values, slopes = (jnp.asarray(part) for part in sampled[:2])
     covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
     measured = np.asarray(fit.motion().displacement)
     j, r = fit.modes.mode_of_interest, fit.data.sensor
@@ -63,8 +67,8 @@ def as_backbone(fit: JointFit) -> Backbone:
         values[:, 1].at[0].set(jnp.where(jnp.isfinite(values[0, 1]), values[0, 1], values[1, 1]))
     )
     return Backbone(
-        squared_frequency=ShapePreservingSpline(displacement, values[:, 0]),
-        modal_damping=ShapePreservingSpline(displacement, damping),
+        squared_frequency=ShapePreservingSpline(jnp.asarray(displacement), values[:, 0]),
+        modal_damping=ShapePreservingSpline(jnp.asarray(displacement), damping),
         squared_frequency_covariance=covariance[0],
         modal_damping_covariance=jnp.nan_to_num(covariance[1]),
         modal_constant=fit.modes.mode_shape[r, j] * fit.modes.participation[j],

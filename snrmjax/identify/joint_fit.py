@@ -220,7 +220,7 @@ def _fitted(
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
         jacobian = np.asarray(answer.jacobian)[:, program.own]
-        covariance = _inverse(jacobian)
+        covariance = inverse_of(jacobian)
         if robust:
             weight = np.sqrt(np.asarray(data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
@@ -246,7 +246,7 @@ def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
     return Spread(jnp.array(scatter.level), spread.linear)
 
 
-def _inverse(jacobian: np.ndarray) -> np.ndarray:
+def inverse_of(jacobian: np.ndarray) -> np.ndarray:
     """(JᵀJ)⁻¹, by singular values of the scaled columns."""
     size = np.linalg.norm(jacobian, axis=0)
     size = np.where(size > 0, size, 1.0)

@@ -20,13 +20,16 @@ from snrmjax.identify.force_balance import (
     STATE_ERRORS,
     BalanceData,
     Spread,
+    error_slopes,
     force_balance,
+    whitener,
 )
 from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import (
     SOLVER,
     JointFit,
     all_residuals,
+    inverse_of,
     whitener_at,
 )
 from snrmjax.model.modes import LinearModes
@@ -50,6 +53,7 @@ class Contribution(NamedTuple):
     source: str
     frequency_share: float  # of the variance of ω̃, mean over amplitudes
     damping_share: float  # of the variance of 2ζ̃ω̃
+    kind: str  # of source: what all levels, or all linear parameters, have in common
 
 
 class Profile(NamedTuple):
@@ -112,34 +116,61 @@ def _second_order(
 def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution]:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
-    Shares of the variance between the smallest and the largest measured displacement, largest
-    first; they sum to one but for rounding.
+    To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error.
+
+    Returns shares of the variance between the smallest and the largest measured displacement,
+    largest first; they sum to one but for rounding.
     """
-    found = sensitivity(fit)
+    vector, restore = fit.vector()
+    found = _first_order(vector, restore, fit.data, fit.modes, fit.spread)
+    jacobian, by_error = np.asarray(found[0]), np.asarray(found[1])
+    p, n, n_levels = len(vector), len(fit.data.level), fit.data.n_levels
+    inverse = inverse_of(jacobian)
+    points = jacobian[: 2 * n].reshape(n, 2, p)
+    by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), n_amplitudes)
     slopes = values_at_displacement(fit, at)[1]
-    total = np.einsum("acp,pq,acq->ac", slopes, found.covariance, slopes)
-    std = np.asarray(fit.data.std)
 
-    def shares(columns: Float[np.ndarray, "unknown column"]) -> tuple[float, float]:
-        variance = np.sum((slopes @ columns) ** 2, axis=2)
-        return tuple(np.mean(variance / total, axis=0).tolist())
-
-    rows = []
+    rows: list[tuple[str, str, np.ndarray]] = []
     for k, kind in enumerate(STATE_ERRORS):
-        if np.any(std[:, k] > 0):
-            rows.append((f"random error of {kind}", found.by_measurement[:, :, k] * std[:, k]))
-    n_levels = fit.data.n_levels
-    levels = found.by_prior[:, : n_levels * len(LEVEL_ERRORS)]
-    levels = levels.reshape(len(levels), n_levels, len(LEVEL_ERRORS))
+        if np.any(by_state[:, :, k]):
+            name = f"random error of {kind}"
+            rows.append((name, name, by_state[:, :, k]))
+    n_linear = len(fit.unknowns.linear)
+    levels = inverse[:, p - n_linear - n_levels * len(LEVEL_ERRORS) : p - n_linear]
+    levels = levels.reshape(p, n_levels, len(LEVEL_ERRORS))
     for k, kind in enumerate(LEVEL_ERRORS):
         if fit.level_std[k] > 0:
-            rows += [(f"{kind} of level {m + 1}", levels[:, m, k : k + 1]) for m in range(n_levels)]
-    linear = found.by_prior[:, n_levels * len(LEVEL_ERRORS) :]
-    rows += [(f"linear parameter {k + 1}", linear[:, k : k + 1]) for k in range(linear.shape[1])]
-    listed = [Contribution(name, *shares(columns)) for name, columns in rows]
+            rows += [
+                (f"{kind} of level {m + 1}", f"{kind} of levels", levels[:, m, k : k + 1])
+                for m in range(n_levels)
+            ]
+    for k in range(n_linear):
+        column = inverse[:, p - n_linear + k]
+        if fit.spread.linear[k] > 0:
+            rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
+    parts = np.stack([np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows])
+    shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
+    listed = [
+        Contribution(source, share[0], share[1], kind)
+        for (source, kind, _), share in zip(rows, shares, strict=True)
+    ]
     return sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
+
+
+@compiled
+def _first_order(
+    vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
+) -> tuple[Array, Array]:
+    """Slopes of the residuals by the unknowns, and of the states' by their own errors."""
+    unknowns, n = restore(vector), len(data.level)
+    slopes = error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), n)
+    whiten = whitener(slopes, data.std)
+    given = (restore, data, modes, spread, whiten)
+    jacobian = jax.jacfwd(lambda v: all_residuals(v, *given))(vector)
+    return jacobian, jnp.sqrt(data.weight)[:, None, None] * (whiten @ slopes)
 
 
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:

@@ -15,6 +15,7 @@ from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Un
 from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.selection import Candidate
+from snrmjax.identify.uncertainty import Contribution
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
@@ -44,7 +45,9 @@ def write_next(path: Path, advice: Sequence[NextMeasurement]) -> None:
     )
 
 
-def summarise_fit(fit: JointFit, responses: Sequence[FittedResponse]) -> dict:
+def summarise_fit(
+    fit: JointFit, responses: Sequence[FittedResponse], shares: Sequence[Contribution] = ()
+) -> dict:
     """What a joint fit found, by name, in the units of the files."""
     std = np.sqrt(np.diag(fit.covariance))
     vector = np.asarray(fit.vector()[0])
@@ -75,6 +78,7 @@ def summarise_fit(fit: JointFit, responses: Sequence[FittedResponse]) -> dict:
             "damping_std_relative": level["damping"],
         },
         "tried": [candidate._asdict() for candidate in fit.candidates],
+        "contributions": [one._asdict() for one in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
         "notes": list(fit.notes),

@@ -55,6 +55,19 @@ def test_resonance_of_known_curves(exact_fit):
     assert not found.continued
 
 
+def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
+    # ω̃² = a(1 − 0.4 u): X ω̃ has its largest value at u = 1.25, short of 1.5² times the data.
+    vector = np.array(exact_fit.vector()[0])
+    vector[1] = -0.4 * vector[0]
+    falling = moved(exact_fit, vector)
+    x = 0.5 * float(falling.unknowns.squared_frequency.scale)
+    speed = x * np.sqrt(vector[0] * (1 - 0.4 * 0.25))
+    force = speed * float(falling.unknowns.modal_damping(speed)) / CONSTANT
+    (found,) = sj.fitted_response(falling, force)[0].resonances
+    assert found.frequency == pytest.approx(speed / x, rel=1e-9)
+    assert found.velocity == pytest.approx(speed, rel=1e-9)
+
+
 def test_every_point_obeys_the_known_curves(exact_fit):
     curve = sj.fitted_response(exact_fit, FORCE)[0]
     speed = np.abs(curve.velocity)

@@ -14,7 +14,7 @@ from snrmjax.identify.uncertainty import (
     sensitivity,
 )
 
-from .exact_states import modes, noisy
+from .exact_states import CONSTANT, NOISE, OMEGA, modes, noisy, stated
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -82,6 +82,26 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     (velocity,) = (r.damping_share for r in near if r.source == "random error of velocity")
     assert gains / velocity == pytest.approx(9, rel=0.1)
     assert far < 0.5 * gains
+
+
+def test_contributions_near_resonance_of_a_linear_mode_are_known():
+    rng, n, constant = np.random.default_rng(3), 60, 12.0
+    omega = OMEGA + 0.5 * constant * np.tan(np.radians(np.linspace(-4, 4, n)))
+    force = np.full(n, 2.0)
+    velocity = 1j * omega * CONSTANT * force / (OMEGA**2 - omega**2 + 1j * omega * constant)
+    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
+    data = stated(np.arange(n) % 5, omega, force, velocity * np.exp(own))
+    rows = contributions(sj.fit_jointly(data, modes(), backbone="polynomial:0", damping="constant"))
+    shares = {row.source.removeprefix("random error of "): row for row in rows}
+    # 2ζω = A F cos φ/v: shares as the squares of 0.3 and 1 %, and of 4° of phase at most.
+    assert shares["force"].damping_share / shares["velocity"].damping_share == pytest.approx(
+        (NOISE["force"] / NOISE["velocity"]) ** 2, rel=0.01
+    )
+    # Beside them stands what levels seem to scatter: shares are compared with one another.
+    assert shares["phase"].damping_share < 0.01 * shares["velocity"].damping_share
+    # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase.
+    for other in ("force", "velocity"):
+        assert shares[other].frequency_share < 0.01 * shares["phase"].frequency_share
 
 
 def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
