@@ -98,8 +98,12 @@ _STARTS: Mapping[str, _Start] = {
     ],
 }
 
-_NOT_NEGATIVE = ("coulomb_friction", "jenkins_slider", "iwan_microslip", "quadratic_damping")
-_NOT_NEGATIVE += ("gap_stiffness", "one_sided_stop")
+_NOT_NEGATIVE = frozenset(
+    {
+        *("coulomb_friction", "jenkins_slider", "iwan_microslip", "quadratic_damping"),
+        *("gap_stiffness", "one_sided_stop"),
+    }
+)
 
 
 def candidate(kind: str, scales: Scales) -> Candidate:
@@ -131,6 +135,14 @@ def parameter_labels(kind: str) -> tuple[str, ...]:
 
 
 KINDS = tuple(EFFECTS)
+
+SECOND_ORDER = frozenset(
+    {
+        *("quadratic_stiffness", "static_preload", "bilinear_stiffness"),
+        *("internal_resonance_1_2", "internal_resonance_1_3"),
+    }
+)
+"""Kinds that change the fundamental by the square of their strength."""
 
 # What would settle which of two effects it is.
 _HARMONICS = "the second and third harmonics of the velocity (with their noise floor)"

@@ -1,5 +1,6 @@
 """Misfits in units of noise, with everything shared or stated marginalised, and fits to them."""
 
+import copy
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,12 +10,13 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from snrmjax.diagnose.candidates import Candidate, parameter_labels
-from snrmjax.diagnose.predictions import Measured, Predictions
+from snrmjax.diagnose.predictions import PLAIN, Measured, Predictions, whitened_states
 from snrmjax.identify.calibration_states import whitened
 from snrmjax.model.parameters import parameter_names, stated_std
 from snrmjax.model.structure import Structure
 
-_STEPS = 8  # of a fit
+_STEPS = 9  # of a fit
+_SCREENED, _KEPT = 2, 2  # steps of all starts, and how many of them go on
 _SETTLED = 0.02  # of χ²: a smaller change ends a fit
 
 
@@ -92,34 +94,61 @@ class Bench:
     def __init__(self, predictions: Predictions):
         self.predictions = predictions
         self.model = predictions.model
-        group = predictions.group("cubic_stiffness")
-        measured = predictions.measured(group, group.values)
-        self.measured = measured
+        group = predictions.group(PLAIN)
         names = _baseline_names(self.model)
-        directions = np.zeros((1, len(group.names), len(names)))
+        directions = np.zeros((1, len(group.names), len(names) + 2))
         for k, name in enumerate(names):
             directions[0, group.place(name), k] = stated_std(self.model, name)
         j = self.model.modes.mode_of_interest + 1
-        linear = np.zeros((1, len(group.names), 2))
-        linear[0, group.place(f"mode_{j}.natural_frequency"), 0] = 1.0
-        linear[0, group.place(f"mode_{j}.damping_ratio"), 1] = 1.0
-        found = predictions.of(group, group.values[None], np.concatenate([directions, linear], 2))
-        raw = weighing(measured, found.slopes[0][:, :, : len(names)])
+        directions[0, group.place(f"mode_{j}.natural_frequency"), -2] = 1.0
+        directions[0, group.place(f"mode_{j}.damping_ratio"), -1] = 1.0
+        found = predictions.of(group, group.values[None], directions)
+        self._columns, self._slopes = found.columns[0], found.slopes[0]
+        self._by_error = predictions.by_error(group, group.values)
+        self._weigh(self._by_error)
+
+    def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
+        chosen = self.predictions.chosen
+        measured = whitened_states(chosen, by_error)
         std = [float(self.model.level_gain_std), float(self.model.level_phase_std)]
-        levels = measured.chosen.n_levels
-        scale = np.concatenate([np.ones(len(names)), np.repeat(std, levels)])
+        scale = np.repeat(std, chosen.n_levels)
+        raw = weighing(measured, self._slopes[:, :, :-2])
+        scale = np.concatenate([np.ones(raw.shared.shape[1] - len(scale)), scale])
         shared = (raw.shared * scale)[:, scale > 0]
         lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
         self.weighing = raw._replace(shared=shared, lower=lower)
-        self.base = self.weighing.noise_units(found.columns)[0]
-        self.by_linear = np.moveaxis(
-            self.weighing.noise_units(np.moveaxis(found.slopes[0][:, :, len(names) :], 2, 0)), 0, 1
-        )
+        self.base = self.weighing.noise_units(self._columns[None])[0]
+        linear = np.moveaxis(self._slopes[:, :, -2:], 2, 0)
+        self.by_linear = self.weighing.noise_units(linear).T
+
+    def reweighed(self, fit: "Fit") -> "Bench":
+        """The same with the errors passed on as the fitted model passes them."""
+        change = np.zeros_like(self._by_error)
+        for kind in dict.fromkeys(fit.kinds):
+            group = self.predictions.group(kind)
+            values = group.values.copy()
+            for label, value in zip(fit.labels, fit.values, strict=True):
+                if label.startswith(f"{kind}."):
+                    values[group.place(label)] = value
+            change += self.predictions.by_error(group, values) - self._by_error
+        other = copy.copy(self)
+        other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
+        return other
 
     @property
     def n_rows(self) -> int:
         """Known numbers."""
         return len(self.base)
+
+    @property
+    def level_numbers(self) -> Int[np.ndarray, " level"]:
+        """Numbers of the levels in the data."""
+        return np.unique(self.predictions.level_numbers)
+
+    def change(self, candidate: Candidate) -> Float[np.ndarray, " row"]:
+        """What a candidate's first start changes, in units of noise."""
+        rows = self._evaluated(candidate, np.array(candidate.starts[:1]))[0][0]
+        return rows - self.base
 
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """Of misfits in units of noise."""
@@ -149,7 +178,9 @@ class Bench:
         cost = np.array([self._cost(r + offset) for r in rows])
         active = np.isfinite(cost)
         lower, upper = np.array(candidate.lower) / unit, np.array(candidate.upper) / unit
-        for _ in range(_STEPS):
+        for turn in range(_STEPS):
+            if turn == _SCREENED:  # the most promising go on
+                active &= cost <= np.sort(cost)[min(_KEPT, trials) - 1]
             at = np.flatnonzero(active)
             if not at.size:
                 break

@@ -81,10 +81,12 @@ class Predictions:
     """Answers for one model and one set of data."""
 
     def __init__(self, model: Structure, data: SteadyStates):
-        self.model = model
+        # Its name would be a part of the programs.
+        self.model = dataclasses.replace(model, name="")
         self.chosen = calibration_states(model, data, HARMONICS)
         self.held = (self.chosen.sensors, self.chosen.orders, HARMONICS)
         self.states: list[np.ndarray] = [np.asarray(part) for part in self.chosen.states]
+        self.level_numbers = np.asarray(data.level)[self.chosen.rows]
         self._groups: dict[str, Group] = {}
 
     def group(self, kind: str) -> Group:
@@ -106,7 +108,7 @@ class Predictions:
         names = parameter_names(model)
         values = np.array([float(parameter_value(model, name)) for name in names])
         if not grow:  # without strength an effect changes no motion
-            return Group(model, names, values, self.group(_PLAIN).near)
+            return Group(model, names, values, self.group(PLAIN).near)
         near = by_blocks(
             lambda *rows: (_grown(model, CalibrationStates(*rows), self.held),),
             _BLOCK,
@@ -140,25 +142,32 @@ class Predictions:
         every = np.concatenate(slopes, axis=2)[:, :, :wanted]
         return Predicted(columns.reshape(trials, n, width), every.reshape(trials, n, width, wanted))
 
-    def measured(self, group: Group, values: Float[np.ndarray, " parameter"]) -> Measured:
-        """The states' errors as a model with these parameters passes them on."""
+    def by_error(
+        self, group: Group, values: Float[np.ndarray, " parameter"]
+    ) -> Float[np.ndarray, "state column input"]:
+        """Derivatives by the states' errors, as a model with these parameters passes them on."""
         each = np.tile(values, (len(self.chosen.rows), 1))
-        by_error = by_blocks(
+        return by_blocks(
             lambda *block: (_by_error(group.model, group.names, self.held, *block),),
             _BLOCK,
             *self.states,
             each,
             group.near,
         )[0]
-        whiten = np.asarray(
-            state_whitener(self.chosen.states, jnp.asarray(by_error), jnp.zeros(()))
-        )
-        used = np.any(whiten != 0, axis=(1, 2))
-        known = np.asarray(self.chosen.states.known) & used[:, None]
-        return Measured(self.chosen, by_error, whiten, known)
 
 
-_PLAIN = "cubic_stiffness"
+def whitened_states(
+    chosen: Selection, by_error: Float[np.ndarray, "state column input"]
+) -> Measured:
+    """The states with the whitening that follows from their errors."""
+    whiten = np.asarray(state_whitener(chosen.states, jnp.asarray(by_error), jnp.zeros(())))
+    used = np.any(whiten != 0, axis=(1, 2))
+    return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
+
+
+PLAIN = "cubic_stiffness"
+"""A kind that every program of quick effects has."""
+
 _ADDED = tuple(kind for kind, e in EFFECTS.items() if issubclass(e, AbstractAddedMode))
 
 

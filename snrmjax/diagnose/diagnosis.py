@@ -1,0 +1,237 @@
+"""The whole diagnosis: locate, name, add, verify, or say that there is nothing or no answer."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from snrmjax.diagnose.candidates import KINDS, SECOND_ORDER, Scales, candidate, decide_by
+from snrmjax.diagnose.evidence import Bench, Fit, unlikely
+from snrmjax.diagnose.locating import Located, located
+from snrmjax.diagnose.naming import DETECTED, Named, Row, named
+from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.verifying import HeldOut, gap, held_out
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.effects import effect_parameters, make_effect
+from snrmjax.model.structure import Structure
+
+_UNLIKELY = 1e-3
+_WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
+_LEAST_STATES = 6
+
+
+class Gap(NamedTuple):
+    """Root-mean-square misfits in units of the stated noise."""
+
+    before: float
+    after: float
+    interpolated: HeldOut | None
+    extrapolated: HeldOut | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What a model lacks, why one believes it, and what would settle what is open."""
+
+    verdict: str  # "none", "named", "ambiguous", "unknown" or "noise_rejected"
+    effects: tuple[str, ...]
+    candidates: tuple[tuple[str, ...], ...]
+    decide_by: str | None
+    located: tuple[Located, ...]
+    parameters: dict[str, tuple[float, float]]  # value and 1σ
+    gap: Gap
+    detection_limits: dict[str, float]
+    p_value: float  # of the misfit that is left
+    noise_scale: float  # that neighbouring states show, over the stated noise
+    notes: tuple[str, ...]
+    table: tuple[tuple[Row, ...], ...]
+    completed: Structure
+    before: Float[np.ndarray, "state part"]  # force misfit in units of noise, real and imaginary
+    after: Float[np.ndarray, "state part"]
+
+
+def diagnose(model: Structure, data: SteadyStates) -> Diagnosis:
+    """Find the physics that a model lacks to explain measured steady states.
+
+    Works in the force balance: the measured fundamental is held, harmonic balance settles the
+    other harmonics, and the force needed is compared with the measured one. Every effect of the
+    library is fitted with the baseline's parameters free inside their stated errors and the
+    levels' errors inside theirs; Schwarz's criterion decides.
+
+    Returns a `Diagnosis`. Raises `ValueError` for too few states, an unknown force or sensors
+    other than the model's.
+    Validity: steady motions with the period of the force; effects that change the motion
+    moderately, so that two of them add up.
+    """
+    predictions = Predictions(model, data)
+    n_states = len(predictions.chosen.rows)
+    if n_states < _LEAST_STATES:
+        raise ValueError(
+            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, not {n_states}."
+        )
+    bench = Bench(predictions)
+    if not np.isfinite(bench.base).all():
+        raise ValueError(
+            "the model has no motion of the measured amplitude for some states: it is too far "
+            "from the data to be compared."
+        )
+    scales = scales_of(predictions)
+    present = {effect.kind for effect in model.effects}
+    found = named(bench, scales, tuple(kind for kind in KINDS if kind not in present))
+    bench, fit = found.bench, found.fit
+    free = located(bench, found.nothing)
+    noise, noise_std = neighbour_noise(bench, fit)
+    verdict, notes = _verdict(found, noise, noise_std)
+    notes += list(predictions.chosen.notes)
+    n_levels = predictions.chosen.n_levels
+    inner = outer = None
+    if n_levels > 2:
+        order = _by_amplitude(bench)
+        inner = held_out(bench, found.nothing, fit, order[n_levels // 2])
+        outer = held_out(bench, found.nothing, fit, order[-1])
+    elif n_levels < 3:
+        notes.append(
+            f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
+            "the answer."
+        )
+    harmonics = bool(predictions.chosen.orders)
+    unclear = {kind for group in found.classes if len(group) > 1 for kind in group}
+    values = _values(bench, fit)
+    force = bench.weighing.column < 2
+    return Diagnosis(
+        verdict=verdict,
+        effects=fit.kinds if verdict != "none" else (),
+        candidates=found.classes if verdict != "none" else (),
+        decide_by=decide_by(unclear, harmonics=harmonics) if unclear else None,
+        located=free.parts,
+        parameters=values,
+        gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
+        detection_limits=_limits(bench, fit, scales, present),
+        p_value=found.p_value,
+        noise_scale=float(np.sqrt(noise)),
+        notes=tuple(notes),
+        table=found.table,
+        completed=_completed(model, fit, values),
+        before=found.nothing.rows[force].reshape(-1, 2),
+        after=fit.rows[force].reshape(-1, 2),
+    )
+
+
+def scales_of(predictions: Predictions) -> Scales:
+    """What is typical of the measured motions."""
+    modes, j = predictions.model.modes, predictions.model.modes.mode_of_interest
+    states = predictions.chosen.states
+    speed, omega, force = (
+        np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
+    )
+    shape = abs(float(modes.mode_shape[predictions.chosen.sensors[0], j]))
+    amplitude = speed / omega / shape
+    return Scales(
+        amplitude=float(np.median(amplitude)),
+        largest=float(np.max(amplitude)),
+        frequency=float(modes.natural_frequency[j]),
+        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        receptance=float(np.median(speed / omega / force)),
+        smallest_force=float(np.min(force)),
+        damping_ratio=float(modes.damping_ratio[j]),
+    )
+
+
+def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
+    """Variance of the force's misfit as second differences along every level show it, and 1σ.
+
+    What varies smoothly from state to state, explained or not, does not enter.
+    """
+    weighing, chosen = bench.weighing, bench.predictions.chosen
+    level = np.asarray(chosen.states.level)
+    squares: list[np.ndarray] = []
+    for column in range(2):
+        mine = weighing.column == column
+        rows, states = fit.rows[mine], weighing.state[mine]
+        for number in range(chosen.n_levels):
+            some = rows[level[states] == number]
+            if len(some) > 2:
+                squares.append((some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6)
+    if not squares:
+        return 1.0, np.inf
+    every = np.concatenate(squares)
+    # Jumps and kinks are no noise: beyond four times the median's 1σ they are cut.
+    limit = 16 * np.median(every) / 0.4549
+    # Neighbouring differences share states: about half as many are independent.
+    value = float(np.mean(np.minimum(every, limit)))
+    return value, value * float(np.sqrt(2 / (0.51 * len(every))))
+
+
+def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]]:
+    n = found.bench.n_rows - len(found.fit.values)
+    reduced = found.fit.chi_square / n
+    too_good = float(chi2.cdf(found.fit.chi_square, n))
+    if too_good < _UNLIKELY:
+        return "noise_rejected", [
+            f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
+            "smaller effects may be hidden by it."
+        ]
+    loud = noise - 1 > _WRONG_NOISE * noise_std or (
+        found.p_value < _UNLIKELY and noise - 1 > 0.5 * _WRONG_NOISE * noise_std
+    )
+    if loud and unlikely(found.fit.chi_square / noise, n) > _UNLIKELY:
+        return "noise_rejected", [
+            f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
+            "allows: it is understated; state it rightly before an effect is named."
+        ]
+    if found.p_value < _UNLIKELY:
+        return "unknown", ["no effect of the library explains what is left."]
+    if not found.fit.kinds:
+        return "none", []
+    unclear = any(len(group) > 1 for group in found.classes)
+    return ("ambiguous" if unclear else "named"), []
+
+
+def _by_amplitude(bench: Bench) -> list[int]:
+    """Levels from the smallest to the largest velocity."""
+    level = np.asarray(bench.predictions.chosen.states.level)
+    speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
+    peak = [speed[level == k].max() for k in range(bench.predictions.chosen.n_levels)]
+    return [int(k) for k in np.argsort(peak)]
+
+
+def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:
+    if not fit.labels:
+        return {}
+    arms = bench.weighing.decorrelated(fit.slopes.T).T
+    size = np.linalg.norm(arms, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-12, hermitian=True)
+    std = np.sqrt(np.diag(inverse)) / size
+    return {
+        label: (float(value), float(error))
+        for label, value, error in zip(fit.labels, fit.values, std, strict=True)
+    }
+
+
+def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[str, float]:
+    """The size of every effect that would have been seen beside what was found."""
+    limits = {}
+    for kind in KINDS:
+        if kind in present or kind in fit.kinds:
+            continue
+        tried = candidate(kind, scales)
+        change = bench.change(tried)
+        square = float(np.sum(bench.weighing.decorrelated(change) ** 2))
+        if not square > 0:
+            continue
+        need = DETECTED + len(tried.unit) * np.log(bench.n_rows)
+        power = 4 if kind in SECOND_ORDER and not bench.predictions.chosen.orders else 2
+        name = f"{kind}.{effect_parameters(kind)[0]}"
+        limits[name] = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+    return limits
+
+
+def _completed(model: Structure, fit: Fit, values: dict[str, tuple[float, float]]) -> Structure:
+    added = tuple(
+        make_effect(kind, {name: values[f"{kind}.{name}"][0] for name in effect_parameters(kind)})
+        for kind in fit.kinds
+    )
+    return dataclasses.replace(model, effects=(*model.effects, *added))

@@ -1,0 +1,119 @@
+"""Which effects the data ask for, and which others they cannot tell from them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.candidates import KINDS, Candidate, Scales, candidate
+from snrmjax.diagnose.evidence import Bench, Fit, unlikely
+
+DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
+AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
+_PROMISING = 40.0  # of the criterion: within it a candidate is weighed anew
+_DOUBTFUL = 0.05  # probability of a fit below which others than the best are built upon
+_OTHERS = 3  # of them
+
+
+class Row(NamedTuple):
+    """A candidate of one step, as a report shows it."""
+
+    kind: str
+    gain: float  # of the criterion over what was there before
+    chi_square: float
+    parameters: dict[str, float]
+
+
+class Named(NamedTuple):
+    """What the data ask for."""
+
+    bench: Bench  # weighed with the answer
+    fit: Fit
+    nothing: Fit
+    classes: tuple[tuple[str, ...], ...]  # of every effect, itself first
+    table: tuple[tuple[Row, ...], ...]  # of every step
+
+    @property
+    def p_value(self) -> float:
+        """Of the misfit that is left."""
+        freedom = self.bench.n_rows - len(self.fit.values)
+        return unlikely(self.fit.chi_square, freedom)
+
+
+def named(bench: Bench, scales: Scales, kinds: tuple[str, ...] = KINDS) -> Named:
+    """Add effects one after the other while the criterion asks for them, two at most."""
+    every = {kind: candidate(kind, scales) for kind in kinds}
+    before = bench.nothing()
+    bench, singles = _tried(bench, every, before)
+    nothing = bench.nothing()
+    table = [_table(bench, nothing, singles)]
+    best = min(singles, key=lambda fit: fit.criterion(bench.n_rows), default=nothing)
+    if _gain(bench, nothing, best) <= DETECTED:
+        return Named(bench, nothing, nothing, (), tuple(table))
+    firsts = [best]
+    if unlikely(best.chi_square, bench.n_rows - len(best.values)) < _DOUBTFUL:
+        order = sorted(singles, key=lambda fit: fit.criterion(bench.n_rows))
+        firsts = order[: 1 + _OTHERS]
+    pairs: list[Fit] = []
+    for first in firsts:
+        others = {kind: c for kind, c in every.items() if kind not in first.kinds}
+        pairs += [bench.fitted(c, first) for c in others.values()]
+    pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=best)
+    if _gain(bench, best, pair) <= DETECTED:
+        return Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
+    bench = bench.reweighed(pair)
+    nothing, classes, winner = bench.nothing(), [], pair
+    for k, kind in enumerate(pair.kinds):
+        other = bench.fitted(every[pair.kinds[1 - k]])
+        rivals = {name: c for name, c in every.items() if name != pair.kinds[1 - k]}
+        fits = [bench.fitted(c, other) for c in rivals.values()]
+        table.append(_table(bench, other, fits))
+        mine = [f for f in fits if f.kinds[1] == kind]
+        fits.sort(key=lambda fit: fit.criterion(bench.n_rows))
+        classes.append(_class(bench, fits, kind, at=1))
+        if mine and k == 1:
+            winner = mine[0]
+    return Named(bench, winner, nothing, tuple(classes), tuple(table))
+
+
+def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Bench, list[Fit]]:
+    """All candidates, the promising ones weighed with the best one's way of passing on errors."""
+    fits = [bench.fitted(c, before) for c in every.values()]
+    fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
+    if not fits:
+        return bench, []
+    best = min(fits, key=lambda fit: fit.criterion(bench.n_rows))
+    if _gain(bench, before, best) <= DETECTED:
+        return bench, fits
+    least = best.criterion(bench.n_rows)
+    again = bench.reweighed(best)
+    near = {
+        fit.kinds[-1]
+        for fit in fits
+        if fit.criterion(bench.n_rows) < least + max(_PROMISING, 0.5 * best.chi_square)
+    }
+    return again, [again.fitted(every[kind], again.nothing()) for kind in near]
+
+
+def _gain(bench: Bench, before: Fit, after: Fit) -> float:
+    return before.criterion(bench.n_rows) - after.criterion(bench.n_rows)
+
+
+def _class(bench: Bench, fits: list[Fit], kind: str, at: int = 0) -> tuple[str, ...]:
+    """The kinds that cannot be told from one, itself first."""
+    mine = min(f.criterion(bench.n_rows) for f in fits if f.kinds[at] == kind)
+    order = sorted(fits, key=lambda fit: fit.criterion(bench.n_rows))
+    near = [f.kinds[at] for f in order if f.criterion(bench.n_rows) < mine + AS_GOOD]
+    return (kind, *(name for name in near if name != kind))
+
+
+def _table(bench: Bench, before: Fit, fits: list[Fit]) -> tuple[Row, ...]:
+    rows = [
+        Row(
+            fit.kinds[-1],
+            _gain(bench, before, fit),
+            fit.chi_square,
+            dict(zip(fit.labels, fit.values.tolist(), strict=True)),
+        )
+        for fit in fits
+    ]
+    return tuple(sorted(rows, key=lambda row: -row.gain))

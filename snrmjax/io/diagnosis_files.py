@@ -1,0 +1,68 @@
+"""`diagnosis.json`: what a diagnosis says, for other programs."""
+
+import math
+from pathlib import Path
+
+from snrmjax.diagnose.diagnosis import Diagnosis
+from snrmjax.diagnose.locating import Located
+from snrmjax.io.results import write_summary
+
+
+def write_diagnosis(path: Path, diagnosis: Diagnosis) -> None:
+    """Write `diagnosis.json`."""
+    write_summary(path, summarise_diagnosis(diagnosis))
+
+
+def summarise_diagnosis(diagnosis: Diagnosis) -> dict:
+    """A diagnosis as plain numbers and texts, in SI units."""
+    gap = diagnosis.gap
+    inner, outer = gap.interpolated, gap.extrapolated
+    return {
+        "verdict": diagnosis.verdict,
+        "effects": list(diagnosis.effects),
+        "candidates": [list(group) for group in diagnosis.candidates],
+        "decide_by": diagnosis.decide_by,
+        "located": [_part(part) for part in diagnosis.located],
+        "parameters": {
+            name: {"value": value, "std": std}
+            for name, (value, std) in diagnosis.parameters.items()
+        },
+        "gap": {
+            "before": gap.before,
+            "after": gap.after,
+            "held_out_before": inner.before if inner else None,
+            "held_out_after": inner.after if inner else None,
+            "held_out_level": inner.level if inner else None,
+            "noise_floor": 1.0,
+            "top_level": outer.level if outer else None,
+            "top_level_before": outer.before if outer else None,
+            "top_level_after": outer.after if outer else None,
+        },
+        "detection_limits": diagnosis.detection_limits,
+        "p_value": diagnosis.p_value,
+        "noise_scale": diagnosis.noise_scale,
+        "notes": list(diagnosis.notes),
+        "tried": [
+            [
+                {
+                    "effect": row.kind,
+                    "gain": row.gain if math.isfinite(row.gain) else None,
+                    "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
+                    "parameters": row.parameters,
+                }
+                for row in step
+            ]
+            for step in diagnosis.table
+        ],
+    }
+
+
+def _part(part: Located) -> dict:
+    entry = {
+        "part": part.part,
+        "velocity_range_m_s": list(part.velocity_range),
+        "p_value": part.p_value,
+    }
+    if part.exponent is not None:
+        entry |= {"exponent": part.exponent, "exponent_std": part.exponent_std}
+    return entry
