@@ -1,4 +1,5 @@
 # The public names and where they live; `__init__.py` imports each on first use.
+from .diagnose.diagnosis import Diagnosis, diagnose_model
 from .identify.backbone import Backbone, BackboneFit, fit_backbone
 from .identify.backbone_points import BackbonePoints, identify_points
 from .identify.calibration import CalibratedModel, calibrate_model
@@ -86,6 +87,7 @@ __all__ = [
     "ControlledCurve",
     "CurveStatus",
     "DampedModeBranch",
+    "Diagnosis",
     "FittedPoint",
     "FittedResponse",
     "Identification",
@@ -121,6 +123,7 @@ __all__ = [
     "contributions",
     "curved_beam",
     "damped_normal_mode",
+    "diagnose_model",
     "equilibria",
     "fit_backbone",
     "fit_jointly",

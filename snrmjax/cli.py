@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify."""
+"""The commands: demo, simulate, nnm, identify, diagnose."""
 
 import os
 import shutil
@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 
 import snrmjax as sj
+from snrmjax.diagnosis_report import write_diagnosis
 from snrmjax.io import joint_results, results
 from snrmjax.io.models import read_model, write_model
 from snrmjax.io.tables import read_steady_states, write_steady_states
@@ -28,6 +29,7 @@ from snrmjax.presentation import (
     Presentation,
     corrected,
     equilibria_notes,
+    fit_as_asked,
     identification_figures,
     present_identification,
     presentation_report,
@@ -253,7 +255,7 @@ def identify(
             _warn(note)
         measured, joint, advice = reading.steady_states, None, []
         if fit is not None or free or advise:
-            joint = _joint_fit(measured, structure, fit or "auto", free or [], robust=robust)
+            joint = fit_as_asked(measured, structure, fit or "auto", free or [], robust=robust)
             measured = corrected(measured, joint)
             advice = sj.next_measurements(joint, advise) if advise else []
         told = present_identification(
@@ -296,22 +298,53 @@ def identify(
             joint_results.write_fitted_backbone(folder / "backbone.csv", joint)
 
 
-def _joint_fit(
-    data: sj.SteadyStates, structure: sj.Structure, fit: str, free: list[str], *, robust: bool
-) -> sj.JointFit:
-    names = fit.split(",")
-    if len(names) > 2:
-        raise ValueError(f"--fit takes one or two families, but {fit!r} names {len(names)}.")
-    return sj.fit_jointly(
-        data,
-        structure.modes,
-        backbone=names[0],
-        damping=names[1] if len(names) == 2 else "auto",
-        free=free,
-        level_gain_std=float(structure.level_gain_std),
-        level_phase_std=float(structure.level_phase_std),
-        robust=robust,
-    )
+@app.command()
+def diagnose(
+    data: Annotated[
+        list[Path],
+        typer.Argument(help="Measured steady states (CSV), one or more.", metavar="DATA"),
+    ],
+    model: Annotated[Path, typer.Option(help="Model of the structure as it is believed (TOML).")],
+    out: Out,
+    responses: Annotated[
+        bool | None,
+        typer.Option(
+            help="Also simulate the responses before and after; if not said, for a single file."
+        ),
+    ] = None,
+) -> None:
+    """Find the physics that a model lacks: where it disagrees with the data, what that is.
+
+    Writes diagnosis.json, figures, report.html and the completed model.toml; of several files each
+    into a folder of its own, with the model of the same name beside the file if there is one.
+    """
+    several = len(data) > 1
+    if len({path.stem for path in data}) < len(data):
+        raise ValueError("two of the data files have the same name: they would share a folder.")
+    refused = []
+    for path in data:
+        beside = path.with_suffix(".toml")
+        own = beside if several and beside.exists() else model
+        try:
+            with _staged(out / path.stem if several else out) as folder:
+                reading = read_steady_states(path, sensors=read_model(own).modes.sensors)
+                for note in reading.notes:
+                    _warn(note)
+                simulate = not several if responses is None else responses
+                found = write_diagnosis(
+                    folder, path.stem, read_model(own), reading.steady_states, simulate=simulate
+                )
+        except ValueError as error:
+            if not several:
+                raise
+            _warn(f"{path.name}: {error}")
+            refused.append(path.name)
+            continue
+        _say(f"{path.name}: {found.verdict.replace('_', ' ')} ({', '.join(found.effects)})")
+        if found.decide_by:
+            _say(f"  what would decide: {found.decide_by}")
+    if refused:
+        raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from snrmjax import plot
 from snrmjax.identify.backbone import BackboneFit
 from snrmjax.identify.fitted_response import as_backbone
 from snrmjax.identify.identification import Identification, identify_backbone
-from snrmjax.identify.joint_fit import JointFit
+from snrmjax.identify.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.prediction import (
     CONTINUED,
@@ -229,4 +229,26 @@ def presentation_report(
         truth=told.truth,
         measured=told.data,
         further=further,
+    )
+
+
+def fit_as_asked(
+    data: SteadyStates, structure: Structure, fit: str, free: Sequence[str], *, robust: bool
+) -> JointFit:
+    """The joint fit that `--fit BACKBONE[,DAMPING]` asks for.
+
+    Raises `ValueError` for more than two families, and what `fit_jointly` raises.
+    """
+    names = fit.split(",")
+    if len(names) > 2:
+        raise ValueError(f"--fit takes one or two families, but {fit!r} names {len(names)}.")
+    return fit_jointly(
+        data,
+        structure.modes,
+        backbone=names[0],
+        damping=names[1] if len(names) == 2 else "auto",
+        free=free,
+        level_gain_std=float(structure.level_gain_std),
+        level_phase_std=float(structure.level_phase_std),
+        robust=robust,
     )

@@ -4,7 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.stats import chi2
 
 from snrmjax.diagnose.candidates import KINDS, SECOND_ORDER, Scales, candidate, decide_by
@@ -48,11 +48,13 @@ class Diagnosis:
     notes: tuple[str, ...]
     table: tuple[tuple[Row, ...], ...]
     completed: Structure
+    rows: Int[np.ndarray, " state"]  # of the data, that were used
+    sensor: int  # whose velocity was held
     before: Float[np.ndarray, "state part"]  # force misfit in units of noise, real and imaginary
     after: Float[np.ndarray, "state part"]
 
 
-def diagnose(model: Structure, data: SteadyStates) -> Diagnosis:
+def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
     """Find the physics that a model lacks to explain measured steady states.
 
     Works in the force balance: the measured fundamental is held, harmonic balance settles the
@@ -114,6 +116,8 @@ def diagnose(model: Structure, data: SteadyStates) -> Diagnosis:
         notes=tuple(notes),
         table=found.table,
         completed=_completed(model, fit, values),
+        rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
+        sensor=predictions.chosen.sensors[0],
         before=found.nothing.rows[force].reshape(-1, 2),
         after=fit.rows[force].reshape(-1, 2),
     )

@@ -1,16 +1,9 @@
 """`diagnosis.json`: what a diagnosis says, for other programs."""
 
 import math
-from pathlib import Path
 
 from snrmjax.diagnose.diagnosis import Diagnosis
 from snrmjax.diagnose.locating import Located
-from snrmjax.io.results import write_summary
-
-
-def write_diagnosis(path: Path, diagnosis: Diagnosis) -> None:
-    """Write `diagnosis.json`."""
-    write_summary(path, summarise_diagnosis(diagnosis))
 
 
 def summarise_diagnosis(diagnosis: Diagnosis) -> dict:

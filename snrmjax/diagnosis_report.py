@@ -1,0 +1,236 @@
+"""Figures and report of a diagnosis."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
+from snrmjax.diagnose.locating import Located
+from snrmjax.diagnose.naming import AS_GOOD, DETECTED
+from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, unit_for
+from snrmjax.io.diagnosis_files import summarise_diagnosis
+from snrmjax.io.models import write_model
+from snrmjax.io.results import write_summary
+from snrmjax.io.units import HERTZ
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.structure import Structure
+from snrmjax.plot import save_figure
+from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
+from snrmjax.simulate.forced_response import forced_response
+from snrmjax.simulate.response_curve import ResponseCurve
+
+_SHOWN = 10  # candidates
+_LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
+
+VERDICTS = {
+    "none": "Nothing is missing that these data could show.",
+    "named": "One answer fits, and no other does nearly as well.",
+    "ambiguous": "Several effects fit about equally well: the data cannot tell them apart.",
+    "unknown": "Something is missing that no effect of the library explains.",
+    "noise_rejected": "The stated noise does not fit the data: no effect is named before it does.",
+}
+
+
+def write_diagnosis(
+    folder: Path, title: str, model: Structure, data: SteadyStates, *, simulate: bool
+) -> Diagnosis:
+    """Diagnose, and write everything that the command writes into a folder."""
+    found = diagnose_model(model, data)
+    write_summary(folder / "diagnosis.json", summarise_diagnosis(found))
+    write_model(folder / "model.toml", found.completed)
+    figures = diagnosis_figures(found, model, data, simulate=simulate)
+    for name, figure in figures.items():
+        save_figure(figure, folder / f"{name}.png")
+    write_report(folder / "report.html", diagnosis_report(found, title.replace("_", " "), figures))
+    return found
+
+
+def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
+    """Misfit of the force in units of noise over frequency and velocity, before and after."""
+    rows = diagnosis.rows
+    frequency = np.asarray(data.frequency)[rows] / HERTZ
+    speed = np.abs(np.asarray(data.velocity))[rows, diagnosis.sensor]
+    unit = unit_for(speed, "m/s")
+    figure, grid = panels(9.5, 4.2, 1, 2)
+    out = diagnosis.gap.interpolated
+    held = np.asarray(data.level)[rows] == out.level if out else np.zeros(len(rows), dtype=bool)
+    for axes, title, misfit in zip(
+        grid[0], ("Before", "After"), (diagnosis.before, diagnosis.after), strict=True
+    ):
+        size = np.sqrt(np.mean(misfit**2, axis=1))
+        marks = axes.scatter(
+            frequency, speed / unit.size, c=size, cmap="viridis", vmin=0.0, vmax=_LARGEST, s=34
+        )
+        ringed = axes.scatter(
+            frequency[held],
+            speed[held] / unit.size,
+            s=90,
+            facecolors="none",
+            edgecolors=IDENTIFIED,
+            linewidths=0.9,
+        )
+        name_axes(axes, title, "frequency (Hz)", f"velocity ({unit.name})")
+        if out:
+            axes.legend([ringed], [f"level {out.level}, held out"], fontsize=9, loc="best")
+    figure.colorbar(marks, ax=grid[0].tolist(), label="misfit of the force (units of noise)")
+    return figure
+
+
+def candidates_figure(diagnosis: Diagnosis) -> Figure:
+    """What every effect would gain in the first step; those that cannot be told apart in colour."""
+    rows = [row for row in diagnosis.table[0][:_SHOWN] if np.isfinite(row.gain)][::-1]
+    figure, grid = panels(7.0, 0.8 + 0.32 * max(len(rows), 3), 1, 1)
+    axes = grid[0, 0]
+    best = max((row.gain for row in rows), default=0.0)
+    near = [row.gain > max(best - AS_GOOD, DETECTED) for row in rows]
+    colours = [IDENTIFIED if one else MEASURED for one in near]
+    axes.barh([row.kind for row in rows], [row.gain for row in rows], color=colours)
+    axes.axvline(DETECTED, color="black", linestyle="--", linewidth=1.0)
+    name_axes(axes, "What each effect explains by itself", "gain of the criterion", "")
+    return figure
+
+
+def simulated_figure(
+    before: Sequence[ResponseCurve],
+    after: Sequence[ResponseCurve],
+    data: SteadyStates,
+    sensor: int,
+) -> Figure:
+    """Responses of the model before and after, over the measured states."""
+    speed = np.abs(np.asarray(data.velocity))[:, sensor]
+    unit = unit_for(speed, "m/s")
+    figure, grid = panels(8.0, 4.6, 1, 1)
+    axes = grid[0, 0]
+    for label, curves, colour in (
+        ("model as given", before, "0.55"),
+        ("completed model", after, IDENTIFIED),
+    ):
+        for k, curve in enumerate(curves):
+            size = np.abs(np.asarray(curve.velocity)[:, 1, sensor]) / unit.size
+            axes.plot(
+                np.asarray(curve.frequency) / HERTZ,
+                size,
+                color=colour,
+                linewidth=1.3,
+                label=label if k == 0 else None,
+            )
+    axes.plot(
+        np.asarray(data.frequency) / HERTZ,
+        speed / unit.size,
+        linestyle="none",
+        marker="o",
+        markersize=4.0,
+        color=SERIES[1],
+        label="measured",
+    )
+    axes.legend(fontsize=9)
+    name_axes(axes, "Responses", "frequency (Hz)", f"velocity ({unit.name})")
+    return figure
+
+
+def diagnosis_figures(
+    diagnosis: Diagnosis, model: Structure, data: SteadyStates, *, simulate: bool
+) -> dict[str, Figure]:
+    """All figures by name; with `simulate` the responses before and after under every level."""
+    figures = {
+        "residuals": residual_figure(diagnosis, data),
+        "candidates": candidates_figure(diagnosis),
+    }
+    if simulate and diagnosis.effects:
+        level, force = np.asarray(data.level), np.asarray(data.force)
+        forces = [float(np.mean(force[level == k])) for k in np.unique(level)]
+        frequency = np.asarray(data.frequency)
+        reach = 0.3 * (frequency.max() - frequency.min())
+        ends = (float(frequency.min() - reach), float(frequency.max() + reach))
+        before, after = (
+            forced_response(one, forces, *ends, harmonic_order=5, stability=False)
+            for one in (model, diagnosis.completed)
+        )
+        figures["responses"] = simulated_figure(before, after, data, diagnosis.sensor)
+    return figures
+
+
+def diagnosis_report(diagnosis: Diagnosis, title: str, figures: dict[str, Figure]) -> Report:
+    """The report of a diagnosis."""
+    gap = diagnosis.gap
+    answers = [
+        (effect, " or ".join(group))
+        for effect, group in zip(diagnosis.effects, diagnosis.candidates, strict=True)
+    ]
+    summary = [
+        ("verdict", diagnosis.verdict.replace("_", " ")),
+        ("effects", ", ".join(diagnosis.effects) or "none"),
+        *((f"what {effect} may be", group) for effect, group in answers),
+        ("misfit before and after, in units of noise", f"{gap.before:.3g} → {gap.after:.3g}"),
+    ]
+    for name, out in (("interpolated", gap.interpolated), ("extrapolated", gap.extrapolated)):
+        if out:
+            summary.append(
+                (f"level {out.level}, held out ({name})", f"{out.before:.3g} → {out.after:.3g}")
+            )
+    if diagnosis.decide_by:
+        summary.append(("what would decide", diagnosis.decide_by))
+    captions = {
+        "residuals": "Misfit of the force of every state. Where the model is right it is 1.",
+        "candidates": "Gain of Schwarz's criterion. Right of the dashed line an effect is seen; "
+        "orange ones cannot be told from the best.",
+        "responses": "Simulated responses under each level's mean force.",
+    }
+    sections = [
+        Section(
+            "Where model and data disagree",
+            tables=[
+                ReportTable(("part", "velocities", "p", "exponent"), _parts(diagnosis.located))
+            ],
+            figures=[ReportFigure(figures["residuals"], captions["residuals"])],
+        ),
+        Section(
+            "What explains it",
+            tables=[
+                ReportTable(
+                    ("parameter", "value", "1σ"),
+                    [(n, f"{v:.5g}", f"{s:.2g}") for n, (v, s) in diagnosis.parameters.items()],
+                ),
+                *(
+                    ReportTable(
+                        ("effect", "gain", "parameters"),
+                        [
+                            (
+                                row.kind,
+                                f"{row.gain:.1f}",
+                                ", ".join(f"{v:.4g}" for v in row.parameters.values()),
+                            )
+                            for row in step[:_SHOWN]
+                        ],
+                        f"Step {number + 1}.",
+                    )
+                    for number, step in enumerate(diagnosis.table)
+                ),
+            ],
+            figures=[ReportFigure(figures["candidates"], captions["candidates"])],
+        ),
+    ]
+    if "responses" in figures:
+        shown = [ReportFigure(figures["responses"], captions["responses"])]
+        sections.append(Section("Simulated responses", figures=shown))
+    limits = sorted(diagnosis.detection_limits.items())
+    sections.append(
+        Section(
+            "What would have been seen",
+            tables=[ReportTable(("parameter", "least size"), [(n, f"{v:.3g}") for n, v in limits])],
+        )
+    )
+    notes = (VERDICTS[diagnosis.verdict], *diagnosis.notes)
+    return Report(title=title, summary=summary, notes=notes, sections=sections)
+
+
+def _parts(parts: Sequence[Located]) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for part in parts:
+        low, high = part.velocity_range
+        exponent = "" if part.exponent is None else f"{part.exponent:.2g} ± {part.exponent_std:.1g}"
+        name = part.part.replace("_", " ")
+        rows.append((name, f"{low:.3g} to {high:.3g} m/s", f"{part.p_value:.1e}", exponent))
+    return rows
