@@ -146,14 +146,16 @@ def scales_of(predictions: Predictions) -> Scales:
 def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
     """Variance of the force's misfit as second differences along every level show it, and 1σ.
 
-    What varies smoothly from state to state, explained or not, does not enter.
+    What varies smoothly from state to state, explained or not, does not enter; what baseline and
+    levels may have in common is taken out first.
     """
     weighing, chosen = bench.weighing, bench.predictions.chosen
+    left = weighing.without_shared(fit.rows)
     level = np.asarray(chosen.states.level)
     squares: list[np.ndarray] = []
     for column in range(2):
         mine = weighing.column == column
-        rows, states = fit.rows[mine], weighing.state[mine]
+        rows, states = left[mine], weighing.state[mine]
         for number in range(chosen.n_levels):
             some = rows[level[states] == number]
             if len(some) > 2:

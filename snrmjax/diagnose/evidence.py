@@ -50,6 +50,11 @@ class Weighing(NamedTuple):
         found = solve_triangular(self.lower, flat.T, lower=True).T.reshape(rows.shape)
         return np.where(good, found, np.nan)
 
+    def without_shared(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        """Rows less the likeliest of what states have in common."""
+        half = solve_triangular(self.lower, rows, lower=True)
+        return np.asarray(solve_triangular(self.lower, half, lower=True, trans="T"))
+
     def of_rows(self, keep: Bool[np.ndarray, " row"]) -> Float[np.ndarray, "kept kept"]:
         """Cholesky's factor for some of the rows by themselves."""
         shared = self.shared[keep]
