@@ -1,0 +1,58 @@
+"""Blind data sets for `snrmjax diagnose`: truth by integration in time, errors of a test.
+
+Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
+     [--only N] [--seed 1]
+
+Writes DIR/sets/NAME.csv and NAME.toml (the baseline, which lacks the effect) and, apart from
+them, DIR/keys/NAME.json (the truth). Nothing here shares code with the program that is judged.
+One JSON line at the end: sets, sweeps, seconds.
+"""
+
+import argparse
+import collections
+import json
+import time
+from pathlib import Path
+
+from plans import HALVES, Case, draw_cases
+from records import write_set
+from truth import Truth, calibrated
+
+
+def generate(half: str, seed: int, only: int | None = None) -> tuple[list[Case], list[Truth]]:
+    """Draw and simulate the sets of one half, or the first `only` of them by name."""
+    cases = draw_cases(half, seed)[:only]
+    truths = calibrated(cases)
+    return cases, truths
+
+
+def main() -> None:
+    """Write one half."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--half", choices=HALVES, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", type=int)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    begin = time.perf_counter()
+    sets, keys = options.out / "sets", options.out / "keys"
+    sets.mkdir(parents=True, exist_ok=True)
+    keys.mkdir(parents=True, exist_ok=True)
+    cases, truths = generate(options.half, options.seed, options.only)
+    for case, truth in zip(cases, truths, strict=True):
+        write_set(case, truth, sets, keys)
+    line = {
+        "half": options.half,
+        "sets": len(cases),
+        "groups": collections.Counter(case.plan.group for case in cases),
+        "sweeps": sum(2 * len(case.sequence) for case in cases),
+        "rows": sum(len(truth.level) for truth in truths),
+        "jumps": sum(truth.jumps for truth in truths),
+        "frequencies_left_out": sum(truth.left_out for truth in truths),
+        "seconds": round(time.perf_counter() - begin, 1),
+    }
+    print(json.dumps(line))
+
+
+if __name__ == "__main__":
+    main()
