@@ -36,7 +36,8 @@ from .measure.indicators import appropriation_of, mode_indicator, nnm_appropriat
 from .measure.steady_states import SteadyStates, join_steady_states, steady_states
 from .model.averaging import averaged_effect, averaged_force, averaged_response
 from .model.beams import curved_beam, flat_beam
-from .model.effects import make_effect
+from .model.effect_base import AbstractHysteresis, AbstractMemoryless
+from .model.effects import make_effect, register_effect
 from .model.modes import LinearModes, linear_modes, linear_response
 from .model.potential import (
     PolynomialPotential,
@@ -80,6 +81,8 @@ from .simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonan
 
 __all__ = [
     "FAMILIES",
+    "AbstractHysteresis",
+    "AbstractMemoryless",
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
@@ -157,6 +160,7 @@ __all__ = [
     "predict_response",
     "profile",
     "reference_sensor",
+    "register_effect",
     "resonance_by_fixed_point",
     "resonances",
     "response_at_velocities",

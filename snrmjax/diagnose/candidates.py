@@ -3,9 +3,12 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.model.effects import EFFECTS, effect_parameters
+from snrmjax.model.averaging import averaged_effect
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 _CHANGE = 0.05  # of the dynamic stiffness near resonance, that a start makes
 
@@ -108,7 +111,8 @@ _NOT_NEGATIVE = frozenset(
 
 def candidate(kind: str, scales: Scales) -> Candidate:
     """Starts, units and bounds of a kind of effect."""
-    starts = tuple(tuple(float(v) for v in start) for start in _STARTS[kind](scales))
+    own = _STARTS[kind](scales) if kind in _STARTS else [_of_ones_own(kind, scales)]
+    starts = tuple(tuple(float(v) for v in start) for start in own)
     n = len(effect_parameters(kind))
     lower, upper = [-_INF] * n, [_INF] * n
     if kind in _NOT_NEGATIVE:
@@ -129,12 +133,25 @@ def candidate(kind: str, scales: Scales) -> Candidate:
     return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
 
 
+def _of_ones_own(kind: str, scales: Scales) -> tuple[float, ...]:
+    """A start for an effect that a user wrote: the first parameter makes the usual change."""
+    typical = getattr(EFFECTS[kind], "typical", {})
+    values = {name: float(typical.get(name, 1.0)) for name in effect_parameters(kind)}
+    first = effect_parameters(kind)[0]
+    effect = make_effect(kind, values)
+    if isinstance(effect, AbstractForce):
+        at = (jnp.asarray(scales.amplitude), jnp.asarray(scales.frequency))
+        change = averaged_effect(effect, *at)
+        size = float(jnp.hypot(change.stiffness, scales.frequency * change.damping))
+        if size > 0:
+            values[first] *= scales.change / size
+    return tuple(values.values())
+
+
 def parameter_labels(kind: str) -> tuple[str, ...]:
     """Names of a candidate's parameters as a diagnosis gives them."""
     return tuple(f"{kind}.{name}" for name in effect_parameters(kind))
 
-
-KINDS = tuple(EFFECTS)
 
 SECOND_ORDER = frozenset(
     {

@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import chi2
 
-from snrmjax.diagnose.candidates import KINDS, SECOND_ORDER, Scales, candidate, decide_by
+from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out
 from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.effects import effect_parameters, make_effect
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.structure import Structure
 
 _UNLIKELY = 1e-3
@@ -81,7 +81,7 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
         )
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
-    found = named(bench, scales, tuple(kind for kind in KINDS if kind not in present))
+    found = named(bench, scales, tuple(kind for kind in EFFECTS if kind not in present))
     bench, fit = found.bench, found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
@@ -220,7 +220,7 @@ def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:
 def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[str, float]:
     """The size of every effect that would have been seen beside what was found."""
     limits = {}
-    for kind in KINDS:
+    for kind in EFFECTS:
         if kind in present or kind in fit.kinds:
             continue
         tried = candidate(kind, scales)

@@ -10,7 +10,13 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from snrmjax.diagnose.candidates import Candidate, parameter_labels
-from snrmjax.diagnose.predictions import PLAIN, Measured, Predictions, whitened_states
+from snrmjax.diagnose.predictions import (
+    PLAIN,
+    Measured,
+    Predicted,
+    Predictions,
+    whitened_states,
+)
 from snrmjax.identify.calibration_states import whitened
 from snrmjax.model.parameters import parameter_names, stated_std
 from snrmjax.model.structure import Structure
@@ -110,6 +116,7 @@ class Bench:
         found = predictions.of(group, group.values[None], directions)
         self._columns, self._slopes = found.columns[0], found.slopes[0]
         self._by_error = predictions.by_error(group, group.values)
+        self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
         self._weigh(self._by_error)
 
     def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
@@ -150,10 +157,30 @@ class Bench:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
 
+    def foretold_gain(self, candidate: Candidate, beside: Fit) -> float:
+        """How much χ² would fall if one of a candidate's starts were scaled as it fits best."""
+        changes = self.weighing.noise_units(self._started(candidate))
+        if beside.slopes.shape[1]:
+            basis = np.linalg.qr(self.weighing.decorrelated(beside.slopes.T).T)[0]
+        else:
+            basis = np.zeros((self.n_rows, 0))
+        left = self.weighing.decorrelated(beside.rows)
+        arms = self.weighing.decorrelated(changes)
+        arms = arms[np.isfinite(arms).all(axis=1)]
+        arms = arms - (arms @ basis) @ basis.T
+        size = np.sum(arms**2, axis=1)
+        along = (arms @ left) ** 2 / np.where(size > 0, size, np.inf)
+        return float(np.max(along, initial=0.0))
+
+    def _started(self, candidate: Candidate) -> Float[np.ndarray, "trial state column"]:
+        if candidate.kind not in self._changes:
+            found = self._predicted(candidate, np.array(candidate.starts))
+            self._changes[candidate.kind] = found.columns - self._columns
+        return self._changes[candidate.kind]
+
     def change(self, candidate: Candidate) -> Float[np.ndarray, " row"]:
         """What a candidate's first start changes, in units of noise."""
-        rows = self._evaluated(candidate, np.array(candidate.starts[:1]))[0][0]
-        return rows - self.base
+        return self.weighing.noise_units(self._started(candidate))[0]
 
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """Of misfits in units of noise."""
@@ -225,6 +252,14 @@ class Bench:
     def _evaluated(
         self, candidate: Candidate, values: Float[np.ndarray, "trial parameter"]
     ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
+        found = self._predicted(candidate, values)
+        rows = self.weighing.noise_units(found.columns)
+        slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
+        return rows, np.moveaxis(slopes, 0, 2)
+
+    def _predicted(
+        self, candidate: Candidate, values: Float[np.ndarray, "trial parameter"]
+    ) -> Predicted:
         group = self.predictions.group(candidate.kind)
         trials, n = values.shape
         every = np.tile(group.values, (trials, 1))
@@ -232,10 +267,7 @@ class Bench:
         for k, label in enumerate(parameter_labels(candidate.kind)):
             every[:, group.place(label)] = values[:, k]
             directions[:, group.place(label), k] = 1.0
-        found = self.predictions.of(group, every, directions)
-        rows = self.weighing.noise_units(found.columns)
-        slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
-        return rows, np.moveaxis(slopes, 0, 2)
+        return self.predictions.of(group, every, directions)
 
 
 def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.candidates import KINDS, Candidate, Scales, candidate
+from snrmjax.diagnose.candidates import Candidate, Scales, candidate
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 
 DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
@@ -12,6 +12,7 @@ AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
 _PROMISING = 40.0  # of the criterion: within it a candidate is weighed anew
 _DOUBTFUL = 0.05  # probability of a fit below which others than the best are built upon
 _OTHERS = 3  # of them
+_TRIED, _WORTH = 9, 4.0  # second effects that are fitted, and what one of their starts must explain
 
 
 class Row(NamedTuple):
@@ -39,7 +40,7 @@ class Named(NamedTuple):
         return unlikely(self.fit.chi_square, freedom)
 
 
-def named(bench: Bench, scales: Scales, kinds: tuple[str, ...] = KINDS) -> Named:
+def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     """Add effects one after the other while the criterion asks for them, two at most."""
     every = {kind: candidate(kind, scales) for kind in kinds}
     before = bench.nothing()
@@ -55,8 +56,7 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...] = KINDS) -> Named
         firsts = order[: 1 + _OTHERS]
     pairs: list[Fit] = []
     for first in firsts:
-        others = {kind: c for kind, c in every.items() if kind not in first.kinds}
-        pairs += [bench.fitted(c, first) for c in others.values()]
+        pairs += [bench.fitted(c, first) for c in _promising(bench, every, first)]
     pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=best)
     if _gain(bench, best, pair) <= DETECTED:
         return Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
@@ -64,8 +64,10 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...] = KINDS) -> Named
     nothing, classes, winner = bench.nothing(), [], pair
     for k, kind in enumerate(pair.kinds):
         other = bench.fitted(every[pair.kinds[1 - k]])
-        rivals = {name: c for name, c in every.items() if name != pair.kinds[1 - k]}
-        fits = [bench.fitted(c, other) for c in rivals.values()]
+        rivals = _promising(bench, every, other)
+        if kind not in {c.kind for c in rivals}:
+            rivals.append(every[kind])
+        fits = [bench.fitted(c, other) for c in rivals]
         table.append(_table(bench, other, fits))
         mine = [f for f in fits if f.kinds[1] == kind]
         fits.sort(key=lambda fit: fit.criterion(bench.n_rows))
@@ -73,6 +75,14 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...] = KINDS) -> Named
         if mine and k == 1:
             winner = mine[0]
     return Named(bench, winner, nothing, tuple(classes), tuple(table))
+
+
+def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[Candidate]:
+    """The candidates of which one start, scaled, would explain most of what is left."""
+    others = [c for kind, c in every.items() if kind not in before.kinds]
+    gains = [bench.foretold_gain(c, before) for c in others]
+    order = np.argsort(gains)[::-1][:_TRIED]
+    return [others[k] for k in order if gains[k] > _WORTH]
 
 
 def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Bench, list[Fit]]:

@@ -191,6 +191,20 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
 """The effects by the kind that files give them."""
 
 
+def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
+    """Make an effect of your own known to files, simulations, calibrations and diagnoses.
+
+    Use as a decorator of a class with a `kind`, parameters as fields and a force. A diagnosis
+    begins where the first parameter changes the motion plainly, with the others at what a class
+    attribute `typical` gives (a mapping; 1 where it is silent).
+    Raises `ValueError` for a kind that exists already.
+    """
+    if effect.kind in EFFECTS:
+        raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
+    EFFECTS[effect.kind] = effect
+    return effect
+
+
 def effect_parameters(kind: str) -> tuple[str, ...]:
     """Names of the parameters of one kind of effect, in the order of its constructor."""
     return tuple(

@@ -1,0 +1,156 @@
+"""Diagnoses of sets that time integration made, and of states that obey a changed balance."""
+
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+import snrmjax as sj
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.model.effects import EFFECTS
+
+HERE = Path(__file__).parent
+KEYS = json.loads((HERE / "keys.json").read_text())
+SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 300.0, 0.01
+NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003}
+
+
+def blind(name):
+    """A set whose truth stands in another file."""
+    model = read_model(HERE / "blind" / f"{name}.toml")
+    data = read_steady_states(HERE / "blind" / f"{name}.csv", sensors=model.modes.sensors)
+    return sj.diagnose_model(model, data.steady_states), KEYS[name]
+
+
+@pytest.mark.parametrize("name", ["blind_08", "blind_10", "blind_12"])
+def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
+    found, key = blind(name)
+    (truth,) = key["effects"]
+    assert found.verdict in ("named", "ambiguous")
+    assert len(found.candidates) == 1
+    assert truth in found.candidates[0]
+    assert (found.decide_by is not None) == (found.verdict == "ambiguous")
+    if found.effects == (truth,):
+        for label, value in key["parameters"].items():
+            estimate, std = found.parameters[label]
+            assert abs(estimate - value) < 4 * std
+            assert estimate == pytest.approx(value, rel=0.1)
+        assert found.completed.effects[-1].kind == truth
+    out = found.gap.interpolated
+    assert found.gap.before > 1.5
+    assert found.gap.after == pytest.approx(1.0, abs=0.25)
+    assert (out.after - 1) < 0.25 * max(out.before - 1, 1.0)
+
+
+def test_where_nothing_is_hidden_nothing_is_found():
+    found, _ = blind("blind_03")
+    assert found.verdict == "none"
+    assert found.effects == ()
+    assert found.gap.after == found.gap.before == pytest.approx(1.0, abs=0.2)
+    # Every effect is given a size that would have been seen.
+    assert len(found.detection_limits) == len(EFFECTS)
+    assert all(0 < limit < np.inf for limit in found.detection_limits.values())
+
+
+def test_understated_noise_is_refused():
+    found, key = blind("blind_01")
+    assert found.verdict == "noise_rejected"
+    assert found.noise_scale == pytest.approx(1 / key["stated_over_true"], rel=0.3)
+    assert "understated" in found.notes[0]
+
+
+def test_an_effect_that_no_one_knows_is_not_named():
+    found, _ = blind("blind_02")
+    assert found.verdict == "unknown"
+    assert found.p_value < 1e-3
+
+
+def balanced(change_of_damping, seed=0, levels=5, per_level=9):
+    """States of a linear mode whose damping changes with velocity, and their noise.
+
+    For a displacement and a frequency the force that holds them is known: nothing is solved.
+    """
+    rng = np.random.default_rng(seed)
+    rows = []
+    for level, tip in enumerate(np.geomspace(1e-4, 1e-3, levels)):
+        for phase in np.radians(np.linspace(-55, 55, per_level)):
+            x = tip * np.cos(phase)
+            omega = OMEGA * (1 - ZETA * np.tan(phase))
+            damping = 2 * ZETA * OMEGA + change_of_damping(omega * x)
+            needed = OMEGA**2 - omega**2 + 1j * omega * damping
+            rows.append((level, omega, abs(needed) * x / (SHAPE * PARTICIPATION), needed, x))
+    level, omega, force, needed, x = (np.array(column) for column in zip(*rows, strict=True))
+    velocity = 1j * omega * x * np.exp(-1j * np.angle(needed))
+    n = len(level)
+    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
+    velocity = velocity * np.exp(own)
+    force = force * np.exp(NOISE["force"] * rng.normal(size=n))
+    return sj.steady_states(
+        level,
+        omega.real,
+        force.real,
+        velocity,
+        velocity_std=NOISE["velocity"] * np.abs(velocity),
+        phase_std=np.full((n, 1), NOISE["phase"]),
+        force_std=NOISE["force"] * force.real,
+    )
+
+
+def linear_model():
+    modes = sj.linear_modes(
+        [OMEGA],
+        [ZETA],
+        [[SHAPE]],
+        [PARTICIPATION],
+        natural_frequency_std=[1e-4 * OMEGA],
+        damping_ratio_std=[0.01 * ZETA],
+    )
+    return sj.structure(modes)
+
+
+def test_what_is_located_is_what_was_changed():
+    found = sj.diagnose_model(linear_model(), balanced(lambda v: 8.0 * v))
+    assert [part.part for part in found.located] == ["damping"]
+    (part,) = found.located
+    assert abs(part.exponent - 1.0) < 3 * part.exponent_std
+    assert "quadratic_damping" in found.candidates[0]
+
+
+class RootDamping(sj.AbstractMemoryless):
+    """f = c √|q̇| sgn q̇, which the library does not have."""
+
+    kind: ClassVar[str] = "root_damping"
+    coefficient: Array
+
+    def force(self, displacement, velocity):
+        """See `AbstractMemoryless.force`."""
+        return self.coefficient * jnp.sign(velocity) * jnp.sqrt(jnp.abs(velocity))
+
+
+def test_an_effect_of_the_users_own_takes_part():
+    # The fundamental of √|cos| sgn cos is 1.1128 (Γ functions): the equivalent damping is c·1.1128
+    # over √(modal velocity).
+    size = 3.0
+    data = balanced(lambda v: 1.1128 * size / np.sqrt(v / SHAPE))
+    sj.register_effect(RootDamping)
+    try:
+        found = sj.diagnose_model(linear_model(), data)
+        assert found.effects == ("root_damping",)
+        value, std = found.parameters["root_damping.coefficient"]
+        assert abs(value - size) < 3 * std
+        assert std < 0.1 * size
+    finally:
+        del EFFECTS["root_damping"]
+    with pytest.raises(ValueError, match="already"):
+        sj.register_effect(type(sj.make_effect("cubic_stiffness", {"coefficient": 1.0})))
+
+
+def test_too_few_states_and_a_model_of_something_else_are_said():
+    data = balanced(lambda v: 0.0 * v, levels=1, per_level=4)
+    with pytest.raises(ValueError, match="at least 6"):
+        sj.diagnose_model(linear_model(), data)
