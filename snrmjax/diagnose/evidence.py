@@ -1,6 +1,7 @@
 """Misfits in units of noise, with everything shared or stated marginalised, and fits to them."""
 
 import copy
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from scipy.stats import chi2
 from snrmjax.diagnose.candidates import Candidate, parameter_labels
 from snrmjax.diagnose.predictions import (
     PLAIN,
+    Group,
     Measured,
     Predicted,
     Predictions,
@@ -99,6 +101,9 @@ class Fit(NamedTuple):
         return self.chi_square + len(self.values) * float(np.log(n_rows))
 
 
+_Evaluation = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
 class Bench:
     """All fits to one set of data."""
 
@@ -136,12 +141,15 @@ class Bench:
     def reweighed(self, fit: "Fit") -> "Bench":
         """The same with the errors passed on as the fitted model passes them."""
         change = np.zeros_like(self._by_error)
-        for kind in dict.fromkeys(fit.kinds):
-            group = self.predictions.group(kind)
-            values = group.values.copy()
-            for label, value in zip(fit.labels, fit.values, strict=True):
-                if label.startswith(f"{kind}."):
+        left = list(dict.fromkeys(fit.kinds))
+        while left:
+            group = self.predictions.group(max(left, key=self.predictions.is_apart))
+            values, mine = group.values.copy(), dict(zip(fit.labels, fit.values, strict=True))
+            for label, value in mine.items():
+                if label in group.names:
                     values[group.place(label)] = value
+            inside = [kind for kind in left if parameter_labels(kind)[0] in group.names]
+            left = [kind for kind in left if kind not in inside]
             change += self.predictions.by_error(group, values) - self._by_error
         other = copy.copy(self)
         other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
@@ -174,7 +182,8 @@ class Bench:
 
     def _started(self, candidate: Candidate) -> Float[np.ndarray, "trial state column"]:
         if candidate.kind not in self._changes:
-            found = self._predicted(candidate, np.array(candidate.starts))
+            group, labels = self.predictions.group(candidate.kind), parameter_labels(candidate.kind)
+            found = self._predicted(group, labels, np.array(candidate.starts))
             self._changes[candidate.kind] = found.columns - self._columns
         return self._changes[candidate.kind]
 
@@ -194,77 +203,96 @@ class Bench:
     def fitted(self, candidate: Candidate, beside: Fit | None = None) -> Fit:
         """The best fit of a candidate from all its starts, on top of what is found already.
 
-        Levenberg–Marquardt in all parameters. Several effects add up: what one changes in what
-        the other does is of second order in both.
+        Levenberg–Marquardt in all parameters.
         """
         before = beside or self.nothing()
-        starts = np.array(candidate.starts) / np.array(candidate.unit)
-        trials, n = starts.shape
-        unit = np.array(candidate.unit)
-        own = starts.copy()
-        rows, slopes = self._evaluated(candidate, own * unit)
-        offset = before.rows - self.base
-        m = len(before.values)
-        old = np.zeros((trials, m))
+        together = self._together(candidate, before)
+        n, m = len(candidate.unit), len(before.values)
+        unit = np.concatenate([candidate.unit, np.where(before.values, np.abs(before.values), 1)])
+        starts = np.array(candidate.starts)
+        trials = len(starts)
+        point = np.concatenate([starts, np.tile(before.values, (trials, 1))], axis=1) / unit
+        lower = np.concatenate([candidate.lower, np.full(m, -np.inf)]) / unit
+        upper = np.concatenate([candidate.upper, np.full(m, np.inf)]) / unit
+        rows, slopes = together(point * unit)
         damping = np.full(trials, 1e-2)
-        cost = np.array([self._cost(r + offset) for r in rows])
+        cost = np.array([self._cost(row) for row in rows])
         active = np.isfinite(cost)
-        lower, upper = np.array(candidate.lower) / unit, np.array(candidate.upper) / unit
         for turn in range(_STEPS):
             if turn == _SCREENED:  # the most promising go on
                 active &= cost <= np.sort(cost)[min(_KEPT, trials) - 1]
             at = np.flatnonzero(active)
             if not at.size:
                 break
-            moved, others = own.copy(), old.copy()
+            moved = point.copy()
             for t in at:
-                left = self.weighing.decorrelated(rows[t] + offset + before.slopes @ old[t])
-                jacobian = np.concatenate([slopes[t] * unit, before.slopes], axis=1)
-                arms = self.weighing.decorrelated(jacobian.T).T
-                step = _damped(arms, left, damping[t])
-                moved[t] = np.clip(own[t] + step[:n], lower, upper)
-                others[t] = old[t] + step[n:]
-            new_rows, new_slopes = self._evaluated(candidate, moved[at] * unit)
+                left = self.weighing.decorrelated(rows[t])
+                arms = self.weighing.decorrelated((slopes[t] * unit).T).T
+                moved[t] = np.clip(point[t] + _damped(arms, left, damping[t]), lower, upper)
+            new_rows, new_slopes = together(moved[at] * unit)
             for place, t in enumerate(at):
-                new = self._cost(new_rows[place] + offset + before.slopes @ others[t])
+                new = self._cost(new_rows[place])
                 if new < cost[t]:
                     active[t] = cost[t] - new > _SETTLED
-                    own[t], old[t], cost[t] = moved[t], others[t], new
+                    point[t], cost[t] = moved[t], new
                     rows[t], slopes[t] = new_rows[place], new_slopes[place]
                     damping[t] *= 0.1
                 else:
                     damping[t] *= 20.0
                     active[t] = damping[t] < 1e4
-        best = int(np.nanargmin(np.where(np.isfinite(cost), cost, np.inf)))
+        best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
+        order = [*range(n, n + m), *range(n)]
         return Fit(
             (*before.kinds, candidate.kind),
             (*before.labels, *parameter_labels(candidate.kind)),
-            np.concatenate([before.values + old[best], own[best] * unit]),
+            (point[best] * unit)[order],
             float(cost[best]),
-            rows[best] + offset + before.slopes @ old[best],
-            np.concatenate([before.slopes, slopes[best]], axis=1),
+            rows[best],
+            slopes[best][:, order],
         )
+
+    def _together(self, candidate: Candidate, before: Fit) -> _Evaluation:
+        """Rows and slopes by a candidate's parameters and those of what is there before.
+
+        One program answers for both where it has both. Else what they change adds up, which
+        leaves out what one changes in what the other does: of second order in both.
+        """
+        labels = (*parameter_labels(candidate.kind), *before.labels)
+        kinds = (candidate.kind, *before.kinds)
+        for kind in kinds:
+            group = self.predictions.group(kind)
+            if set(labels) <= set(group.names):
+                return lambda values: self._evaluated(group, labels, values)
+        group, n = self.predictions.group(candidate.kind), len(candidate.unit)
+
+        def added(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rows, slopes = self._evaluated(group, labels[:n], values[:, :n])
+            moved = (values[:, n:] - before.values) @ before.slopes.T
+            others = np.broadcast_to(before.slopes, (len(values), *before.slopes.shape))
+            rows = rows + before.rows - self.base + moved
+            return rows, np.concatenate([slopes, others], axis=2)
+
+        return added
 
     def _cost(self, rows: np.ndarray) -> float:
         value = self.chi_square(rows)
         return value if np.isfinite(value) else np.inf
 
     def _evaluated(
-        self, candidate: Candidate, values: Float[np.ndarray, "trial parameter"]
+        self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
     ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
-        found = self._predicted(candidate, values)
+        found = self._predicted(group, labels, values)
         rows = self.weighing.noise_units(found.columns)
         slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
         return rows, np.moveaxis(slopes, 0, 2)
 
     def _predicted(
-        self, candidate: Candidate, values: Float[np.ndarray, "trial parameter"]
+        self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
     ) -> Predicted:
-        group = self.predictions.group(candidate.kind)
         trials, n = values.shape
         every = np.tile(group.values, (trials, 1))
         directions = np.zeros((trials, len(group.names), n))
-        for k, label in enumerate(parameter_labels(candidate.kind)):
+        for k, label in enumerate(labels):
             every[:, group.place(label)] = values[:, k]
             directions[:, group.place(label), k] = 1.0
         return self.predictions.of(group, every, directions)

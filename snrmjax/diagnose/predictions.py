@@ -93,13 +93,17 @@ class Predictions:
         """The structure that has this kind of effect.
 
         Effects that are quick to follow share one; friction, contacts and further modes, which
-        need many samples of a cycle or more unknowns, have programs of their own.
+        need many samples of a cycle or more unknowns, have programs of their own beside them.
         """
-        own = [k for k in EFFECTS if _family(k) == _family(kind)]
+        own = [k for k in EFFECTS if _family(k) in ("", _family(kind))]
         key = _family(kind)
         if key not in self._groups:
             self._groups[key] = self._prepared(own, grow=key in ("", *_ADDED))
         return self._groups[key]
+
+    def is_apart(self, kind: str) -> bool:
+        """Whether a kind has a program of its own."""
+        return _family(kind) != ""
 
     def _prepared(self, kinds: list[str], *, grow: bool) -> Group:
         present = [effect.kind for effect in self.model.effects]
