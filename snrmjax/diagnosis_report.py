@@ -1,5 +1,6 @@
 """Figures and report of a diagnosis."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
 from snrmjax.diagnose.locating import Located
 from snrmjax.diagnose.naming import AS_GOOD, DETECTED
 from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, unit_for
+from snrmjax.identify.joint_fit import fit_jointly
 from snrmjax.io.diagnosis_files import summarise_diagnosis
 from snrmjax.io.models import write_model
 from snrmjax.io.results import write_summary
@@ -17,6 +19,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
 from snrmjax.plot import save_figure
+from snrmjax.presentation import corrected
 from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
 from snrmjax.simulate.forced_response import forced_response
 from snrmjax.simulate.response_curve import ResponseCurve
@@ -36,8 +39,21 @@ VERDICTS = {
 def write_diagnosis(
     folder: Path, title: str, model: Structure, data: SteadyStates, *, simulate: bool
 ) -> Diagnosis:
-    """Diagnose, and write everything that the command writes into a folder."""
+    """Diagnose, and write everything that the command writes into a folder.
+
+    Where the force is known as a drive voltage only, a joint fit finds its gain first.
+    """
+    notes: tuple[str, ...] = ()
+    if not np.any(np.isfinite(np.asarray(data.force))):
+        fit = fit_jointly(data, model.modes, free=("force_gain",))
+        data = corrected(data, fit)
+        gain = float(np.exp(fit.unknowns.log_force_gain))
+        notes = (
+            f"the force is known as a drive voltage only; {gain:.4g} N/V is taken, from a joint "
+            "fit of smooth curves: an error of that gain can pass for an effect.",
+        )
     found = diagnose_model(model, data)
+    found = dataclasses.replace(found, notes=(*notes, *found.notes))
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found))
     write_model(folder / "model.toml", found.completed)
     figures = diagnosis_figures(found, model, data, simulate=simulate)

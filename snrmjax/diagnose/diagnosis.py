@@ -13,6 +13,7 @@ from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out
+from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.structure import Structure
@@ -20,6 +21,7 @@ from snrmjax.model.structure import Structure
 _UNLIKELY = 1e-3
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LEAST_STATES = 6
+_FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
 
 
 class Gap(NamedTuple):
@@ -79,14 +81,23 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
+    notes: list[str] = []
+    if not predictions.chosen.noise_stated:
+        size = max(float(np.sqrt(neighbour_noise(bench, bench.nothing())[0])), _FINEST)
+        predictions.scale_errors(size)
+        bench = Bench(predictions)
+        notes.append(
+            f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
+            "radian are taken, which is how much neighbouring states scatter."
+        )
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
     found = named(bench, scales, tuple(kind for kind in EFFECTS if kind not in present))
     bench, fit = found.bench, found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
-    verdict, notes = _verdict(found, noise, noise_std)
-    notes += list(predictions.chosen.notes)
+    verdict, reasons = _verdict(found, noise, noise_std)
+    notes = [*reasons, *notes, *predictions.chosen.notes]
     n_levels = predictions.chosen.n_levels
     inner = outer = None
     if n_levels > 2:

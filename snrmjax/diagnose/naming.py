@@ -12,7 +12,9 @@ AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
 _PROMISING = 40.0  # of the criterion: within it a candidate is weighed anew
 _DOUBTFUL = 0.05  # probability of a fit below which others than the best are built upon
 _OTHERS = 3  # of them
-_TRIED, _WORTH = 9, 4.0  # second effects that are fitted, and what one of their starts must explain
+# Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
+# such a share of what the best would.
+_TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
 
 
 class Row(NamedTuple):
@@ -78,16 +80,20 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
 
 
 def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[Candidate]:
-    """The candidates of which one start, scaled, would explain most of what is left."""
+    """The candidates of which one start, scaled, would explain most of what is left.
+
+    Starts are coarse: what explains a quarter of what the best one explains may yet win.
+    """
     others = [c for kind, c in every.items() if kind not in before.kinds]
     gains = [bench.foretold_gain(c, before) for c in others]
-    order = np.argsort(gains)[::-1][:_TRIED]
-    return [others[k] for k in order if gains[k] > _WORTH]
+    order = np.argsort(gains)[::-1]
+    least = max(_WORTH, _SHARE * max(gains, default=0.0))
+    return [others[k] for n, k in enumerate(order) if gains[k] > (_WORTH if n < _TRIED else least)]
 
 
 def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Bench, list[Fit]]:
-    """All candidates, the promising ones weighed with the best one's way of passing on errors."""
-    fits = [bench.fitted(c, before) for c in every.values()]
+    """Candidates, the promising ones weighed with the best one's way of passing on errors."""
+    fits = [bench.fitted(c, before) for c in _promising(bench, every, before)]
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     if not fits:
         return bench, []
@@ -96,12 +102,14 @@ def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Benc
         return bench, fits
     least = best.criterion(bench.n_rows)
     again = bench.reweighed(best)
-    near = {
-        fit.kinds[-1]
-        for fit in fits
-        if fit.criterion(bench.n_rows) < least + max(_PROMISING, 0.5 * best.chi_square)
-    }
-    return again, [again.fitted(every[kind], again.nothing()) for kind in near]
+    reach = least + max(_PROMISING, 0.5 * best.chi_square)
+    near = [fit for fit in fits if fit.criterion(bench.n_rows) < reach]
+    return again, [again.fitted(_from(every, fit), again.nothing()) for fit in near]
+
+
+def _from(every: dict[str, Candidate], fit: Fit) -> Candidate:
+    """A candidate that begins where a fit to it ended."""
+    return every[fit.kinds[-1]]._replace(starts=(tuple(fit.values.tolist()),))
 
 
 def _gain(bench: Bench, before: Fit, after: Fit) -> float:

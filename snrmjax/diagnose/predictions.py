@@ -101,6 +101,12 @@ class Predictions:
             self._groups[key] = self._prepared(own, grow=key in ("", *_ADDED))
         return self._groups[key]
 
+    def scale_errors(self, factor: float) -> None:
+        """Take all errors of force, velocities and phases so many times larger."""
+        states = self.chosen.states
+        self.chosen = self.chosen._replace(states=states._replace(error=factor * states.error))
+        self.states = [np.asarray(part) for part in self.chosen.states]
+
     def is_apart(self, kind: str) -> bool:
         """Whether a kind has a program of its own."""
         return _family(kind) != ""
