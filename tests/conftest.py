@@ -37,6 +37,11 @@ def quick_compilation(request: pytest.FixtureRequest):
 
 
 def pytest_collection_modifyitems(items):
+    if not os.environ.get("SNRMJAX_LONG_TESTS"):
+        skip = pytest.mark.skip(reason="takes long: set SNRMJAX_LONG_TESTS=1")
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(skip)
     # What runs longest starts first: no worker then waits at the end for the other's last file.
     long = ("test_notebooks.py", "test_cli.py", "test_calibration.py")
     items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(long))

@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-LONG = ("03_joint_fit_and_error_bars",)  # minutes: run with SNRMJAX_LONG_TESTS=1
+LONG = ("02_forced_responses", "03_joint_fit_and_error_bars")  # a minute and more
+PATHS = [
+    pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)
+    for path in sorted(NOTEBOOKS.glob("*.py"))
+]
 
 
-@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", PATHS)
 def test_it_runs_to_its_end(path, tmp_path):
-    if path.stem in LONG and not os.environ.get("SNRMJAX_LONG_TESTS"):
-        pytest.skip("takes minutes; set SNRMJAX_LONG_TESTS=1")
     # In a process of its own: warnings there are its readers' business, not errors of ours.
     done = subprocess.run(
         [sys.executable, str(path), str(tmp_path)],

@@ -27,7 +27,9 @@ def blind(name):
     return sj.diagnose_model(model, data.steady_states), KEYS[name]
 
 
-@pytest.mark.parametrize("name", ["blind_08", "blind_10", "blind_12"])
+@pytest.mark.parametrize(
+    "name", ["blind_10", "blind_12", pytest.param("blind_08", marks=pytest.mark.long)]
+)
 def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
     found, key = blind(name)
     (truth,) = key["effects"]
@@ -64,6 +66,7 @@ def test_understated_noise_is_refused():
     assert "understated" in found.notes[0]
 
 
+@pytest.mark.long
 def test_an_effect_that_no_one_knows_is_not_named():
     found, _ = blind("blind_02")
     assert found.verdict == "unknown"

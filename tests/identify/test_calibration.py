@@ -148,6 +148,7 @@ def test_exact_data_of_the_flat_beam_give_its_dominant_coefficients():
     assert found.model.potential.coefficient_std[20] == found.std[0]
 
 
+@pytest.mark.long
 def test_drag_is_found_from_zero_and_beside_the_damping_of_the_mode():
     model = curved(make_effect("quadratic_damping", {"coefficient": 0.8}))
     names = (DRAG, "mode_1.damping_ratio", "potential.1111")
@@ -160,6 +161,7 @@ def test_drag_is_found_from_zero_and_beside_the_damping_of_the_mode():
 NAMES = ("potential.1111", "mode_1.damping_ratio")
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_stated(exact):
     start, truth = scaled(curved(), NAMES, np.array([1.3, 0.7]))
     found = [
@@ -188,6 +190,7 @@ def test_the_order_of_rows_does_not_matter(exact):
     np.testing.assert_allclose(second.residuals, first.residuals[turned], atol=1e-6)
 
 
+@pytest.mark.long
 def test_what_a_level_shares_is_found(exact):
     gain = np.array([0.03, -0.02, 0.01])
     turn = np.array([-0.02, 0.01, 0.03])
@@ -225,6 +228,7 @@ def test_a_prior_weighs_as_much_as_its_std_says(exact):
     np.testing.assert_allclose(found.std[0], free.std[0] / np.sqrt(2), rtol=0.01)
 
 
+@pytest.mark.long
 def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
     modes = sj.linear_modes([400.0, 2500.0], [0.03, 0.01], [[2.0, 1.0], [5.0, -3.0]], [100.0, 20.0])
     potential = sj.polynomial_potential({"1111": 5e9, "1112": 4e9, "111": 1e6}, 2)

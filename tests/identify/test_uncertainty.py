@@ -115,6 +115,7 @@ def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
         profile(fit, "damping.dry")
 
 
+@pytest.mark.long
 def test_bootstrap_and_posterior_agree_with_the_covariance_for_independent_noise():
     independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
     assert not independent.level_std.any()  # the bootstrap would not see what levels share

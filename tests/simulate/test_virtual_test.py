@@ -295,6 +295,7 @@ def test_a_drifting_structure_is_recorded_as_it_is_at_the_time():
 # ----------------------------------------------------------------------------------- in time
 
 
+@pytest.mark.long
 def test_a_drifting_structure_is_stepped_through_in_time():
     test = phase_resonance_test(
         drifting(0.02),
@@ -317,6 +318,7 @@ def test_a_drifting_structure_is_stepped_through_in_time():
     assert np.all(np.abs(np.cos(phases(states)) ** 2 - 0.6) < 0.1)
 
 
+@pytest.mark.long
 def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
     options = {"by": "time_integration", "steps_per_sweep": 81, "appropriation": (0.4, 0.8)}
     test = run(**options)
