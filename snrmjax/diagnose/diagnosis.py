@@ -19,6 +19,7 @@ from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.structure import Structure
 
 _UNLIKELY = 1e-3
+_TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LEAST_STATES = 6
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
@@ -198,7 +199,8 @@ def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[st
             f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
             "allows: it is understated; state it rightly before an effect is named."
         ]
-    if found.p_value < _UNLIKELY:
+    # A noise that is stated a little too small everywhere is no sign of further physics.
+    if unlikely(found.fit.chi_square / np.clip(noise, 1.0, _TOLERATED), n) < _UNLIKELY:
         return "unknown", ["no effect of the library explains what is left."]
     if not found.fit.kinds:
         return "none", []
