@@ -29,7 +29,8 @@ def quick_compilation(request: pytest.FixtureRequest):
     import jax
 
     before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", "simulate" not in request.path.parts)
+    quick = not {"simulate", "diagnose"} & set(request.path.parts)
+    jax.config.update("jax_disable_most_optimizations", quick)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
     # The programs of all modules together would fill gigabytes; the store has them on disk.

@@ -95,6 +95,13 @@ class Fit(NamedTuple):
     chi_square: float
     rows: Float[np.ndarray, " row"]  # in units of noise
     slopes: Float[np.ndarray, "row parameter"]
+    lower: Float[np.ndarray, " parameter"]
+    upper: Float[np.ndarray, " parameter"]
+
+    def of_kind(self, kind: str) -> tuple[float, ...]:
+        """The parameters of one of its kinds."""
+        pairs = zip(self.labels, self.values.tolist(), strict=True)
+        return tuple(value for label, value in pairs if label.startswith(f"{kind}."))
 
     def criterion(self, n_rows: int) -> float:
         """Schwarz's."""
@@ -198,7 +205,8 @@ class Bench:
     def nothing(self) -> Fit:
         """The baseline by itself."""
         empty = np.zeros((self.n_rows, 0))
-        return Fit((), (), np.zeros(0), self.chi_square(self.base), self.base, empty)
+        none = np.zeros(0)
+        return Fit((), (), none, self.chi_square(self.base), self.base, empty, none, none)
 
     def fitted(self, candidate: Candidate, beside: Fit | None = None) -> Fit:
         """The best fit of a candidate from all its starts, on top of what is found already.
@@ -212,8 +220,8 @@ class Bench:
         starts = np.array(candidate.starts)
         trials = len(starts)
         point = np.concatenate([starts, np.tile(before.values, (trials, 1))], axis=1) / unit
-        lower = np.concatenate([candidate.lower, np.full(m, -np.inf)]) / unit
-        upper = np.concatenate([candidate.upper, np.full(m, np.inf)]) / unit
+        lower = np.concatenate([candidate.lower, before.lower]) / unit
+        upper = np.concatenate([candidate.upper, before.upper]) / unit
         rows, slopes = together(point * unit)
         damping = np.full(trials, 1e-2)
         cost = np.array([self._cost(row) for row in rows])
@@ -249,6 +257,8 @@ class Bench:
             float(cost[best]),
             rows[best],
             slopes[best][:, order],
+            (lower * unit)[order],
+            (upper * unit)[order],
         )
 
     def _together(self, candidate: Candidate, before: Fit) -> _Evaluation:

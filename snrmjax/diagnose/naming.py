@@ -64,11 +64,17 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
         return Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
     bench = bench.reweighed(pair)
     nothing, classes, winner = bench.nothing(), [], pair
+    alone = [bench.fitted(_also_from(every[kind], pair)) for kind in pair.kinds]
+    simple = min(alone, key=lambda fit: fit.criterion(bench.n_rows))
+    if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
+        # What two seemed to be is one that no start had come near to.
+        fits = [bench.fitted(_from(every, f)) for f in singles if f.kinds != simple.kinds]
+        answers = (_class(bench, [simple, *fits], simple.kinds[0]),)
+        return Named(bench, simple, nothing, answers, tuple(table))
     for k, kind in enumerate(pair.kinds):
-        other = bench.fitted(every[pair.kinds[1 - k]])
+        other = alone[1 - k]
         rivals = _promising(bench, every, other)
-        if kind not in {c.kind for c in rivals}:
-            rivals.append(every[kind])
+        rivals = [c for c in rivals if c.kind != kind] + [_also_from(every[kind], pair)]
         fits = [bench.fitted(c, other) for c in rivals]
         table.append(_table(bench, other, fits))
         mine = [f for f in fits if f.kinds[1] == kind]
@@ -105,6 +111,17 @@ def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Benc
     reach = least + max(_PROMISING, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(bench.n_rows) < reach]
     return again, [again.fitted(_from(every, fit), again.nothing()) for fit in near]
+
+
+def _also_from(one: Candidate, pair: Fit) -> Candidate:
+    """A candidate that also begins where it stands in a pair."""
+    return one._replace(starts=(*one.starts, pair.of_kind(one.kind)))
+
+
+def _rest(every: dict[str, Candidate], first: Fit, pair: Fit) -> tuple[Candidate, Fit]:
+    """The other one of a pair, and what it is fitted beside."""
+    (kind,) = set(pair.kinds) - set(first.kinds)
+    return _also_from(every[kind], pair), first
 
 
 def _from(every: dict[str, Candidate], fit: Fit) -> Candidate:

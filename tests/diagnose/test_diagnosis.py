@@ -28,7 +28,12 @@ def blind(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["blind_10", "blind_12", pytest.param("blind_08", marks=pytest.mark.long)]
+    "name",
+    [
+        "blind_12",
+        pytest.param("blind_08", marks=pytest.mark.long),
+        pytest.param("blind_10", marks=pytest.mark.long),
+    ],
 )
 def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
     found, key = blind(name)
@@ -59,6 +64,7 @@ def test_where_nothing_is_hidden_nothing_is_found():
     assert all(0 < limit < np.inf for limit in found.detection_limits.values())
 
 
+@pytest.mark.long
 def test_understated_noise_is_refused():
     found, key = blind("blind_01")
     assert found.verdict == "noise_rejected"
