@@ -186,7 +186,8 @@ def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[st
     n = found.bench.n_rows - len(found.fit.values)
     reduced = found.fit.chi_square / n
     too_good = float(chi2.cdf(found.fit.chi_square, n))
-    if too_good < _UNLIKELY:
+    stated = found.bench.predictions.chosen.noise_stated
+    if stated and too_good < _UNLIKELY:
         return "noise_rejected", [
             f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
             "smaller effects may be hidden by it."
@@ -194,7 +195,7 @@ def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[st
     loud = noise - 1 > _WRONG_NOISE * noise_std or (
         found.p_value < _UNLIKELY and noise - 1 > 0.5 * _WRONG_NOISE * noise_std
     )
-    if loud and unlikely(found.fit.chi_square / noise, n) > _UNLIKELY:
+    if stated and loud and unlikely(found.fit.chi_square / noise, n) > _UNLIKELY:
         return "noise_rejected", [
             f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
             "allows: it is understated; state it rightly before an effect is named."
@@ -238,7 +239,7 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
             continue
         tried = candidate(kind, scales)
         change = bench.change(tried)
-        square = float(np.sum(bench.weighing.decorrelated(change) ** 2))
+        square = bench.chi_square(change)
         if not square > 0:
             continue
         need = DETECTED + len(tried.unit) * np.log(bench.n_rows)

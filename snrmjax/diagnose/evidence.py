@@ -180,8 +180,10 @@ class Bench:
         else:
             basis = np.zeros((self.n_rows, 0))
         left = self.weighing.decorrelated(beside.rows)
+        changes = changes[np.isfinite(changes).all(axis=1)]
+        if not len(changes):
+            return 0.0  # no start has a motion
         arms = self.weighing.decorrelated(changes)
-        arms = arms[np.isfinite(arms).all(axis=1)]
         arms = arms - (arms @ basis) @ basis.T
         size = np.sum(arms**2, axis=1)
         along = (arms @ left) ** 2 / np.where(size > 0, size, np.inf)

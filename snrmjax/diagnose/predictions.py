@@ -181,8 +181,13 @@ PLAIN = "cubic_stiffness"
 _ADDED = tuple(kind for kind, e in EFFECTS.items() if issubclass(e, AbstractAddedMode))
 
 
+_LIBRARY = frozenset(EFFECTS)
+
+
 def _family(kind: str) -> str:
-    """Which program answers for a kind of effect."""
+    """Which program answers for a kind of effect; a user's own cannot spoil another's."""
+    if kind not in _LIBRARY:
+        return kind
     effect = EFFECTS[kind]
     if issubclass(effect, AbstractKinked):
         return "kinked"
