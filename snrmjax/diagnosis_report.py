@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
 from snrmjax.diagnose.locating import Located
 from snrmjax.diagnose.naming import AS_GOOD, DETECTED
+from snrmjax.diagnose.summary import summarise_diagnosis
 from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, unit_for
 from snrmjax.identify.joint_fit import fit_jointly
-from snrmjax.io.diagnosis_files import summarise_diagnosis
 from snrmjax.io.models import write_model
 from snrmjax.io.results import write_summary
 from snrmjax.io.units import HERTZ

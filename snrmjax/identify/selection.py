@@ -172,26 +172,31 @@ def select_families(
     with the fewest parameters is taken.
     """
 
-    def workbench(data: BalanceData) -> _Workbench:
-        slopes = _slopes(in_one_form(pilot), data, modes, spread)
-        known = _Slopes(*(np.asarray(a) for a in slopes))
+    def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter]:
+        known = _Slopes(*(np.asarray(a) for a in _slopes(in_one_form(at), data, modes, spread)))
         work = _Workbench(data, spread, known, free)
-        work.use(work.scatter(pilot.squared_frequency, pilot.modal_damping))
-        return work
+        scatter = work.scatter(at.squared_frequency, at.modal_damping)
+        work.use(scatter)
+        return work, scatter
 
-    work = workbench(data)
-    jitter = work.jitter(pilot)
-    if jitter > 0:
-        work = workbench(eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(jitter)))
+    def prepared(at: Unknowns) -> tuple[_Workbench, Scatter, float]:
+        work, scatter = workbench(data, at)
+        jitter = work.jitter(at)
+        if jitter > 0:
+            wandering = data.std.at[:, 3].set(jitter)
+            work, scatter = workbench(eqx.tree_at(lambda d: d.std, data, wandering), at)
+        return work, scatter, jitter
+
     # What the rough pilot misses looks like levels that differ: its scatter serves to choose
-    # families, theirs to choose again, until both belong together.
+    # families, and theirs to choose again, until both belong together.
+    work, scatter, jitter = prepared(pilot)
     for _ in range(_ROUNDS):
         tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, pilot.modal_damping)
         other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
-        scatter = work.scatter(tried.best, other.best)
-        settled = np.array_equal(np.array(scatter.level) > 0, work.level_std > 0)
-        work.use(scatter)
-        if settled:
+        before, pair = work, (tried.best, other.best)
+        pilot = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
+        work, scatter, jitter = prepared(pilot)
+        if np.array_equal(work.level_std > 0, before.level_std > 0):
             break
     return Selection(tried.best, other.best, scatter, jitter, (*tried.table, *other.table))
 

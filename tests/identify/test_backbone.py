@@ -179,6 +179,7 @@ def study(seeds, **errors):
 
 
 class TestBands:
+    @pytest.mark.long
     def test_bands_of_stated_noise_cover_the_truth(self):
         scores, sizes = study(200, amplitude=0.01, phase=0.01, force=0.005)
         covered = np.mean(np.abs(scores) < 1.96, axis=0)

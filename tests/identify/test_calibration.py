@@ -91,6 +91,7 @@ def test_a_linear_structure_needs_the_force_of_its_closed_form():
     np.testing.assert_allclose(found.velocity[:, 1, 1], other, rtol=1e-10)
 
 
+@pytest.mark.long
 def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
     model = curved(
         make_effect("sensor_gain_error", {"gain": 0.05}),

@@ -63,7 +63,9 @@ def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
     x = 0.5 * float(falling.unknowns.squared_frequency.scale)
     speed = x * np.sqrt(vector[0] * (1 - 0.4 * 0.25))
     force = speed * float(falling.unknowns.modal_damping(speed)) / CONSTANT
-    (found,) = sj.fitted_response(falling, force)[0].resonances
+    # Beyond that turn the velocity falls, and the force has a second resonance there.
+    tips = sj.fitted_response(falling, force)[0].resonances
+    (found,) = (point for point in tips if not point.continued)
     assert found.frequency == pytest.approx(speed / x, rel=1e-9)
     assert found.velocity == pytest.approx(speed, rel=1e-9)
 

@@ -278,6 +278,7 @@ def response_of_drifting(drift, states):
     return 6j * omega * np.asarray(states.force) / dynamic
 
 
+@pytest.mark.long
 def test_a_drifting_structure_is_recorded_as_it_is_at_the_time():
     # 3 % of drift are one and a half half-widths of the resonance.
     test = phase_resonance_test(drifting(0.03), [1.0, 2.0, 2.0], 400.0, 600.0)
