@@ -53,7 +53,7 @@ class Diagnosis:
     completed: Structure
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
-    before: Float[np.ndarray, "state part"]  # force misfit in units of noise, real and imaginary
+    before: Float[np.ndarray, "state part"]  # force misfit over noise, less what states share
     after: Float[np.ndarray, "state part"]
 
 
@@ -130,8 +130,8 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
         completed=_completed(model, fit, values),
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
-        before=found.nothing.rows[force].reshape(-1, 2),
-        after=fit.rows[force].reshape(-1, 2),
+        before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
+        after=bench.weighing.without_shared(fit.rows)[force].reshape(-1, 2),
     )
 
 
