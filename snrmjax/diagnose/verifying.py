@@ -24,13 +24,8 @@ def held_out(bench: Bench, nothing: Fit, fit: Fit, level: int) -> HeldOut:
     """
     levels = np.asarray(bench.predictions.chosen.states.level)
     out = levels[bench.weighing.state] == level
-    number = level_numbers(bench)[level]
+    number = int(bench.level_numbers[level])
     return HeldOut(number, _gap(bench, nothing, out), _gap(bench, fit, out))
-
-
-def level_numbers(bench: Bench) -> list[int]:
-    """The levels' numbers in the data, in the order of their places."""
-    return [int(number) for number in bench.level_numbers]
 
 
 def gap(bench: Bench, fit: Fit) -> float:
