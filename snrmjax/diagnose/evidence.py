@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
-from snrmjax.diagnose.candidates import Candidate, parameter_labels
+from snrmjax.diagnose.candidates import SECOND_ORDER, Candidate, parameter_labels
 from snrmjax.diagnose.predictions import (
     PLAIN,
     Group,
@@ -25,6 +25,7 @@ from snrmjax.model.structure import Structure
 
 _STEPS = 9  # of a fit
 _SCREENED, _KEPT = 2, 2  # steps of all starts, and how many of them go on
+_SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
 _SETTLED = 0.02  # of χ²: a smaller change ends a fit
 
 
@@ -172,22 +173,34 @@ class Bench:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
 
-    def foretold_gain(self, candidate: Candidate, beside: Fit) -> float:
-        """How much χ² would fall if one of a candidate's starts were scaled as it fits best."""
+    def foretold(self, candidate: Candidate, beside: Fit) -> tuple[float, Candidate]:
+        """How much χ² would fall if the best start were scaled as it fits, and the best starts.
+
+        These are the candidate's own, scaled so.
+        """
         changes = self.weighing.noise_units(self._started(candidate))
         if beside.slopes.shape[1]:
             basis = np.linalg.qr(self.weighing.decorrelated(beside.slopes.T).T)[0]
         else:
             basis = np.zeros((self.n_rows, 0))
         left = self.weighing.decorrelated(beside.rows)
-        changes = changes[np.isfinite(changes).all(axis=1)]
-        if not len(changes):
-            return 0.0  # no start has a motion
-        arms = self.weighing.decorrelated(changes)
+        moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
+        if not moves.size:
+            return 0.0, candidate  # no start has a motion
+        arms = self.weighing.decorrelated(changes[moves])
         arms = arms - (arms @ basis) @ basis.T
         size = np.sum(arms**2, axis=1)
-        along = (arms @ left) ** 2 / np.where(size > 0, size, np.inf)
-        return float(np.max(along, initial=0.0))
+        factor = -(arms @ left) / np.where(size > 0, size, np.inf)
+        factor = np.where((factor < 0) & (candidate.lower[0] >= 0), 0.0, factor)
+        gains = factor**2 * size
+        # Those of second order change as the square of their strength, whatever its sign.
+        scaled = np.sqrt(np.abs(factor)) if candidate.kind in SECOND_ORDER else factor
+        starts = []
+        for k in np.argsort(gains)[::-1][:_KEPT]:
+            strength, *shape = candidate.starts[moves[k]]
+            times = np.clip(abs(scaled[k]), *_SCALED) * (-1.0 if scaled[k] < 0 else 1.0)
+            starts.append((float(strength * times), *shape))
+        return float(np.max(gains)), candidate._replace(starts=tuple(starts))
 
     def _started(self, candidate: Candidate) -> Float[np.ndarray, "trial state column"]:
         if candidate.kind not in self._changes:

@@ -91,10 +91,11 @@ def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[C
     Starts are coarse: what explains a quarter of what the best one explains may yet win.
     """
     others = [c for kind, c in every.items() if kind not in before.kinds]
-    gains = [bench.foretold_gain(c, before) for c in others]
-    order = np.argsort(gains)[::-1]
-    least = max(_WORTH, _SHARE * max(gains, default=0.0))
-    return [others[k] for n, k in enumerate(order) if gains[k] > (_WORTH if n < _TRIED else least)]
+    foretold = [bench.foretold(c, before) for c in others]
+    foretold.sort(key=lambda pair: -pair[0])
+    least = max(_WORTH, _SHARE * max((gain for gain, _ in foretold), default=0.0))
+    worth = [_WORTH if n < _TRIED else least for n in range(len(foretold))]
+    return [c for (gain, c), need in zip(foretold, worth, strict=True) if gain > need]
 
 
 def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Bench, list[Fit]]:

@@ -10,42 +10,37 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from snrmjax.diagnose import programs
 from snrmjax.identify.calibration_states import (
     CalibrationStates,
     Selection,
     calibration_states,
     state_whitener,
 )
-from snrmjax.identify.needed_force import held_state, missed_columns
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effect_base import (
-    AbstractAddedMode,
     AbstractEffect,
-    AbstractHysteresis,
-    AbstractKinked,
 )
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.parameters import parameter_names, parameter_value, with_parameters
+from snrmjax.model.parameters import parameter_names, parameter_value
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.blocks import by_blocks, mapped
-from snrmjax.simulate.compiled import compiled
-
-HARMONICS = 5
-"""Of the motions: one sees three of them, and two more bend those."""
+from snrmjax.simulate.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
-_DIRECTIONS = 6  # derivatives that a call gives
+_DIRECTIONS = 3  # derivatives that a call gives
+_ACTIVE = 4  # effects at once, at most
+_TRIALS = _BLOCK  # that may meet in a block, at most
 
 
 class Group(NamedTuple):
-    """A structure with several effects without strength, and how it moves then."""
+    """A structure with several effects without strength."""
 
     model: Structure
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
-    near: Float[np.ndarray, "state entry"]
+    force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
 
     def place(self, name: str) -> int:
         """Where a parameter is."""
@@ -83,22 +78,31 @@ class Predictions:
     def __init__(self, model: Structure, data: SteadyStates):
         # Its name would be a part of the programs.
         self.model = dataclasses.replace(model, name="")
-        self.chosen = calibration_states(model, data, HARMONICS)
-        self.held = (self.chosen.sensors, self.chosen.orders, HARMONICS)
+        self.chosen = calibration_states(model, data, programs.HARMONICS)
+        self.held = (self.chosen.sensors, self.chosen.orders, programs.HARMONICS)
         self.states: list[np.ndarray] = [np.asarray(part) for part in self.chosen.states]
         self.level_numbers = np.asarray(data.level)[self.chosen.rows]
         self._groups: dict[str, Group] = {}
+        found = by_blocks(self._baseline_motions, _BLOCK, *self.states)
+        # Room for a power of two of states: few sizes compile.
+        room = [padded(rows) for rows in (*self.states, *found)]
+        arrays = jax.device_put(room)
+        self._stored = programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:])
+
+    def _baseline_motions(self, *rows: Array) -> tuple[Array, Array]:
+        states = CalibrationStates(*rows)
+        near = programs.grown(self.model, states, self.held)
+        return near, programs.inverse_jacobian(self.model, states, near, self.held)
 
     def group(self, kind: str) -> Group:
         """The structure that has this kind of effect.
 
-        Effects that are quick to follow share one; friction, contacts and further modes, which
-        need many samples of a cycle or more unknowns, have programs of their own beside them.
+        The library shares one; effects of a user have structures of their own, which have the
+        library's too.
         """
-        own = [k for k in EFFECTS if _family(k) in ("", _family(kind))]
-        key = _family(kind)
+        key = kind if kind not in _LIBRARY else ""
         if key not in self._groups:
-            self._groups[key] = self._prepared(own, grow=key in ("", *_ADDED))
+            self._groups[key] = self._prepared([k for k in EFFECTS if k in _LIBRARY or k == kind])
         return self._groups[key]
 
     def scale_errors(self, factor: float) -> None:
@@ -109,22 +113,18 @@ class Predictions:
 
     def is_apart(self, kind: str) -> bool:
         """Whether a kind has a program of its own."""
-        return _family(kind) != ""
+        return kind not in _LIBRARY
 
-    def _prepared(self, kinds: list[str], *, grow: bool) -> Group:
+    def _prepared(self, kinds: list[str]) -> Group:
         present = [effect.kind for effect in self.model.effects]
         added = tuple(_without_strength(k, self.model) for k in kinds if k not in present)
         model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
         names = parameter_names(model)
         values = np.array([float(parameter_value(model, name)) for name in names])
-        if not grow:  # without strength an effect changes no motion
-            return Group(model, names, values, self.group(PLAIN).near)
-        near = by_blocks(
-            lambda *rows: (_grown(model, CalibrationStates(*rows), self.held),),
-            _BLOCK,
-            *self.states,
-        )[0]
-        return Group(model, names, values, near)
+        kinds = [added[k].kind for k in programs.forces_of(added)]
+        owner = [name.split(".")[0] for name in names]
+        force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
+        return Group(model, names, values, force)
 
     def of(
         self,
@@ -133,37 +133,74 @@ class Predictions:
         directions: Float[np.ndarray, "trial parameter direction"],
     ) -> Predicted:
         """What the states miss under every trial's parameters."""
-        n = len(self.chosen.rows)
-        trials, wanted = len(values), directions.shape[2]
-        rows = [np.tile(a, (trials, *(1,) * (a.ndim - 1))) for a in self.states]
-        near = np.tile(group.near, (trials, 1))
-        each = np.repeat(values, n, axis=0)
-        columns: np.ndarray = np.empty(0)
-        slopes = []
-        for begin in range(0, max(wanted, 1), _DIRECTIONS):
-            some = directions[:, :, begin : begin + _DIRECTIONS]
-            some = np.pad(some, ((0, 0), (0, 0), (0, _DIRECTIONS - some.shape[2])))
-            arrays = (*rows, each, np.repeat(some, n, axis=0), near)
-            columns, slope = by_blocks(
-                lambda *block: _missed(group.model, group.names, self.held, *block), _BLOCK, *arrays
+        none = np.zeros((self.states[6].shape[1], _DIRECTIONS))
+        wanted = directions.shape[2]
+        parts = [
+            self._answers(
+                group, values, _filled(directions[:, :, begin : begin + _DIRECTIONS]), none
             )
-            slopes.append(slope)
-        width = columns.shape[1]
-        every = np.concatenate(slopes, axis=2)[:, :, :wanted]
-        return Predicted(columns.reshape(trials, n, width), every.reshape(trials, n, width, wanted))
+            for begin in range(0, max(wanted, 1), _DIRECTIONS)
+        ]
+        slopes = np.concatenate([slope for _, slope in parts], axis=3)
+        return Predicted(parts[0][0], slopes[..., :wanted])
 
     def by_error(
         self, group: Group, values: Float[np.ndarray, " parameter"]
     ) -> Float[np.ndarray, "state column input"]:
         """Derivatives by the states' errors, as a model with these parameters passes them on."""
-        each = np.tile(values, (len(self.chosen.rows), 1))
-        return by_blocks(
-            lambda *block: (_by_error(group.model, group.names, self.held, *block),),
-            _BLOCK,
-            *self.states,
-            each,
-            group.near,
-        )[0]
+        inputs = self.states[6].shape[1]
+        none = np.zeros((1, len(values), _DIRECTIONS))
+        slopes = [
+            self._answers(group, values[None], none, _filled(some))[1][0]
+            for some in np.split(np.eye(inputs), range(_DIRECTIONS, inputs, _DIRECTIONS), axis=1)
+        ]
+        return np.concatenate(slopes, axis=2)[:, :, :inputs]
+
+    def _answers(
+        self,
+        group: Group,
+        values: Float[np.ndarray, "trial parameter"],
+        by_value: Float[np.ndarray, "trial parameter direction"],
+        by_error: Float[np.ndarray, "input direction"],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and slopes: friction by its formulas, and marching where they fail."""
+        used = np.any(values != group.values, axis=0) | np.any(by_value, axis=(0, 2))
+        forces = np.unique(group.force[used & (group.force >= 0)])
+        active = np.full(_ACTIVE, -1)
+        active[: len(forces)] = forces
+        fixed = (group.model, group.names, self.held, len(self.model.effects))
+        n, trials = len(self.chosen.rows), len(values)
+        state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
+
+        def answered(swings: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+            def block(some: np.ndarray) -> list[np.ndarray]:
+                at = padded(some, _BLOCK)
+                first = int(trial[some[0]])
+                near = slice(first, first + _TRIALS)
+                ours = [padded(a[near], _TRIALS) for a in (values, by_value)]
+                table = programs.Trials(*jax.device_put((*ours, by_error)))
+                arrays = (active, self._stored, table, state[at], trial[at] - first)
+                found = programs.missed(*fixed, swings, *arrays)
+                return [np.asarray(a)[: len(some)] for a in found]
+
+            blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
+            parts = over_cores(block, blocks)
+            return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+        found = answered(True, np.arange(n * trials))
+        left = np.flatnonzero(~np.isfinite(found[0]).all(axis=1))
+        slides = any(group.names[k].split(".")[0] in _SLIDING for k in np.flatnonzero(used))
+        if left.size and slides:
+            for part, own in zip(found, answered(False, left), strict=True):
+                part[left] = own
+        columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in found)
+        return columns, slopes
+
+
+def _filled(directions: Float[np.ndarray, "*entry some"]) -> np.ndarray:
+    room = np.zeros((*directions.shape[:-1], _DIRECTIONS))
+    room[..., : directions.shape[-1]] = directions
+    return room
 
 
 def whitened_states(
@@ -178,20 +215,8 @@ def whitened_states(
 PLAIN = "cubic_stiffness"
 """A kind that every program of quick effects has."""
 
-_ADDED = tuple(kind for kind, e in EFFECTS.items() if issubclass(e, AbstractAddedMode))
-
-
 _LIBRARY = frozenset(EFFECTS)
-
-
-def _family(kind: str) -> str:
-    """Which program answers for a kind of effect; a user's own cannot spoil another's."""
-    if kind not in _LIBRARY:
-        return kind
-    effect = EFFECTS[kind]
-    if issubclass(effect, AbstractKinked):
-        return "kinked"
-    return kind if issubclass(effect, (AbstractHysteresis, AbstractAddedMode)) else ""
+_SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
 
 
 def _without_strength(kind: str, model: Structure) -> AbstractEffect:
@@ -214,50 +239,3 @@ def _without_strength(kind: str, model: Structure) -> AbstractEffect:
     }
     zero = dict.fromkeys(effect_parameters(kind), 0.0)
     return make_effect(kind, zero | shapes.get(kind, {}))
-
-
-_Held = tuple[tuple[int, ...], tuple[int, ...], int]
-
-
-@compiled
-def _grown(model: Structure, states: CalibrationStates, held: _Held) -> Float[Array, "row entry"]:
-    def one(*row: Array) -> Array:
-        state = CalibrationStates(*row)
-        return held_state(model, state, state.velocity[0], held[0][0], held[2]).grown()
-
-    return mapped(one, *states)
-
-
-@compiled
-def _missed(
-    model: Structure, names: tuple[str, ...], held: _Held, *rows: Array
-) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
-    def one(*row: Array) -> tuple[Array, Array]:
-        *state, values, directions, near = row
-
-        def of(change: Array) -> tuple[Array, Array]:
-            changed = with_parameters(model, names, values + directions @ change)
-            none = jnp.zeros_like(state[6])
-            found = missed_columns(changed, CalibrationStates(*state), held, 1.0, none, near)[0]
-            return found, found
-
-        slopes, columns = jax.jacfwd(of, has_aux=True)(jnp.zeros(directions.shape[1]))
-        return columns, slopes
-
-    return mapped(one, *rows)
-
-
-@compiled
-def _by_error(
-    model: Structure, names: tuple[str, ...], held: _Held, *rows: Array
-) -> Float[Array, "row column input"]:
-    def one(*row: Array) -> Array:
-        *state, values, near = row
-        changed = with_parameters(model, names, values)
-
-        def of(error: Array) -> Array:
-            return missed_columns(changed, CalibrationStates(*state), held, 1.0, error, near)[0]
-
-        return jax.jacfwd(of)(jnp.zeros_like(state[6]))
-
-    return mapped(one, *rows)

@@ -212,7 +212,7 @@ def _columns(
     shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
     factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
     held = (settings.sensors, settings.orders, settings.harmonic_order)
-    return missed_columns(model, state, held, factor, error, near)
+    return missed_columns(model, state, held, factor, error, lambda held: held.solved(near))
 
 
 @compiled

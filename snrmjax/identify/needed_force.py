@@ -1,5 +1,7 @@
 """The force that a measured motion needs: one value however the response folds."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -74,13 +76,13 @@ def missed_columns(
     held: tuple[tuple[int, ...], tuple[int, ...], int],
     factor: Complex[Array, ""] | float,
     error: Float[Array, " input"],
-    near: Float[Array, " entry"],
+    solved: Callable[[HeldMotion], Float[Array, " entry"]],
 ) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
     """What a model misses of one state's force, other sensors and harmonics.
 
     Arguments: `held` has the sensors (the reference first), the harmonics that are compared and
     the harmonic order; all velocities are taken times `factor`; `error` adds to the logarithms of
-    force and velocities and to the phases, for derivatives; the motion is looked for `near` one.
+    force and velocities and to the phases, for derivatives; `solved` finds the motion.
     Returns real and imaginary parts, of the force over the measured one and of the rest over the
     measured velocity, and the motion.
     """
@@ -89,7 +91,7 @@ def missed_columns(
     own = factor * jnp.exp(error[1 : n + 1] + 1j * error[n + 1 :])
     velocity, harmonics = state.velocity * own, state.harmonics * own[:, None]
     motion = held_state(model, state, velocity[0], sensors[0], harmonic_order)
-    point = motion.solved(near)
+    point = solved(motion)
     force, seen = motion.recorded(point)
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics

@@ -159,7 +159,7 @@ def harmonic_balance(
     """The balance of `model` under a cosine force of amplitude `force` (N).
 
     `n_samples` defaults to the alias-free number for a polynomial potential and to at least
-    128 when there are effects, whose forces are not polynomial.
+    128 when there are effects with forces, which are not polynomial.
     Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to tell the
     harmonics apart.
     """
@@ -190,7 +190,7 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
         )
     if n_samples is None:
         n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
-        if model.effects:
+        if any(isinstance(effect, AbstractForce) for effect in model.effects):
             n_samples = max(n_samples, 128, 16 * harmonic_order)
         if model.by_cycle:
             kinked = any(isinstance(e, AbstractKinked) for e in model.effects)

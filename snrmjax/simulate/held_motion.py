@@ -17,6 +17,8 @@ from snrmjax.simulate.harmonics import displacement_phasors, velocity_phasors
 # Growth of a motion, in shares of the velocity that was measured.
 _SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
 _NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
+_SECANTS = 20  # steps with one Jacobian that is brought up to date, at most
+_CLOSE = 1e-4  # relative size of such a step after which two more are exact enough
 
 
 class HeldMotion(eqx.Module):
@@ -93,6 +95,39 @@ class HeldMotion(eqx.Module):
         last = jnp.linalg.solve(jacobian, self.equations(point))
         left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
         return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan)
+
+    def solved_by_secants(
+        self, start: Float[Array, " unknown"], inverse: Float[Array, "unknown unknown"]
+    ) -> Float[Array, " unknown"]:
+        """The solution near `start`, from an inverse Jacobian there; NaN without one.
+
+        Broyden's method: no step needs another Jacobian. Derivatives are what two more steps
+        carry: off by the square of what is left of the Jacobian's error.
+        """
+        fixed = jax.lax.stop_gradient(self)
+
+        def step(state: tuple) -> tuple:
+            point, left, inverse, count, _ = state
+            move = -inverse @ left
+            new = fixed.equations(point + move)
+            back = inverse @ (new - left)
+            length, size = move @ back, jnp.linalg.norm(move)
+            # What rounding makes of a step says nothing.
+            sure = (jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)) & (size > _NEAR)
+            change = jnp.outer(move - back, move @ inverse) / jnp.where(sure, length, 1.0)
+            inverse = inverse + jnp.where(sure, change, 0.0)
+            return point + move, new, inverse, count + 1, jnp.max(jnp.abs(move))
+
+        def going(state: tuple) -> Array:
+            *_, count, size = state
+            return (count < _SECANTS) & (size > _CLOSE)  # false for NaN
+
+        start = jax.lax.stop_gradient(start)
+        first = (start, fixed.equations(start), inverse, jnp.array(0), jnp.array(jnp.inf))
+        point, _, inverse, _, size = jax.lax.while_loop(going, step, first)
+        point = jnp.where(size <= _CLOSE, point, jnp.nan)
+        # In a loop the equations are compiled once.
+        return jax.lax.fori_loop(0, 2, lambda _, p: p - inverse @ self.equations(p), point)
 
     def grown(self) -> Float[Array, " unknown"]:
         """The solution that grows from small amplitudes, as a start for `solved`; else NaN.

@@ -1,0 +1,249 @@
+"""The compiled programs behind predictions: rows of states, each under parameters of its own.
+
+A motion under a trial's parameters is reached from the baseline's by steps with the baseline's
+Jacobian, for many rows at once. One program answers for many effects: those that a call does not
+ask for are passed over.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from snrmjax.identify.calibration_states import CalibrationStates
+from snrmjax.identify.needed_force import held_state, missed_columns
+from snrmjax.model.effect_base import (
+    AbstractEffect,
+    AbstractForce,
+    AbstractKinked,
+    AbstractMemoryless,
+)
+from snrmjax.model.friction import IwanMicroslip, JenkinsSlider
+from snrmjax.model.mode_coupling import AbstractInternalResonance
+from snrmjax.model.parameters import with_parameters
+from snrmjax.model.structure import Structure
+from snrmjax.simulate.blocks import mapped
+from snrmjax.simulate.compiled import compiled
+from snrmjax.simulate.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.harmonics import displacement_phasors, harmonic_basis
+from snrmjax.simulate.held_motion import HeldMotion
+
+HARMONICS = 5
+"""Of the motions: one sees three of them, and two more bend those."""
+
+Held = tuple[tuple[int, ...], tuple[int, ...], int]
+"""The sensors (the reference first), the harmonics compared and the harmonics of a motion."""
+
+
+@compiled
+def grown(model: Structure, states: CalibrationStates, held: Held) -> Float[Array, "row entry"]:
+    """Motions grown from small amplitudes; NaN where none was found."""
+
+    def one(*row: Array) -> Array:
+        state = CalibrationStates(*row)
+        return held_state(model, state, state.velocity[0], held[0][0], held[2]).grown()
+
+    return mapped(one, *states)
+
+
+@compiled
+def inverse_jacobian(
+    model: Structure, states: CalibrationStates, near: Float[Array, "row entry"], held: Held
+) -> Float[Array, "row entry entry"]:
+    """Of the equations of every state, at a motion."""
+
+    def one(near: Array, *row: Array) -> Array:
+        state = CalibrationStates(*row)
+        motion = held_state(model, state, state.velocity[0], held[0][0], held[2])
+        return jnp.linalg.inv(motion.linearised(near)[1])
+
+    return mapped(one, near, *states)
+
+
+class Stored(NamedTuple):
+    """States, baseline motions and inverse Jacobians there; a row for every state, and spare."""
+
+    states: CalibrationStates
+    near: Float[Array, "state entry"]
+    inverse: Float[Array, "state entry entry"]
+
+
+class Trials(NamedTuple):
+    """Parameters of some trials, and directions for derivatives, of the errors for all alike."""
+
+    values: Float[Array, "trial parameter"]
+    by_value: Float[Array, "trial parameter direction"]
+    by_error: Float[Array, "input direction"]
+
+
+@compiled
+def missed(
+    model: Structure,
+    names: tuple[str, ...],
+    held: Held,
+    own: int,
+    swings: bool,
+    active: Int[Array, " place"],
+    stored: Stored,
+    trials: Trials,
+    state: Int[Array, " row"],
+    trial: Int[Array, " row"],
+) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
+    """What every row misses, and its derivatives; NaN where no motion was found.
+
+    Arguments: the first `own` effects are the baseline's; with `swings` friction is taken by
+    formulas for cycles that turn only twice, and others give NaN; of the added `forces_of` only
+    those count whose numbers stand in `active` before a negative one; a row is a state and a
+    trial by their numbers.
+    """
+
+    def one(state: Array, trial: Array) -> tuple[Array, Array]:
+        measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
+        values, by_value = trials.values[trial], trials.by_value[trial]
+
+        def of(change: Array) -> tuple[Array, Array]:
+            changed = with_parameters(model, names, values + by_value @ change)
+            added = changed.effects[own:]
+            forces = [_quick(added[k], swings=swings) for k in forces_of(added)]
+            rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
+            changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
+
+            def solved(motion: HeldMotion) -> Array:
+                parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
+                balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
+                forced = dataclasses.replace(motion, balance=balance)
+                return forced.solved_by_secants(near, inverse)
+
+            error = trials.by_error @ change
+            found = missed_columns(changed, measured, held, 1.0, error, solved)[0]
+            return found, found
+
+        slopes, columns = jax.jacfwd(of, has_aux=True)(jnp.zeros(by_value.shape[1]))
+        return columns, slopes
+
+    return jax.vmap(one)(state, trial)
+
+
+def forces_of(effects: Sequence[AbstractEffect]) -> list[int]:
+    """Which effects are taken as forces on the mode of interest."""
+    kinds = (AbstractForce, AbstractInternalResonance)
+    return [k for k, effect in enumerate(effects) if isinstance(effect, kinds)]
+
+
+class _ForcedBalance(HarmonicBalance):
+    """A balance with further forces, each sampled as it needs; few of them count."""
+
+    forces: tuple[AbstractForce, ...] = ()
+    active: Int[Array, " place"] = eqx.field(default_factory=lambda: jnp.zeros(0, dtype=int))
+
+    def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
+        """See `HarmonicBalance.residual`."""
+        j = self.model.modes.mode_of_interest
+        x, omega = self.coefficients(point)[:, j], point[-1] * self.frequency_scale
+        branches = [partial(_harmonics, force) for force in self.forces]
+
+        def more(k: Array, total: Array) -> Array:
+            return total + jax.lax.switch(self.active[k], branches, x, omega)
+
+        count = jnp.sum(self.active >= 0)
+        added = jax.lax.fori_loop(0, count, more, jnp.zeros_like(x))
+        unit = self.frequency_scale**2 * self.displacement_scale
+        left = super().residual(point).reshape(self.n_coefficients, -1)
+        return left.at[:, j].add(added / unit).reshape(-1)
+
+
+def _harmonics(
+    effect: AbstractForce, x: Float[Array, " coefficient"], omega: Array
+) -> Float[Array, " coefficient"]:
+    """Coefficients of a force over the cycle of a mode's coefficients."""
+    memoryless = isinstance(effect, AbstractMemoryless)
+    n_samples = 512 if isinstance(effect, AbstractKinked) else 128 if memoryless else 256
+    basis = harmonic_basis(HARMONICS, n_samples)
+    q = jnp.asarray(basis.synthesis) @ x
+    v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
+    return jnp.asarray(basis.analysis) @ effect.cycle_force(q, v)
+
+
+def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:
+    if isinstance(effect, AbstractInternalResonance):
+        return _Resonance(effect)
+    if swings and isinstance(effect, JenkinsSlider):
+        return _SwingingSlider(effect.stiffness, effect.slip_displacement)
+    if swings and isinstance(effect, IwanMicroslip):
+        return _SwingingIwan(effect.coefficient, effect.exponent)
+    assert isinstance(effect, AbstractForce)
+    return effect
+
+
+class _Resonance(AbstractForce):
+    """What a coupled mode in steady motion does to the mode of interest."""
+
+    kind: ClassVar[str] = "resonance"
+    effect: AbstractInternalResonance
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        mode, q, n = self.effect, displacement, self.effect.order
+        basis = harmonic_basis(HARMONICS, q.shape[0])
+        slope = jnp.asarray(basis.synthesis @ basis.derivative) @ (jnp.asarray(basis.analysis) @ q)
+        omega = jnp.sqrt(jnp.sum(velocity**2) / jnp.sum(slope**2))
+        load = displacement_phasors((jnp.asarray(basis.analysis) @ q**n)[:, None])[:, 0]
+        own = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
+        rate = jnp.arange(HARMONICS + 1) * omega
+        stiffness = own**2 - rate**2 + 2j * mode.damping_ratio * own * rate
+        answer = -mode.coefficient * load / stiffness
+        parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)[jnp.array(_KEPT)]
+        return n * mode.coefficient * q ** (n - 1) * (jnp.asarray(basis.synthesis) @ parts)
+
+
+_KEPT = (0, *range(2, 2 * HARMONICS + 2))  # the mean has no sine
+
+
+class _SwingingSlider(JenkinsSlider):
+    """A slider over a cycle between two turns; NaN over others."""
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        q, slip = displacement, self.slip_displacement
+        high, low, falling = _swing(q)
+        down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
+        stuck = jnp.clip(0.0, high - slip, low + slip)
+        position = jnp.where(2 * slip < high - low, jnp.where(falling, down, up), stuck)
+        return -self.stiffness * position
+
+
+class _SwingingIwan(IwanMicroslip):
+    """Masing's rule over a cycle between two turns; NaN over others."""
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        high, low, falling = _swing(displacement)
+        backbone = 0.5 * (high - low)
+        gone = jnp.where(falling, high - displacement, displacement - low) / 2
+        branch = self._lost(backbone) - 2 * self._lost(gone)
+        return jnp.where(falling, -branch, branch)
+
+    def _lost(self, stretch: Array) -> Array:
+        """What the virgin curve c|x|^p has lost."""
+        safe = jnp.where(stretch > 0, stretch, 1.0)
+        return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
+
+
+def _swing(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
+    """The largest and the smallest sample, NaN where there are further turns, and what falls."""
+    n = q.shape[0]
+    top, bottom = jnp.argmax(q), jnp.argmin(q)
+    since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
+    ahead = jnp.roll(q, -1) - q
+    swings = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
+    nothing = jnp.where(swings, 0.0, jnp.nan)
+    return q[top] + nothing, q[bottom] + nothing, since <= fall

@@ -1,0 +1,92 @@
+"""Predictions of the quick programs against Newton's method and finite differences."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.diagnose.candidates import candidate, parameter_labels
+from snrmjax.diagnose.diagnosis import scales_of
+from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.programs import HARMONICS
+from snrmjax.identify.needed_force import needed_force
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+
+OMEGA, ZETA = 300.0, 0.01
+QUICK = ("gap_stiffness", "iwan_microslip", "internal_resonance_1_3", "mode_shape_change")
+EVERY = [k if k in QUICK else pytest.param(k, marks=pytest.mark.long) for k in EFFECTS]
+
+
+@pytest.fixture(scope="module")
+def predictions():
+    """States that a linear model needs two per cent more force for."""
+    modes = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    model = dataclasses.replace(sj.structure(modes), name="")
+    frequency = OMEGA * np.tile(np.linspace(0.98, 1.02, 4), 2)
+    q = np.repeat([1e-3, 3e-3], 4) * np.exp(1j * np.tile([-0.5, -1.2, -2.0, -2.6], 2))
+    needed = np.abs((OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency) * q) / 3.0
+    level = np.repeat([1, 2], 4)
+    data = sj.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
+    return Predictions(model, data), data
+
+
+def moderate(kind, scales):
+    """Parameters that change the motion plainly, but not greatly."""
+    start = list(candidate(kind, scales).starts[-1])
+    start[0] *= 0.5
+    return np.array(start)
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
+    ours, data = predictions
+    values = moderate(kind, scales_of(ours))
+    found = asked(ours, kind, values[None])[0]
+    effect = make_effect(kind, dict(zip(effect_parameters(kind), values, strict=True)))
+    model = dataclasses.replace(ours.model, effects=(effect,))
+    needed = needed_force(model, data, harmonic_order=HARMONICS)
+    assert needed.converged.all()
+    missed = np.asarray(needed.force) / np.asarray(data.force) - 1
+    # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.
+    # Steps end below 1e-4, and two more follow.
+    tolerance = 1e-4 if kind == "iwan_microslip" else 1e-5
+    change = np.max(np.abs(missed - missed_by(ours)))
+    assert np.max(np.abs(found - missed)) < tolerance * max(change, 1e-3)
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_slopes_are_those_of_finite_differences(predictions, kind):
+    ours, _ = predictions
+    values = moderate(kind, scales_of(ours))
+    group, labels = ours.group(kind), parameter_labels(kind)
+    directions = np.zeros((1, len(group.names), len(labels)))
+    every = group.values.copy()
+    for k, label in enumerate(labels):
+        every[group.place(label)] = values[k]
+        directions[0, group.place(label), k] = 1.0
+    slopes = ours.of(group, every[None], directions).slopes[0]
+    for k in range(len(labels)):
+        step = np.zeros(len(labels))
+        step[k] = 1e-3 * (abs(values[k]) or 1.0)
+        up, down = asked(ours, kind, np.stack([values + step, values - step]))
+        expected = (up - down) / (2 * step[k])
+        found = slopes[:, 0, k] + 1j * slopes[:, 1, k]
+        # They carry the baseline's Jacobian: exact for what an effect does by itself.
+        assert np.max(np.abs(found - expected)) < 0.03 * np.max(np.abs(expected)) + 1e-12
+
+
+def asked(ours, kind, values):
+    """Complex force misfits of trials, over the measured force."""
+    group, labels = ours.group(kind), parameter_labels(kind)
+    every = np.tile(group.values, (len(values), 1))
+    every[:, [group.place(label) for label in labels]] = values
+    found = ours.of(group, every, np.zeros((len(values), len(group.names), 0)))
+    return found.columns[..., 0] + 1j * found.columns[..., 1]
+
+
+def missed_by(ours):
+    """The same of the baseline."""
+    group = ours.group("cubic_stiffness")
+    found = ours.of(group, group.values[None], np.zeros((1, len(group.names), 0)))
+    return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
