@@ -1,17 +1,20 @@
 """Blind data sets for `snrmjax diagnose`: truth by integration in time, errors of a test.
 
 Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
-     [--only N] [--seed 1]
+     [--only N] [--names NAME,NAME…] [--with-harmonics] [--seed 1]
 
 Writes DIR/sets/NAME.csv and NAME.toml (the baseline, which lacks the effect) and, apart from
 them, DIR/keys/NAME.json (the truth). Nothing here shares code with the program that is judged.
-One JSON line at the end: sets, sweeps, seconds.
+`--with-harmonics` writes what the same tests give when harmonics are recorded too: the measurement
+that an ambiguous answer to a set of fundamentals asks for. One JSON line at the end: sets, sweeps,
+seconds.
 """
 
 import argparse
 import collections
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from plans import HALVES, Case, draw_cases
@@ -19,9 +22,13 @@ from records import write_set
 from truth import Truth, calibrated
 
 
-def generate(half: str, seed: int, only: int | None = None) -> tuple[list[Case], list[Truth]]:
-    """Draw and simulate the sets of one half, or the first `only` of them by name."""
+def generate(
+    half: str, seed: int, only: int | None = None, names: list[str] | None = None
+) -> tuple[list[Case], list[Truth]]:
+    """Draw and simulate the sets of one half, the first `only` of them or those of some names."""
     cases = draw_cases(half, seed)[:only]
+    if names is not None:
+        cases = [case for case in cases if case.name in names]
     truths = calibrated(cases)
     return cases, truths
 
@@ -32,14 +39,18 @@ def main() -> None:
     parser.add_argument("--half", choices=HALVES, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", type=int)
+    parser.add_argument("--names", type=lambda text: text.split(","))
+    parser.add_argument("--with-harmonics", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     begin = time.perf_counter()
     sets, keys = options.out / "sets", options.out / "keys"
     sets.mkdir(parents=True, exist_ok=True)
     keys.mkdir(parents=True, exist_ok=True)
-    cases, truths = generate(options.half, options.seed, options.only)
+    cases, truths = generate(options.half, options.seed, options.only, options.names)
     for case, truth in zip(cases, truths, strict=True):
+        if options.with_harmonics:
+            case.plan = replace(case.plan, harmonics=True)
         write_set(case, truth, sets, keys)
     line = {
         "half": options.half,

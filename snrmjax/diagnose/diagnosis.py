@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.stats import chi2
 
 from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
+from snrmjax.diagnose.doubts import Doubt, doubts
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
@@ -22,6 +23,7 @@ _UNLIKELY = 1e-3
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LEAST_STATES = 6
+_TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
 
 
@@ -83,21 +85,25 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
             "from the data to be compared."
         )
     notes: list[str] = []
-    if not predictions.chosen.noise_stated:
-        size = max(float(np.sqrt(neighbour_noise(bench, bench.nothing())[0])), _FINEST)
-        predictions.scale_errors(size)
-        bench = Bench(predictions)
-        notes.append(
-            f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
-            "radian are taken, which is how much neighbouring states scatter."
-        )
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
-    found = named(bench, scales, tuple(kind for kind in EFFECTS if kind not in present))
+    kinds = tuple(kind for kind in EFFECTS if kind not in present)
+    if predictions.chosen.noise_stated:
+        found = named(bench, scales, kinds)
+    else:
+        found, size = _named_and_noise(predictions, bench, scales, kinds)
+        notes.append(
+            f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
+            "radian are taken, which is what the answer leaves; how well it fits is no proof then."
+        )
     bench, fit = found.bench, found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
     verdict, reasons = _verdict(found, noise, noise_std)
+    open_ends = doubts(fit.kinds, free.parts) if verdict in ("named", "ambiguous") else []
+    if open_ends:
+        verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
+        reasons = [doubt.reason for doubt in open_ends]
     notes = [*reasons, *notes, *predictions.chosen.notes]
     n_levels = predictions.chosen.n_levels
     inner = outer = None
@@ -118,7 +124,7 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
         candidates=found.classes if verdict != "none" else (),
-        decide_by=decide_by(unclear, harmonics=harmonics) if unclear else None,
+        decide_by=_decide_by(unclear, open_ends, harmonics=harmonics),
         located=free.parts,
         parameters=values,
         gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
@@ -133,6 +139,36 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
         before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
         after=bench.weighing.without_shared(fit.rows)[force].reshape(-1, 2),
     )
+
+
+def _named_and_noise(
+    predictions: Predictions, bench: Bench, scales: Scales, kinds: tuple[str, ...]
+) -> tuple[Named, float]:
+    """What is missing, with noise as large as what is left; its size over the assumed one.
+
+    It begins with what no free curves of amplitude explain, and is never below what neighbouring
+    states show.
+    """
+    least = max(float(np.sqrt(neighbour_noise(bench, bench.nothing())[0])), _FINEST)
+    predictions.scale_errors(least)
+    bench = Bench(predictions)
+    free = located(bench, bench.nothing())
+    factor = float(np.sqrt(max(free.chi_square / free.freedom, 1.0)))
+    size = least
+    for _ in range(_TURNS):
+        predictions.scale_errors(factor)
+        size *= factor
+        found = named(Bench(predictions), scales, kinds)
+        factor = max(gap(found.bench, found.fit), least / size)
+        if factor > _NEAR:
+            break
+    return found, size
+
+
+def _decide_by(unclear: set[str], open_ends: list[Doubt], *, harmonics: bool) -> str | None:
+    sentences = [decide_by(unclear, harmonics=harmonics)] if unclear else []
+    sentences += [f"{d.decide_by[0].upper()}{d.decide_by[1:]}." for d in open_ends]
+    return " ".join(sentences) or None
 
 
 def scales_of(predictions: Predictions) -> Scales:

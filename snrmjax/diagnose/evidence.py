@@ -70,21 +70,34 @@ class Weighing(NamedTuple):
         return np.linalg.cholesky(np.eye(int(keep.sum())) + shared @ shared.T)
 
 
-def weighing(measured: Measured, baseline: Float[np.ndarray, "state column prior"]) -> Weighing:
-    """Arguments: `baseline` are slopes by the baseline's own parameters, times their 1σ."""
+def weighing(
+    measured: Measured,
+    baseline: Float[np.ndarray, "state column prior"],
+    by_linear: Float[np.ndarray, "state column two"],
+    level_std: Float[np.ndarray, " four"],
+) -> Weighing:
+    """Arguments: `baseline` are slopes by the baseline's own parameters, times their 1σ.
+
+    `by_linear` are slopes by natural frequency and damping ratio; `level_std` 1σ of what levels
+    have of their own: gain, phase, natural frequency and damping ratio.
+    """
     states, levels = measured.states, measured.chosen.n_levels
     known = measured.known
     n_sensors = np.asarray(states.velocity).shape[1]
     gain = measured.by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
     phase = measured.by_error[:, :, n_sensors + 1 :].sum(axis=2)
     member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
-    parts = [baseline]
-    for slope in (gain, phase):
-        parts.append(slope[:, :, None] * member[:, None, :])
-    every = np.concatenate(parts, axis=2)
+    slopes = (gain, phase, *np.moveaxis(by_linear, 2, 0))
+    parts = [
+        std * slope[:, :, None] * member[:, None, :]
+        for slope, std in zip(slopes, level_std, strict=True)
+        if std > 0
+    ]
+    every = np.concatenate([baseline, *parts], axis=2)
     own = np.asarray(whitened(jnp.asarray(measured.whiten), jnp.asarray(every)))[known]
     state, column = np.nonzero(known)
-    return Weighing(measured.whiten, known, own, np.eye(len(own)), state, column)
+    lower = np.linalg.cholesky(np.eye(len(own)) + own @ own.T)
+    return Weighing(measured.whiten, known, own, lower, state, column)
 
 
 class Fit(NamedTuple):
@@ -130,18 +143,28 @@ class Bench:
         self._columns, self._slopes = found.columns[0], found.slopes[0]
         self._by_error = predictions.by_error(group, group.values)
         self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
-        self._weigh(self._by_error)
+        self._weigh(self._by_error + self._of_what_is_missed())
+
+    def _of_what_is_missed(self) -> Float[np.ndarray, "state column input"]:
+        """What errors of the velocity do to the force that the baseline does not know of.
+
+        That force turns with the velocity, and is taken to grow with it: where a baseline misses
+        most of the damping, it would else pass on too little of the errors.
+        """
+        sensors = np.asarray(self.predictions.chosen.states.velocity).shape[1]
+        missing = -(self._columns[:, 0] + 1j * self._columns[:, 1])
+        change = np.zeros_like(self._by_error)
+        for place, part in ((1, missing), (1 + sensors, 1j * missing)):
+            change[:, 0, place], change[:, 1, place] = part.real, part.imag
+        return change
 
     def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
-        chosen = self.predictions.chosen
-        measured = whitened_states(chosen, by_error)
-        std = [float(self.model.level_gain_std), float(self.model.level_phase_std)]
-        scale = np.repeat(std, chosen.n_levels)
-        raw = weighing(measured, self._slopes[:, :, :-2])
-        scale = np.concatenate([np.ones(raw.shared.shape[1] - len(scale)), scale])
-        shared = (raw.shared * scale)[:, scale > 0]
-        lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
-        self.weighing = raw._replace(shared=shared, lower=lower)
+        measured = whitened_states(self.predictions.chosen, by_error)
+        model = self.model
+        levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
+        std = np.array([float(value) for value in (*levels, model.level_damping_std)])
+        parts = self._slopes[:, :, :-2], self._slopes[:, :, -2:]
+        self.weighing = weighing(measured, *parts, std)
         self.base = self.weighing.noise_units(self._columns[None])[0]
         linear = np.moveaxis(self._slopes[:, :, -2:], 2, 0)
         self.by_linear = self.weighing.noise_units(linear).T

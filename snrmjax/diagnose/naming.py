@@ -43,13 +43,13 @@ class Named(NamedTuple):
 
 
 def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
-    """Add effects one after the other while the criterion asks for them, two at most."""
+    """Add effects one after the other while the criterion asks for them, three at most."""
     every = {kind: candidate(kind, scales) for kind in kinds}
     before = bench.nothing()
     bench, singles = _tried(bench, every, before)
     nothing = bench.nothing()
     table = [_table(bench, nothing, singles)]
-    best = min(singles, key=lambda fit: fit.criterion(bench.n_rows), default=nothing)
+    best = _simplest(bench, singles) if singles else nothing
     if _gain(bench, nothing, best) <= DETECTED:
         return Named(bench, nothing, nothing, (), tuple(table))
     firsts = [best]
@@ -59,30 +59,40 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     pairs: list[Fit] = []
     for first in firsts:
         pairs += [bench.fitted(c, first) for c in _promising(bench, every, first)]
-    pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=best)
-    if _gain(bench, best, pair) <= DETECTED:
+    lowest = min(singles, key=lambda fit: fit.criterion(bench.n_rows))
+    pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=lowest)
+    if _gain(bench, lowest, pair) <= DETECTED:
         return Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
     bench = bench.reweighed(pair)
-    nothing, classes, winner = bench.nothing(), [], pair
-    alone = [bench.fitted(_also_from(every[kind], pair)) for kind in pair.kinds]
+    nothing = bench.nothing()
+    alone = [_alone(bench, every, kind, pair) for kind in pair.kinds]
     simple = min(alone, key=lambda fit: fit.criterion(bench.n_rows))
     if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
         # What two seemed to be is one that no start had come near to.
         fits = [bench.fitted(_from(every, f)) for f in singles if f.kinds != simple.kinds]
         answers = (_class(bench, [simple, *fits], simple.kinds[0]),)
         return Named(bench, simple, nothing, answers, tuple(table))
-    for k, kind in enumerate(pair.kinds):
-        other = alone[1 - k]
-        rivals = _promising(bench, every, other)
-        rivals = [c for c in rivals if c.kind != kind] + [_also_from(every[kind], pair)]
+    # Each is chosen anew beside the other: the first one beside the second, then the reverse.
+    classes: list[tuple[str, ...]] = []
+    kind, other = pair.kinds[0], alone[1]
+    for place in range(2):
+        rivals = [c for c in _promising(bench, every, other) if c.kind != kind]
+        rivals.append(_also_from(every[kind], pair))
         fits = [bench.fitted(c, other) for c in rivals]
         table.append(_table(bench, other, fits))
-        mine = [f for f in fits if f.kinds[1] == kind]
-        fits.sort(key=lambda fit: fit.criterion(bench.n_rows))
-        classes.append(_class(bench, fits, kind, at=1))
-        if mine and k == 1:
-            winner = mine[0]
-    return Named(bench, winner, nothing, tuple(classes), tuple(table))
+        pair = _simplest(bench, fits)
+        classes.append(_class(bench, fits, pair.kinds[1], at=1))
+        if place == 0:
+            kind, chosen = pair.kinds
+            other = alone[0] if chosen == alone[0].kinds[0] else _alone(bench, every, chosen, pair)
+    if unlikely(pair.chi_square, bench.n_rows - len(pair.values)) < _DOUBTFUL:
+        thirds = [bench.fitted(c, pair) for c in _promising(bench, every, pair)]
+        third = min(thirds, key=lambda fit: fit.criterion(bench.n_rows), default=pair)
+        if _gain(bench, pair, third) > DETECTED:
+            table.append(_table(bench, pair, thirds))
+            pair = _simplest(bench, thirds)
+            classes.append(_class(bench, thirds, pair.kinds[2], at=2))
+    return Named(bench, pair, nothing, tuple(classes), tuple(table))
 
 
 def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[Candidate]:
@@ -119,6 +129,10 @@ def _also_from(one: Candidate, pair: Fit) -> Candidate:
     return one._replace(starts=(*one.starts, pair.of_kind(one.kind)))
 
 
+def _alone(bench: Bench, every: dict[str, Candidate], kind: str, pair: Fit) -> Fit:
+    return bench.fitted(_also_from(every[kind], pair))
+
+
 def _rest(every: dict[str, Candidate], first: Fit, pair: Fit) -> tuple[Candidate, Fit]:
     """The other one of a pair, and what it is fitted beside."""
     (kind,) = set(pair.kinds) - set(first.kinds)
@@ -134,11 +148,22 @@ def _gain(bench: Bench, before: Fit, after: Fit) -> float:
     return before.criterion(bench.n_rows) - after.criterion(bench.n_rows)
 
 
+def _simplest(bench: Bench, fits: list[Fit]) -> Fit:
+    """Of the fits that are about as good as the best, one with the fewest parameters.
+
+    A further mode or a threshold can be laid where chance bends the data; no criterion that
+    counts parameters charges for the choice of place.
+    """
+    least = min(fit.criterion(bench.n_rows) for fit in fits)
+    near = [fit for fit in fits if fit.criterion(bench.n_rows) < least + AS_GOOD]
+    return min(near, key=lambda fit: (len(fit.values), fit.criterion(bench.n_rows)))
+
+
 def _class(bench: Bench, fits: list[Fit], kind: str, at: int = 0) -> tuple[str, ...]:
     """The kinds that cannot be told from one, itself first."""
-    mine = min(f.criterion(bench.n_rows) for f in fits if f.kinds[at] == kind)
     order = sorted(fits, key=lambda fit: fit.criterion(bench.n_rows))
-    near = [f.kinds[at] for f in order if f.criterion(bench.n_rows) < mine + AS_GOOD]
+    least = order[0].criterion(bench.n_rows)
+    near = [f.kinds[at] for f in order if f.criterion(bench.n_rows) < least + AS_GOOD]
     return (kind, *(name for name in near if name != kind))
 
 

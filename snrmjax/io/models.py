@@ -35,7 +35,10 @@ from snrmjax.model.structure import Structure, structure
 _MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
 _MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std")
 _RIGID_BODY_KEYS = ("shape", "participation")
-_MEASUREMENT_KEYS = ("level_gain_std", "level_phase_std_deg")
+_MEASUREMENT_KEYS = (
+    *("level_gain_std", "level_phase_std_deg"),
+    *("level_frequency_std_hz", "level_damping_ratio_std"),
+)
 _TOP_KEYS = (
     "name",
     "mode_of_interest",
@@ -136,6 +139,9 @@ def _read(text: str, file: str, stem: str) -> Structure:
         level_gain_std=measurement.number("level_gain_std", NOT_NEGATIVE, default=0.0),
         level_phase_std=measurement.number("level_phase_std_deg", NOT_NEGATIVE, default=0.0)
         * DEGREE,
+        level_frequency_std=measurement.number("level_frequency_std_hz", NOT_NEGATIVE, default=0.0)
+        * HERTZ,
+        level_damping_std=measurement.number("level_damping_ratio_std", NOT_NEGATIVE, default=0.0),
         name=name,
     )
 
@@ -299,6 +305,10 @@ def _entries(model: Structure) -> dict[str, object]:
     measurement = {
         "level_gain_std": _one("level_gain_std", model.level_gain_std),
         "level_phase_std_deg": in_unit(_one("level_phase_std", model.level_phase_std), DEGREE),
+        "level_frequency_std_hz": in_unit(
+            _one("level_frequency_std", model.level_frequency_std), HERTZ
+        ),
+        "level_damping_ratio_std": _one("level_damping_std", model.level_damping_std),
     }
     parts: dict[str, object] = {
         "name": model.name,

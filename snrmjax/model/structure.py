@@ -36,7 +36,9 @@ class Structure(eqx.Module):
     """q̈ + 2ζωq̇ + ω²q + ∂V/∂q + Σ effects = Φᵀb F(t), in modal coordinates q (kg^1/2 m).
 
     `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ errors that all measurements
-    of one level share; they belong to the test set-up and travel with the model file.
+    of one level share; `level_frequency_std` (rad/s) and `level_damping_std` (of the damping ratio)
+    say how far the mode of interest itself differs from level to level, as a bolted joint does
+    from run to run. They belong to the test set-up and travel with the model file.
     `test_order`, from 0 to 1, is when in a test the structure is looked at.
     """
 
@@ -45,6 +47,8 @@ class Structure(eqx.Module):
     effects: tuple[AbstractEffect, ...] = ()
     level_gain_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     level_phase_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    level_frequency_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
+    level_damping_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     test_order: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     name: str = eqx.field(static=True, default="structure")
 
@@ -176,12 +180,15 @@ def structure(
     effects: tuple[AbstractEffect, ...] = (),
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
+    level_frequency_std: float = 0.0,
+    level_damping_std: float = 0.0,
     test_order: float = 0.0,
     name: str = "structure",
 ) -> Structure:
     """Build a `Structure`; without a potential it is linear but for its effects.
 
-    Arguments: `level_gain_std` relative, `level_phase_std` in rad, `test_order` from 0 to 1.
+    Arguments: `level_gain_std` relative, `level_phase_std` in rad, `level_frequency_std` in rad/s,
+    `level_damping_std` of the damping ratio, `test_order` from 0 to 1.
     Raises `ValueError` when potential and modes disagree about the number of modes.
     """
     if potential is None:
@@ -196,6 +203,8 @@ def structure(
         effects=tuple(effects),
         level_gain_std=jnp.asarray(float(level_gain_std)),
         level_phase_std=jnp.asarray(float(level_phase_std)),
+        level_frequency_std=jnp.asarray(float(level_frequency_std)),
+        level_damping_std=jnp.asarray(float(level_damping_std)),
         test_order=jnp.asarray(float(test_order)),
         name=name,
     )

@@ -1,0 +1,99 @@
+"""Reasons to doubt an answer that fits: what a law outside the library could do as well."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.locating import Located
+
+_CONTRADICTED = 4.0  # 1σ between an exponent and the law that was named
+_CURVE = 0.05  # 1σ of an exponent that a free curve of few knots adds
+
+
+class Doubt(NamedTuple):
+    """Why an answer may be an imitation, and what would tell."""
+
+    reason: str
+    decide_by: str
+    refutes: bool = False
+
+
+# Exponents of the change of ω̃² or δ against amplitude, by the part where it shows.
+_EXPONENTS = {
+    "coulomb_friction": ("damping", -1.0),
+    "quadratic_damping": ("damping", 1.0),
+    "cubic_damping": ("damping", 2.0),
+    "van_der_pol_damping": ("damping", 2.0),
+    "cubic_stiffness": ("stiffness", 2.0),
+    "quadratic_stiffness": ("stiffness", 2.0),
+    "quintic_stiffness": ("stiffness", 4.0),
+}
+
+_SAME_PART = (
+    frozenset(
+        {
+            *("quadratic_stiffness", "cubic_stiffness", "quintic_stiffness", "static_preload"),
+            *("bilinear_stiffness", "gap_stiffness", "one_sided_stop"),
+        }
+    ),
+    frozenset(
+        {"coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"},
+    ),
+    frozenset({"jenkins_slider", "iwan_microslip"}),
+    frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),
+)
+_RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
+_WIDER = "widen the range of levels at both ends and record the second and third harmonics"
+
+
+def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt]:
+    """Reasons to doubt the effects that were found, from what was located before any name."""
+    found: list[Doubt] = []
+    if len(effects) == 1:
+        found += _of_exponent(effects[0], located)
+        if effects[0] == "iwan_microslip":
+            found.append(
+                Doubt(
+                    "other laws of friction with the same backbone, such as Bouc and Wen's, fit "
+                    "as well.",
+                    "measure a hysteresis loop, or levels over two decades",
+                )
+            )
+    if len(effects) == 2 and any(group >= set(effects) for group in _SAME_PART):
+        found.append(
+            Doubt(
+                f"{effects[0]} and {effects[1]} act on the same part: they may be one law that "
+                "the library does not have.",
+                _WIDER,
+            )
+        )
+    elif len(effects) == 2 and _RESONANCES & set(effects):
+        found.append(
+            Doubt(
+                "a further mode beside another effect can imitate a law that the library does not "
+                "have.",
+                f"step finely through the frequency of the further mode, or {_WIDER}",
+            )
+        )
+    return found
+
+
+def _of_exponent(effect: str, located: tuple[Located, ...]) -> list[Doubt]:
+    """The power of amplitude that was located, against that of the law that was named."""
+    if effect not in _EXPONENTS:
+        return []
+    part, expected = _EXPONENTS[effect]
+    mine = [p for p in located if p.part == part and p.exponent is not None]
+    if not mine or mine[0].exponent is None or mine[0].exponent_std is None:
+        return []
+    exponent, std = mine[0].exponent, float(np.hypot(mine[0].exponent_std, _CURVE))
+    if abs(exponent - expected) > _CONTRADICTED * std:
+        reason = (
+            f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
+            f"which is not the {expected:g} of {effect}."
+        )
+        return [Doubt(reason, _WIDER, refutes=True)]
+    if effect == "coulomb_friction" and abs(exponent + 0.5) < 2 * std:
+        reason = "damping that goes with the square root of the velocity fits as well."
+        return [Doubt(reason, "measure smaller amplitudes, or a free decay")]
+    return []
