@@ -41,18 +41,21 @@ def write_diagnosis(
 ) -> Diagnosis:
     """Diagnose, and write everything that the command writes into a folder.
 
-    Where the force is known as a drive voltage only, a joint fit finds its gain first.
+    Where the force is known as a drive voltage only, a joint fit finds a first gain, which stays
+    free.
     """
     notes: tuple[str, ...] = ()
+    gain_std = 0.0
     if not np.any(np.isfinite(np.asarray(data.force))):
         fit = fit_jointly(data, model.modes, free=("force_gain",))
         data = corrected(data, fit)
         gain = float(np.exp(fit.unknowns.log_force_gain))
         notes = (
-            f"the force is known as a drive voltage only; {gain:.4g} N/V is taken, from a joint "
-            "fit of smooth curves: an error of that gain can pass for an effect.",
+            f"the force is known as a drive voltage only: about {gain:.4g} N/V by a joint fit of "
+            "smooth curves. Its gain stays free, so that damping and gain errors cannot be told.",
         )
-    found = diagnose_model(model, data)
+        gain_std = 1.0
+    found = diagnose_model(model, data, force_gain_std=gain_std)
     found = dataclasses.replace(found, notes=(*notes, *found.notes))
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found))
     write_model(folder / "model.toml", found.completed)

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import chi2
@@ -17,11 +18,13 @@ from snrmjax.diagnose.verifying import HeldOut, gap, held_out
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structure import Structure
 
 _UNLIKELY = 1e-3
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
+_LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
 _LEAST_STATES = 6
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
@@ -59,7 +62,9 @@ class Diagnosis:
     after: Float[np.ndarray, "state part"]
 
 
-def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
+def diagnose_model(
+    model: Structure, data: SteadyStates, *, force_gain_std: float = 0.0
+) -> Diagnosis:
     """Find the physics that a model lacks to explain measured steady states.
 
     Works in the force balance: the measured fundamental is held, harmonic balance settles the
@@ -67,12 +72,14 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
     library is fitted with the baseline's parameters free inside their stated errors and the
     levels' errors inside theirs; Schwarz's criterion decides.
 
+    `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
+
     Returns a `Diagnosis`. Raises `ValueError` for too few states, an unknown force or sensors
     other than the model's.
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
     """
-    predictions = Predictions(model, data)
+    predictions = Predictions(model, data, force_gain_std)
     n_states = len(predictions.chosen.rows)
     if n_states < _LEAST_STATES:
         raise ValueError(
@@ -87,6 +94,8 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
     notes: list[str] = []
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
+    if force_gain_std > 0:  # of a gain that is not known none can be missing
+        present |= {"force_gain_error", "sensor_gain_error"}
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
     if predictions.chosen.noise_stated:
         found = named(bench, scales, kinds)
@@ -133,7 +142,7 @@ def diagnose_model(model: Structure, data: SteadyStates) -> Diagnosis:
         noise_scale=float(np.sqrt(noise)),
         notes=tuple(notes),
         table=found.table,
-        completed=_completed(model, fit, values),
+        completed=_completed(model, bench, fit, values),
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
         before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
@@ -238,7 +247,14 @@ def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[st
         ]
     # A noise that is stated a little too small everywhere is no sign of further physics.
     if unlikely(found.fit.chi_square / np.clip(noise, 1.0, _TOLERATED), n) < _UNLIKELY:
-        return "unknown", ["no effect of the library explains what is left."]
+        reasons = ["no effect of the library explains what is left."]
+        if noise > _LOUD**2:
+            reasons.append(
+                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
+                "that counts here: state what a repeated test shows, or no noise at all, and "
+                "diagnose again."
+            )
+        return "unknown", reasons
     if not found.fit.kinds:
         return "none", []
     unclear = any(len(group) > 1 for group in found.classes)
@@ -285,9 +301,19 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
     return limits
 
 
-def _completed(model: Structure, fit: Fit, values: dict[str, tuple[float, float]]) -> Structure:
+def _completed(
+    model: Structure, bench: Bench, fit: Fit, values: dict[str, tuple[float, float]]
+) -> Structure:
+    """The model with what was found, and its own parameters where the data put them.
+
+    A model that lacks nothing stays as it is.
+    """
+    if not fit.kinds:
+        return model
     added = tuple(
         make_effect(kind, {name: values[f"{kind}.{name}"][0] for name in effect_parameters(kind)})
         for kind in fit.kinds
     )
-    return dataclasses.replace(model, effects=(*model.effects, *added))
+    own = bench.baseline(fit)
+    moved = with_parameters(model, tuple(own), jnp.array(list(own.values()))) if own else model
+    return dataclasses.replace(moved, effects=(*model.effects, *added))

@@ -1,5 +1,6 @@
 """Reasons to doubt an answer that fits: what a law outside the library could do as well."""
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -51,23 +52,24 @@ def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt
     found: list[Doubt] = []
     if len(effects) == 1:
         found += _of_exponent(effects[0], located)
-        if effects[0] == "iwan_microslip":
-            found.append(
-                Doubt(
-                    "other laws of friction with the same backbone, such as Bouc and Wen's, fit "
-                    "as well.",
-                    "measure a hysteresis loop, or levels over two decades",
-                )
-            )
-    if len(effects) == 2 and any(group >= set(effects) for group in _SAME_PART):
+    if "iwan_microslip" in effects:
         found.append(
             Doubt(
-                f"{effects[0]} and {effects[1]} act on the same part: they may be one law that "
-                "the library does not have.",
+                "other laws of friction with the same backbone, such as Bouc and Wen's, fit as "
+                "well.",
+                "measure a hysteresis loop, or levels over two decades",
+            )
+        )
+    alike = [pair for pair in combinations(effects, 2) if any(g >= set(pair) for g in _SAME_PART)]
+    if alike:
+        found.append(
+            Doubt(
+                f"{' and '.join(alike[0])} act on the same part: they may be one law that the "
+                "library does not have.",
                 _WIDER,
             )
         )
-    elif len(effects) == 2 and _RESONANCES & set(effects):
+    elif len(effects) > 1 and _RESONANCES & set(effects):
         found.append(
             Doubt(
                 "a further mode beside another effect can imitate a law that the library does not "

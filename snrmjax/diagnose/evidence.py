@@ -20,12 +20,13 @@ from snrmjax.diagnose.predictions import (
     whitened_states,
 )
 from snrmjax.identify.calibration_states import whitened
-from snrmjax.model.parameters import parameter_names, stated_std
+from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
 from snrmjax.model.structure import Structure
 
 _STEPS = 9  # of a fit
 _SCREENED, _KEPT = 2, 2  # steps of all starts, and how many of them go on
 _SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
+_WEAKER = 3  # times a start without a motion is tried with less strength
 _SETTLED = 0.02  # of χ²: a smaller change ends a fit
 
 
@@ -63,6 +64,10 @@ class Weighing(NamedTuple):
         """Rows less the likeliest of what states have in common."""
         half = solve_triangular(self.lower, rows, lower=True)
         return np.asarray(solve_triangular(self.lower, half, lower=True, trans="T"))
+
+    def likeliest(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, " shared"]:
+        """What states share, in its own 1σ, as the misfits tell it."""
+        return np.asarray(-self.shared.T @ self.without_shared(rows))
 
     def of_rows(self, keep: Bool[np.ndarray, " row"]) -> Float[np.ndarray, "kept kept"]:
         """Cholesky's factor for some of the rows by themselves."""
@@ -163,8 +168,10 @@ class Bench:
         model = self.model
         levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
         std = np.array([float(value) for value in (*levels, model.level_damping_std)])
-        parts = self._slopes[:, :, :-2], self._slopes[:, :, -2:]
-        self.weighing = weighing(measured, *parts, std)
+        own, by_linear = self._slopes[:, :, :-2], self._slopes[:, :, -2:]
+        gain = self.predictions.force_gain_std * by_error[:, :, :1]
+        shared = np.concatenate([own, gain], axis=2) if np.any(gain) else own
+        self.weighing = weighing(measured, shared, by_linear, std)
         self.base = self.weighing.noise_units(self._columns[None])[0]
         linear = np.moveaxis(self._slopes[:, :, -2:], 2, 0)
         self.by_linear = self.weighing.noise_units(linear).T
@@ -236,6 +243,15 @@ class Bench:
         """What a candidate's first start changes, in units of noise."""
         return self.weighing.noise_units(self._started(candidate))[0]
 
+    def baseline(self, fit: "Fit") -> dict[str, float]:
+        """The baseline's parameters that have a stated error, where that and the data put them."""
+        moved = self.weighing.likeliest(fit.rows)
+        names = _baseline_names(self.model)
+        return {
+            name: float(parameter_value(self.model, name)) + stated_std(self.model, name) * step
+            for name, step in zip(names, moved[: len(names)].tolist(), strict=True)
+        }
+
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """Of misfits in units of noise."""
         return float(np.sum(self.weighing.decorrelated(rows) ** 2))
@@ -263,6 +279,13 @@ class Bench:
         rows, slopes = together(point * unit)
         damping = np.full(trials, 1e-2)
         cost = np.array([self._cost(row) for row in rows])
+        for _ in range(_WEAKER):
+            lost = np.flatnonzero(~np.isfinite(cost))
+            if not lost.size:
+                break
+            point[lost, 0] *= 0.3  # too strong to have a motion
+            rows[lost], slopes[lost] = together(point[lost] * unit)
+            cost[lost] = [self._cost(row) for row in rows[lost]]
         active = np.isfinite(cost)
         for turn in range(_STEPS):
             if turn == _SCREENED:  # the most promising go on

@@ -75,13 +75,14 @@ class Measured(NamedTuple):
 class Predictions:
     """Answers for one model and one set of data."""
 
-    def __init__(self, model: Structure, data: SteadyStates):
+    def __init__(self, model: Structure, data: SteadyStates, force_gain_std: float = 0.0):
         # Its name would be a part of the programs.
         self.model = dataclasses.replace(model, name="")
         self.chosen = calibration_states(model, data, programs.HARMONICS)
         self.held = (self.chosen.sensors, self.chosen.orders, programs.HARMONICS)
         self.states: list[np.ndarray] = [np.asarray(part) for part in self.chosen.states]
         self.level_numbers = np.asarray(data.level)[self.chosen.rows]
+        self.force_gain_std = force_gain_std
         self._groups: dict[str, Group] = {}
         found = by_blocks(self._baseline_motions, _BLOCK, *self.states)
         # Room for a power of two of states: few sizes compile.

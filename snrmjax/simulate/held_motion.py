@@ -18,7 +18,7 @@ from snrmjax.simulate.harmonics import displacement_phasors, velocity_phasors
 _SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
 _NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
 _SECANTS = 20  # steps with one Jacobian that is brought up to date, at most
-_CLOSE = 1e-4  # relative size of such a step after which two more are exact enough
+_CLOSE = 1e-5  # relative size of such a step after which the error is far below all noise
 
 
 class HeldMotion(eqx.Module):
@@ -101,8 +101,8 @@ class HeldMotion(eqx.Module):
     ) -> Float[Array, " unknown"]:
         """The solution near `start`, from an inverse Jacobian there; NaN without one.
 
-        Broyden's method: no step needs another Jacobian. Derivatives are what two more steps
-        carry: off by the square of what is left of the Jacobian's error.
+        Broyden's method: no step needs another Jacobian. Derivatives are what three steps with
+        the first one carry: off by the cube of what the effects change in it.
         """
         fixed = jax.lax.stop_gradient(self)
 
@@ -124,10 +124,11 @@ class HeldMotion(eqx.Module):
 
         start = jax.lax.stop_gradient(start)
         first = (start, fixed.equations(start), inverse, jnp.array(0), jnp.array(jnp.inf))
-        point, _, inverse, _, size = jax.lax.while_loop(going, step, first)
+        point, *_, size = jax.lax.while_loop(going, step, first)
         point = jnp.where(size <= _CLOSE, point, jnp.nan)
         # In a loop the equations are compiled once.
-        return jax.lax.fori_loop(0, 2, lambda _, p: p - inverse @ self.equations(p), point)
+        moved = jax.lax.fori_loop(0, 3, lambda _, p: p - inverse @ self.equations(p), point)
+        return point + (moved - jax.lax.stop_gradient(moved))
 
     def grown(self) -> Float[Array, " unknown"]:
         """The solution that grows from small amplitudes, as a start for `solved`; else NaN.

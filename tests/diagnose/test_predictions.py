@@ -49,7 +49,7 @@ def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
     assert needed.converged.all()
     missed = np.asarray(needed.force) / np.asarray(data.force) - 1
     # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.
-    # Steps end below 1e-4, and two more follow.
+    # Steps end below 1e-5.
     tolerance = 1e-4 if kind == "iwan_microslip" else 1e-5
     change = np.max(np.abs(missed - missed_by(ours)))
     assert np.max(np.abs(found - missed)) < tolerance * max(change, 1e-3)
