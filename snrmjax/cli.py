@@ -340,7 +340,8 @@ def diagnose(
             _warn(f"{path.name}: {error}")
             refused.append(path.name)
             continue
-        _say(f"{path.name}: {found.verdict.replace('_', ' ')} ({', '.join(found.effects)})")
+        effects = f" ({', '.join(found.effects)})" if found.effects else ""
+        _say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
         if found.decide_by:
             _say(f"  what would decide: {found.decide_by}")
     if refused:

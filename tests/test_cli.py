@@ -257,3 +257,38 @@ def test_a_wrong_joint_fit_ends_with_two(files, tmp_path, run_here, option, name
     assert "Traceback" not in stderr
     assert named in stderr
     assert not out.exists()
+
+
+def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path, monkeypatch, capsys):
+    blind = Path(__file__).parent / "diagnose" / "blind" / "blind_03"
+    out = tmp_path / "out"
+    table, model = (str(blind.with_suffix(suffix)) for suffix in (".csv", ".toml"))
+    command = ["snrmjax", "diagnose", table, "--model", model, "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in (0, None)
+    told = json.loads((out / "diagnosis.json").read_text())
+    assert told["verdict"] == "none"
+    assert told["effects"] == told["candidates"] == []
+    assert told["decide_by"] is None
+    assert set(told["gap"]) >= {
+        "before",
+        "after",
+        "held_out_before",
+        "held_out_after",
+        "noise_floor",
+    }
+    assert (out / "model.toml").read_text().startswith("name")
+    assert (out / "report.html").stat().st_size > 1000
+    assert list(out.glob("*.png"))
+    assert "blind_03.csv: none\n" in capsys.readouterr().err
+
+
+def test_diagnose_refuses_too_few_states(files, tmp_path, run_here):
+    model, data = files
+    data.write_text(HEADER + "".join(ROWS.splitlines(keepends=True)[:4]))
+    out = tmp_path / "out"
+    code, stderr = run_here("diagnose", str(data), "--model", str(model), "--out", str(out))
+    assert code == 2
+    assert "at least 6" in stderr

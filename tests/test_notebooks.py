@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-LONG = ("02_forced_responses", "03_joint_fit_and_error_bars")  # a minute and more
+LONG = (
+    "02_forced_responses",
+    "03_joint_fit_and_error_bars",
+    "04_the_missing_effect",
+)  # a minute and more
 PATHS = [
     pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)
     for path in sorted(NOTEBOOKS.glob("*.py"))

@@ -26,6 +26,7 @@ _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
 _LEAST_STATES = 6
+_ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
 
@@ -114,6 +115,7 @@ def diagnose_model(
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
     notes = [*reasons, *notes, *predictions.chosen.notes]
+    values = _values(bench, fit)
     n_levels = predictions.chosen.n_levels
     inner = outer = None
     if n_levels > 2:
@@ -125,9 +127,14 @@ def diagnose_model(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
             "the answer."
         )
+    shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
+    if abs(shift) > _ANOTHER:
+        notes.append(
+            f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
+            "of another mode?"
+        )
     harmonics = bool(predictions.chosen.orders)
     unclear = {kind for group in found.classes if len(group) > 1 for kind in group}
-    values = _values(bench, fit)
     force = bench.weighing.column < 2
     return Diagnosis(
         verdict=verdict,

@@ -46,9 +46,9 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     """Add effects one after the other while the criterion asks for them, three at most."""
     every = {kind: candidate(kind, scales) for kind in kinds}
     before = bench.nothing()
-    bench, singles = _tried(bench, every, before)
+    bench, singles, others = _tried(bench, every, before)
     nothing = bench.nothing()
-    table = [_table(bench, nothing, singles)]
+    table = [(*_table(bench, nothing, singles), *others)]
     best = _simplest(bench, singles) if singles else nothing
     if _gain(bench, nothing, best) <= DETECTED:
         return Named(bench, nothing, nothing, (), tuple(table))
@@ -108,20 +108,27 @@ def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[C
     return [c for (gain, c), need in zip(foretold, worth, strict=True) if gain > need]
 
 
-def _tried(bench: Bench, every: dict[str, Candidate], before: Fit) -> tuple[Bench, list[Fit]]:
-    """Candidates, the promising ones weighed with the best one's way of passing on errors."""
+def _tried(
+    bench: Bench, every: dict[str, Candidate], before: Fit
+) -> tuple[Bench, list[Fit], tuple[Row, ...]]:
+    """Candidates, the promising ones weighed with the best one's way of passing on errors.
+
+    Returns the others as rows for a report.
+    """
     fits = [bench.fitted(c, before) for c in _promising(bench, every, before)]
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     if not fits:
-        return bench, []
+        return bench, [], ()
     best = min(fits, key=lambda fit: fit.criterion(bench.n_rows))
     if _gain(bench, before, best) <= DETECTED:
-        return bench, fits
+        return bench, fits, ()
     least = best.criterion(bench.n_rows)
     again = bench.reweighed(best)
     reach = least + max(_PROMISING, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(bench.n_rows) < reach]
-    return again, [again.fitted(_from(every, fit), again.nothing()) for fit in near]
+    far = [fit for fit in fits if fit.criterion(bench.n_rows) >= reach]
+    anew = [again.fitted(_from(every, fit), again.nothing()) for fit in near]
+    return again, anew, _table(bench, before, far)
 
 
 def _also_from(one: Candidate, pair: Fit) -> Candidate:

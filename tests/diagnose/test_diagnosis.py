@@ -1,5 +1,6 @@
 """Diagnoses of sets that time integration made, and of states that obey a changed balance."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import ClassVar
@@ -78,19 +79,22 @@ def test_an_effect_that_no_one_knows_is_not_named():
     assert found.p_value < 1e-3
 
 
-def balanced(change_of_damping, seed=0, levels=5, per_level=9):
+def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
     """States of a linear mode whose damping changes with velocity, and their noise.
+
+    `shift` is the relative 1σ by which the natural frequency differs from level to level.
 
     For a displacement and a frequency the force that holds them is known: nothing is solved.
     """
     rng = np.random.default_rng(seed)
     rows = []
+    shifts = shift * np.random.default_rng([seed, 1]).normal(size=levels)
     for level, tip in enumerate(np.geomspace(1e-4, 1e-3, levels)):
         for phase in np.radians(np.linspace(-55, 55, per_level)):
             x = tip * np.cos(phase)
             omega = OMEGA * (1 - ZETA * np.tan(phase))
             damping = 2 * ZETA * OMEGA + change_of_damping(omega * x)
-            needed = OMEGA**2 - omega**2 + 1j * omega * damping
+            needed = (OMEGA * (1 + shifts[level])) ** 2 - omega**2 + 1j * omega * damping
             rows.append((level, omega, abs(needed) * x / (SHAPE * PARTICIPATION), needed, x))
     level, omega, force, needed, x = (np.array(column) for column in zip(*rows, strict=True))
     velocity = 1j * omega * x * np.exp(-1j * np.angle(needed))
@@ -109,16 +113,16 @@ def balanced(change_of_damping, seed=0, levels=5, per_level=9):
     )
 
 
-def linear_model():
+def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
     modes = sj.linear_modes(
-        [OMEGA],
-        [ZETA],
+        [frequency],
+        [damping],
         [[SHAPE]],
         [PARTICIPATION],
         natural_frequency_std=[1e-4 * OMEGA],
-        damping_ratio_std=[0.01 * ZETA],
+        damping_ratio_std=[damping_std * ZETA],
     )
-    return sj.structure(modes)
+    return sj.structure(modes, **settings)
 
 
 def test_what_is_located_is_what_was_changed():
@@ -162,3 +166,58 @@ def test_too_few_states_and_a_model_of_something_else_are_said():
     data = balanced(lambda v: 0.0 * v, levels=1, per_level=4)
     with pytest.raises(ValueError, match="at least 6"):
         sj.diagnose_model(linear_model(), data)
+
+
+def quadratic(velocity):
+    """The change of damping that quadratic damping makes, 18 kg^-1/2 at these shapes."""
+    return 8.0 * velocity
+
+
+def test_levels_whose_mode_differs_are_no_effect_once_that_is_stated():
+    data = balanced(lambda v: 0.0 * v, shift=1e-3)
+    unaware = sj.diagnose_model(linear_model(), data)
+    assert unaware.gap.before > 1.3
+    told = sj.diagnose_model(linear_model(level_frequency_std=1e-3 * OMEGA), data)
+    assert told.verdict == "none"
+    assert told.gap.before == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_completed_model_has_the_baseline_that_the_data_know_better():
+    baseline = linear_model(damping=1.04 * ZETA, damping_std=0.05)
+    found = sj.diagnose_model(baseline, balanced(quadratic))
+    assert found.effects == ("quadratic_damping",)
+    assert float(found.completed.modes.damping_ratio[0]) == pytest.approx(ZETA, rel=0.015)
+    assert float(baseline.modes.damping_ratio[0]) == 1.04 * ZETA
+
+
+def test_without_stated_noise_its_size_is_found_with_the_effect():
+    data = balanced(quadratic)
+    nothing = np.full((data.n_states, 1), np.nan)
+    silent = dataclasses.replace(
+        data, velocity_std=nothing, phase_std=nothing, force_std=nothing[:, 0]
+    )
+    found = sj.diagnose_model(linear_model(), silent)
+    assert found.effects == ("quadratic_damping",)
+    size = float(found.notes[0].split("is stated: ")[1].split(" %")[0])
+    # Velocity, phase and force together, as one relative error of all.
+    assert size == pytest.approx(100 * NOISE["velocity"], rel=0.35)
+
+
+def test_an_unknown_force_gain_passes_for_nothing():
+    data = balanced(quadratic)
+    louder = dataclasses.replace(data, force=1.5 * data.force, force_std=1.5 * data.force_std)
+    found = sj.diagnose_model(linear_model(), louder, force_gain_std=1.0)
+    assert found.effects == ("quadratic_damping",)
+    value, std = found.parameters["quadratic_damping.coefficient"]
+    known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
+    assert abs(value - known[0]) < 3 * std
+    assert not any("gain" in name for name in found.detection_limits)
+
+
+def test_data_of_another_mode_and_of_one_level_are_said():
+    far = sj.diagnose_model(linear_model(frequency=3 * OMEGA), balanced(quadratic))
+    assert "linear_frequency_shift" in far.effects
+    assert any("another mode" in note for note in far.notes)
+    one = sj.diagnose_model(linear_model(), balanced(quadratic, levels=1, per_level=20))
+    assert any("1 level only" in note for note in one.notes)
+    assert one.gap.interpolated is None

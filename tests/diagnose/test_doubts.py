@@ -1,0 +1,50 @@
+"""Answers that a law outside the library could imitate are marked."""
+
+import pytest
+
+from snrmjax.diagnose.doubts import doubts
+from snrmjax.diagnose.locating import Located
+
+
+def grows(part, exponent, std=0.05):
+    return (Located(part, (0.1, 1.0), 1e-9, exponent, std),)
+
+
+def test_a_law_of_the_located_power_is_not_doubted():
+    assert doubts(("coulomb_friction",), grows("damping", -1.05)) == []
+    assert doubts(("cubic_stiffness",), grows("stiffness", 2.1, 0.1)) == []
+    assert doubts(("quadratic_damping", "cubic_stiffness"), grows("damping", 1.0)) == []
+
+
+def test_a_law_of_another_power_is_refuted():
+    # Damping by the square root of the velocity goes with the power −1/2.
+    (doubt,) = doubts(("coulomb_friction",), grows("damping", -0.5))
+    assert doubt.refutes
+    assert "-0.50" in doubt.reason
+
+
+def test_a_power_that_is_hardly_known_refutes_nothing_but_leaves_the_rival():
+    (doubt,) = doubts(("coulomb_friction",), grows("damping", -0.8, 0.3))
+    assert not doubt.refutes
+    assert "decay" in doubt.decide_by
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        ("gap_stiffness", "quintic_stiffness"),
+        ("quadratic_damping", "cubic_stiffness", "cubic_damping"),
+        ("iwan_microslip", "jenkins_slider"),
+        ("internal_resonance_1_3", "quintic_stiffness"),
+        ("iwan_microslip",),
+    ],
+)
+def test_imitations_are_marked_with_what_would_decide(effects):
+    found = doubts(effects, ())
+    assert found
+    assert not any(doubt.refutes for doubt in found)
+    assert all(doubt.decide_by for doubt in found)
+
+
+def test_a_located_power_of_the_other_part_says_nothing():
+    assert doubts(("coulomb_friction",), grows("stiffness", -0.5)) == []
