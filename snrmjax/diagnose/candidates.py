@@ -211,7 +211,7 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
 def decide_by(kinds: set[str], *, harmonics: bool) -> str:
     """A sentence: the measurement that would settle which of several kinds it is."""
     fitting = [sentence for group, sentence in _DECIDES if len(group & kinds) > 1 or group <= kinds]
-    if not harmonics and not any("harmonic" in sentence for sentence in fitting):
+    if not fitting and not harmonics:
         fitting.append(f"record {_HARMONICS} at the largest level")
     if not fitting:
         fitting.append("widen the range of levels and measure farther off resonance on both sides")

@@ -2,6 +2,7 @@
 
 import pytest
 
+from snrmjax.diagnose.candidates import decide_by
 from snrmjax.diagnose.doubts import doubts
 from snrmjax.diagnose.locating import Located
 
@@ -48,3 +49,12 @@ def test_imitations_are_marked_with_what_would_decide(effects):
 
 def test_a_located_power_of_the_other_part_says_nothing():
     assert doubts(("coulomb_friction",), grows("stiffness", -0.5)) == []
+
+
+def test_what_would_decide_is_asked_for_and_nothing_beside_it():
+    gains = decide_by({"force_gain_error", "sensor_gain_error"}, harmonics=False)
+    assert "calibrate" in gains.lower()
+    assert "harmonic" not in gains
+    assert "harmonic 2" in decide_by({"gap_stiffness", "one_sided_stop"}, harmonics=False)
+    assert "harmonics" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=False)
+    assert "levels" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=True)
