@@ -20,9 +20,7 @@ from snrmjax.identify.calibration_states import (
     state_whitener,
 )
 from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.effect_base import (
-    AbstractEffect,
-)
+from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import parameter_names, parameter_value
 from snrmjax.model.structure import Structure
@@ -214,7 +212,7 @@ def whitened_states(
 
 
 PLAIN = "cubic_stiffness"
-"""A kind that every program of quick effects has."""
+"""A kind of the library, whose program also answers for the baseline by itself."""
 
 _LIBRARY = frozenset(EFFECTS)
 _SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
