@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -177,8 +177,7 @@ def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:
         return _SwingingSlider(effect.stiffness, effect.slip_displacement)
     if swings and isinstance(effect, IwanMicroslip):
         return _SwingingIwan(effect.coefficient, effect.exponent)
-    assert isinstance(effect, AbstractForce)
-    return effect
+    return cast(AbstractForce, effect)  # one of `forces_of`
 
 
 class _Resonance(AbstractForce):
