@@ -16,6 +16,7 @@ import json
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
@@ -228,7 +229,10 @@ def main() -> None:
             jobs = [(beam, chosen.seed + k, level_known) for k in range(chosen.tests)]
             begin = time.perf_counter()
             if chosen.workers > 1:
-                with ProcessPoolExecutor(chosen.workers) as pool:
+                # A fork of a process that has begun with JAX may wait for ever.
+                context = get_context("spawn")
+                settings = {"initializer": FAMILY.update, "initargs": (FAMILY,)}
+                with ProcessPoolExecutor(chosen.workers, context, **settings) as pool:
                     rows = list(pool.map(_work, jobs, chunksize=8))
             else:
                 rows = [_work(job) for job in jobs]

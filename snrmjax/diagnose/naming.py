@@ -46,9 +46,9 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     """Add effects one after the other while the criterion asks for them, three at most."""
     every = {kind: candidate(kind, scales) for kind in kinds}
     before = bench.nothing()
-    bench, singles, others = _tried(bench, every, before)
+    bench, singles, rows = _tried(bench, every, before)
     nothing = bench.nothing()
-    table = [(*_table(bench, nothing, singles), *others)]
+    table = [rows]
     best = _simplest(bench, singles) if singles else nothing
     if _gain(bench, nothing, best) <= DETECTED:
         return Named(bench, nothing, nothing, (), tuple(table))
@@ -113,22 +113,21 @@ def _tried(
 ) -> tuple[Bench, list[Fit], tuple[Row, ...]]:
     """Candidates, the promising ones weighed with the best one's way of passing on errors.
 
-    Returns the others as rows for a report.
+    Returns all of them as rows for a report too, in the weighing that all share.
     """
     fits = [bench.fitted(c, before) for c in _promising(bench, every, before)]
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
+    rows = _table(bench, before, fits)
     if not fits:
-        return bench, [], ()
+        return bench, [], rows
     best = min(fits, key=lambda fit: fit.criterion(bench.n_rows))
     if _gain(bench, before, best) <= DETECTED:
-        return bench, fits, ()
+        return bench, fits, rows
     least = best.criterion(bench.n_rows)
     again = bench.reweighed(best)
     reach = least + max(_PROMISING, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(bench.n_rows) < reach]
-    far = [fit for fit in fits if fit.criterion(bench.n_rows) >= reach]
-    anew = [again.fitted(_from(every, fit), again.nothing()) for fit in near]
-    return again, anew, _table(bench, before, far)
+    return again, [again.fitted(_from(every, fit), again.nothing()) for fit in near], rows
 
 
 def _also_from(one: Candidate, pair: Fit) -> Candidate:
