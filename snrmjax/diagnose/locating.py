@@ -35,7 +35,7 @@ class FreeFit(NamedTuple):
         return unlikely(self.chi_square, self.freedom)
 
 
-def located(bench: Bench, base: Fit, level: float = _P_VALUE) -> FreeFit:
+def located(bench: Bench, base: Fit) -> FreeFit:
     """Fit free curves of stiffness and damping to the force, and judge every part by itself."""
     weighing, states = bench.weighing, bench.predictions.states
     speed = np.abs(states[4][:, 0])
@@ -53,7 +53,7 @@ def located(bench: Bench, base: Fit, level: float = _P_VALUE) -> FreeFit:
     for k, name in enumerate(("stiffness", "damping")):
         without = force.chi_square(rows, both[1 - k])[0]
         p_value = unlikely(without - free, _FREE)
-        if p_value < level:
+        if p_value < _P_VALUE:
             own = slice(k * _FREE, (k + 1) * _FREE)
             parts.append(
                 Located(
@@ -66,7 +66,7 @@ def located(bench: Bench, base: Fit, level: float = _P_VALUE) -> FreeFit:
     n_force = int(of_force.sum())
     left = unlikely(free, n_force - 2 * _FREE)
     everywhere = (float(speed.min()), float(speed.max()))
-    if left < level and nothing > n_force:
+    if left < _P_VALUE and nothing > n_force:
         parts.append(Located("not_a_function_of_amplitude", everywhere, left))
     n_sensors = states[4].shape[1]
     orders = bench.predictions.chosen.orders
@@ -81,7 +81,7 @@ def located(bench: Bench, base: Fit, level: float = _P_VALUE) -> FreeFit:
             np.where(mine, base.rows, 0.0), np.zeros((len(rows), 0))
         )[0]
         p_value = unlikely(square, int(mine.sum()))
-        if p_value < level:
+        if p_value < _P_VALUE:
             large = np.abs(base.rows[mine]) > 2.5
             where = speed[weighing.state[mine][large]] if large.any() else speed
             parts.append(
