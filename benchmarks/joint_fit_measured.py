@@ -26,7 +26,7 @@ from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.fitted_curves import values_with_slopes
-from snrmjax.identify.joint_fit import JointFit, all_residuals, whitener_at
+from snrmjax.identify.joint_fit import JointFit, all_residuals, weighing_at
 from snrmjax.identify.uncertainty import sensitivity
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
@@ -162,8 +162,8 @@ def halves(data: sj.SteadyStates, model: sj.Structure, free: tuple[str, ...]) ->
 
 
 @compiled
-def _residuals(vector, restore, data, modes, spread, whiten):
-    return all_residuals(vector, restore, data, modes, spread, whiten)
+def _residuals(vector, restore, data, modes, spread, weighing):
+    return all_residuals(vector, restore, data, modes, spread, weighing)
 
 
 def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
@@ -175,8 +175,8 @@ def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
 
     fit = fit_once()
     vector, restore = fit.vector()
-    whiten = whitener_at(restore(vector), fit.data, fit.modes, fit.spread)
-    given = (restore, fit.data, fit.modes, fit.spread, whiten)
+    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
+    given = (restore, fit.data, fit.modes, fit.spread, weighing)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def residuals(y: np.ndarray) -> np.ndarray:

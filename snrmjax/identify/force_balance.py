@@ -6,6 +6,7 @@ curve, however the response folds.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,6 +38,7 @@ class BalanceData(eqx.Module):
     share: Float[Array, "state sensor"]  # of the sensors in it
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for what a robust loss mistrusts
+    correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
     n_levels: int = eqx.field(static=True)
     sensor: int = eqx.field(static=True)  # the one whose motion is meant
 
@@ -90,6 +92,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             share=jnp.asarray(share)[keep],
             std=jnp.asarray(np.pad(errors[keep], ((0, 0), (0, 1)))),
             weight=jnp.ones(int(keep.sum())),
+            correction=no_errors(int(keep.sum())),
             n_levels=len(levels),
             sensor=r,
         ),
@@ -173,7 +176,7 @@ def force_balance(
     stiffness = squared - omega**2 + 1j * omega * damping
     needed = stiffness * motion.velocity / (1j * omega * constant)
     # Relative to the recorded force, but with no advantage from a larger gain.
-    unit = jax.lax.stop_gradient(motion.force) * jnp.exp(error[:, 0])
+    unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit
     return jnp.stack([excess.real, excess.imag], axis=1)
 
@@ -184,16 +187,46 @@ def no_errors(n_states: int) -> Float[Array, "state input"]:
 
 
 def error_slopes(
-    balance: Callable[[Array], Array], n_states: int
+    balance: Callable[[Array], Array], at: Float[Array, "state input"]
 ) -> Float[Array, "state part input"]:
-    """Derivatives of the balance with respect to `STATE_ERRORS`.
+    """Derivatives of the balance with respect to `STATE_ERRORS`, `at` some.
 
     Every state has its own: one push forward for each input gives them all.
     """
-    zero, kinds = no_errors(n_states), len(STATE_ERRORS)
+    n_states, kinds = at.shape
     directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
-    slopes = jax.vmap(lambda d: jax.jvp(balance, (zero,), (d,))[1])(directions)
+    slopes = jax.vmap(lambda d: jax.jvp(balance, (at,), (d,))[1])(directions)
     return jnp.moveaxis(slopes, 0, 2)
+
+
+class Weighing(NamedTuple):
+    """What turns a balance into independent residuals of unit variance, state by state."""
+
+    whiten: Float[Array, "state part part"]
+    offset: Float[Array, "state part"]  # of the balance, from the corrected state to the record
+
+
+def weighing_at(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Weighing:
+    """How much every balance weighs, by its slopes at the corrected states.
+
+    The balance is straight between a record and its corrected state, which lies on the curves:
+    there its slopes do not go up and down with the noise, as they do at the record, where they
+    pull every curve to one side.
+    Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
+    8 (1987) 1052, doi:10.1137/0908085.
+    """
+    slopes = slopes_by_error(unknowns, data, modes, spread)
+    offset = -jnp.einsum("sie,se->si", slopes, data.correction)
+    return Weighing(whitener(slopes, data.std), offset)
+
+
+def slopes_by_error(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Float[Array, "state part input"]:
+    """Derivatives of the balance by the states' errors, at the corrected states."""
+    return error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), data.correction)
 
 
 def whitener(

@@ -17,12 +17,12 @@ from snrmjax.identify.force_balance import (
     Motion,
     Spread,
     Unknowns,
+    Weighing,
     balance_data,
-    error_slopes,
     force_balance,
-    no_errors,
     recorded_motion,
-    whitener,
+    slopes_by_error,
+    weighing_at,
 )
 from snrmjax.identify.free_unknowns import (
     FREE,
@@ -46,6 +46,7 @@ SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
 _ROUNDS = 3  # of fitting and weighting anew
+_FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
@@ -198,12 +199,12 @@ def _fitted(
     robust: bool,
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
-    program, stated_std = programmed(start, free), data.std
+    program, stated_std, n = programmed(start, free), data.std, len(data.level)
 
     def as_noisy(scatter: Scatter) -> float:
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
-    converged, none = False, np.zeros((len(data.level), 2, 2))
+    converged, none = False, Weighing(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
     # An outlier has widened the noise at first: its weight falls round by round.
     rounds = 2 * _ROUNDS if robust else _ROUNDS
     for turn in range(rounds):
@@ -213,9 +214,9 @@ def _fitted(
         linear = _linearised(program.vector, *settings, none, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
-        vector, good = _solve(program.vector, *settings, linear.whiten, unit)
+        vector, good = _solve(program.vector, *settings, linear.weighing, unit)
         program, converged = program._replace(vector=vector), bool(good)
-        answer = _linearised(vector, *settings, linear.whiten, np.array(False))
+        answer = _linearised(vector, *settings, linear.weighing, np.array(False))
         residuals = np.asarray(answer.residuals)
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
@@ -226,6 +227,7 @@ def _fitted(
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
         if turn < rounds - 1:
+            data = eqx.tree_at(lambda d: d.correction, data, answer.correction)
             rows = jacobian[: residuals.size]
             spent = float(np.sum((rows @ covariance) * rows))
             dof = max(residuals.size - spent, 1.0)
@@ -258,10 +260,11 @@ def inverse_of(jacobian: np.ndarray) -> np.ndarray:
 class _Linear(NamedTuple):
     """The whitened problem at some unknowns."""
 
-    whiten: Array
+    weighing: Weighing
     residuals: Array  # of the states
     jacobian: Array  # of all residuals, priors included
     cost: Array
+    correction: Array  # of every state's record: its likeliest error, taken back
 
 
 def whitened(
@@ -269,22 +272,11 @@ def whitened(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
-    whiten: Float[Array, "state part part"],
+    weighing: Weighing,
 ) -> Float[Array, "state part"]:
     """Residuals of the states, of unit variance where the noise is as stated."""
-    none = no_errors(len(data.level))
-    balance = force_balance(unknowns, data, modes, spread, none)
-    return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", whiten, balance)
-
-
-def whitener_at(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> Float[Array, "state part part"]:
-    """What makes the balance's errors independent, at some unknowns."""
-    slopes = error_slopes(
-        lambda e: force_balance(unknowns, data, modes, spread, e), len(data.level)
-    )
-    return whitener(slopes, data.std)
+    balance = force_balance(unknowns, data, modes, spread, data.correction) + weighing.offset
+    return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", weighing.whiten, balance)
 
 
 def all_residuals(
@@ -293,11 +285,11 @@ def all_residuals(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
-    whiten: Array,
+    weighing: Weighing,
 ) -> Float[Array, " residual"]:
     """Whitened residuals of the states, then the priors of levels and linear parameters."""
     unknowns = restore(vector)
-    points = whitened(unknowns, data, modes, spread, whiten).reshape(-1)
+    points = whitened(unknowns, data, modes, spread, weighing).reshape(-1)
     return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
 
 
@@ -308,22 +300,28 @@ def _linearised(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
-    whiten: Array,
+    weighing: Weighing,
     anew: Array,
 ) -> _Linear:
     """Residuals and slopes, with the whitening given or `anew` with that of these unknowns."""
-    whiten = jnp.where(anew, whitener_at(restore(vector), data, modes, spread), whiten)
+    fresh = weighing_at(restore(vector), data, modes, spread)
+    weighing = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, weighing)
 
     def residuals(vector: Array) -> Array:
-        return all_residuals(vector, restore, data, modes, spread, whiten)
+        return all_residuals(vector, restore, data, modes, spread, weighing)
 
     left, push = jax.linearize(residuals, vector)
     n = 2 * len(data.level)
+    points = left[:n].reshape(-1, 2)
+    unweighted = points / jnp.sqrt(jnp.maximum(data.weight, 1e-12))[:, None]
+    slopes = slopes_by_error(restore(vector), data, modes, spread)
+    found = -jnp.einsum("sji,skj,sk->si", slopes, weighing.whiten, unweighted) * data.std**2
     return _Linear(
-        whiten=whiten,
-        residuals=left[:n].reshape(-1, 2),
+        weighing=weighing,
+        residuals=points,
         jacobian=jax.vmap(push)(jnp.eye(vector.size)).T,
         cost=jnp.sum(left**2),
+        correction=jnp.clip(found, -_FARTHEST, _FARTHEST),
     )
 
 
@@ -334,7 +332,7 @@ def _solve(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
-    whiten: Array,
+    weighing: Weighing,
     unit: Array,
 ) -> tuple[Array, Array]:
     """Levenberg–Marquardt from the present unknowns; the vector found and whether it is one.
@@ -342,7 +340,7 @@ def _solve(
     Every unknown counts in its own `unit`, so that the solver's damping treats all alike.
     """
     solution: optx.Solution = optx.least_squares(
-        lambda y, _: all_residuals(y * unit, restore, data, modes, spread, whiten),
+        lambda y, _: all_residuals(y * unit, restore, data, modes, spread, weighing),
         *(SOLVER, vector / unit),
         max_steps=200,
         throw=False,

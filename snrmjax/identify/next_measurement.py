@@ -15,9 +15,16 @@ from snrmjax.identify.fitted_response import (
     fitted_response,
     point_slopes,
 )
-from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
+from snrmjax.identify.force_balance import (
+    LEVEL_ERRORS,
+    BalanceData,
+    Spread,
+    Unknowns,
+    no_errors,
+    weighing_at,
+)
 from snrmjax.identify.free_unknowns import Restore
-from snrmjax.identify.joint_fit import JointFit, whitened, whitener_at
+from snrmjax.identify.joint_fit import JointFit, whitened
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -177,6 +184,7 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         share=jnp.asarray(share),
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
+        correction=no_errors(n),
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
@@ -199,10 +207,10 @@ def _slopes(
     def unknowns_of(vector: Array, level: Array) -> Unknowns:
         return eqx.tree_at(lambda u: u.level, restore(vector), level)
 
-    whiten = whitener_at(unknowns_of(vector, new), data, modes, spread)
+    weighing = weighing_at(unknowns_of(vector, new), data, modes, spread)
 
     def residuals(vector: Array, level: Array) -> Array:
-        return whitened(unknowns_of(vector, level), data, modes, spread, whiten)
+        return whitened(unknowns_of(vector, level), data, modes, spread, weighing)
 
     # The levels of the fit have no part in a new one: their columns come out as zeros.
     by_vector = jax.jacfwd(residuals)(vector, new)

@@ -99,7 +99,7 @@ def _slopes(unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: S
     n = len(data.level)
     zero = no_errors(n)
     whiten = whitener(
-        error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), n), data.std
+        error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), zero), data.std
     )
     ones = jnp.ones_like(spread.level)
     raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)

@@ -20,9 +20,8 @@ from snrmjax.identify.force_balance import (
     STATE_ERRORS,
     BalanceData,
     Spread,
-    error_slopes,
-    force_balance,
-    whitener,
+    slopes_by_error,
+    weighing_at,
 )
 from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import (
@@ -30,7 +29,7 @@ from snrmjax.identify.joint_fit import (
     JointFit,
     all_residuals,
     inverse_of,
-    whitener_at,
+    whitened,
 )
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
@@ -94,13 +93,13 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 def _second_order(
     vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
 ) -> tuple[Array, Array]:
-    whiten = whitener_at(restore(vector), data, modes, spread)
+    weighing = weighing_at(restore(vector), data, modes, spread)
 
     def gradient(vector: Array, error: Array) -> Array:
         def cost(vector: Array) -> Array:
             unknowns = restore(vector)
-            balance = force_balance(unknowns, data, modes, spread, error)
-            points = jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", whiten, balance)
+            erring = eqx.tree_at(lambda d: d.correction, data, data.correction + error)
+            points = whitened(unknowns, erring, modes, spread, weighing)
             priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
             return 0.5 * (jnp.sum(points**2) + priors)
 
@@ -165,12 +164,11 @@ def _first_order(
     vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
 ) -> tuple[Array, Array]:
     """Slopes of the residuals by the unknowns, and of the states' by their own errors."""
-    unknowns, n = restore(vector), len(data.level)
-    slopes = error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), n)
-    whiten = whitener(slopes, data.std)
-    given = (restore, data, modes, spread, whiten)
+    slopes = slopes_by_error(restore(vector), data, modes, spread)
+    weighing = weighing_at(restore(vector), data, modes, spread)
+    given = (restore, data, modes, spread, weighing)
     jacobian = jax.jacfwd(lambda v: all_residuals(v, *given))(vector)
-    return jacobian, jnp.sqrt(data.weight)[:, None, None] * (whiten @ slopes)
+    return jacobian, jnp.sqrt(data.weight)[:, None, None] * (weighing.whiten @ slopes)
 
 
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
@@ -212,13 +210,13 @@ def _pinned(
     index: Array,
     values: Array,
 ) -> Float[Array, " value"]:
-    whiten = whitener_at(restore(vector), data, modes, spread)
+    weighing = weighing_at(restore(vector), data, modes, spread)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(value: Array) -> Array:
         def residuals(y: Array, _: None = None) -> Array:
             point = vector + y * unit
-            free = all_residuals(point, restore, data, modes, spread, whiten)
+            free = all_residuals(point, restore, data, modes, spread, weighing)
             held = _PIN * (point[index] - value) / unit[index]
             return jnp.append(free, held)
 
@@ -268,13 +266,13 @@ def _resampled(
     std: Array,
     weights: Array,
 ) -> Float[Array, "sample unknown"]:
-    whiten = whitener_at(restore(vector), data, modes, spread)
+    weighing = weighing_at(restore(vector), data, modes, spread)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(weight: Array) -> Array:
         drawn = eqx.tree_at(lambda d: d.weight, data, weight)
         found: optx.Solution = optx.least_squares(
-            lambda y, _: all_residuals(vector + y * unit, restore, drawn, modes, spread, whiten),
+            lambda y, _: all_residuals(vector + y * unit, restore, drawn, modes, spread, weighing),
             *(SOLVER, jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
@@ -300,11 +298,11 @@ def sample_posterior(
     vector, restore = fit.vector()
     values, directions = np.linalg.eigh(fit.covariance)
     root = jnp.asarray(directions * np.sqrt(np.maximum(values, 0.0)))
-    whiten = whitener_at(restore(vector), fit.data, fit.modes, fit.spread)
+    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
 
     def potential(z: Array) -> Array:
         point = vector + root @ z
-        residuals = all_residuals(point, restore, fit.data, fit.modes, fit.spread, whiten)
+        residuals = all_residuals(point, restore, fit.data, fit.modes, fit.spread, weighing)
         return 0.5 * jnp.sum(residuals**2)
 
     chain = MCMC(

@@ -23,7 +23,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, linear_modes
 
 BAND_POINTS = 200
-_FORMAT = 1
+_FORMAT = 2
 
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:

@@ -28,11 +28,11 @@ def fit():
 def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 
-    from snrmjax.identify.joint_fit import SOLVER, Restore, all_residuals, whitener_at
+    from snrmjax.identify.joint_fit import SOLVER, Restore, all_residuals, weighing_at
 
     slopes = sensitivity(fit).by_measurement
     vector, restore = fit.vector()
-    whiten = whitener_at(restore(vector), fit.data, fit.modes, fit.spread)
+    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def refit(state, kind, change):
@@ -46,7 +46,7 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
         data = eqx.tree_at(lambda d: getattr(d, name), fit.data, getattr(fit.data, name) * by)
         found = optx.least_squares(
             lambda y, _: all_residuals(
-                vector + y * unit, Restore(fit.unknowns, ()), data, fit.modes, fit.spread, whiten
+                vector + y * unit, Restore(fit.unknowns, ()), data, fit.modes, fit.spread, weighing
             ),
             *(SOLVER, jnp.zeros_like(vector)),
         )
