@@ -3,15 +3,16 @@
 Run: python benchmarks/next_measurement.py [--tests 100] [--seed 0]
 
 One mode with stiffening and with damping that rises with velocity, known exactly. Four levels of
-five noisy states are fitted jointly; then ten more states are measured, once where the fit advises
-and once spread evenly (ten forces between the smallest and the largest, phases from 45° lead to
-45° lag in turn), with the same noise, and the fit repeated. The mean relative band of both curves
-after over before says what each ten are worth. One JSON line.
+five noisy states are fitted jointly; then ten more states are measured where the fit advises, and
+ten that are spread evenly over the same forces, in three ways: ten forces with phases from 45°
+lead to 45° lag in turn (which takes a controller that holds a phase), ten forces with frequencies
+evenly between the ends of each response, and a grid of five forces and two frequencies. With the
+same noise, the fit is repeated. The mean relative band of both curves after over before says what
+each ten are worth. One JSON line.
 """
 
 import argparse
 import json
-from collections.abc import Callable
 
 import numpy as np
 
@@ -19,7 +20,7 @@ import snrmjax as sj
 
 OMEGA, CONSTANT = 500.0, 6.0
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
-FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "polynomial:1@velocity"}
+FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "viscous_quadratic@velocity"}
 FORCES = (0.3, 0.8, 1.6, 2.6)
 MODES = sj.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
 
@@ -99,14 +100,59 @@ def band(fit: sj.JointFit, at: np.ndarray) -> float:
     )
 
 
-def numbered(forces: list[float], first: int) -> Callable[[float], int]:
-    """Equal forces are one level."""
-    known = {force: first + k for k, force in enumerate(dict.fromkeys(forces))}
-    return known.__getitem__
+def advised(fit: sj.JointFit) -> list[Row]:
+    """Ten states where the fit wants them; equal forces are one level."""
+    advice = sj.next_measurements(fit, 10)
+    level = {force: 10 + k for k, force in enumerate(dict.fromkeys(one.force for one in advice))}
+    return [
+        (
+            *(level[one.force], one.force, one.frequency),
+            at_frequency(one.force, one.frequency, one.velocity),
+        )
+        for one in advice
+    ]
 
 
-def one_test(seed: int) -> tuple[float, float]:
-    """Band ratios after ten advised and after ten even states."""
+def even(way: str) -> list[Row]:
+    """Ten states spread evenly."""
+    turns = [
+        0,
+        5,
+        1,
+        6,
+        2,
+        7,
+        3,
+        8,
+        4,
+        9,
+    ]  # so that force and place on the response do not go along
+    forces = np.linspace(FORCES[0], FORCES[-1], 5 if way == "grid" else 10)
+    if way == "phases":
+        phases = np.radians(np.linspace(45, -45, 10))[turns]
+        return [
+            (40 + k, f, *at_phase(f, p))
+            for k, (f, p) in enumerate(zip(forces, phases, strict=True))
+        ]
+    shares = (
+        np.tile([0.25, 0.75], (5, 1)) if way == "grid" else (np.array(turns)[:, None] + 0.5) / 10
+    )
+    rows: list[Row] = []
+    for k, (force, mine) in enumerate(zip(forces, shares, strict=True)):
+        low, high = (at_phase(force, np.radians(end))[0] for end in (70, -70))
+        tip, velocity = at_phase(force, 0.0)
+        for omega in low + mine * (high - low):
+            # A sweep up stays on the branch of large motion as far as resonance.
+            expected = abs(velocity) if omega <= tip else 0.0
+            rows.append((40 + k, force, omega, at_frequency(force, omega, expected)))
+    return rows
+
+
+WAYS = ("phases", "frequencies", "grid")
+
+
+def one_test(seed: int) -> list[float]:
+    """Band ratios after ten advised and after ten even states, way by way."""
     rng, gains = np.random.default_rng(seed), {}
     rows = [
         (k, force, *at_phase(force, phase))
@@ -117,26 +163,11 @@ def one_test(seed: int) -> tuple[float, float]:
     fit = fitted(data)
     speed = np.abs(np.asarray(fit.motion().velocity))
     at = np.linspace(speed.min(), speed.max(), 25)
-    advice = sj.next_measurements(fit, 10)
-    level = numbered([one.force for one in advice], 10)
-    advised = [
-        (
-            *(level(one.force), one.force, one.frequency),
-            at_frequency(one.force, one.frequency, one.velocity),
-        )
-        for one in advice
-    ]
-    spread = np.linspace(FORCES[0], FORCES[-1], 10)
-    phases = np.radians(np.linspace(45, -45, 10))[[0, 5, 1, 6, 2, 7, 3, 8, 4, 9]]
-    even = [
-        (40 + k, f, *at_phase(f, p)) for k, (f, p) in enumerate(zip(spread, phases, strict=True))
-    ]
-    before = band(fit, at)
-    ratios = []
-    for more in (advised, even):
-        joined = sj.join_steady_states(data, measured(more, rng, gains))
+    before, ratios = band(fit, at), []
+    for more in (advised(fit), *map(even, WAYS)):
+        joined = sj.join_steady_states(data, measured(more, rng, dict(gains)))
         ratios.append(band(fitted(joined), at) / before)
-    return ratios[0], ratios[1]
+    return ratios
 
 
 def main() -> None:
@@ -146,16 +177,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     ratios = np.array([one_test(chosen.seed + k) for k in range(chosen.tests)])
-    gain = (1 - ratios[:, 0]) / (1 - ratios[:, 1])
-    line = {
+    line: dict[str, object] = {
         "benchmark": "next_measurement",
         "tests": len(ratios),
         "band_after_advised": round(float(np.median(ratios[:, 0])), 3),
-        "band_after_even": round(float(np.median(ratios[:, 1])), 3),
-        "shrinks_more_by_median": round(float(np.median(gain)), 2),
-        "share_at_least_1_5": round(float(np.mean(gain >= 1.5)), 2),
-        "share_better": round(float(np.mean(gain > 1)), 2),
     }
+    for k, way in enumerate(WAYS, 1):
+        gain = (1 - ratios[:, 0]) / (1 - ratios[:, k])
+        line[f"even_{way}"] = {
+            "band_after": round(float(np.median(ratios[:, k])), 3),
+            "advice_shrinks_more_by_median": round(float(np.median(gain)), 2),
+            "share_at_least_1_5": round(float(np.mean(gain >= 1.5)), 2),
+            "share_better": round(float(np.mean(gain > 1)), 2),
+        }
     print(json.dumps(line), flush=True)
 
 
