@@ -322,6 +322,9 @@ class _Workbench:
         rows = []
         arguments = (choice.argument,) if choice.argument else ARGUMENTS
         most = most_parameters(known.speed, self.data.n_levels)
+        if name == "damping":
+            # With as many as there are levels, the levels' gains would pass for damping.
+            most = min(most, max(self.data.n_levels - 1, 2))
         for kind in kinds if choice.kind == "auto" else (choice.kind,):
             family = FAMILIES[kind]
             for size in family.orders if choice.size is None else (choice.size,):
@@ -352,8 +355,10 @@ class _Workbench:
         # A level that one curve misses by far makes that spread large: it must not excuse it.
         as_good = (total[best] - total) <= np.minimum(spread, _DECISIVE)
         as_good[best] = True
-        order = np.lexsort((-total, sizes))
-        chosen = next(int(k) for k in order if as_good[k])
+        # Of equally many parameters the one that is listed first, unless another is clearly better:
+        # what the noise decides would widen nobody's band.
+        least = as_good & (sizes == sizes[as_good].min())
+        chosen = int(np.flatnonzero(least & (total >= total[least].max() - _DECISIVE))[0])
         # Bands know a curve's spread, not the bias of a term too few: one more if data allow.
         fair = (total[best] - total) <= 2 * spread + _UNDECIDED
         mine = rows[chosen]
