@@ -64,7 +64,8 @@ def phase_resonance_test(
     range; states whose appropriation indicator (Eq. 20, of the fundamental) lies inside
     `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over what a
     test can reach of both sides. Where a stable branch ends, the test jumps to the next one,
-    which is noted in `jumps`; states between the two are not reached.
+    which is noted in `jumps`, and follows that one both ways; states between the two are not
+    reached.
 
     `by="harmonic_balance"` steps infinitely slowly and records exact states, at `order` from 0
     to 1 in the order of the rows. `by="time_integration"` is `stepped_sine`: each level starts
@@ -168,6 +169,7 @@ def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
 
     A sweep follows a stable branch until it ends, then goes on with the next stable points of
     the same curve at that frequency or, beyond a window of period doubling, the next frequency.
+    From where it lands it is also turned round: a resonance can lie behind it.
     """
     n = len(curve.frequency)
     visited = np.zeros(n, dtype=bool)
@@ -189,4 +191,8 @@ def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
                 break
             jumps.append(float(curve.frequency[order[k]]))
             k += 1 + int(beyond[0])
+            back = k - 1
+            while back >= 0 and stable[back]:
+                visited[order[back]] = True
+                back -= 1
     return visited, jumps
