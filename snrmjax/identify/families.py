@@ -269,7 +269,7 @@ class Spline(AbstractFamily):
     """
 
     kind: ClassVar[str] = "spline"
-    orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6, 8, 10)
+    orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6, 8, 10, 14)
     knots: Float[Array, " knot"]  # of (amplitude/scale)²
     mix: Float[Array, "term knot"]  # from values at the knots to coefficients of 1, u and the cubes
 

@@ -100,40 +100,64 @@ class _Likelihood(NamedTuple):
         dof = max(n - int(np.sum(~bound)), 1)
         return cls(x.T @ x, x.T @ residuals, float(residuals @ residuals), n, dof, std, index)
 
-    def value(self, noise: float, level: np.ndarray) -> float:
-        """−2 log of the restricted likelihood."""
+    def value_and_slopes(
+        self, noise: float, level: np.ndarray
+    ) -> tuple[float, Float[np.ndarray, " logarithm"]]:
+        """−2 log of the restricted likelihood, and slopes by the logarithms of its arguments."""
         std = self.prior_std.copy()
         std[self.where] = level
         # What moves nothing and has no prior says nothing.
-        keep = (std > 0) & ((np.diag(self.gram) > 0) | np.isfinite(std))
-        own = std[keep & np.isfinite(std)]
-        a = self.gram[np.ix_(keep, keep)] / noise**2 + np.diag(1.0 / std[keep] ** 2)
-        size = np.sqrt(np.diag(a))
+        diagonal = np.diagonal(self.gram)
+        keep = (std > 0) & ((diagonal > 0) | np.isfinite(std))
+        every = bool(keep.all())
+        gram = (self.gram if every else self.gram[np.ix_(keep, keep)]) / noise**2
+        pull, own = self.pull[keep] / noise**2, std[keep]
+        a = gram + np.diag(1.0 / own**2)
+        size = np.sqrt(np.diagonal(a))
         factor = np.linalg.cholesky(a / np.outer(size, size) + 1e-13 * np.eye(len(a)))
-        q = np.linalg.solve(factor, self.pull[keep] / noise**2 / size)
-        determinant = 2 * np.sum(np.log(np.diag(factor))) + 2 * np.sum(np.log(size))
-        return float(
+        root = np.linalg.inv(factor) / size
+        x = root.T @ (root @ pull)
+        determinant = 2 * np.sum(np.log(np.diagonal(factor))) + 2 * np.sum(np.log(size))
+        value = float(
             self.total / noise**2
-            - q @ q
+            - pull @ x
             + determinant
-            + 2 * np.sum(np.log(own))
+            + 2 * np.sum(np.log(own[np.isfinite(own)]))
             + self.rows * np.log(noise**2)
         )
+        # Traces of the inverse times what changes; the inverse is rootᵀ·root.
+        by_noise = 2 * (
+            self.rows
+            - self.total / noise**2
+            + 2 * (pull @ x)
+            - x @ gram @ x
+            - np.sum((root @ gram) * root)
+        )
+        share = np.zeros(len(std))
+        share[keep] = 1.0 - (np.sum(root**2, axis=0) + x**2) / own**2
+        return value, np.concatenate([[by_noise], 2 * np.sum(share[self.where], axis=0)])
 
     def best(self, stated: np.ndarray, chosen: Bool[np.ndarray, " error"]) -> _Best:
         """The likeliest noise, and 1σ of the chosen kinds of error."""
+        asked = np.concatenate([[True], chosen])
 
         def unpacked(point: np.ndarray) -> tuple[float, np.ndarray]:
             level = stated.copy()
-            level[chosen] = np.clip(np.exp(point[1:]), _NOTHING, _LARGEST)
-            return float(np.exp(np.clip(point[0], -40.0, 40.0))), level
+            level[chosen] = np.exp(point[1:])
+            return float(np.exp(point[0])), level
 
-        start = np.log([max(np.sqrt(self.total / self.dof), 1e-12), *np.full(chosen.sum(), 0.01)])
-        corners = np.concatenate([start[None], start + np.eye(len(start))])
+        def of_logarithms(point: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slopes = self.value_and_slopes(*unpacked(point))
+            return value, slopes[asked]
+
+        middle = np.log(max(np.sqrt(self.total / self.dof), 1e-12))
+        ends = np.log([_NOTHING, _LARGEST])
         answer = minimize(
-            lambda point: self.value(*unpacked(point)),
-            start,
-            method="Nelder-Mead",
-            options={"xatol": 1e-2, "fatol": 1e-2, "initial_simplex": corners},
+            of_logarithms,
+            np.concatenate([[middle], np.full(chosen.sum(), np.log(0.01))]),
+            method="L-BFGS-B",
+            jac=True,
+            bounds=[(middle - 30.0, middle + 3.0)] + [tuple(ends)] * int(chosen.sum()),
+            options={"ftol": 1e-9, "gtol": 1e-4},
         )
         return _Best(float(answer.fun), *unpacked(answer.x))
