@@ -118,7 +118,8 @@ def fit_jointly(
     Levenberg–Marquardt on residuals whitened with the stated noise. Gain and phase errors that a
     level shares are unknowns with the stated 1σ; where levels scatter more than that allows, a
     deviation of stiffness and damping from level to level is estimated too (restricted maximum
-    likelihood) and enters the bands. The other modes' frequencies and dampings stay inside their
+    likelihood) and enters the bands. Where the stated noise is believed, slopes are taken at the
+    states freed of their likeliest errors (orthogonal distance regression). The other modes' frequencies and dampings stay inside their
     stated errors.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
@@ -227,12 +228,15 @@ def _fitted(
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
         if turn < rounds - 1:
-            data = eqx.tree_at(lambda d: d.correction, data, answer.correction)
             rows = jacobian[: residuals.size]
             spent = float(np.sum((rows @ covariance) * rows))
             dof = max(residuals.size - spent, 1.0)
             noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
             scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
+            # What a wrong noise would take for errors can lead far away from the records.
+            trusted = stated and not scatter.contradicts_upward
+            correction = answer.correction if trusted else jnp.zeros_like(answer.correction)
+            data = eqx.tree_at(lambda d: d.correction, data, correction)
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
         covariance=covariance,
