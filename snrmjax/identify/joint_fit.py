@@ -47,6 +47,8 @@ SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
 )
 _ROUNDS = 3  # of fitting and weighting anew
 _FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
+_BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
+_ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
@@ -119,8 +121,8 @@ def fit_jointly(
     level shares are unknowns with the stated 1σ; where levels scatter more than that allows, a
     deviation of stiffness and damping from level to level is estimated too (restricted maximum
     likelihood) and enters the bands. Where the stated noise is believed, slopes are taken at the
-    states freed of their likeliest errors (orthogonal distance regression). The other modes' frequencies and dampings stay inside their
-    stated errors.
+    states freed of their likeliest errors (orthogonal distance regression). The other modes'
+    frequencies and dampings stay inside their stated errors.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
@@ -159,6 +161,8 @@ def fit_jointly(
     settings = (measured, modes, level, released, chosen.scatter)
     best = _fitted(start, *settings, stated=stated, robust=robust)
     notes = _notes(best, measured, spread.level, stated=stated)
+    motion = recorded_motion(in_one_form(best.unknowns), best.data, modes, best.spread)
+    notes += _notes_on_reach(motion, np.asarray(best.data.level))
     return JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
@@ -389,5 +393,28 @@ def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> 
         notes.append(
             f"{data.n_levels} level{'s' if data.n_levels > 1 else ''} only: nothing says how far "
             "levels differ from one another, and the bands do not include it."
+        )
+    return tuple(notes)
+
+
+def _notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:
+    """What states on one side of resonance, or of one amplitude, leave open."""
+    notes = []
+    phase = np.degrees(np.angle(np.asarray(motion.velocity)))
+    if phase.min() > _BESIDE or phase.max() < -_BESIDE:
+        near, far = sorted((abs(phase.min()), abs(phase.max())))
+        side = "below" if phase.min() > 0 else "above"
+        notes.append(
+            f"all states lie on one side of resonance ({near:.0f}° to {far:.0f}° {side} it): an "
+            "error of phase that they share passes for a change of natural frequency and damping, "
+            "and no band contains it unless it is stated."
+        )
+    size = np.asarray(motion.displacement)
+    peaks = np.array([size[level == k].max() for k in np.unique(level)])
+    if len(peaks) > 1 and peaks.max() < _ALIKE * peaks.min():
+        notes.append(
+            f"the levels' largest amplitudes lie within {100 * (peaks.max() / peaks.min() - 1):.2g}"
+            " % of each other: no level tells more than another of how the mode changes with "
+            "amplitude, and only smaller states of the same levels do."
         )
     return tuple(notes)

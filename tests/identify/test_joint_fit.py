@@ -268,6 +268,32 @@ def test_too_few_states_and_one_level_are_said():
     assert any("1 level only" in note for note in found.notes)
 
 
+def test_states_on_one_side_and_levels_of_one_amplitude_are_said():
+    level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(1)))
+    families = {"backbone": "polynomial:1", "damping": "polynomial:1"}
+
+    def notes(keep, index):
+        data = stated(index, omega[keep], force[keep], velocity[keep])
+        return " ".join(fit_jointly(data, modes(), **families).notes)
+
+    one_side = np.flatnonzero(np.angle(velocity) > np.radians(10))
+    assert "on one side of resonance (1" in notes(one_side, level[one_side])
+    twice = np.concatenate([np.flatnonzero(level == 3)] * 2)
+    said = notes(twice, np.repeat([0, 1], len(twice) // 2))
+    assert "lie within 0 % of each other" in said
+    assert "one side" not in said
+    said = notes(np.arange(len(level)), level)
+    assert "one side" not in said
+    assert "of each other" not in said
+
+
+def test_noise_that_is_contradicted_corrects_no_record():
+    believed = fit_jointly(noisy(2), modes(), **TRUE)
+    assert np.max(np.abs(np.asarray(believed.data.correction))) > 0.003
+    doubted = fit_jointly(noisy(2, scale=8.0), modes(), **TRUE)
+    assert not np.any(np.asarray(doubted.data.correction))
+
+
 def test_parse_family():
     assert parse_family("spline:5@velocity") == ("spline", 5, "velocity")
     assert parse_family("auto") == ("auto", None, None)
