@@ -1,11 +1,12 @@
 """Where a joint fit begins: instruments' gain and phase, then rough curves, by least squares."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from snrmjax.identify.families import (
     AbstractFamily,
@@ -120,3 +121,13 @@ def most_parameters(amplitude: Float[np.ndarray, " state"], n_levels: int) -> in
     """How many parameters of a curve the spread of amplitudes, or the levels, can tell apart."""
     apart = np.log(np.max(amplitude) / np.min(amplitude)) / np.log(_APART)
     return int(np.clip(max(apart, n_levels - 2), 1, max(len(amplitude) // 4, 1)))
+
+
+def levels_apart(amplitude: Float[np.ndarray, " state"], level: Int[np.ndarray, " state"]) -> bool:
+    """Whether no level shares half of its amplitudes, or of its neighbour's, with the next."""
+    size = np.log(amplitude)
+    ends = sorted((size[level == k].min(), size[level == k].max()) for k in np.unique(level))
+    return all(
+        below[1] - above[0] < 0.5 * min(below[1] - below[0], above[1] - above[0])
+        for below, above in itertools.pairwise(ends)
+    )

@@ -30,7 +30,7 @@ from snrmjax.identify.force_balance import (
     whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
-from snrmjax.identify.pilot import most_parameters
+from snrmjax.identify.pilot import levels_apart, most_parameters
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -322,7 +322,7 @@ class _Workbench:
         rows = []
         arguments = (choice.argument,) if choice.argument else ARGUMENTS
         most = most_parameters(known.speed, self.data.n_levels)
-        if name == "damping":
+        if name == "damping" and levels_apart(known.speed, np.asarray(self.data.level)):
             # With as many as there are levels, the levels' gains would pass for damping.
             most = min(most, max(self.data.n_levels - 1, 2))
         for kind in kinds if choice.kind == "auto" else (choice.kind,):
