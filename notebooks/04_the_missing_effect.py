@@ -122,11 +122,27 @@ headline["the level held out is foretold to within its noise"] = found.gap.inter
 # responses of both models over the measured states, and what each effect would explain by itself.
 
 # %%
-figures = diagnosis_report.diagnosis_figures(found, model, test.steady_states, simulate=True)
+figures = diagnosis_report.diagnosis_figures(found, test.steady_states)
+found, foretold, figures["responses"] = diagnosis_report.with_responses(
+    found, model, test.steady_states
+)
 show(figures["residuals"], "residuals")
 
 # %%
 show(figures["responses"], "responses")
+for row in foretold:
+    print(
+        f"level {row.level}{', not seen' if row.held_out else ''}: resonance measured "
+        f"{row.measured.frequency:.3f} Hz, {row.measured.velocity:.4f} m/s; before "
+        f"{row.before.frequency:.3f} Hz, {row.before.velocity:.4f} m/s; completed "
+        f"{row.after.frequency:.3f} Hz, {row.after.velocity:.4f} m/s"
+    )
+unseen = [row for row in foretold if row.held_out]
+headline["resonances of levels not seen foretold within 0.1 Hz and 2 %"] = all(
+    abs(row.after.frequency - row.measured.frequency) < 0.1
+    and abs(row.after.velocity / row.measured.velocity - 1) < 0.02
+    for row in unseen
+)
 
 # %%
 show(figures["candidates"], "candidates")
@@ -198,7 +214,7 @@ else:
     data = read_steady_states(table, sensors=linear.modes.sensors).steady_states
     joint = sj.diagnose_model(bolted, data)
     report(joint)
-    figures = diagnosis_report.diagnosis_figures(joint, bolted, data, simulate=False)
+    figures = diagnosis_report.diagnosis_figures(joint, data)
     show(figures["residuals"], "brake_reuss_residuals")
     headline["damping is located to grow"] = any(p.part == "damping" for p in joint.located)
     headline["level held out: gap closed by two thirds or more"] = (

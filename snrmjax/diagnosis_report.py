@@ -8,6 +8,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
+from snrmjax.diagnose.foretelling import (
+    LevelResponse,
+    Resonance,
+    level_forces,
+    level_responses,
+    responses,
+    where_rivals_differ,
+)
 from snrmjax.diagnose.locating import Located
 from snrmjax.diagnose.naming import AS_GOOD, DETECTED
 from snrmjax.diagnose.summary import summarise_diagnosis
@@ -21,7 +29,6 @@ from snrmjax.model.structure import Structure
 from snrmjax.plot import save_figure
 from snrmjax.presentation import corrected
 from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
-from snrmjax.simulate.forced_response import forced_response
 from snrmjax.simulate.response_curve import ResponseCurve
 
 _SHOWN = 10  # candidates
@@ -57,13 +64,34 @@ def write_diagnosis(
         gain_std = 1.0
     found = diagnose_model(model, data, force_gain_std=gain_std)
     found = dataclasses.replace(found, notes=(*notes, *found.notes))
-    write_summary(folder / "diagnosis.json", summarise_diagnosis(found))
+    foretold: list[LevelResponse] = []
+    figures = diagnosis_figures(found, data)
+    if simulate and found.effects:
+        found, foretold, figures["responses"] = with_responses(found, model, data)
+    write_summary(folder / "diagnosis.json", summarise_diagnosis(found, foretold))
     write_model(folder / "model.toml", found.completed)
-    figures = diagnosis_figures(found, model, data, simulate=simulate)
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png")
-    write_report(folder / "report.html", diagnosis_report(found, title.replace("_", " "), figures))
+    report = diagnosis_report(found, title.replace("_", " "), figures, foretold)
+    write_report(folder / "report.html", report)
     return found
+
+
+def with_responses(
+    found: Diagnosis, model: Structure, data: SteadyStates
+) -> tuple[Diagnosis, list[LevelResponse], Figure]:
+    """What simulation adds: where rivals differ most, resonances and responses of all levels."""
+    forces = list(level_forces(data).values())
+    before, after = (responses(one, data, forces) for one in (model, found.completed))
+    foretold = level_responses(before, after, data, found.sensor, found.blind)
+    sentences = [
+        where_rivals_differ(effect, found.completed, rival, other, data, found.sensor)
+        for effect, rival, other in found.rivals
+    ]
+    wanted = " ".join(s for s in (found.decide_by, *sentences) if s)
+    old, new = ([c for one in curves for c in one] for curves in (before, after))
+    figure = simulated_figure(old, new, data, found.sensor)
+    return dataclasses.replace(found, decide_by=wanted or None), foretold, figure
 
 
 def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
@@ -149,30 +177,21 @@ def simulated_figure(
     return figure
 
 
-def diagnosis_figures(
-    diagnosis: Diagnosis, model: Structure, data: SteadyStates, *, simulate: bool
-) -> dict[str, Figure]:
-    """All figures by name; with `simulate` the responses before and after under every level."""
-    figures = {
+def diagnosis_figures(diagnosis: Diagnosis, data: SteadyStates) -> dict[str, Figure]:
+    """The figures that need no simulation, by name."""
+    return {
         "residuals": residual_figure(diagnosis, data),
         "candidates": candidates_figure(diagnosis),
     }
-    if simulate and diagnosis.effects:
-        level, force = np.asarray(data.level), np.asarray(data.force)
-        forces = [float(np.mean(force[level == k])) for k in np.unique(level)]
-        frequency = np.asarray(data.frequency)
-        reach = 0.3 * (frequency.max() - frequency.min())
-        ends = (float(frequency.min() - reach), float(frequency.max() + reach))
-        before, after = (
-            forced_response(one, forces, *ends, harmonic_order=5, stability=False)
-            for one in (model, diagnosis.completed)
-        )
-        figures["responses"] = simulated_figure(before, after, data, diagnosis.sensor)
-    return figures
 
 
-def diagnosis_report(diagnosis: Diagnosis, title: str, figures: dict[str, Figure]) -> Report:
-    """The report of a diagnosis."""
+def diagnosis_report(
+    diagnosis: Diagnosis,
+    title: str,
+    figures: dict[str, Figure],
+    foretold: Sequence[LevelResponse] = (),
+) -> Report:
+    """The report of a diagnosis; `foretold` are resonances of the simulated responses."""
     gap = diagnosis.gap
     answers = [
         (effect, " or ".join(group))
@@ -233,7 +252,13 @@ def diagnosis_report(diagnosis: Diagnosis, title: str, figures: dict[str, Figure
     ]
     if "responses" in figures:
         shown = [ReportFigure(figures["responses"], captions["responses"])]
-        sections.append(Section("Simulated responses", figures=shown))
+        table = ReportTable(
+            ("level", "force (N)", "measured", "model as given", "completed model"),
+            [_resonances(row) for row in foretold],
+            "Resonances: frequency, velocity and, of models, where the branch ends. Levels marked "
+            "with * are foretold by a model that has not seen them.",
+        )
+        sections.append(Section("Simulated responses", tables=[table], figures=shown))
     limits = sorted(diagnosis.detection_limits.items())
     sections.append(
         Section(
@@ -253,3 +278,15 @@ def _parts(parts: Sequence[Located]) -> list[tuple[str, str, str, str]]:
         name = part.part.replace("_", " ")
         rows.append((name, f"{low:.3g} to {high:.3g} m/s", f"{part.p_value:.1e}", exponent))
     return rows
+
+
+def _resonances(row: LevelResponse) -> tuple[str, ...]:
+    def words(one: Resonance) -> str:
+        if not np.isfinite(one.frequency):
+            return "none"
+        fold = f", fold {one.fold:.5g} Hz" if np.isfinite(one.fold) else ""
+        return f"{one.frequency:.5g} Hz, {one.velocity:.3g} m/s{fold}"
+
+    mark = "*" if row.held_out else ""
+    each = (words(one) for one in (row.measured, row.before, row.after))
+    return (f"{row.level}{mark}", f"{row.force:.3g}", *each)

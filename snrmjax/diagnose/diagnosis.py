@@ -1,6 +1,7 @@
 """The whole diagnosis: locate, name, add, verify, or say that there is nothing or no answer."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
-from snrmjax.diagnose.verifying import HeldOut, gap, held_out
+from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
@@ -57,6 +58,8 @@ class Diagnosis:
     notes: tuple[str, ...]
     table: tuple[tuple[Row, ...], ...]
     completed: Structure
+    rivals: tuple[tuple[str, str, Structure], ...]  # an effect, what it may be, the model with that
+    blind: dict[int, Structure]  # completed without having seen a level
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
     before: Float[np.ndarray, "state part"]  # force misfit over noise, less what states share
@@ -115,13 +118,18 @@ def diagnose_model(
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
     notes = [*reasons, *notes, *predictions.chosen.notes]
-    values = _values(bench, fit)
+    values, own = _values(bench, fit), bench.baseline(fit)
     n_levels = predictions.chosen.n_levels
     inner = outer = None
+    blind = {}
     if n_levels > 2:
         order = _by_amplitude(bench)
-        inner = held_out(bench, found.nothing, fit, order[n_levels // 2])
-        outer = held_out(bench, found.nothing, fit, order[-1])
+        places = (order[n_levels // 2], order[-1])
+        inner, outer = (held_out(bench, found.nothing, fit, place) for place in places)
+        for place in places if fit.kinds else ():
+            unseen = without_level(bench, fit, place)
+            mine = dict(zip(fit.labels, unseen.values.tolist(), strict=True))
+            blind[unseen.level] = _completed(model, unseen.baseline, fit.kinds, mine)
     elif n_levels < 3:
         notes.append(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
@@ -149,7 +157,9 @@ def diagnose_model(
         noise_scale=float(np.sqrt(noise)),
         notes=tuple(notes),
         table=found.table,
-        completed=_completed(model, bench, fit, values),
+        completed=_completed(model, own, fit.kinds, {name: v for name, (v, _) in values.items()}),
+        rivals=tuple(_rivals(model, own, found)),
+        blind=blind,
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
         before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
@@ -309,18 +319,30 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
 
 
 def _completed(
-    model: Structure, bench: Bench, fit: Fit, values: dict[str, tuple[float, float]]
+    model: Structure, own: dict[str, float], kinds: tuple[str, ...], values: dict[str, float]
 ) -> Structure:
     """The model with what was found, and its own parameters where the data put them.
 
     A model that lacks nothing stays as it is.
     """
-    if not fit.kinds:
+    if not kinds:
         return model
     added = tuple(
-        make_effect(kind, {name: values[f"{kind}.{name}"][0] for name in effect_parameters(kind)})
-        for kind in fit.kinds
+        make_effect(kind, {name: values[f"{kind}.{name}"] for name in effect_parameters(kind)})
+        for kind in kinds
     )
-    own = bench.baseline(fit)
     moved = with_parameters(model, tuple(own), jnp.array(list(own.values()))) if own else model
     return dataclasses.replace(moved, effects=(*model.effects, *added))
+
+
+def _rivals(
+    model: Structure, own: dict[str, float], found: Named
+) -> Iterator[tuple[str, str, Structure]]:
+    """The model with the next best of every class in place of the one named."""
+    for place, group in enumerate(found.classes):
+        for rival in group[1:2]:
+            kinds = tuple(rival if k == place else kind for k, kind in enumerate(found.fit.kinds))
+            for row in (row for step in found.table[::-1] for row in step):
+                if {label.partition(".")[0] for label in row.parameters} == set(kinds):
+                    yield group[0], rival, _completed(model, own, kinds, row.parameters)
+                    break

@@ -65,8 +65,14 @@ class Weighing(NamedTuple):
         half = solve_triangular(self.lower, rows, lower=True)
         return np.asarray(solve_triangular(self.lower, half, lower=True, trans="T"))
 
-    def likeliest(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, " shared"]:
-        """What states share, in its own 1σ, as the misfits tell it."""
+    def likeliest(
+        self, rows: Float[np.ndarray, " row"], kept: Bool[np.ndarray, " row"] | None = None
+    ) -> Float[np.ndarray, " shared"]:
+        """What states share, in its own 1σ, as the misfits, all or some of them, tell it."""
+        if kept is not None:
+            half = solve_triangular(self.of_rows(kept), rows[kept], lower=True)
+            left = solve_triangular(self.of_rows(kept), half, lower=True, trans="T")
+            return np.asarray(-self.shared[kept].T @ left)
         return np.asarray(-self.shared.T @ self.without_shared(rows))
 
     def of_rows(self, keep: Bool[np.ndarray, " row"]) -> Float[np.ndarray, "kept kept"]:
@@ -243,9 +249,14 @@ class Bench:
         """What a candidate's first start changes, in units of noise."""
         return self.weighing.noise_units(self._started(candidate))[0]
 
-    def baseline(self, fit: "Fit") -> dict[str, float]:
-        """The baseline's parameters that have a stated error, where that and the data put them."""
-        moved = self.weighing.likeliest(fit.rows)
+    def baseline(
+        self, fit: "Fit", kept: Bool[np.ndarray, " row"] | None = None
+    ) -> dict[str, float]:
+        """The baseline's parameters that have a stated error, where that and the data put them.
+
+        Of the data the rows `kept`, or all.
+        """
+        moved = self.weighing.likeliest(fit.rows, kept)
         names = _baseline_names(self.model)
         return {
             name: float(parameter_value(self.model, name)) + stated_std(self.model, name) * step

@@ -1,13 +1,15 @@
 """`diagnosis.json`: what a diagnosis says, for other programs."""
 
 import math
+from collections.abc import Sequence
 
 from snrmjax.diagnose.diagnosis import Diagnosis
+from snrmjax.diagnose.foretelling import LevelResponse
 from snrmjax.diagnose.locating import Located
 
 
-def summarise_diagnosis(diagnosis: Diagnosis) -> dict:
-    """A diagnosis as plain numbers and texts, in SI units."""
+def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] = ()) -> dict:
+    """A diagnosis as plain numbers and texts, in SI units; `foretold` are simulated resonances."""
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
     return {
@@ -35,6 +37,24 @@ def summarise_diagnosis(diagnosis: Diagnosis) -> dict:
         "p_value": diagnosis.p_value,
         "noise_scale": diagnosis.noise_scale,
         "notes": list(diagnosis.notes),
+        "resonances": [
+            {
+                "level": row.level,
+                "force_n": row.force,
+                "held_out": row.held_out,
+                **{
+                    f"{name}_{quantity}": value if math.isfinite(value) else None
+                    for name in ("measured", "before", "after")
+                    for quantity, value in zip(
+                        ("frequency_hz", "velocity_m_s", "fold_hz"),
+                        getattr(row, name)[:3],
+                        strict=True,
+                    )
+                    if (name, quantity) != ("measured", "fold_hz")
+                },
+            }
+            for row in foretold
+        ],
         "tried": [
             [
                 {

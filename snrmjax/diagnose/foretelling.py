@@ -1,0 +1,147 @@
+"""What models foretell of a test: resonances under its forces, and where rivals differ most."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.structure import Structure
+from snrmjax.simulate.forced_response import forced_response
+from snrmjax.simulate.response_curve import ResponseCurve
+
+ORDER = 5  # harmonics of the responses
+_BEYOND = 1.5  # times the largest force: one level more that a test could add
+_REACH = 0.3  # of the measured range of frequencies, added at both ends
+# What a careful test tells apart: relative velocity and frequency, share of a harmonic.
+_RESOLVED = {"velocity": 0.01, "frequency": 2e-4, "harmonic 2": 1e-3, "harmonic 3": 1e-3}
+
+
+class Resonance(NamedTuple):
+    """Where a response is in phase with its force; NaN for what a test or a curve does not have."""
+
+    frequency: float  # Hz
+    velocity: float  # m/s
+    fold: float = np.nan  # Hz, of the branch that ends nearest above
+    harmonic_2: float = np.nan  # of the velocity, over the fundamental
+    harmonic_3: float = np.nan
+
+
+class LevelResponse(NamedTuple):
+    """A level's measured resonance and what two models foretell."""
+
+    level: int
+    force: float  # N, mean
+    measured: Resonance
+    before: Resonance
+    after: Resonance
+    held_out: bool  # whether `after` is of a model that has not seen the level
+
+
+def level_forces(data: SteadyStates) -> dict[int, float]:
+    """Mean force of every level, N."""
+    level, force = np.asarray(data.level), np.asarray(data.force)
+    return {int(k): float(np.mean(force[level == k])) for k in np.unique(level)}
+
+
+def responses(
+    model: Structure, data: SteadyStates, forces: Sequence[float]
+) -> list[list[ResponseCurve]]:
+    """Simulated responses around the measured frequencies, force by force."""
+    frequency = np.asarray(data.frequency)
+    reach = _REACH * (frequency.max() - frequency.min())
+    ends = (float(frequency.min() - reach), float(frequency.max() + reach))
+    curves = forced_response(model, list(forces), *ends, harmonic_order=ORDER, stability=False)
+    return [[c for c in curves if np.isclose(c.force, force, rtol=1e-9)] for force in forces]
+
+
+def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
+    """By interpolation in phase between the states on both sides; NaN where one side is empty."""
+    mine = np.asarray(data.level) == level
+    velocity, frequency = np.asarray(data.velocity)[mine, sensor], np.asarray(data.frequency)[mine]
+    phase = np.angle(velocity)
+    order = np.argsort(phase)
+    if phase.min() > 0 or phase.max() < 0:
+        return Resonance(np.nan, np.nan)
+    at, tip = (np.interp(0.0, phase[order], c[order]) for c in (frequency, np.abs(velocity)))
+    return Resonance(float(at) / (2 * np.pi), float(tip))
+
+
+def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonance:
+    """The strongest phase resonance of a response."""
+    found = [
+        (float(np.abs(c.velocity[k, 1, sensor])), c, int(k))
+        for c in curves
+        for k in c.at_events("phase_resonance")
+    ]
+    if not found:
+        return Resonance(np.nan, np.nan)
+    size, curve, k = max(found, key=lambda one: one[0])
+    folds = curve.at_events("fold")
+    fold = np.nan
+    if folds.size:
+        tips = np.abs(curve.velocity[folds, 1, sensor])
+        fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
+    shares = np.abs(curve.velocity[k, 2:4, sensor]) / size
+    return Resonance(float(curve.frequency[k]) / (2 * np.pi), size, fold, *shares.tolist())
+
+
+def level_responses(
+    before: Sequence[Sequence[ResponseCurve]],
+    after: Sequence[Sequence[ResponseCurve]],
+    data: SteadyStates,
+    sensor: int,
+    blind: Mapping[int, Structure],
+) -> list[LevelResponse]:
+    """Measured and foretold resonances of every level.
+
+    `before` and `after` are responses under the levels' forces; `blind` has models that have not
+    seen a level, which speak for it in place of `after`.
+    """
+    rows = []
+    for (level, force), old, new in zip(level_forces(data).items(), before, after, strict=True):
+        own = responses(blind[level], data, [force])[0] if level in blind else new
+        rows.append(
+            LevelResponse(
+                level,
+                force,
+                measured_resonance(data, level, sensor),
+                simulated_resonance(old, sensor),
+                simulated_resonance(own, sensor),
+                level in blind,
+            )
+        )
+    return rows
+
+
+def where_rivals_differ(
+    name: str, model: Structure, rival: str, other: Structure, data: SteadyStates, sensor: int
+) -> str | None:
+    """The measurement at resonance in which two models differ most, in words.
+
+    Of velocity, frequency and the harmonics that were not measured, in units of what a careful
+    test resolves; None where they differ in nothing that it would see.
+    """
+    known = level_forces(data)
+    forces = [*known.values(), _BEYOND * max(known.values())]
+    places = [f"level {k} ({f:.3g} N)" for k, f in known.items()]
+    places.append(f"{forces[-1]:.3g} N, beyond the measured levels,")
+    mine, theirs = (responses(one, data, forces) for one in (model, other))
+    best: tuple[float, str] = (2.0, "")
+    for place, one, two in zip(places, mine, theirs, strict=True):
+        a, b = simulated_resonance(one, sensor), simulated_resonance(two, sensor)
+        for quantity, resolved in _RESOLVED.items():
+            share = quantity.startswith("harmonic")
+            if share and int(quantity[-1]) in data.harmonic_order:
+                continue
+            values = [getattr(r, quantity.replace(" ", "_")) for r in (a, b)]
+            apart = abs(values[0] - values[1]) / (1.0 if share else abs(values[0])) / resolved
+            if np.isfinite(apart) and apart > best[0]:
+                unit = {"velocity": "m/s", "frequency": "Hz"}.get(quantity, "% of the fundamental")
+                first, second = (f"{100 * v if share else v:.4g}" for v in values)
+                best = (
+                    float(apart),
+                    f"They differ most at resonance under {place} near {a.frequency:.4g} Hz: "
+                    f"{quantity} {first} {unit} with {name}, {second} with {rival}.",
+                )
+    return best[1] or None
