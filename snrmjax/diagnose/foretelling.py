@@ -56,14 +56,20 @@ def responses(
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
-    """By interpolation in phase between the states on both sides; NaN where one side is empty."""
+    """By interpolation between the states on both sides; NaN where one side is empty.
+
+    Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least.
+    """
     mine = np.asarray(data.level) == level
     velocity, frequency = np.asarray(data.velocity)[mine, sensor], np.asarray(data.frequency)[mine]
     phase = np.angle(velocity)
     order = np.argsort(phase)
-    if phase.min() > 0 or phase.max() < 0:
+    order = order[np.cos(phase[order]) > 0]
+    phase, velocity, frequency = phase[order], velocity[order], frequency[order]
+    if not order.size or phase[0] > 0 or phase[-1] < 0:
         return Resonance(np.nan, np.nan)
-    at, tip = (np.interp(0.0, phase[order], c[order]) for c in (frequency, np.abs(velocity)))
+    at = np.interp(0.0, np.tan(phase), frequency)
+    tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
     return Resonance(float(at) / (2 * np.pi), float(tip))
 
 
@@ -138,7 +144,9 @@ def where_rivals_differ(
             apart = abs(values[0] - values[1]) / (1.0 if share else abs(values[0])) / resolved
             if np.isfinite(apart) and apart > best[0]:
                 unit = {"velocity": "m/s", "frequency": "Hz"}.get(quantity, "% of the fundamental")
-                first, second = (f"{100 * v if share else v:.4g}" for v in values)
+                first, second = (
+                    f"{round(100 * v, 6):.3g}" if share else f"{v:.4g}" for v in values
+                )
                 best = (
                     float(apart),
                     f"They differ most at resonance under {place} near {a.frequency:.4g} Hz: "

@@ -1,0 +1,69 @@
+"""What models foretell of a test, against closed forms of a linear mode and of a hardening one."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.diagnose.foretelling import (
+    measured_resonance,
+    responses,
+    simulated_resonance,
+    where_rivals_differ,
+)
+
+OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
+FORCES = (1.0, 4.0)
+
+
+def linear():
+    """One mode, driven and seen at the same place."""
+    modes = sj.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE])
+    return sj.structure(modes)
+
+
+def states(model, phases=(-40.0, -15.0, 20.0, 45.0)):
+    """Exact states of the linear mode: V = iΩ·φ²F/(ω² − Ω² + 2iζωΩ)."""
+    rows = []
+    for level, force in enumerate(FORCES):
+        for phase in np.radians(phases):
+            # tan φ = (ω² − Ω²)/(2ζωΩ), solved for Ω.
+            b = ZETA * OMEGA * np.tan(phase)
+            frequency = -b + np.sqrt(b**2 + OMEGA**2)
+            stiffness = OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency
+            rows.append((level, frequency, force, 1j * frequency * SHAPE**2 * force / stiffness))
+    return sj.steady_states(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def test_resonances_of_a_linear_mode_are_its_own():
+    model = linear()
+    data = states(model)
+    curves = responses(model, data, FORCES)
+    for level, force in enumerate(FORCES):
+        exact = SHAPE**2 * force / (2 * ZETA * OMEGA)
+        for found in (measured_resonance(data, level, 0), simulated_resonance(curves[level], 0)):
+            # Ω is not quite straight against tan φ: ζ² tan φ₁ tan φ₂/2 is 5e-6 here.
+            assert found.frequency == pytest.approx(50.0, rel=1e-5)
+            assert found.velocity == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_level_on_one_side_of_resonance_has_no_measured_one():
+    assert np.isnan(measured_resonance(states(linear(), (10.0, 30.0)), 0, 0).frequency)
+
+
+def test_rivals_differ_in_the_harmonic_that_only_one_of_them_makes():
+    model, data = linear(), states(linear())
+    tip = SHAPE * FORCES[1] / (2 * ZETA * OMEGA**2)  # modal amplitude
+    # On one side twice as stiff: the same backbone to first order.
+    both, one = (
+        dataclasses.replace(
+            model,
+            effects=(sj.make_effect(kind, {"stiffness": stiff * OMEGA**2, "gap": 0.6 * tip}),),
+        )
+        for kind, stiff in (("gap_stiffness", 0.02), ("one_sided_stop", 0.04))
+    )
+    said = where_rivals_differ("gap_stiffness", both, "one_sided_stop", one, data, 0)
+    assert "harmonic 2 0 % of the fundamental with gap_stiffness" in said
+    same = where_rivals_differ("gap_stiffness", both, "gap_stiffness", both, data, 0)
+    assert same is None
