@@ -10,6 +10,12 @@ import pytest
 from jaxtyping import Array
 
 import snrmjax as sj
+from snrmjax.diagnose.foretelling import (
+    level_forces,
+    measured_resonance,
+    responses,
+    simulated_resonance,
+)
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effects import EFFECTS
@@ -20,11 +26,16 @@ SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 300.0, 0.01
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003}
 
 
-def blind(name):
-    """A set whose truth stands in another file."""
+def files(name):
+    """Model and data of a set."""
     model = read_model(HERE / "blind" / f"{name}.toml")
     data = read_steady_states(HERE / "blind" / f"{name}.csv", sensors=model.modes.sensors)
-    return sj.diagnose_model(model, data.steady_states), KEYS[name]
+    return model, data.steady_states
+
+
+def blind(name):
+    """A set whose truth stands in another file."""
+    return sj.diagnose_model(*files(name)), KEYS[name]
 
 
 @pytest.mark.parametrize(
@@ -52,6 +63,21 @@ def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
     assert found.gap.before > 1.5
     assert found.gap.after == pytest.approx(1.0, abs=0.25)
     assert (out.after - 1) < 0.25 * max(out.before - 1, 1.0)
+
+
+def test_unseen_levels_resonate_where_the_completed_model_says():
+    model, data = files("blind_12")
+    found = sj.diagnose_model(model, data)
+    top = max(found.blind)
+    force = level_forces(data)[top]
+    (curves,) = responses(found.blind[top], data, [force])
+    foretold, measured = simulated_resonance(curves, 0), measured_resonance(data, top, 0)
+    # The model that has not seen the level is another one than that which has seen all.
+    assert found.blind[top].effects != found.completed.effects
+    assert foretold.frequency == pytest.approx(measured.frequency, rel=2e-3)
+    assert foretold.velocity == pytest.approx(measured.velocity, rel=0.02)
+    (before,) = responses(model, data, [force])
+    assert not simulated_resonance(before, 0).velocity < 1.2 * measured.velocity
 
 
 def test_where_nothing_is_hidden_nothing_is_found():
