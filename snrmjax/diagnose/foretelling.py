@@ -39,8 +39,9 @@ class LevelResponse(NamedTuple):
 
 
 def level_forces(data: SteadyStates) -> dict[int, float]:
-    """Mean force of every level, N."""
+    """Mean force of every level that has a known one, N."""
     level, force = np.asarray(data.level), np.asarray(data.force)
+    level, force = level[np.isfinite(force)], force[np.isfinite(force)]
     return {int(k): float(np.mean(force[level == k])) for k in np.unique(level)}
 
 
@@ -60,8 +61,9 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance
 
     Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least.
     """
-    mine = np.asarray(data.level) == level
-    velocity, frequency = np.asarray(data.velocity)[mine, sensor], np.asarray(data.frequency)[mine]
+    velocity, frequency = np.asarray(data.velocity)[:, sensor], np.asarray(data.frequency)
+    mine = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
+    velocity, frequency = velocity[mine], frequency[mine]
     phase = np.angle(velocity)
     order = np.argsort(phase)
     order = order[np.cos(phase[order]) > 0]
