@@ -81,7 +81,7 @@ def with_responses(
     found: Diagnosis, model: Structure, data: SteadyStates
 ) -> tuple[Diagnosis, list[LevelResponse], Figure]:
     """What simulation adds: where rivals differ most, resonances and responses of all levels."""
-    forces = list(level_forces(data).values())
+    forces = list(level_forces(data, found.sensor).values())
     before, after = (responses(one, data, forces) for one in (model, found.completed))
     foretold = level_responses(before, after, data, found.sensor, found.blind)
     sentences = [

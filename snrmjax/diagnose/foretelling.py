@@ -31,18 +31,30 @@ class LevelResponse(NamedTuple):
     """A level's measured resonance and what two models foretell."""
 
     level: int
-    force: float  # N, mean
+    force: float  # N, at resonance
     measured: Resonance
     before: Resonance
     after: Resonance
     held_out: bool  # whether `after` is of a model that has not seen the level
 
 
-def level_forces(data: SteadyStates) -> dict[int, float]:
-    """Mean force of every level that has a known one, N."""
+def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
+    """Force of every level that has a known one, N: at resonance, where its states enclose it.
+
+    A test that holds the response changes the force along a level; elsewhere it is their mean.
+    """
     level, force = np.asarray(data.level), np.asarray(data.force)
-    level, force = level[np.isfinite(force)], force[np.isfinite(force)]
-    return {int(k): float(np.mean(force[level == k])) for k in np.unique(level)}
+    velocity = np.asarray(data.velocity)[:, sensor]
+    good = np.isfinite(force) & np.isfinite(np.abs(velocity))
+    found = {}
+    for number in np.unique(level[good]):
+        mine = good & (level == number)
+        phase, order = np.angle(velocity[mine]), np.argsort(np.angle(velocity[mine]))
+        inside = phase.min() <= 0 <= phase.max()
+        own = force[mine]
+        at = np.interp(0.0, phase[order], own[order]) if inside else np.mean(own)
+        found[int(number)] = float(at)
+    return found
 
 
 def responses(
@@ -107,7 +119,9 @@ def level_responses(
     seen a level, which speak for it in place of `after`.
     """
     rows = []
-    for (level, force), old, new in zip(level_forces(data).items(), before, after, strict=True):
+    for (level, force), old, new in zip(
+        level_forces(data, sensor).items(), before, after, strict=True
+    ):
         own = responses(blind[level], data, [force])[0] if level in blind else new
         rows.append(
             LevelResponse(
@@ -130,7 +144,7 @@ def where_rivals_differ(
     Of velocity, frequency and the harmonics that were not measured, in units of what a careful
     test resolves; None where they differ in nothing that it would see.
     """
-    known = level_forces(data)
+    known = level_forces(data, sensor)
     forces = [*known.values(), _BEYOND * max(known.values())]
     places = [f"level {k} ({f:.3g} N)" for k, f in known.items()]
     places.append(f"{forces[-1]:.3g} N, beyond the measured levels,")

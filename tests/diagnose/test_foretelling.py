@@ -2,11 +2,13 @@
 
 import dataclasses
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import snrmjax as sj
 from snrmjax.diagnose.foretelling import (
+    level_forces,
     measured_resonance,
     responses,
     simulated_resonance,
@@ -67,3 +69,13 @@ def test_rivals_differ_in_the_harmonic_that_only_one_of_them_makes():
     assert "harmonic 2 0 % of the fundamental with gap_stiffness" in said
     same = where_rivals_differ("gap_stiffness", both, "gap_stiffness", both, data, 0)
     assert same is None
+
+
+def test_the_force_of_a_level_is_that_at_its_resonance():
+    data = states(linear(), (-40.0, -10.0, 10.0, 40.0))
+    # Holding the response takes more force away from resonance.
+    held = data.force * np.tile([1.4, 1.1, 1.1, 1.4], len(FORCES))
+    found = level_forces(eqx.tree_at(lambda d: d.force, data, held))
+    assert found == pytest.approx({0: 1.1 * FORCES[0], 1: 1.1 * FORCES[1]})
+    aside = states(linear(), (10.0, 40.0))
+    assert level_forces(aside) == pytest.approx(dict(enumerate(FORCES)))
