@@ -214,7 +214,7 @@ def diagnosis_report(
         "residuals": "Misfit of the force of every state. Where the model is right it is 1.",
         "candidates": "Gain of Schwarz's criterion. Right of the dashed line an effect is seen; "
         "orange ones cannot be told from the best.",
-        "responses": "Simulated responses under each level's mean force.",
+        "responses": "Simulated responses under each level's force at resonance.",
     }
     sections = [
         Section(
