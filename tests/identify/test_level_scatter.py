@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from snrmjax.identify.level_scatter import Linearised, estimated_scatter, level_columns
+from snrmjax.identify.level_scatter import (
+    Linearised,
+    _Likelihood,
+    estimated_scatter,
+    level_columns,
+)
+from snrmjax.identify.pilot import levels_apart
 
 N_LEVELS, PER_LEVEL = 12, 20
 
@@ -52,3 +58,25 @@ def test_stated_scatter_is_kept_and_two_levels_say_nothing():
     assert estimated_scatter(problem, index).level[0] == 0.05
     problem, index = sample(3, shared=0.02)
     assert estimated_scatter(problem, index[:2]).level == (0.0, 0.0)
+
+
+def test_slopes_of_the_likelihood_are_those_of_differences():
+    problem, index = sample(1, noise=0.7, shared=0.02)
+    likelihood = _Likelihood.of(problem, index)
+    at = np.log([0.8, 0.03, 0.01])
+
+    def value(point):
+        noise, *level = np.exp(point)
+        return likelihood.value_and_slopes(noise, np.array(level))[0]
+
+    slopes = likelihood.value_and_slopes(0.8, np.array([0.03, 0.01]))[1]
+    step = 1e-4 * np.eye(3)
+    wanted = [(value(at + row) - value(at - row)) / 2e-4 for row in step]
+    np.testing.assert_allclose(slopes, wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_levels_that_share_half_of_their_amplitudes_are_not_apart():
+    level = np.repeat([0, 1], 2)
+    # On a logarithmic scale: 1 to 2 beside 1.8 to 3.6, then beside 1.2 to 2.4.
+    assert levels_apart(np.array([1.0, 2.0, 1.8, 3.6]), level)
+    assert not levels_apart(np.array([1.0, 2.0, 1.2, 2.4]), level)

@@ -1,5 +1,7 @@
 """The virtual test: which states it records, that they are true, and what errors it adds."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,12 @@ from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.structure import structure
 from snrmjax.simulate.controlled_test import phase_controlled_test, response_controlled_test
 from snrmjax.simulate.recording import VisitedStates, recorded_states
-from snrmjax.simulate.virtual_test import NO_ERRORS, MeasurementErrors, phase_resonance_test
+from snrmjax.simulate.virtual_test import (
+    NO_ERRORS,
+    MeasurementErrors,
+    _swept,
+    phase_resonance_test,
+)
 
 HZ = 2 * np.pi
 RANGE = (30 * HZ, 110 * HZ)
@@ -500,3 +507,16 @@ def test_one_state_and_odd_numbers_are_shared_among_the_sides():
     states = run(forces, points_per_level=5).steady_states
     assert states.n_states == 80
     assert int(jnp.sum(jnp.angle(states.velocity) > 0)) == 48
+
+
+def test_a_sweep_turns_round_where_it_lands():
+    # Along the curve: a low branch up to 5, back to 2 unstable, an upper one from 2 to 8, back to 6
+    # unstable, and on to 9. Both sweeps land inside the upper branch and turn round there.
+    frequency = np.array([1.0, 3, 5, 4, 2, 3, 4, 5.5, 8, 7, 6, 7.5, 9])
+    stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 0, 0, 1, 1], dtype=bool)
+    curve = SimpleNamespace(
+        frequency=frequency, stable=stable, at_events=lambda _: np.array([], dtype=int)
+    )
+    visited, jumps = _swept(curve)
+    np.testing.assert_array_equal(visited, stable)
+    assert jumps == [5.0, 8.0, 7.5, 3.0]
