@@ -510,13 +510,14 @@ def test_one_state_and_odd_numbers_are_shared_among_the_sides():
 
 
 def test_a_sweep_turns_round_where_it_lands():
-    # Along the curve: a low branch up to 5, back to 2 unstable, an upper one from 2 to 8, back to 6
-    # unstable, and on to 9. Both sweeps land inside the upper branch and turn round there.
-    frequency = np.array([1.0, 3, 5, 4, 2, 3, 4, 5.5, 8, 7, 6, 7.5, 9])
-    stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 0, 0, 1, 1], dtype=bool)
+    # Along the curve: a low branch up to 10, back unstable, one from 2 to 8, back unstable, and one
+    # from 6.5 on. The sweep up jumps past the middle branch; the sweep down lands inside it, and
+    # finds its upper end only by turning round.
+    frequency = np.array([1.0, 5, 10, 6, 2, 2.5, 4, 5.5, 7, 8, 7.5, 6.5, 9, 12])
+    stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1], dtype=bool)
     curve = SimpleNamespace(
         frequency=frequency, stable=stable, at_events=lambda _: np.array([], dtype=int)
     )
     visited, jumps = _swept(curve)
     np.testing.assert_array_equal(visited, stable)
-    assert jumps == [5.0, 8.0, 7.5, 3.0]
+    assert jumps == [10.0, 6.5, 2.5]
