@@ -24,6 +24,8 @@ from snrmjax.simulate.compiled import compiled
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
 
+_UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
+
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
 
@@ -68,8 +70,10 @@ class Spread(eqx.Module):
 def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
     """The states with a measured velocity, and whether their noise is stated.
 
-    Where nobody stated any noise, amplitude and phase get the same relative error, larger off
-    resonance (`mistrust`); the fit then finds its size.
+    Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
+    off resonance (`mistrust`); the fit then finds its size. Without an error of the force a state
+    near a fold would be exact in one direction, since amplitude and phase there move the balance
+    in the other: a force of which no error is stated gets a tenth of the velocity's.
     """
     r = reference_sensor(modes)
     stated = relative_errors(data)
@@ -81,7 +85,9 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
         far = mistrust(velocity)
-        errors = np.stack([np.zeros_like(far), far, far], axis=1)
+        errors = np.stack([far, far, far], axis=1)
+    of_force = np.where(errors[:, 0] > 0, errors[:, 0], _UNSTATED_FORCE * errors[:, 1])
+    errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
     levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
     return (
         BalanceData(
@@ -90,7 +96,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             force=jnp.asarray(force[keep]),
             velocity=jnp.asarray(velocity[keep]),
             share=jnp.asarray(share)[keep],
-            std=jnp.asarray(np.pad(errors[keep], ((0, 0), (0, 1)))),
+            std=jnp.asarray(errors[keep]),
             weight=jnp.ones(int(keep.sum())),
             correction=no_errors(int(keep.sum())),
             n_levels=len(levels),

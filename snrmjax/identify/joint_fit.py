@@ -45,7 +45,8 @@ from snrmjax.simulate.compiled import compiled
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
-_ROUNDS = 3  # of fitting and weighting anew
+_ROUNDS = 3, 12  # of fitting and weighting anew: at least, at most
+_SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
 _FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
@@ -209,10 +210,11 @@ def _fitted(
     def as_noisy(scatter: Scatter) -> float:
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
-    converged, none = False, Weighing(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
+    none = Weighing(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
+    fewest, most = _ROUNDS
     # An outlier has widened the noise at first: its weight falls round by round.
-    rounds = 2 * _ROUNDS if robust else _ROUNDS
-    for turn in range(rounds):
+    fewest = 2 * fewest if robust else fewest
+    for turn in range(most):
         widened = as_noisy(scatter)
         data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
         settings = (program.restore, data, modes, spread)
@@ -220,7 +222,7 @@ def _fitted(
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
         vector, good = _solve(program.vector, *settings, linear.weighing, unit)
-        program, converged = program._replace(vector=vector), bool(good)
+        program = program._replace(vector=vector)
         answer = _linearised(vector, *settings, linear.weighing, np.array(False))
         residuals = np.asarray(answer.residuals)
         if not np.isfinite(float(answer.cost)):
@@ -231,16 +233,16 @@ def _fitted(
             weight = np.sqrt(np.asarray(data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
             data = eqx.tree_at(lambda d: d.weight, data, jnp.asarray(np.minimum(1.0, lower)))
-        if turn < rounds - 1:
-            rows = jacobian[: residuals.size]
-            spent = float(np.sum((rows @ covariance) * rows))
-            dof = max(residuals.size - spent, 1.0)
-            noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
-            scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
-            # What a wrong noise would take for errors can lead far away from the records.
-            trusted = stated and not scatter.contradicts_upward
-            correction = answer.correction if trusted else jnp.zeros_like(answer.correction)
-            data = eqx.tree_at(lambda d: d.correction, data, correction)
+        settled = float(linear.cost) - float(answer.cost) < _SETTLED
+        if turn == most - 1 or (settled and turn >= fewest - 1):
+            break
+        dof = max(residuals.size - _spent(jacobian, residuals.size), 1.0)
+        noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
+        scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
+        # What a wrong noise would take for errors can lead far away from the records.
+        trusted = stated and not scatter.contradicts_upward
+        correction = answer.correction if trusted else jnp.zeros_like(answer.correction)
+        data = eqx.tree_at(lambda d: d.correction, data, correction)
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
         covariance=covariance,
@@ -248,7 +250,7 @@ def _fitted(
         data=data,
         scatter=scatter,
         residuals=residuals,
-        converged=converged,
+        converged=bool(good) and settled,
     )
 
 
@@ -263,6 +265,13 @@ def inverse_of(jacobian: np.ndarray) -> np.ndarray:
     _, values, rows = np.linalg.svd(jacobian / size, full_matrices=False)
     root = (rows.T / values) / size[:, None]
     return root @ root.T
+
+
+def _spent(jacobian: np.ndarray, n_rows: int) -> float:
+    """Degrees of freedom that the unknowns take from the first rows."""
+    size = np.linalg.norm(jacobian, axis=0)
+    basis = np.linalg.qr(jacobian / np.where(size > 0, size, 1.0))[0]
+    return float(np.sum(basis[:n_rows] ** 2))
 
 
 class _Linear(NamedTuple):
