@@ -31,10 +31,12 @@ from snrmjax.identify.free_unknowns import (
     named_unknowns,
     programmed,
 )
+from snrmjax.identify.joint_notes import notes_on_noise, notes_on_reach
 from snrmjax.identify.level_scatter import Scatter
 from snrmjax.identify.pilot import pilot_start
 from snrmjax.identify.selection import (
     Candidate,
+    Selection,
     parse_family,
     select_families,
 )
@@ -46,10 +48,9 @@ SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
 _ROUNDS = 3, 12  # of fitting and weighting anew: at least, at most
+_CHOICES = 3  # of families and of what levels scatter, at most
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
 _FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
-_BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
-_ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
@@ -153,17 +154,37 @@ def fit_jointly(
     )
     spread = Spread(jnp.array([level_gain_std, level_phase_std, 0.0, 0.0]), jnp.asarray(linear_std))
     wanted = parse_family(backbone), parse_family(damping)
+
+    def select(pilot: Unknowns, data: BalanceData, *, scatter_too: bool) -> Selection:
+        settings = (*wanted, released)
+        return select_families(data, modes, spread, pilot, *settings, scatter_too=scatter_too)
+
+    def fitted(chosen: Selection, pilot: Unknowns, data: BalanceData) -> _Fitted:
+        noisy = eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(chosen.jitter))
+        level = _with_scatter(spread, chosen.scatter)
+        start = _started(pilot, chosen, level)
+        settings = (modes, level, released, chosen.scatter)
+        return _fitted(start, noisy, *settings, stated=stated, robust=robust)
+
+    # What the rough pilot misses would pass for levels that differ: a fit comes first.
     pilot = pilot_start(measured, modes, spread, released)
-    chosen = select_families(measured, modes, spread, pilot, *wanted, released)
-    measured = eqx.tree_at(lambda d: d.std, measured, measured.std.at[:, 3].set(chosen.jitter))
-    level = _with_scatter(spread, chosen.scatter)
-    pair = (chosen.squared_frequency, chosen.modal_damping)
-    start = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
-    settings = (measured, modes, level, released, chosen.scatter)
-    best = _fitted(start, *settings, stated=stated, robust=robust)
-    notes = _notes(best, measured, spread.level, stated=stated)
+    chosen = select(pilot, measured, scatter_too=False)
+    best = fitted(chosen, pilot, measured)
+    for _ in range(_CHOICES):
+        raw = best.unknowns.level * best.spread.level
+        pilot = eqx.tree_at(lambda u: u.level, best.unknowns, raw)
+        measured = eqx.tree_at(lambda d: d.correction, measured, best.data.correction)
+        before, chosen = chosen, select(pilot, measured, scatter_too=True)
+        if chosen.agrees_with(before):
+            break
+        best = fitted(chosen, pilot, measured)
+    notes: tuple[str, ...] = ()
+    if not best.converged:
+        notes = ("the fit did not converge: try a simpler family.",)
+    told = (best.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
+    notes += notes_on_noise(*told, stated=stated)
     motion = recorded_motion(in_one_form(best.unknowns), best.data, modes, best.spread)
-    notes += _notes_on_reach(motion, np.asarray(best.data.level))
+    notes += notes_on_reach(motion, np.asarray(best.data.level))
     return JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
@@ -251,6 +272,16 @@ def _fitted(
         scatter=scatter,
         residuals=residuals,
         converged=bool(good) and settled,
+    )
+
+
+def _started(pilot: Unknowns, chosen: Selection, spread: Spread) -> Unknowns:
+    """The chosen curves, and the pilot's deviations of levels in units of their new 1σ."""
+    unit = jnp.where(spread.level > 0, spread.level, 1.0)
+    level = jnp.where(spread.level > 0, pilot.level / unit, 0.0)
+    pair = (chosen.squared_frequency, chosen.modal_damping)
+    return eqx.tree_at(
+        lambda u: (u.squared_frequency, u.modal_damping, u.level), pilot, (*pair, level)
     )
 
 
@@ -363,67 +394,3 @@ def _solve(
         throw=False,
     )
     return solution.value * unit, jnp.asarray(solution.result == optx.RESULTS.successful)
-
-
-def _notes(found: _Fitted, data: BalanceData, given: Array, *, stated: bool) -> tuple[str, ...]:
-    notes = []
-    scatter = found.scatter
-    if not found.converged:
-        notes.append("the fit did not converge: try a simpler family.")
-    if stated and scatter.contradicts_upward:
-        notes.append(
-            f"residuals are {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated noise: "
-            "the noise is understated or the model is wrong; the bands are widened accordingly."
-        )
-    if stated and scatter.noise + 3 * scatter.noise_std < 1:
-        notes.append(
-            f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
-            "noise: it is overstated, and the bands are wider than need be."
-        )
-    units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
-    found_only = np.where(np.asarray(given) > 0, 0.0, scatter.level)
-    jitter = 0.5 * float(data.std[0, 3]) * (1.0 if stated else scatter.noise)
-    if jitter > 0:
-        notes.append(
-            f"natural frequency wanders by {100 * jitter:.2g} % from state to state (1σ), which "
-            "no stated noise explains."
-        )
-    shared = [
-        f"{factor * value:.2g} {name}"
-        for (factor, name), value in zip((*units, (100, "% in damping")), found_only, strict=True)
-        if value > 0
-    ]
-    if shared:
-        notes.append(
-            f"levels differ from one another by {', '.join(shared)} (1σ), which no stated error "
-            "explains; the bands include it."
-        )
-    if data.n_levels < 3:
-        notes.append(
-            f"{data.n_levels} level{'s' if data.n_levels > 1 else ''} only: nothing says how far "
-            "levels differ from one another, and the bands do not include it."
-        )
-    return tuple(notes)
-
-
-def _notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:
-    """What states on one side of resonance, or of one amplitude, leave open."""
-    notes = []
-    phase = np.degrees(np.angle(np.asarray(motion.velocity)))
-    if phase.min() > _BESIDE or phase.max() < -_BESIDE:
-        near, far = sorted((abs(phase.min()), abs(phase.max())))
-        side = "below" if phase.min() > 0 else "above"
-        notes.append(
-            f"all states lie on one side of resonance ({near:.0f}° to {far:.0f}° {side} it): an "
-            "error of phase that they share passes for a change of natural frequency and damping, "
-            "and no band contains it unless it is stated."
-        )
-    size = np.asarray(motion.displacement)
-    peaks = np.array([size[level == k].max() for k in np.unique(level)])
-    if len(peaks) > 1 and peaks.max() < _ALIKE * peaks.min():
-        notes.append(
-            f"the levels' largest amplitudes lie within {100 * (peaks.max() / peaks.min() - 1):.2g}"
-            " % of each other: no level tells more than another of how the mode changes with "
-            "amplitude, and only smaller states of the same levels do."
-        )
-    return tuple(notes)

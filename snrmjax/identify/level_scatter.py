@@ -43,17 +43,20 @@ def level_columns(
     return full.reshape(n * parts, n_levels * errors)
 
 
-def estimated_scatter(problem: Linearised, index: Int[np.ndarray, "level error"]) -> Scatter:
+def estimated_scatter(
+    problem: Linearised, index: Int[np.ndarray, "level error"], *, look: bool = True
+) -> Scatter:
     """Restricted maximum likelihood of the noise and of what levels share beyond what is stated.
 
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
     `prior_std` is zero were not stated and are estimated. They enter one after the other, while
-    the likelihood asks for them; with fewer than three levels none does.
+    the likelihood asks for them; with fewer than three levels, or without `look`, none does.
     Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
     """
     likelihood = _Likelihood.of(problem, index)
     stated = problem.prior_std[index[0]]
-    open_kinds = [k for k in range(index.shape[1]) if stated[k] == 0] if len(index) > 2 else []
+    look = look and len(index) > 2
+    open_kinds = [k for k in range(index.shape[1]) if stated[k] == 0] if look else []
     found = likelihood.best(stated, np.zeros(len(stated), dtype=bool))
     chosen = np.zeros(len(stated), dtype=bool)
     while open_kinds:

@@ -3,13 +3,12 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.optimize import minimize
 
-from snrmjax.identify.any_family import in_one_form
+from snrmjax.identify.balance_slopes import BalanceSlopes, balance_slopes
 from snrmjax.identify.families import (
     BACKBONE_FAMILIES,
     DAMPING_FAMILIES,
@@ -23,16 +22,10 @@ from snrmjax.identify.force_balance import (
     BalanceData,
     Spread,
     Unknowns,
-    error_slopes,
-    force_balance,
-    motion_of,
-    no_errors,
-    whitener,
 )
 from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
 from snrmjax.identify.pilot import levels_apart, most_parameters
 from snrmjax.model.modes import LinearModes
-from snrmjax.simulate.compiled import compiled
 
 _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
@@ -80,71 +73,6 @@ def parse_family(text: str) -> Choice:
     return Choice(kind, int(size) if size else None, known[argument])
 
 
-class _Slopes(NamedTuple):
-    """The whitened balance at the pilot and its slopes, on the host."""
-
-    balance: np.ndarray  # (state, part)
-    by_squared: np.ndarray  # (state, part)
-    by_damping: np.ndarray
-    by_level: np.ndarray  # (state, part, error), in the errors' own units
-    by_other: np.ndarray  # (state, part, unknown): gain, offset, phase, linear deviations
-    displacement: np.ndarray
-    speed: np.ndarray
-    squared: np.ndarray
-    damping: np.ndarray
-
-
-@compiled
-def _slopes(unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> tuple:
-    n = len(data.level)
-    zero = no_errors(n)
-    whiten = whitener(
-        error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), zero), data.std
-    )
-    ones = jnp.ones_like(spread.level)
-    raw = eqx.tree_at(lambda u: u.level, unknowns, unknowns.level * spread.level)
-    unit = Spread(ones, spread.linear)
-
-    def balance(level: Array, other: tuple[Array, Array, Array, Array]) -> Array:
-        each = eqx.tree_at(
-            lambda u: (*(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),),
-            raw,
-            (*other, raw.level + level),
-        )
-        own = force_balance(each, data, modes, unit, zero)
-        return jnp.einsum("sij,sj->si", whiten, own)
-
-    other = (raw.log_force_gain, raw.force_offset, raw.instrument_phase, raw.linear)
-    still = jnp.zeros_like(raw.level)
-    # Every level's error moves its own states only: one push forward for all levels.
-    kinds = still.shape[1]
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *still.shape))
-    by_level = jax.vmap(lambda d: jax.jvp(lambda b: balance(b, other), (still,), (d,))[1])
-    others = jax.jacfwd(lambda o: balance(still, o))(other)
-    columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
-    motion = motion_of(raw, data, modes, unit, zero)
-    # The balance is linear in the values of both curves.
-    constant = modes.mode_shape[data.sensor, modes.mode_of_interest]
-    constant = constant * modes.participation[modes.mode_of_interest]
-    by_damping = motion.velocity / (constant * motion.force)
-    by_squared = by_damping / (1j * data.frequency)
-    level = raw.level[data.level]
-
-    def parts(slope: Array, share: Array) -> Array:
-        both = jnp.stack([slope.real, slope.imag], axis=1) * share[:, None]
-        return jnp.einsum("sij,sj->si", whiten, both)
-
-    return (
-        *(balance(still, other), parts(by_squared, 1 + level[:, 2])),
-        parts(by_damping, 1 + level[:, 3]),
-        jnp.moveaxis(by_level(directions), 0, 2),
-        jnp.concatenate(columns, axis=2),
-        *(motion.displacement, jnp.abs(motion.velocity)),
-        raw.squared_frequency(motion.amplitude(raw.squared_frequency)),
-        raw.modal_damping(motion.amplitude(raw.modal_damping)),
-    )
-
-
 class Selection(NamedTuple):
     """Where the joint fit starts, and the table of what was tried."""
 
@@ -153,6 +81,15 @@ class Selection(NamedTuple):
     scatter: Scatter
     jitter: float  # 1σ of relative stiffness from state to state that no stated noise explains
     table: tuple[Candidate, ...]
+
+    def agrees_with(self, other: "Selection") -> bool:
+        """Whether it chose the same families and the same kinds of scatter."""
+
+        def kinds(one: Selection) -> tuple:
+            names = [(c.curve, c.family, c.size, c.argument) for c in one.table if c.chosen]
+            return names, [s > 0 for s in one.scatter.level], one.jitter > 0
+
+        return kinds(self) == kinds(other)
 
 
 def select_families(
@@ -163,19 +100,22 @@ def select_families(
     backbone: Choice,
     damping: Choice,
     free: tuple[str, ...],
+    *,
+    scatter_too: bool,
 ) -> Selection:
     """Try families on the balance linearised at the pilot, and take the simplest good one.
 
     Levels are left out in turn (every third state where there are fewer than three levels) and
     predicted with their own errors unknown; the score is the log density of what was measured
     there. Of the candidates within one standard error of the best, and not clearly worse, the one
-    with the fewest parameters is taken.
+    with the fewest parameters is taken. The pilot's deviations of levels are in their own units;
+    states are taken as `data` corrects them. What levels scatter beyond what is stated is looked
+    for if `scatter_too`.
     """
 
     def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter]:
-        known = _Slopes(*(np.asarray(a) for a in _slopes(in_one_form(at), data, modes, spread)))
-        work = _Workbench(data, spread, known, free)
-        scatter = work.scatter(at.squared_frequency, at.modal_damping)
+        work = _Workbench(data, spread, balance_slopes(at, data, modes, spread), free)
+        scatter = work.scatter(at.squared_frequency, at.modal_damping, look=scatter_too)
         work.use(scatter)
         return work, scatter
 
@@ -209,7 +149,9 @@ class _Compared(NamedTuple):
 class _Workbench:
     """The linearised balance, on which families are tried one after the other."""
 
-    def __init__(self, data: BalanceData, spread: Spread, known: _Slopes, free: tuple[str, ...]):
+    def __init__(
+        self, data: BalanceData, spread: Spread, known: BalanceSlopes, free: tuple[str, ...]
+    ):
         self.data, self.known = data, known
         names = ("force_gain", "force_offset", "instrument_phase")
         keep = [k for k, name in enumerate(names) if name in free]
@@ -256,7 +198,7 @@ class _Workbench:
             residuals.reshape(-1) / self.noise, slopes / self.noise, std, np.zeros(len(std))
         )
 
-    def scatter(self, squared: AbstractFamily, damping: AbstractFamily) -> Scatter:
+    def scatter(self, squared: AbstractFamily, damping: AbstractFamily, *, look: bool) -> Scatter:
         """What noise and levels say beyond these curves, with nothing but the stated known."""
         problem = self.problem(squared, damping)
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
@@ -266,7 +208,7 @@ class _Workbench:
             problem.residuals * self.noise, problem.slopes * self.noise, std, problem.deviation
         )
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
-        return estimated_scatter(raw, index)
+        return estimated_scatter(raw, index, look=look)
 
     def jitter(self, pilot: Unknowns) -> float:
         """1σ of relative stiffness from state to state, zero unless the residuals ask for it.

@@ -1,0 +1,83 @@
+"""What a joint fit says in words of its data: noise, levels, and where the states lie."""
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.identify.force_balance import Motion
+from snrmjax.identify.level_scatter import Scatter
+
+_BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
+_ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
+
+
+def notes_on_noise(
+    scatter: Scatter,
+    jitter: float,
+    given: Float[np.ndarray, " error"],
+    n_levels: int,
+    *,
+    stated: bool,
+) -> tuple[str, ...]:
+    """Where noise and levels are not as stated.
+
+    Arguments: `jitter` 1σ of relative stiffness from state to state, in units of the noise where
+    none is stated; `given` the stated 1σ of levels' errors.
+    """
+    notes = []
+    if stated and scatter.contradicts_upward:
+        notes.append(
+            f"residuals are {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated noise: "
+            "the noise is understated or the model is wrong; the bands are widened accordingly."
+        )
+    if stated and scatter.noise + 3 * scatter.noise_std < 1:
+        notes.append(
+            f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
+            "noise: it is overstated, and the bands are wider than need be."
+        )
+    units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
+    found_only = np.where(given > 0, 0.0, scatter.level)
+    if jitter > 0:
+        jitter = 0.5 * jitter * (1.0 if stated else scatter.noise)
+        notes.append(
+            f"natural frequency wanders by {100 * jitter:.2g} % from state to state (1σ), which "
+            "no stated noise explains."
+        )
+    shared = [
+        f"{factor * value:.2g} {name}"
+        for (factor, name), value in zip((*units, (100, "% in damping")), found_only, strict=True)
+        if value > 0
+    ]
+    if shared:
+        notes.append(
+            f"levels differ from one another by {', '.join(shared)} (1σ), which no stated error "
+            "explains; the bands include it."
+        )
+    if n_levels < 3:
+        notes.append(
+            f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing says how far "
+            "levels differ from one another, and the bands do not include it."
+        )
+    return tuple(notes)
+
+
+def notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:
+    """What states on one side of resonance, or of one amplitude, leave open."""
+    notes = []
+    phase = np.degrees(np.angle(np.asarray(motion.velocity)))
+    if phase.min() > _BESIDE or phase.max() < -_BESIDE:
+        near, far = sorted((abs(phase.min()), abs(phase.max())))
+        side = "below" if phase.min() > 0 else "above"
+        notes.append(
+            f"all states lie on one side of resonance ({near:.0f}° to {far:.0f}° {side} it): an "
+            "error of phase that they share passes for a change of natural frequency and damping, "
+            "and no band contains it unless it is stated."
+        )
+    size = np.asarray(motion.displacement)
+    peaks = np.array([size[level == k].max() for k in np.unique(level)])
+    if len(peaks) > 1 and peaks.max() < _ALIKE * peaks.min():
+        notes.append(
+            f"the levels' largest amplitudes lie within {100 * (peaks.max() / peaks.min() - 1):.2g}"
+            " % of each other: no level tells more than another of how the mode changes with "
+            "amplitude, and only smaller states of the same levels do."
+        )
+    return tuple(notes)
