@@ -12,10 +12,8 @@ R = TypeVar("R")
 # XLA's default order for a CPU lets independent steps run side by side, each in a thread of a
 # pool. On matrices of a hundred rows handing a step over takes longer than the step; the cores
 # are put to use by whole curves instead (`blocks.over_cores`).
-_SEQUENTIAL = {
-    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
-    "xla_backend_optimization_level": 1,  # compiles an eighth faster, runs as fast
-}
+_SEQUENTIAL = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+_LEVEL = {"xla_backend_optimization_level": 1}  # compiles an eighth faster, runs as fast
 
 
 def compiled(function: Callable[..., R]) -> Callable[..., R]:
@@ -34,7 +32,8 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
 
     run.__name__ = function.__name__
     program = partial(jax.jit, run, static_argnums=(0, 1))
-    anywhere, sequential = program(), program(compiler_options=_SEQUENTIAL)
+    anywhere, quick = program(), program(compiler_options=_SEQUENTIAL)
+    sequential = program(compiler_options=_SEQUENTIAL | _LEVEL)
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
@@ -43,8 +42,11 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         fixed = tuple(_Array if known else a for a, known in zip(leaves, is_array, strict=True))
         arrays = [a for a, known in zip(leaves, is_array, strict=True) if known]
         inside = any(isinstance(a, jax.core.Tracer) for a in arrays)
-        chosen = anywhere if inside or not _known() else sequential
-        return chosen(structure, fixed, arrays)
+        if inside or not _known():
+            return anywhere(structure, fixed, arrays)
+        # A level of its own would overrule the user who asks JAX to compile quickly.
+        hurried = jax.config.values["jax_disable_most_optimizations"]
+        return (quick if hurried else sequential)(structure, fixed, arrays)
 
     return call
 
@@ -59,7 +61,7 @@ def _known() -> bool:
     if jax.default_backend() != "cpu":
         return False
     try:
-        jax.jit(lambda: 0, compiler_options=_SEQUENTIAL).lower().compile()
+        jax.jit(lambda: 0, compiler_options=_SEQUENTIAL | _LEVEL).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
