@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -44,6 +45,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
     """One command in a process of its own."""
     return subprocess.run(
         [sys.executable, "-c", "from snrmjax.cli import main; main()", *arguments],
+        env=os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
         capture_output=True,
         text=True,
         timeout=600,

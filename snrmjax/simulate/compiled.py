@@ -1,7 +1,7 @@
 """Programs of many small steps, compiled to run one step after the other."""
 
 from collections.abc import Callable
-from functools import cache, partial, wraps
+from functools import cache, wraps
 from typing import Any, TypeVar
 
 import jax
@@ -9,12 +9,14 @@ import numpy as np
 
 R = TypeVar("R")
 
-# XLA's default order for a CPU lets independent steps run side by side, each in a thread of a
-# pool. On matrices of a hundred rows handing a step over takes longer than the step; the cores
-# are put to use by whole curves instead (`blocks.over_cores`).
-_SEQUENTIAL = {
+_LEVEL = "xla_backend_optimization_level"
+_OPTIONS: dict[str, str | bool | int] = {
+    # XLA's default order for a CPU lets independent steps run side by side, each in a thread of a
+    # pool. On matrices of a hundred rows handing a step over takes longer than the step; the
+    # cores are put to use by whole curves instead (`blocks.over_cores`).
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
-    "xla_backend_optimization_level": 1,  # compiles an eighth faster, runs as fast
+    "xla_cpu_use_fusion_emitters": False,  # compiles a third faster, runs as fast
+    _LEVEL: 1,  # compiles an eighth faster, runs as fast
 }
 
 
@@ -33,8 +35,11 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         return function(*arguments, **named)
 
     run.__name__ = function.__name__
-    program = partial(jax.jit, run, static_argnums=(0, 1))
-    anywhere, sequential = program(), program(compiler_options=_SEQUENTIAL)
+    inside = jax.jit(run, static_argnums=(0, 1))
+
+    @cache
+    def outermost(hurried: bool) -> Callable[..., R]:
+        return jax.jit(run, static_argnums=(0, 1), compiler_options=_options(hurried))
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
@@ -42,9 +47,9 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         is_array = [isinstance(a, (jax.Array, np.ndarray, np.generic)) for a in leaves]
         fixed = tuple(_Array if known else a for a, known in zip(leaves, is_array, strict=True))
         arrays = [a for a, known in zip(leaves, is_array, strict=True) if known]
-        inside = any(isinstance(a, jax.core.Tracer) for a in arrays)
-        chosen = anywhere if inside or not _known() else sequential
-        return chosen(structure, fixed, arrays)
+        traced = any(isinstance(a, jax.core.Tracer) for a in arrays)
+        hurried = jax.config.values["jax_disable_most_optimizations"]
+        return (inside if traced else outermost(hurried))(structure, fixed, arrays)
 
     return call
 
@@ -54,12 +59,23 @@ class _Array:
 
 
 @cache
-def _known() -> bool:
-    """Whether this version of XLA has the option, and the programs run on a CPU."""
+def _options(hurried: bool) -> dict[str, str | bool | int]:
+    """Those that this version of XLA has; none where the programs do not run on a CPU.
+
+    A level of ours would overrule a user who asks JAX to compile in a hurry.
+    """
     if jax.default_backend() != "cpu":
-        return False
+        return {}
+    return {
+        name: value
+        for name, value in _OPTIONS.items()
+        if not (hurried and name == _LEVEL) and _known(name, value)
+    }
+
+
+def _known(name: str, value: str | bool | int) -> bool:
     try:
-        jax.jit(lambda: 0, compiler_options=_SEQUENTIAL).lower().compile()
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
