@@ -13,6 +13,7 @@ LONG = (
     "02_forced_responses",
     "03_joint_fit_and_error_bars",
     "04_the_missing_effect",
+    "05_the_papers_open_ends",
 )  # a minute and more
 PATHS = [
     pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)
