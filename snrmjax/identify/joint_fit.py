@@ -48,7 +48,6 @@ SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
 _ROUNDS = 3, 12  # of fitting and weighting anew: at least, at most
-_CHOICES = 3  # of families and of what levels scatter, at most
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
 _FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
@@ -170,13 +169,11 @@ def fit_jointly(
     pilot = pilot_start(measured, modes, spread, released)
     chosen = select(pilot, measured, scatter_too=False)
     best = fitted(chosen, pilot, measured)
-    for _ in range(_CHOICES):
-        raw = best.unknowns.level * best.spread.level
-        pilot = eqx.tree_at(lambda u: u.level, best.unknowns, raw)
-        measured = eqx.tree_at(lambda d: d.correction, measured, best.data.correction)
-        before, chosen = chosen, select(pilot, measured, scatter_too=True)
-        if chosen.agrees_with(before):
-            break
+    raw = best.unknowns.level * best.spread.level
+    pilot = eqx.tree_at(lambda u: u.level, best.unknowns, raw)
+    measured = eqx.tree_at(lambda d: d.correction, measured, best.data.correction)
+    before, chosen = chosen, select(pilot, measured, scatter_too=True)
+    if not chosen.agrees_with(before):
         best = fitted(chosen, pilot, measured)
     notes: tuple[str, ...] = ()
     if not best.converged:
