@@ -109,7 +109,9 @@ def diagnose_model(
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
     verdict, reasons = judged(found, noise, noise_std)
-    open_ends = doubts(fit.kinds, free.parts) if verdict in ("named", "ambiguous") else []
+    open_ends: list[Doubt] = []
+    if verdict in ("named", "ambiguous"):
+        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
@@ -123,7 +125,7 @@ def diagnose_model(
         inner, outer = (
             held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
         )
-        missed = not_foretold(inner, outer, doubted=bool(open_ends))
+        missed = not_foretold(inner, outer, doubted=not all(d.twin for d in open_ends))
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
         for place in places if fit.kinds else ():

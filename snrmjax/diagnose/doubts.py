@@ -17,6 +17,7 @@ class Doubt(NamedTuple):
     reason: str
     decide_by: str
     refutes: bool = False
+    twin: bool = False  # the other law does the same to all that was measured
 
 
 # Exponents of the change of ω̃² or δ against amplitude, by the part where it shows.
@@ -43,13 +44,19 @@ _SAME_PART = (
     frozenset({"jenkins_slider", "iwan_microslip"}),
     frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),
 )
+_DIRECTED = ("quadratic_damping", "cubic_damping")  # as of a fluid that flows through a valve
 _RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
 
-def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt]:
-    """Reasons to doubt the effects that were found, from what was located before any name."""
-    found: list[Doubt] = []
+def doubts(
+    effects: tuple[str, ...], located: tuple[Located, ...], orders: tuple[int, ...]
+) -> list[Doubt]:
+    """Reasons to doubt the effects that were found, from what was located before any name.
+
+    `orders` are the harmonics that were measured.
+    """
+    found = _of_harmonics(effects, orders)
     if len(effects) == 1:
         found += _of_exponent(effects[0], located)
     if "iwan_microslip" in effects:
@@ -60,6 +67,8 @@ def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt
                 "measure a hysteresis loop, or levels over two decades",
             )
         )
+    if len(effects) > 2:
+        found.append(Doubt("three effects together can follow most laws.", _WIDER))
     alike = [pair for pair in combinations(effects, 2) if any(g >= set(pair) for g in _SAME_PART)]
     if alike:
         found.append(
@@ -75,6 +84,29 @@ def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt
                 "a further mode beside another effect can imitate a law that the library does not "
                 "have.",
                 f"step finely through the frequency of the further mode, or {_WIDER}",
+            )
+        )
+    return found
+
+
+def _of_harmonics(effects: tuple[str, ...], orders: tuple[int, ...]) -> list[Doubt]:
+    """What has the same fundamental, and is told by a harmonic that was not measured."""
+    found = []
+    mine = [kind for kind in effects if kind in _DIRECTED]
+    if mine and 2 not in orders:
+        found.append(
+            Doubt(
+                f"a damping that acts more in one direction than in the other has the same "
+                f"fundamental as {mine[0]}.",
+                "record harmonic 2 at the largest level",
+                twin=True,
+            )
+        )
+    if "mode_shape_change" in effects and 3 not in orders:
+        found.append(
+            Doubt(
+                "a sensor that saturates can do what mode_shape_change does.",
+                "record harmonic 3 at the largest level, or use a second sensor",
             )
         )
     return found
