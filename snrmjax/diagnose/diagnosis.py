@@ -15,6 +15,7 @@ from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tole
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.sidedness import acts_both_ways
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
@@ -111,7 +112,8 @@ def diagnose_model(
     verdict, reasons = judged(found, noise, noise_std)
     open_ends: list[Doubt] = []
     if verdict in ("named", "ambiguous"):
-        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders)
+        both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
+        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]

@@ -44,19 +44,24 @@ _SAME_PART = (
     frozenset({"jenkins_slider", "iwan_microslip"}),
     frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),
 )
-_DIRECTED = ("quadratic_damping", "cubic_damping")  # as of a fluid that flows through a valve
+DIRECTED = ("quadratic_damping", "cubic_damping")
+"""Damping as of a fluid, which a valve may let pass in one direction only."""
 _RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
 
 def doubts(
-    effects: tuple[str, ...], located: tuple[Located, ...], orders: tuple[int, ...]
+    effects: tuple[str, ...],
+    located: tuple[Located, ...],
+    orders: tuple[int, ...] = (),
+    both_ways: frozenset[str] = frozenset(),
 ) -> list[Doubt]:
     """Reasons to doubt the effects that were found, from what was located before any name.
 
-    `orders` are the harmonics that were measured.
+    `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
+    shows to act in both directions.
     """
-    found = _of_harmonics(effects, orders)
+    found = _of_harmonics(effects, orders, both_ways)
     if len(effects) == 1:
         found += _of_exponent(effects[0], located)
     if "iwan_microslip" in effects:
@@ -65,6 +70,7 @@ def doubts(
                 "other laws of friction with the same backbone, such as Bouc and Wen's, fit as "
                 "well.",
                 "measure a hysteresis loop, or levels over two decades",
+                twin=True,
             )
         )
     if len(effects) > 2:
@@ -89,16 +95,18 @@ def doubts(
     return found
 
 
-def _of_harmonics(effects: tuple[str, ...], orders: tuple[int, ...]) -> list[Doubt]:
-    """What has the same fundamental, and is told by a harmonic that was not measured."""
+def _of_harmonics(
+    effects: tuple[str, ...], orders: tuple[int, ...], both_ways: frozenset[str]
+) -> list[Doubt]:
+    """What has the same fundamental, and is told by a harmonic that was not or hardly measured."""
     found = []
-    mine = [kind for kind in effects if kind in _DIRECTED]
-    if mine and 2 not in orders:
+    mine = [kind for kind in effects if kind in DIRECTED and kind not in both_ways]
+    if mine:
+        closer = " with less noise" if 2 in orders else ""
         found.append(
             Doubt(
-                f"a damping that acts more in one direction than in the other has the same "
-                f"fundamental as {mine[0]}.",
-                "record harmonic 2 at the largest level",
+                f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
+                f"record harmonic 2 at the largest level{closer}",
                 twin=True,
             )
         )

@@ -86,7 +86,7 @@ def _refitted(
     change = -np.linalg.pinv(matrix, rcond=1e-12) @ (scaled[kept].T @ inverse @ fit.rows[kept])
     values, vectors = np.linalg.eigh(matrix)
     # What the kept rows do not see at all is open: as good as any size.
-    root = vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    root = vectors / np.sqrt(np.maximum(values, 1e-12))
     return change / size, fit.rows + scaled @ change, scaled @ root
 
 

@@ -11,12 +11,17 @@ import pytest
 from jaxtyping import Array
 
 import snrmjax as sj
+from snrmjax.diagnose.diagnosis import scales_of
+from snrmjax.diagnose.evidence import Bench
 from snrmjax.diagnose.foretelling import (
     level_forces,
     measured_resonance,
     responses,
     simulated_resonance,
 )
+from snrmjax.diagnose.naming import named
+from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.sidedness import acts_both_ways, even_share
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effects import EFFECTS
@@ -105,6 +110,32 @@ def test_an_effect_that_no_one_knows_is_not_named():
     found, _ = blind("blind_02")
     assert found.verdict == "unknown"
     assert found.p_value < 1e-3
+
+
+def test_two_simple_effects_are_not_read_as_a_further_mode():
+    # A 1:2 resonance with free frequency and damping fits as well, with one parameter more.
+    found, key = blind("blind_13")
+    assert sorted(found.effects) == sorted(key["effects"])
+
+
+@pytest.mark.long
+def test_a_mode_close_by_is_not_taken_for_noise():
+    found, key = blind("blind_14")
+    assert key["outside"] == "close_mode"
+    assert found.verdict == "unknown"
+
+
+@pytest.mark.long
+def test_damping_of_one_direction_shows_in_harmonic_2():
+    model, data = files("blind_15")
+    scales = scales_of(Predictions(model, data))
+    found = named(Bench(Predictions(model, data)), scales, ("quadratic_damping",))
+    assert KEYS["blind_15"]["outside"] == "asymmetric_damping"
+    # It acts in one direction only: even and odd part are equal.
+    share, std = even_share(found.bench, found.fit, "quadratic_damping")
+    assert share == pytest.approx(1.0, abs=3 * std)
+    assert std < 0.3
+    assert not acts_both_ways(found.bench, found.fit, "quadratic_damping")
 
 
 def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
