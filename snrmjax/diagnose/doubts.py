@@ -39,7 +39,10 @@ _SAME_PART = (
         }
     ),
     frozenset(
-        {"coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"},
+        {
+            *("coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"),
+            "linear_damping_change",
+        }
     ),
     frozenset({"jenkins_slider", "iwan_microslip"}),
     frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),

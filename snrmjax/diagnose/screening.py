@@ -10,7 +10,7 @@ from snrmjax.diagnose.evidence import Bench, Fit
 _KEPT = 2  # starts of a candidate
 _SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
 _TIMES = 3  # that a kind stands in pairs
-_ALIKE = 1e-3  # 1 − cos² between changes that cannot be told apart
+_ALIKE = 1e-3  # 1 − cos² between changes, less than which is not relied upon
 
 
 def foretold(bench: Bench, candidate: Candidate, beside: Fit) -> tuple[float, Candidate]:
@@ -59,7 +59,7 @@ def foretold_pairs(
     factor = (along[:, None] - across * along) / left / size[:, None]  # of one beside another
     least = [-np.inf if c.kind not in SECOND_ORDER and c.lower[0] < 0 else 0.0 for c in candidates]
     good = factor > np.array(least)[whose][:, None]
-    good = good & good.T & (whose[:, None] < whose) & (1 - across**2 > _ALIKE)
+    good = good & good.T & (whose[:, None] < whose)
     gain = (along[:, None] ** 2 + along**2 - 2 * across * np.outer(along, along)) / left
     cost = np.array([len(c.unit) for c in candidates])[whose] * np.log(bench.n_rows)
     gain = np.where(good, gain - cost[:, None] - cost, -np.inf)

@@ -38,6 +38,7 @@ def test_a_power_that_is_hardly_known_refutes_nothing_but_leaves_the_rival():
         ("gap_stiffness", "quintic_stiffness"),
         ("quadratic_damping", "cubic_stiffness", "cubic_damping"),
         ("iwan_microslip", "jenkins_slider"),
+        ("coulomb_friction", "linear_damping_change"),
         ("internal_resonance_1_3", "quintic_stiffness"),
         ("iwan_microslip",),
     ],
