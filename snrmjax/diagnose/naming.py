@@ -77,8 +77,9 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
         # What two seemed to be is one that no start had come near to.
         fits = [bench.fitted(_from(every, f)) for f in singles if f.kinds != simple.kinds]
-        answers = (_class(bench, [simple, *fits], simple.kinds[0]),)
-        return Named(bench, simple, nothing, answers, tuple(table))
+        one = _simplest(bench, [simple, *fits])
+        answers = (_class(bench, [simple, *fits], one.kinds[0]),)
+        return Named(bench, one, nothing, answers, tuple(table))
     # Each is chosen anew beside the other: the first one beside the second, then the reverse.
     classes: list[tuple[str, ...]] = []
     kind, other = pair.kinds[0], alone[1]
