@@ -7,14 +7,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import chi2
 
 from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
 from snrmjax.diagnose.doubts import Doubt, doubts
-from snrmjax.diagnose.evidence import Bench, Fit, unlikely
+from snrmjax.diagnose.evidence import Bench, Fit
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.sidedness import acts_both_ways
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
@@ -22,10 +23,6 @@ from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structure import Structure
 
-_UNLIKELY = 1e-3
-_TOLERATED = 1.7  # variance over the stated one that neighbours show
-_WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
-_LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
 _LEAST_STATES = 6
 _ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
@@ -112,12 +109,14 @@ def diagnose_model(
     bench, fit = found.bench, found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
-    verdict, reasons = _verdict(found, noise, noise_std)
-    open_ends = doubts(fit.kinds, free.parts) if verdict in ("named", "ambiguous") else []
+    verdict, reasons = judged(found, noise, noise_std)
+    open_ends: list[Doubt] = []
+    if verdict in ("named", "ambiguous"):
+        both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
+        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
-    notes = [*reasons, *notes, *predictions.chosen.notes]
     values, own = _values(bench, fit), bench.baseline(fit)
     n_levels = predictions.chosen.n_levels
     inner = outer = None
@@ -125,7 +124,12 @@ def diagnose_model(
     if n_levels > 2:
         order = _by_amplitude(bench)
         places = (order[n_levels // 2], order[-1])
-        inner, outer = (held_out(bench, found.nothing, fit, place) for place in places)
+        inner, outer = (
+            held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
+        )
+        missed = not_foretold(inner, outer, doubted=not all(d.twin for d in open_ends))
+        if verdict in ("named", "ambiguous") and missed is not None:
+            verdict, reasons = "unknown", [missed, *reasons]
         for place in places if fit.kinds else ():
             unseen = without_level(bench, fit, place)
             mine = dict(zip(fit.labels, unseen.values.tolist(), strict=True))
@@ -135,6 +139,7 @@ def diagnose_model(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
             "the answer."
         )
+    notes = [*reasons, *notes, *predictions.chosen.notes]
     shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
     if abs(shift) > _ANOTHER:
         notes.append(
@@ -215,67 +220,6 @@ def scales_of(predictions: Predictions) -> Scales:
         smallest_force=float(np.min(force)),
         damping_ratio=float(modes.damping_ratio[j]),
     )
-
-
-def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
-    """Variance of the force's misfit as second differences along every level show it, and 1σ.
-
-    What varies smoothly from state to state, explained or not, does not enter; what baseline and
-    levels may have in common is taken out first.
-    """
-    weighing, chosen = bench.weighing, bench.predictions.chosen
-    left = weighing.without_shared(fit.rows)
-    level = np.asarray(chosen.states.level)
-    squares: list[np.ndarray] = []
-    for column in range(2):
-        mine = weighing.column == column
-        rows, states = left[mine], weighing.state[mine]
-        for number in range(chosen.n_levels):
-            some = rows[level[states] == number]
-            if len(some) > 2:
-                squares.append((some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6)
-    if not squares:
-        return 1.0, np.inf
-    every = np.concatenate(squares)
-    # Jumps and kinks are no noise: beyond four times the median's 1σ they are cut.
-    limit = 16 * np.median(every) / 0.4549
-    # Neighbouring differences share states: about half as many are independent.
-    value = float(np.mean(np.minimum(every, limit)))
-    return value, value * float(np.sqrt(2 / (0.51 * len(every))))
-
-
-def _verdict(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]]:
-    n = found.bench.n_rows - len(found.fit.values)
-    reduced = found.fit.chi_square / n
-    too_good = float(chi2.cdf(found.fit.chi_square, n))
-    stated = found.bench.predictions.chosen.noise_stated
-    if stated and too_good < _UNLIKELY:
-        return "noise_rejected", [
-            f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
-            "smaller effects may be hidden by it."
-        ]
-    loud = noise - 1 > _WRONG_NOISE * noise_std or (
-        found.p_value < _UNLIKELY and noise - 1 > 0.5 * _WRONG_NOISE * noise_std
-    )
-    if stated and loud and unlikely(found.fit.chi_square / noise, n) > _UNLIKELY:
-        return "noise_rejected", [
-            f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
-            "allows: it is understated; state it rightly before an effect is named."
-        ]
-    # A noise that is stated a little too small everywhere is no sign of further physics.
-    if unlikely(found.fit.chi_square / np.clip(noise, 1.0, _TOLERATED), n) < _UNLIKELY:
-        reasons = ["no effect of the library explains what is left."]
-        if noise > _LOUD**2:
-            reasons.append(
-                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
-                "that counts here: state what a repeated test shows, or no noise at all, and "
-                "diagnose again."
-            )
-        return "unknown", reasons
-    if not found.fit.kinds:
-        return "none", []
-    unclear = any(len(group) > 1 for group in found.classes)
-    return ("ambiguous" if unclear else "named"), []
 
 
 def _by_amplitude(bench: Bench) -> list[int]:

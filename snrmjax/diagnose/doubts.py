@@ -17,6 +17,7 @@ class Doubt(NamedTuple):
     reason: str
     decide_by: str
     refutes: bool = False
+    twin: bool = False  # the other law does the same to all that was measured
 
 
 # Exponents of the change of ω̃² or δ against amplitude, by the part where it shows.
@@ -38,18 +39,32 @@ _SAME_PART = (
         }
     ),
     frozenset(
-        {"coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"},
+        {
+            *("coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"),
+            "linear_damping_change",
+        }
     ),
     frozenset({"jenkins_slider", "iwan_microslip"}),
     frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),
 )
+DIRECTED = ("quadratic_damping", "cubic_damping")
+"""Damping as of a fluid, which a valve may let pass in one direction only."""
 _RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
 
-def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt]:
-    """Reasons to doubt the effects that were found, from what was located before any name."""
-    found: list[Doubt] = []
+def doubts(
+    effects: tuple[str, ...],
+    located: tuple[Located, ...],
+    orders: tuple[int, ...] = (),
+    both_ways: frozenset[str] = frozenset(),
+) -> list[Doubt]:
+    """Reasons to doubt the effects that were found, from what was located before any name.
+
+    `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
+    shows to act in both directions.
+    """
+    found = _of_harmonics(effects, orders, both_ways)
     if len(effects) == 1:
         found += _of_exponent(effects[0], located)
     if "iwan_microslip" in effects:
@@ -58,8 +73,11 @@ def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt
                 "other laws of friction with the same backbone, such as Bouc and Wen's, fit as "
                 "well.",
                 "measure a hysteresis loop, or levels over two decades",
+                twin=True,
             )
         )
+    if len(effects) > 2:
+        found.append(Doubt("three effects together can follow most laws.", _WIDER))
     alike = [pair for pair in combinations(effects, 2) if any(g >= set(pair) for g in _SAME_PART)]
     if alike:
         found.append(
@@ -75,6 +93,31 @@ def doubts(effects: tuple[str, ...], located: tuple[Located, ...]) -> list[Doubt
                 "a further mode beside another effect can imitate a law that the library does not "
                 "have.",
                 f"step finely through the frequency of the further mode, or {_WIDER}",
+            )
+        )
+    return found
+
+
+def _of_harmonics(
+    effects: tuple[str, ...], orders: tuple[int, ...], both_ways: frozenset[str]
+) -> list[Doubt]:
+    """What has the same fundamental, and is told by a harmonic that was not or hardly measured."""
+    found = []
+    mine = [kind for kind in effects if kind in DIRECTED and kind not in both_ways]
+    if mine:
+        closer = " with less noise" if 2 in orders else ""
+        found.append(
+            Doubt(
+                f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
+                f"record harmonic 2 at the largest level{closer}",
+                twin=True,
+            )
+        )
+    if "mode_shape_change" in effects and 3 not in orders:
+        found.append(
+            Doubt(
+                "a sensor that saturates can do what mode_shape_change does.",
+                "record harmonic 3 at the largest level, or use a second sensor",
             )
         )
     return found

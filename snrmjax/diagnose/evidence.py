@@ -25,7 +25,7 @@ from snrmjax.model.structure import Structure
 
 _STEPS = 9  # of a fit
 _SCREENED, _KEPT = 2, 2  # steps of all starts, and how many of them go on
-_SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
+_WEAK = 0.1  # of its strength, at which a start without a motion is looked at
 _WEAKER = 3  # times a start without a motion is tried with less strength
 _SETTLED = 0.02  # of χ²: a smaller change ends a fit
 
@@ -209,45 +209,32 @@ class Bench:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
 
-    def foretold(self, candidate: Candidate, beside: Fit) -> tuple[float, Candidate]:
-        """How much χ² would fall if the best start were scaled as it fits, and the best starts.
+    def at_start(self, candidate: Candidate) -> Fit:
+        """A candidate as it begins, not fitted."""
+        group, labels = self.predictions.group(candidate.kind), parameter_labels(candidate.kind)
+        values = np.array(candidate.starts[:1])
+        rows, slopes = self._evaluated(group, labels, values)
+        bounds = np.array(candidate.lower), np.array(candidate.upper)
+        cost = self._cost(rows[0])
+        return Fit((candidate.kind,), labels, values[0], cost, rows[0], slopes[0], *bounds)
 
-        These are the candidate's own, scaled so.
-        """
-        changes = self.weighing.noise_units(self._started(candidate))
-        if beside.slopes.shape[1]:
-            basis = np.linalg.qr(self.weighing.decorrelated(beside.slopes.T).T)[0]
-        else:
-            basis = np.zeros((self.n_rows, 0))
-        left = self.weighing.decorrelated(beside.rows)
-        moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
-        if not moves.size:
-            return 0.0, candidate  # no start has a motion
-        arms = self.weighing.decorrelated(changes[moves])
-        arms = arms - (arms @ basis) @ basis.T
-        size = np.sum(arms**2, axis=1)
-        factor = -(arms @ left) / np.where(size > 0, size, np.inf)
-        factor = np.where((factor < 0) & (candidate.lower[0] >= 0), 0.0, factor)
-        gains = factor**2 * size
-        # Those of second order change as the square of their strength, whatever its sign.
-        scaled = np.sqrt(np.abs(factor)) if candidate.kind in SECOND_ORDER else factor
-        starts = []
-        for k in np.argsort(gains)[::-1][:_KEPT]:
-            strength, *shape = candidate.starts[moves[k]]
-            times = np.clip(abs(scaled[k]), *_SCALED) * (-1.0 if scaled[k] < 0 else 1.0)
-            starts.append((float(strength * times), *shape))
-        return float(np.max(gains)), candidate._replace(starts=tuple(starts))
-
-    def _started(self, candidate: Candidate) -> Float[np.ndarray, "trial state column"]:
+    def started(self, candidate: Candidate) -> Float[np.ndarray, "trial state column"]:
+        """What a candidate's starts change."""
         if candidate.kind not in self._changes:
             group, labels = self.predictions.group(candidate.kind), parameter_labels(candidate.kind)
-            found = self._predicted(group, labels, np.array(candidate.starts))
-            self._changes[candidate.kind] = found.columns - self._columns
+            starts = np.array(candidate.starts)
+            changes = self._predicted(group, labels, starts).columns - self._columns
+            lost = ~np.isfinite(self.weighing.noise_units(changes)).all(axis=1)
+            if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
+                starts[:, 0] *= _WEAK
+                weak = self._predicted(group, labels, starts[lost]).columns - self._columns
+                changes[lost] = weak / _WEAK ** (2 if candidate.kind in SECOND_ORDER else 1)
+            self._changes[candidate.kind] = changes
         return self._changes[candidate.kind]
 
     def change(self, candidate: Candidate) -> Float[np.ndarray, " row"]:
         """What a candidate's first start changes, in units of noise."""
-        return self.weighing.noise_units(self._started(candidate))[0]
+        return self.weighing.noise_units(self.started(candidate))[0]
 
     def baseline(
         self, fit: "Fit", kept: Bool[np.ndarray, " row"] | None = None

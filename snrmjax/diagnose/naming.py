@@ -6,12 +6,15 @@ import numpy as np
 
 from snrmjax.diagnose.candidates import Candidate, Scales, candidate
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
+from snrmjax.diagnose.screening import foretold, foretold_pairs
 
 DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
 AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
 _PROMISING = 40.0  # of the criterion: within it a candidate is weighed anew
-_DOUBTFUL = 0.05  # probability of a fit below which others than the best are built upon
-_OTHERS = 3  # of them
+_DOUBTFUL = 0.05  # probability of a fit below which pairs without the best one are fitted too
+_REFUTED = 1e-3  # probability of a pair below which a third effect is looked for
+_PAIRS = 8  # that are fitted from their own starts
+_ONE = 2  # parameters of one effect; one with more is weighed against two effects
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
@@ -52,17 +55,21 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     best = _simplest(bench, singles) if singles else nothing
     if _gain(bench, nothing, best) <= DETECTED:
         return Named(bench, nothing, nothing, (), tuple(table))
-    firsts = [best]
-    if unlikely(best.chi_square, bench.n_rows - len(best.values)) < _DOUBTFUL:
-        order = sorted(singles, key=lambda fit: fit.criterion(bench.n_rows))
-        firsts = order[: 1 + _OTHERS]
-    pairs: list[Fit] = []
-    for first in firsts:
-        pairs += [bench.fitted(c, first) for c in _promising(bench, every, first)]
+    pairs = [bench.fitted(c, best) for c in _promising(bench, every, best)]
+    twins: list[Fit] = []
+    if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
+        twins = _pairs(bench, every, most=len(best.values))
+    if _is_below(bench, best, _DOUBTFUL):
+        pairs += _pairs(bench, every)
     lowest = min(singles, key=lambda fit: fit.criterion(bench.n_rows))
     pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=lowest)
-    if _gain(bench, lowest, pair) <= DETECTED:
-        return Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
+    single = _gain(bench, lowest, pair) <= DETECTED
+    if single:
+        as_simple = _simplest(bench, [best, *twins])
+        if as_simple is best:
+            answers = (_class(bench, singles, best.kinds[0]),)
+            return Named(bench, best, nothing, answers, tuple(table))
+        pair = as_simple
     bench = bench.reweighed(pair)
     nothing = bench.nothing()
     alone = [_alone(bench, every, kind, pair) for kind in pair.kinds]
@@ -70,8 +77,9 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
         # What two seemed to be is one that no start had come near to.
         fits = [bench.fitted(_from(every, f)) for f in singles if f.kinds != simple.kinds]
-        answers = (_class(bench, [simple, *fits], simple.kinds[0]),)
-        return Named(bench, simple, nothing, answers, tuple(table))
+        one = _simplest(bench, [simple, *fits])
+        answers = (_class(bench, [simple, *fits], one.kinds[0]),)
+        return Named(bench, one, nothing, answers, tuple(table))
     # Each is chosen anew beside the other: the first one beside the second, then the reverse.
     classes: list[tuple[str, ...]] = []
     kind, other = pair.kinds[0], alone[1]
@@ -85,7 +93,11 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
         if place == 0:
             kind, chosen = pair.kinds
             other = alone[0] if chosen == alone[0].kinds[0] else _alone(bench, every, chosen, pair)
-    if unlikely(pair.chi_square, bench.n_rows - len(pair.values)) < _DOUBTFUL:
+    if single:  # one effect with more parameters is another reading of both
+        best = bench.fitted(_from(every, best))
+        if _gain(bench, best, pair) < AS_GOOD and best.kinds[0] not in classes[0]:
+            classes[0] = (*classes[0], *best.kinds)
+    if _is_below(bench, pair, _REFUTED):
         thirds = [bench.fitted(c, pair) for c in _promising(bench, every, pair)]
         third = min(thirds, key=lambda fit: fit.criterion(bench.n_rows), default=pair)
         if _gain(bench, pair, third) > DETECTED:
@@ -95,17 +107,34 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     return Named(bench, pair, nothing, tuple(classes), tuple(table))
 
 
+def _pairs(bench: Bench, every: dict[str, Candidate], most: int | None = None) -> list[Fit]:
+    """Fits of the two kinds each that promise most, from starts of their own.
+
+    With at most so many parameters.
+    """
+    promised = [
+        (one, two)
+        for _, one, two in foretold_pairs(bench, list(every.values()))
+        if most is None or len(one.unit) + len(two.unit) <= most
+    ]
+    return [bench.fitted(two, bench.at_start(one)) for one, two in promised[:_PAIRS]]
+
+
+def _is_below(bench: Bench, fit: Fit, probability: float) -> bool:
+    return unlikely(fit.chi_square, bench.n_rows - len(fit.values)) < probability
+
+
 def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[Candidate]:
     """The candidates of which one start, scaled, would explain most of what is left.
 
     Starts are coarse: what explains a quarter of what the best one explains may yet win.
     """
     others = [c for kind, c in every.items() if kind not in before.kinds]
-    foretold = [bench.foretold(c, before) for c in others]
-    foretold.sort(key=lambda pair: -pair[0])
-    least = max(_WORTH, _SHARE * max((gain for gain, _ in foretold), default=0.0))
-    worth = [_WORTH if n < _TRIED else least for n in range(len(foretold))]
-    return [c for (gain, c), need in zip(foretold, worth, strict=True) if gain > need]
+    changes = [foretold(bench, c, before) for c in others]
+    changes.sort(key=lambda pair: -pair[0])
+    least = max(_WORTH, _SHARE * max((gain for gain, _ in changes), default=0.0))
+    worth = [_WORTH if n < _TRIED else least for n in range(len(changes))]
+    return [c for (gain, c), need in zip(changes, worth, strict=True) if gain > need]
 
 
 def _tried(

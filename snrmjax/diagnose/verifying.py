@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from snrmjax.diagnose.evidence import Bench, Fit
+from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 
 
 class HeldOut(NamedTuple):
@@ -14,17 +14,28 @@ class HeldOut(NamedTuple):
     level: int
     before: float
     after: float
+    p_value: float  # of `after` by noise alone
+    uncertain_p_value: float  # by noise and what the other levels leave open of the parameters
 
 
-def held_out(bench: Bench, nothing: Fit, fit: Fit, level: int) -> HeldOut:
+def held_out(bench: Bench, nothing: Fit, fit: Fit, level: int, noise: float = 1.0) -> HeldOut:
     """Fit to the other levels alone, and compare with the one left out.
 
     The misfit is that of the level given the others: what it shares with them through the
-    baseline's stated errors is foretold too; its own gain and phase are not.
+    baseline's stated errors is foretold too; its own gain and phase are not. `noise` is the
+    variance over the stated one for which probabilities are given.
     """
     out = _rows_of(bench, level)
-    number = int(bench.level_numbers[level])
-    return HeldOut(number, _gap(bench, nothing, out), _gap(bench, fit, out))
+    n_out = int(out.sum())
+    before, _ = _foretold(bench, nothing, out)
+    after, open_too = _foretold(bench, fit, out)
+    return HeldOut(
+        int(bench.level_numbers[level]),
+        float(np.sqrt(before / n_out)),
+        float(np.sqrt(after / n_out)),
+        unlikely(after / noise, n_out),
+        unlikely(open_too / noise, n_out),
+    )
 
 
 class Unseen(NamedTuple):
@@ -38,7 +49,7 @@ class Unseen(NamedTuple):
 def without_level(bench: Bench, fit: Fit, level: int) -> Unseen:
     """One step from the whole fit to the best one without a level's rows."""
     kept = ~_rows_of(bench, level)
-    change, rows = _refitted(bench, fit, kept)
+    change, rows, _ = _refitted(bench, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
     number = int(bench.level_numbers[level])
     return Unseen(number, values, bench.baseline(fit._replace(rows=rows), kept))
@@ -56,11 +67,16 @@ def _rows_of(bench: Bench, level: int) -> Bool[np.ndarray, " row"]:
 
 def _refitted(
     bench: Bench, fit: Fit, kept: Bool[np.ndarray, " row"]
-) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " row"]]:
-    """The change of a fit's parameters that some rows ask for, and all rows after it."""
+) -> tuple[
+    Float[np.ndarray, " parameter"], Float[np.ndarray, " row"], Float[np.ndarray, "row any"]
+]:
+    """The change of a fit's parameters that some rows ask for, all rows after it, and its root.
+
+    The root's columns are what independent unit errors of the change add to all rows.
+    """
     slopes = fit.slopes
     if not slopes.shape[1]:
-        return np.zeros(0), fit.rows
+        return np.zeros(0), fit.rows, slopes
     shared = bench.weighing.shared[kept]
     inverse = np.linalg.inv(np.eye(len(shared)) + shared @ shared.T)
     size = np.linalg.norm(slopes, axis=0)
@@ -68,16 +84,24 @@ def _refitted(
     scaled = slopes / size
     matrix = scaled[kept].T @ inverse @ scaled[kept]
     change = -np.linalg.pinv(matrix, rcond=1e-12) @ (scaled[kept].T @ inverse @ fit.rows[kept])
-    return change / size, fit.rows + scaled @ change
+    values, vectors = np.linalg.eigh(matrix)
+    # What the kept rows do not see at all is open: as good as any size.
+    root = vectors / np.sqrt(np.maximum(values, 1e-12))
+    return change / size, fit.rows + scaled @ change, scaled @ root
 
 
-def _gap(bench: Bench, fit: Fit, out: Bool[np.ndarray, " row"]) -> float:
+def _foretold(bench: Bench, fit: Fit, out: Bool[np.ndarray, " row"]) -> tuple[float, float]:
+    """χ² of rows left out, with the fitted parameters taken as known and as uncertain."""
     shared = bench.weighing.shared
     covariance = np.eye(len(shared)) + shared @ shared.T
     kept = ~out
     inverse = np.linalg.inv(covariance[np.ix_(kept, kept)])
-    rows = _refitted(bench, fit, kept)[1]
+    _, rows, root = _refitted(bench, fit, kept)
     across = covariance[np.ix_(out, kept)] @ inverse
     left = rows[out] - across @ rows[kept]
     own = covariance[np.ix_(out, out)] - across @ covariance[np.ix_(kept, out)]
-    return float(np.sqrt(left @ np.linalg.solve(own, left) / out.sum()))
+    spread = root[out] - across @ root[kept]
+    known, uncertain = (
+        float(left @ np.linalg.solve(c, left)) for c in (own, own + spread @ spread.T)
+    )
+    return known, uncertain

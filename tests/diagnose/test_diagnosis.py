@@ -11,12 +11,18 @@ import pytest
 from jaxtyping import Array
 
 import snrmjax as sj
+from snrmjax.diagnose.candidates import candidate
+from snrmjax.diagnose.diagnosis import scales_of
+from snrmjax.diagnose.evidence import Bench
 from snrmjax.diagnose.foretelling import (
     level_forces,
     measured_resonance,
     responses,
     simulated_resonance,
 )
+from snrmjax.diagnose.naming import named
+from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.sidedness import acts_both_ways, even_share
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effects import EFFECTS
@@ -105,6 +111,59 @@ def test_an_effect_that_no_one_knows_is_not_named():
     found, _ = blind("blind_02")
     assert found.verdict == "unknown"
     assert found.p_value < 1e-3
+
+
+def test_two_simple_effects_are_not_read_as_a_further_mode():
+    # A 1:2 resonance with free frequency and damping fits as well, with one parameter more.
+    found, key = blind("blind_13")
+    assert sorted(found.effects) == sorted(key["effects"])
+
+
+@pytest.mark.long
+def test_a_mode_close_by_is_not_taken_for_noise():
+    found, key = blind("blind_14")
+    assert key["outside"] == "close_mode"
+    assert found.verdict == "unknown"
+
+
+@pytest.mark.long
+def test_an_imitation_that_misses_the_level_left_out_is_no_answer():
+    found, key = blind("blind_16")
+    assert key["outside"] == "magnet_stiffness"
+    assert found.p_value > 1e-3  # it fits
+    assert found.gap.interpolated.p_value < 1e-3
+    assert found.verdict == "unknown"
+
+
+def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(monkeypatch):
+    predictions = Predictions(linear_model(), balanced(quadratic))
+    one = candidate("cubic_damping", scales_of(predictions))
+    usual = Bench(predictions).change(one)
+    whole = Bench._predicted
+
+    def only_weak(self, group, labels, values):
+        found = whole(self, group, labels, values)
+        return found._replace(
+            columns=np.where(values[0, 0] > 0.5 * one.unit[0], np.nan, 1) * found[0]
+        )
+
+    bench = Bench(predictions)
+    monkeypatch.setattr(Bench, "_predicted", only_weak)
+    # A force of first order: what is left is what its harmonics do to each other.
+    np.testing.assert_allclose(bench.change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max())
+
+
+@pytest.mark.long
+def test_damping_of_one_direction_shows_in_harmonic_2():
+    model, data = files("blind_15")
+    scales = scales_of(Predictions(model, data))
+    found = named(Bench(Predictions(model, data)), scales, ("quadratic_damping",))
+    assert KEYS["blind_15"]["outside"] == "asymmetric_damping"
+    # It acts in one direction only: even and odd part are equal.
+    share, std = even_share(found.bench, found.fit, "quadratic_damping")
+    assert share == pytest.approx(1.0, abs=3 * std)
+    assert std < 0.3
+    assert not acts_both_ways(found.bench, found.fit, "quadratic_damping")
 
 
 def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
@@ -226,7 +285,8 @@ def test_without_stated_noise_its_size_is_found_with_the_effect():
     )
     found = sj.diagnose_model(linear_model(), silent)
     assert found.effects == ("quadratic_damping",)
-    size = float(found.notes[0].split("is stated: ")[1].split(" %")[0])
+    (note,) = (note for note in found.notes if "is stated: " in note)
+    size = float(note.split("is stated: ")[1].split(" %")[0])
     # Velocity, phase and force together, as one relative error of all.
     assert size == pytest.approx(100 * NOISE["velocity"], rel=0.35)
 

@@ -14,7 +14,9 @@ def grows(part, exponent, std=0.05):
 def test_a_law_of_the_located_power_is_not_doubted():
     assert doubts(("coulomb_friction",), grows("damping", -1.05)) == []
     assert doubts(("cubic_stiffness",), grows("stiffness", 2.1, 0.1)) == []
-    assert doubts(("quadratic_damping", "cubic_stiffness"), grows("damping", 1.0)) == []
+    both_ways = frozenset({"quadratic_damping"})
+    two = ("quadratic_damping", "cubic_stiffness")
+    assert doubts(two, grows("damping", 1.0), (2, 3), both_ways) == []
 
 
 def test_a_law_of_another_power_is_refuted():
@@ -36,6 +38,7 @@ def test_a_power_that_is_hardly_known_refutes_nothing_but_leaves_the_rival():
         ("gap_stiffness", "quintic_stiffness"),
         ("quadratic_damping", "cubic_stiffness", "cubic_damping"),
         ("iwan_microslip", "jenkins_slider"),
+        ("coulomb_friction", "linear_damping_change"),
         ("internal_resonance_1_3", "quintic_stiffness"),
         ("iwan_microslip",),
     ],
@@ -45,6 +48,25 @@ def test_imitations_are_marked_with_what_would_decide(effects):
     assert found
     assert not any(doubt.refutes for doubt in found)
     assert all(doubt.decide_by for doubt in found)
+
+
+@pytest.mark.parametrize("orders", [(), (2, 3)])
+def test_damping_of_one_direction_is_a_twin_until_harmonic_2_excludes_it(orders):
+    (doubt,) = doubts(("quadratic_damping",), grows("damping", 1.0), orders)
+    assert doubt.twin
+    assert "one direction" in doubt.reason
+    assert ("less noise" in doubt.decide_by) == bool(orders)
+
+
+def test_a_sensor_that_saturates_is_told_by_harmonic_3():
+    (doubt,) = doubts(("mode_shape_change",), (), ())
+    assert not doubt.twin
+    assert doubts(("mode_shape_change",), (), (2, 3)) == []
+
+
+def test_three_effects_are_doubted():
+    (doubt,) = doubts(("coulomb_friction", "frequency_drift", "cubic_stiffness"), (), (2, 3))
+    assert "three" in doubt.reason
 
 
 def test_a_located_power_of_the_other_part_says_nothing():

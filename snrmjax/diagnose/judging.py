@@ -1,0 +1,166 @@
+"""The verdict on an answer: whether it leaves noise, and whether it foretells unseen levels.
+
+Noise that is stated too small makes every misfit larger by one factor, everywhere and without
+order. What grows with the level, or what neighbours along the resonance share, is physics.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.stats import chi2, norm
+from scipy.stats import f as fisher
+
+from snrmjax.diagnose.evidence import Bench, Fit, unlikely
+from snrmjax.diagnose.naming import Named
+from snrmjax.diagnose.verifying import HeldOut
+
+UNLIKELY = 1e-3
+_MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
+_TOLERATED = 1.7  # variance over the stated one that neighbours show
+_WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
+_LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
+
+
+def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
+    """Variance of the force's misfit as second differences along every level show it, and 1σ.
+
+    What varies smoothly from state to state, explained or not, does not enter; what baseline and
+    levels may have in common is taken out first.
+    """
+    left = bench.weighing.without_shared(fit.rows)
+    squares = [
+        (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
+        for some in _along(bench, left)
+        if len(some) > 2
+    ]
+    if not squares:
+        return 1.0, np.inf
+    every = np.concatenate(squares)
+    # Jumps and kinks are no noise: beyond four times the median's 1σ they are cut.
+    limit = 16 * np.median(every) / 0.4549
+    # Neighbouring differences share states: about half as many are independent.
+    value = float(np.mean(np.minimum(every, limit)))
+    return value, value * float(np.sqrt(2 / (0.51 * len(every))))
+
+
+def pattern(bench: Bench, fit: Fit) -> str | None:
+    """Why what is left cannot be noise of any one size; None where it can."""
+    left = bench.weighing.without_shared(fit.rows)
+    level = np.asarray(bench.predictions.chosen.states.level)[bench.weighing.state]
+    of_force = bench.weighing.column < 2
+    groups = [
+        (level == k) & (of_force == force) for k in np.unique(level) for force in (True, False)
+    ]
+    groups = [mine for mine in groups if mine.any() and not mine.all()]
+    for mine in groups:
+        ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
+        if fisher.sf(ratio, mine.sum(), (~mine).sum()) < UNLIKELY / len(groups):
+            name = bench.level_numbers[int(level[mine][0])]
+            what = "the force" if of_force[mine][0] else "the harmonics"
+            return (
+                f"what is left of {what} at level {name} is {np.sqrt(ratio):.2g} times as large as "
+                "elsewhere: noise of one size it is not."
+            )
+    for of_test in (True, False):
+        parts = list(_along(bench, left, of_test=of_test))
+        number = sum(max(len(some) - 1, 0) for some in parts)
+        if not number:
+            continue
+        square = np.mean(np.concatenate(parts) ** 2)
+        common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
+        if norm.sf(common * np.sqrt(number)) < UNLIKELY / 2:
+            order = "in the order of the test" if of_test else "along the resonance"
+            return (
+                f"neighbours {order} are left with like misfits (correlation {common:.2f}): noise "
+                "has none."
+            )
+    return None
+
+
+def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]]:
+    """Verdict and reasons from the fit; `noise` and 1σ are as neighbours show it."""
+    n = found.bench.n_rows - len(found.fit.values)
+    reduced = found.fit.chi_square / n
+    too_good = float(chi2.cdf(found.fit.chi_square, n))
+    stated = found.bench.predictions.chosen.noise_stated
+    if stated and too_good < UNLIKELY:
+        return "noise_rejected", [
+            f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
+            "smaller effects may be hidden by it."
+        ]
+    misfit = found.p_value < UNLIKELY
+    structure = pattern(found.bench, found.fit) if misfit else None
+    loud = noise - 1 > (0.5 if misfit else 1.0) * _WRONG_NOISE * noise_std
+    if stated and loud and structure is None:
+        return "noise_rejected", [
+            f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
+            "allows: it is understated; state it rightly before an effect is named."
+        ]
+    if unlikely(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
+        reasons = ["no effect of the library explains what is left."]
+        if structure is not None:
+            reasons.append(structure)
+        elif noise > _LOUD**2:
+            reasons.append(
+                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
+                "that counts here: state what a repeated test shows, or no noise at all, and "
+                "diagnose again."
+            )
+        return "unknown", reasons
+    if not found.fit.kinds:
+        return "none", []
+    unclear = any(len(group) > 1 for group in found.classes)
+    return ("ambiguous" if unclear else "named"), []
+
+
+def tolerated(noise: float, structure: str | None = None) -> float:
+    """Variance that counts as noise: one stated a little too small is no sign of further physics.
+
+    Not where what is left has a structure.
+    """
+    return float(np.clip(noise, 1.0, _TOLERATED)) if structure is None else 1.0
+
+
+def not_foretold(inner: HeldOut, outer: HeldOut, *, doubted: bool) -> str | None:
+    """Why held-out levels speak against an answer; None where they do not.
+
+    Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
+    answer may be an imitation, which is then worth no more than what it foretells.
+    """
+    for held in (inner, outer):
+        if held.uncertain_p_value < UNLIKELY / 2:
+            return (
+                f"level {held.level}, left out, is missed by {held.after:.2g} times the noise, "
+                "more than the uncertainty of the parameters allows: the law is another one."
+            )
+    if inner.after > inner.before and inner.p_value < UNLIKELY:
+        return (
+            f"level {inner.level}, left out, is foretold worse than without the effects: "
+            f"{inner.after:.2g} times the noise, {inner.before:.2g} before."
+        )
+    if doubted and inner.p_value < _MISSED:
+        return (
+            f"the answer may be an imitation, and level {inner.level}, left out, is missed by "
+            f"{inner.after:.2g} times the noise."
+        )
+    return None
+
+
+def _along(
+    bench: Bench, rows: Float[np.ndarray, " row"], *, of_test: bool = False
+) -> Iterator[Float[np.ndarray, " state"]]:
+    """Rows of the force, level by level, along the resonance or in the order of the test.
+
+    Along a resonance that bends over the phase of the velocity is what never turns back.
+    """
+    weighing, chosen = bench.weighing, bench.predictions.chosen
+    level = np.asarray(chosen.states.level)
+    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
+    for column in range(2):
+        mine = weighing.column == column
+        values, states = rows[mine], weighing.state[mine]
+        for number in range(chosen.n_levels):
+            some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
+            keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]
+            yield values[some[np.argsort(keys, kind="stable")]]
