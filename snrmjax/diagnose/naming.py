@@ -64,11 +64,11 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     lowest = min(singles, key=lambda fit: fit.criterion(bench.n_rows))
     pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=lowest)
     single = _gain(bench, lowest, pair) <= DETECTED
+    of_one = Named(bench, best, nothing, (_class(bench, singles, best.kinds[0]),), tuple(table))
     if single:
         as_simple = _simplest(bench, [best, *twins])
         if as_simple is best:
-            answers = (_class(bench, singles, best.kinds[0]),)
-            return Named(bench, best, nothing, answers, tuple(table))
+            return of_one
         pair = as_simple
     bench = bench.reweighed(pair)
     nothing = bench.nothing()
@@ -85,8 +85,11 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     kind, other = pair.kinds[0], alone[1]
     for place in range(2):
         rivals = [c for c in _promising(bench, every, other) if c.kind != kind]
-        rivals.append(_also_from(every[kind], pair))
         fits = [bench.fitted(c, other) for c in rivals]
+        # Beside the other one fitted alone the pair itself may be far away.
+        begun = bench.at_start(_where(every, pair, other.kinds[0]))
+        own = [bench.fitted(_where(every, pair, kind), start) for start in (begun, other)]
+        fits.append(min(own, key=lambda fit: fit.criterion(bench.n_rows)))
         table.append(_table(bench, other, fits))
         pair = _simplest(bench, fits)
         classes.append(_class(bench, fits, pair.kinds[1], at=1))
@@ -97,6 +100,8 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
         best = bench.fitted(_from(every, best))
         if _gain(bench, best, pair) < AS_GOOD and best.kinds[0] not in classes[0]:
             classes[0] = (*classes[0], *best.kinds)
+    if _is_below(bench, pair, _REFUTED) and of_one.p_value > _REFUTED:
+        return of_one  # weighed with its own way of passing on errors the pair is worse
     if _is_below(bench, pair, _REFUTED):
         thirds = [bench.fitted(c, pair) for c in _promising(bench, every, pair)]
         third = min(thirds, key=lambda fit: fit.criterion(bench.n_rows), default=pair)
@@ -162,6 +167,11 @@ def _tried(
 def _also_from(one: Candidate, pair: Fit) -> Candidate:
     """A candidate that also begins where it stands in a pair."""
     return one._replace(starts=(*one.starts, pair.of_kind(one.kind)))
+
+
+def _where(every: dict[str, Candidate], pair: Fit, kind: str) -> Candidate:
+    """A candidate that begins where it stands in a pair."""
+    return every[kind]._replace(starts=(pair.of_kind(kind),))
 
 
 def _alone(bench: Bench, every: dict[str, Candidate], kind: str, pair: Fit) -> Fit:
