@@ -90,7 +90,7 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
                 (
                     *(level, level in inside, best.velocity / velocity - 1),
                     (best.frequency - frequency) / HERTZ,
-                    best.velocity_std / velocity,
+                    np.hypot(best.velocity_std / velocity, fit.level_std[0]),
                     best.frequency_std / HERTZ,
                 )
             )
@@ -108,6 +108,9 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
             frequency_error_median_hz=np.nanmedian(np.abs(part[:, 3])),
             frequency_error_largest_hz=np.nanmax(np.abs(part[:, 3])),
             within_0_15_hz=np.mean(np.abs(part[:, 3]) < 0.15),
+            # A held-out level has a gain of its own, as large as the fit says that levels have.
+            velocity_inside_95=np.mean(np.abs(part[:, 2]) < 1.96 * part[:, 4]),
+            velocity_std_median=np.nanmedian(part[:, 4]),
             not_found=int(np.isnan(part[:, 2]).sum()),
         )
 
