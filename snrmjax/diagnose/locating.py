@@ -10,6 +10,10 @@ from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 _FREE = 6  # of a free curve of amplitude
 _SEEN = 2.0  # 1σ of a free curve beyond which an amplitude belongs to the range
 _P_VALUE = 1e-3
+_STEP = 0.01
+_POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
+_TELLING = 16.0  # of χ², that a power must explain before it is told
+_STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
 class Located(NamedTuple):
@@ -60,7 +64,7 @@ def located(bench: Bench, base: Fit) -> FreeFit:
                     name,
                     _range(speed, hats, values[own], covariance[own, own]),
                     p_value,
-                    *_exponent(knots, values[own], covariance[own, own]),
+                    *power_of_amplitude(knots, values[own], covariance[own, own]),
                 )
             )
     n_force = int(of_force.sum())
@@ -122,18 +126,24 @@ def _range(
     return float(where.min()), float(where.max())
 
 
-def _exponent(
+def power_of_amplitude(
     logarithm: np.ndarray, values: np.ndarray, covariance: np.ndarray
 ) -> tuple[float | None, float | None]:
-    """Slope of log |change| against log amplitude, where the change has one sign."""
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    sure = np.abs(values) > 2 * std
-    if sure.sum() < 3 or len(set(np.sign(values[sure]))) > 1:
+    """The power of amplitude that a free curve follows, and 1σ; None where it follows no power.
+
+    Least squares on the curve itself with all its covariance: what the linear parameters leave
+    open moves every amplitude alike, and small changes are kept although they are not seen.
+    """
+    straight = (_STRAIGHT * values) ** 2 + 1e-12 * np.trace(covariance)
+    doubt = covariance + np.diag(straight)
+    root = np.linalg.inv(np.linalg.cholesky(doubt))
+    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, _POWERS))
+    explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
+    best = int(np.argmax(explained))
+    left = float(curve @ curve - explained[best])
+    if explained[best] < _TELLING or unlikely(left, _FREE - 2) < _P_VALUE:
         return None, None
-    x, y, e = logarithm[sure], np.log(np.abs(values[sure])), std[sure] / np.abs(values[sure])
-    weight = 1 / np.maximum(e, 0.02) ** 2
-    mean = np.sum(weight * x) / np.sum(weight)
-    spread = np.sum(weight * (x - mean) ** 2)
-    if spread < 1e-6:
+    below = np.flatnonzero(explained > explained[best] - 1.0)
+    if below[0] == 0 or below[-1] == len(_POWERS) - 1:
         return None, None
-    return float(np.sum(weight * (x - mean) * y) / spread), float(1 / np.sqrt(spread))
+    return float(_POWERS[best]), float(0.5 * (_POWERS[below[-1]] - _POWERS[below[0]]) + _STEP / 2)

@@ -114,7 +114,10 @@ class TestExactStates:
         np.testing.assert_allclose(paper.amplitude, size, rtol=ROUNDING)
         np.testing.assert_allclose(paper.backbone_velocity, size, rtol=ROUNDING)
         assert (displaced.argument, paper.argument) == ("displacement", "velocity")
-        np.testing.assert_array_equal(paper.natural_frequency, displaced.natural_frequency)
+        # Two programs: the last bit may differ.
+        np.testing.assert_allclose(
+            paper.natural_frequency, displaced.natural_frequency, rtol=2 * np.finfo(float).eps
+        )
 
     def test_a_sensor_that_missed_a_state_is_left_out(self):
         velocity = TRUTH.velocity.copy()

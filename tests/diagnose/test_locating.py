@@ -1,0 +1,47 @@
+"""The power of amplitude that a free curve follows, from curves whose power is known."""
+
+import numpy as np
+
+from snrmjax.diagnose.locating import power_of_amplitude
+
+AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
+OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common
+COVARIANCE = OWN**2 * np.eye(6) + SHARED**2 * np.ones((6, 6))
+
+
+def drawn(rng, power):
+    """A free curve, one at its largest, with its errors."""
+    exact = np.exp(power * AMPLITUDE)
+    return exact / exact.max() + OWN * rng.normal(size=6) + SHARED * rng.normal()
+
+
+def test_the_power_and_its_error_are_right_with_an_offset_that_is_not_known():
+    rng = np.random.default_rng(0)
+    for power in (1.0, 2.0, 4.0, -1.0):
+        found = [power_of_amplitude(AMPLITUDE, drawn(rng, power), COVARIANCE) for _ in range(200)]
+        told = np.array([pair for pair in found if pair[0] is not None])
+        assert len(told) > 180
+        off = (told[:, 0] - power) / told[:, 1]
+        assert abs(np.mean(off)) < 0.25
+        assert 0.8 < np.std(off) < 1.25
+
+
+def test_small_changes_are_kept_although_they_are_not_seen_one_by_one():
+    """Of those beyond two standard deviations alone the power would come out too low."""
+    rng = np.random.default_rng(1)
+    covariance = 0.15**2 * np.eye(6)
+    found = [
+        power_of_amplitude(AMPLITUDE, np.exp(2 * AMPLITUDE) + 0.15 * rng.normal(size=6), covariance)
+        for _ in range(300)
+    ]
+    told = np.array([pair for pair in found if pair[0] is not None])
+    assert np.median(told[:, 0]) > 1.85
+    assert np.mean(np.abs(told[:, 0] - 2.0) < 1.96 * told[:, 1]) > 0.9
+
+
+def test_a_curve_of_no_power_has_none():
+    rng = np.random.default_rng(2)
+    covariance = OWN**2 * np.eye(6)
+    peak = np.array([0.0, 0.8, 1.0, 0.6, 0.3, 0.1])
+    assert power_of_amplitude(AMPLITUDE, peak, covariance) == (None, None)
+    assert power_of_amplitude(AMPLITUDE, OWN * rng.normal(size=6), covariance) == (None, None)
