@@ -47,7 +47,14 @@ from snrmjax.simulate.compiled import compiled
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
+# A round starts near its end and another one follows: cost to 1e-7, unknowns to 1 % of their 1σ.
+_ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
+)
+_TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
 _ROUNDS = 3, 12  # of fitting and weighting anew: at least, at most
+_ROUGHLY = 2, 2  # the same, of a fit that is but the pilot of another
+_CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
 _FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
@@ -158,23 +165,29 @@ def fit_jointly(
         settings = (*wanted, released)
         return select_families(data, modes, spread, pilot, *settings, scatter_too=scatter_too)
 
-    def fitted(chosen: Selection, pilot: Unknowns, data: BalanceData) -> _Fitted:
+    def fitted(
+        chosen: Selection, pilot: Unknowns, data: BalanceData, rounds: tuple[int, int]
+    ) -> _Fitted:
         noisy = eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(chosen.jitter))
         level = _with_scatter(spread, chosen.scatter)
         start = _started(pilot, chosen, level)
         settings = (modes, level, released, chosen.scatter)
-        return _fitted(start, noisy, *settings, stated=stated, robust=robust)
+        return _fitted(start, noisy, *settings, stated=stated, robust=robust, rounds=rounds)
 
-    # What the rough pilot misses would pass for levels that differ: a fit comes first.
-    pilot = pilot_start(measured, modes, spread, released)
-    chosen = select(pilot, measured, scatter_too=False)
-    best = fitted(chosen, pilot, measured)
-    raw = best.unknowns.level * best.spread.level
-    pilot = eqx.tree_at(lambda u: u.level, best.unknowns, raw)
-    measured = eqx.tree_at(lambda d: d.correction, measured, best.data.correction)
-    before, chosen = chosen, select(pilot, measured, scatter_too=True)
-    if not chosen.agrees_with(before):
-        best = fitted(chosen, pilot, measured)
+    # What the rough pilot misses would pass for levels that differ: a fit without that comes first.
+    rough = pilot_start(measured, modes, spread, released)
+    begun = fitted(select(rough, measured, scatter_too=False), rough, measured, _ROUGHLY)
+    raw = begun.unknowns.level * begun.spread.level
+    pilot = eqx.tree_at(lambda u: u.level, begun.unknowns, raw)
+    corrected = eqx.tree_at(lambda d: d.correction, measured, begun.data.correction)
+    chosen = select(pilot, corrected, scatter_too=True)
+    best = fitted(chosen, pilot, corrected, _ROUNDS)
+    if not best.converged or (stated and best.scatter.contradicts_upward):
+        # Where levels differ so much that no fit without that comes near, the pilot knows better.
+        other = select(rough, measured, scatter_too=True)
+        again = fitted(other, rough, measured, _ROUNDS)
+        if again.scatter.noise < _CLEARLY_LESS * best.scatter.noise:
+            chosen, best = other, again
     notes: tuple[str, ...] = ()
     if not best.converged:
         notes = ("the fit did not converge: try a simpler family.",)
@@ -221,6 +234,7 @@ def _fitted(
     *,
     stated: bool,
     robust: bool,
+    rounds: tuple[int, int],
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
     program, stated_std, n = programmed(start, free), data.std, len(data.level)
@@ -229,16 +243,16 @@ def _fitted(
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
     none = Weighing(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
-    fewest, most = _ROUNDS
+    fewest, most = rounds
     # An outlier has widened the noise at first: its weight falls round by round.
-    fewest = 2 * fewest if robust else fewest
+    fewest, most = (2 * fewest, max(2 * fewest, most)) if robust else (fewest, most)
     for turn in range(most):
         widened = as_noisy(scatter)
         data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
         settings = (program.restore, data, modes, spread)
         linear = _linearised(program.vector, *settings, none, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
-        unit = jnp.asarray(1.0 / np.where(size > 0, size, 1.0))
+        unit = jnp.asarray(_TRUST / np.where(size > 0, size, 1.0))
         vector, good = _solve(program.vector, *settings, linear.weighing, unit)
         program = program._replace(vector=vector)
         answer = _linearised(vector, *settings, linear.weighing, np.array(False))
@@ -386,7 +400,7 @@ def _solve(
     """
     solution: optx.Solution = optx.least_squares(
         lambda y, _: all_residuals(y * unit, restore, data, modes, spread, weighing),
-        *(SOLVER, vector / unit),
+        *(_ROUND, vector / unit),
         max_steps=200,
         throw=False,
     )

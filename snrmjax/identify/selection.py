@@ -82,15 +82,6 @@ class Selection(NamedTuple):
     jitter: float  # 1σ of relative stiffness from state to state that no stated noise explains
     table: tuple[Candidate, ...]
 
-    def agrees_with(self, other: "Selection") -> bool:
-        """Whether it chose the same families and the same kinds of scatter."""
-
-        def kinds(one: Selection) -> tuple:
-            names = [(c.curve, c.family, c.size, c.argument) for c in one.table if c.chosen]
-            return names, [s > 0 for s in one.scatter.level], one.jitter > 0
-
-        return kinds(self) == kinds(other)
-
 
 def select_families(
     data: BalanceData,
