@@ -101,7 +101,7 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
         reasons = ["no effect of the library explains what is left."]
         if structure is not None:
             reasons.append(structure)
-        elif noise > _LOUD**2:
+        if noise > _LOUD**2:
             reasons.append(
                 f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
                 "that counts here: state what a repeated test shows, or no noise at all, and "
