@@ -128,9 +128,10 @@ def fit_jointly(
     Levenberg–Marquardt on residuals whitened with the stated noise. Gain and phase errors that a
     level shares are unknowns with the stated 1σ; where levels scatter more than that allows, a
     deviation of stiffness and damping from level to level is estimated too (restricted maximum
-    likelihood) and enters the bands. Where the stated noise is believed, slopes are taken at the
-    states freed of their likeliest errors (orthogonal distance regression). The other modes'
-    frequencies and dampings stay inside their stated errors.
+    likelihood) and enters the bands. Both families and that scatter are chosen at a first fit that
+    knows no scatter, or at the pilot where that leads to clearly less noise. Where the stated noise
+    is believed, slopes are taken at the states freed of their likeliest errors (orthogonal distance
+    regression). The other modes' frequencies and dampings stay inside their stated errors.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is

@@ -165,7 +165,6 @@ def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(mo
     np.testing.assert_allclose(bench.change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max())
 
 
-@pytest.mark.long
 def test_damping_of_one_direction_shows_in_harmonic_2():
     model, data = files("blind_15")
     scales = scales_of(Predictions(model, data))
