@@ -10,8 +10,8 @@ against what that level's own states say (its points nearest to resonance). Susp
 gain and phase free; frequency and damping from zero to the largest velocity; two halves of the
 levels fitted apart, compared in units of their bands. Both: whitened residuals, and what the
 program says. Then the speed of a fit of all 328 points against `scipy.optimize.least_squares`
-with finite differences on the same residuals, and of the derivative of the fitted curves by every
-measurement. One JSON line each.
+with finite differences on the same residuals, of the fit's own solver on these from the same
+start, and of the derivative of the fitted curves by every measurement. One JSON line each.
 """
 
 import argparse
@@ -26,7 +26,8 @@ from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.fitted_curves import values_with_slopes
-from snrmjax.identify.joint_fit import JointFit, all_residuals, weighing_at
+from snrmjax.identify.force_balance import weighing_at
+from snrmjax.identify.joint_fit import JointFit, _solve, all_residuals
 from snrmjax.identify.uncertainty import sensitivity
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
@@ -194,11 +195,18 @@ def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
         slopes = values_with_slopes(fit, at)[1]
         return np.einsum("acp,pse->acse", slopes, sensitivity(fit).by_measurement)
 
+    def solve() -> None:
+        near = jnp.asarray(vector + start * unit)
+        frozen = np.array(False)  # the same residuals: weights and corrections stay
+        _solve(near, *given, frozen, jnp.asarray(100.0 * unit))[0].block_until_ready()
+
     derivatives()
-    times: dict[str, list[float]] = {"fit": [], "scipy": [], "derivatives": []}
+    solve()
+    times: dict[str, list[float]] = {"fit": [], "solver": [], "scipy": [], "derivatives": []}
     for _ in range(5):
         for name, work in (
             ("fit", fit_once),
+            ("solver", solve),
             ("scipy", lambda: least_squares(residuals, start, x_scale=1.0, method="trf")),
             ("derivatives", derivatives),
         ):
@@ -213,6 +221,7 @@ def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
         of_curves=11,
         **{f"{k}_seconds": v for k, v in medians.items()},
         scipy_over_fit=medians["scipy"] / medians["fit"],
+        scipy_over_solver=medians["scipy"] / medians["solver"],
         derivatives_over_fit=medians["derivatives"] / medians["fit"],
     )
 

@@ -8,20 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.identify.families import (
-    AbstractCurve,
-    AbstractFamily,
-    PowerLaw,
-    Spline,
-    SumOfPowers,
-)
+from snrmjax.identify.families import PowerLaw, SumOfPowers
+from snrmjax.identify.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.force_balance import Unknowns
+from snrmjax.identify.splines import SmoothingSpline, Spline, hats
 
+_FAR = 1e6  # (amplitude/scale)² of a knot that is none
 _SIZE = 12  # parameters; a larger family takes a multiple of it
 
 
 class AnyFamily(AbstractCurve):
-    """Σ c_k x^e_k + Σ d_k max(x² − κ_k, 0)³ with coefficients linear in the parameters.
+    """Σ c_k x^e_k + Σ d_k h_k(x²), with the `hats` h_k and coefficients linear in the parameters.
 
     What a family does not have is multiplied by zero: parameters beyond its own move nothing.
     """
@@ -32,6 +29,11 @@ class AnyFamily(AbstractCurve):
     knots: Float[Array, " knot"]
     mix: Float[Array, "basis parameter"]  # from parameters to coefficients
     of_velocity: Bool[Array, ""]
+    prior: Float[Array, "row parameter"]  # what of the parameters is expected near zero, in its 1σ
+
+    def prior_residuals(self) -> Float[Array, " row"]:
+        """See `AbstractCurve`."""
+        return self.prior @ self.parameters
 
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractCurve`."""
@@ -62,14 +64,14 @@ def _basis(x: Array, parameters: Array, shape: _Shape) -> _Basis:
     known = x > 0
     inside = jnp.where(known, x, 1.0)
     powers = jnp.exp(exponents * jnp.log(inside))
-    above = jnp.maximum(x**2 - knots, 0.0)
+    bent, by_u = hats(x[..., 0] ** 2, knots)
     rest = jnp.where(exponents == 0, 1.0, 0.0)
-    none = jnp.zeros_like(above)
+    none = jnp.zeros_like(bent)
     growing = jnp.where(known, exponents * powers / inside, jnp.where(exponents == 1, 1.0, 0.0))
     logarithms = jnp.where(known & is_free, powers * jnp.log(inside), 0.0)
     return _Basis(
-        jnp.concatenate([jnp.where(known, powers, rest), above**3], axis=-1),
-        jnp.concatenate([growing, 6 * x * above**2], axis=-1),
+        jnp.concatenate([jnp.where(known, powers, rest), bent], axis=-1),
+        jnp.concatenate([growing, 2 * x * by_u], axis=-1),
         jnp.concatenate([logarithms, none], axis=-1),
     )
 
@@ -101,9 +103,11 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
     """The same curve as an `AnyFamily`; a family that users wrote stays what it is."""
     n = family.parameters.shape[0]
     size = -(-n // _SIZE) * _SIZE
-    exponents, knots = np.zeros(size), np.full(size, np.inf)
+    exponents, knots = np.zeros(size), _FAR * np.arange(1.0, size + 3)
     mix, free = np.zeros((2 * size, size)), np.zeros(size, dtype=bool)
-    largest = 1.0
+    largest, prior = 1.0, np.zeros((size, size))
+    if isinstance(family, SmoothingSpline):
+        prior[: n - 2, :n] = np.asarray(family.bends) / float(family.bend_std)
     if isinstance(family, SumOfPowers):
         exponents[:n] = family.powers(family.order)
         mix[:n, :n] = np.eye(n)
@@ -114,7 +118,7 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
         exponents[1] = 2.0
         knots[:n] = np.asarray(family.knots)
         mix[:2, :n] = np.asarray(family.mix)[:2]
-        mix[size : size + n, :n] = np.asarray(family.mix)[2:]
+        mix[size : size + n - 2, :n] = np.asarray(family.mix)[2:]
     else:
         return family
     return AnyFamily(
@@ -126,6 +130,7 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
         knots=jnp.asarray(knots),
         mix=jnp.asarray(mix),
         of_velocity=jnp.asarray(family.argument == "velocity"),
+        prior=jnp.asarray(prior),
     )
 
 

@@ -1,11 +1,7 @@
-"""Families of smooth curves of amplitude with a few parameters, for the joint fit.
-
-Every member is ω̃²(amplitude) in rad²/s² or 2ζ̃ω̃(amplitude) in 1/s. Its parameters are what its
-terms contribute at the largest measured amplitude, so that all have the unit of the value.
-"""
+"""Families of smooth curves of amplitude with a few parameters, for the joint fit."""
 
 from abc import abstractmethod
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,65 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-Argument = Literal["displacement", "velocity"]
-
-
-class Coefficient(NamedTuple):
-    """A parameter as an engineer writes it: coefficient·amplitude^power, or a bare number."""
-
-    name: str
-    power: float  # of the amplitude that the coefficient multiplies
-    is_value: bool  # False: a number without unit, such as an exponent
-
-
-class AbstractCurve(eqx.Module):
-    """A curve of amplitude with parameters that a fit may move."""
-
-    parameters: Float[Array, " parameter"]
-    scale: Float[Array, ""]  # the largest measured amplitude, m or m/s
-
-    @abstractmethod
-    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Value at the amplitude that is its own, exact in the limit of zero."""
-
-    @abstractmethod
-    def amplitude(self, displacement: Array, velocity: Array) -> Array:
-        """The one of the two amplitudes that this curve is a function of."""
-
-
-class AbstractFamily(AbstractCurve):
-    """A curve of amplitude by name; `argument` says of which amplitude."""
-
-    kind: ClassVar[str]
-    orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
-    argument: Argument = eqx.field(static=True)
-
-    def amplitude(self, displacement: Array, velocity: Array) -> Array:
-        """See `AbstractCurve`."""
-        return displacement if self.argument == "displacement" else velocity
-
-    @abstractmethod
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        """What the parameters are called and the power of amplitude that each belongs to."""
-
-    @classmethod
-    @abstractmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: Float[np.ndarray, " point"],
-        values: Float[np.ndarray, " point"],
-        weight: Float[np.ndarray, " point"],
-    ) -> list["AbstractFamily"]:
-        """Members near scattered points: one where the family is linear, several elsewhere."""
-
-
-def _linear_start(
-    columns: np.ndarray, values: np.ndarray, weight: np.ndarray
-) -> Float[np.ndarray, " parameter"]:
-    solution = np.linalg.lstsq(columns * weight[:, None], values * weight, rcond=1e-10)[0]
-    return np.asarray(solution)
+from snrmjax.identify.family_base import AbstractFamily, Argument, Coefficient, linear_start
+from snrmjax.identify.splines import SmoothingSpline, Spline, spline_columns
 
 
 class SumOfPowers(AbstractFamily):
@@ -118,7 +57,7 @@ class SumOfPowers(AbstractFamily):
         """See `AbstractFamily`."""
         scale = float(np.max(amplitude))
         columns = np.stack([(amplitude / scale) ** p for p in cls.powers(order)], axis=1)
-        start = _linear_start(columns, values, weight)
+        start = linear_start(columns, values, weight)
         return [cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument)]
 
 
@@ -242,7 +181,7 @@ class PowerLaw(AbstractFamily):
         for power in cls.tried:
             columns = np.stack([np.ones(len(values)), (amplitude / scale) ** power], axis=1)
             share = power / cls.largest_exponent
-            start = [*_linear_start(columns, values, weight), np.log(share / (1 - share))]
+            start = [*linear_start(columns, values, weight), np.log(share / (1 - share))]
             found.append(cls(jnp.asarray(start), jnp.asarray(scale, dtype=jnp.float64), argument))
         return found
 
@@ -260,103 +199,21 @@ class ViscousMicroslip(PowerLaw):
     tried: ClassVar[tuple[float, ...]] = (0.2, 0.5, 0.8)
 
 
-class Spline(AbstractFamily):
-    """A natural cubic spline in amplitude², through values at knots; the first knot is at zero.
-
-    Drawn by truncated powers, which are straight beyond the last knot, and not by intervals:
-    the program is a tenth of what a search for intervals and its derivatives compile to.
-    Reference: Hastie, Tibshirani & Friedman, The Elements of Statistical Learning (2009), (5.4).
-    """
-
-    kind: ClassVar[str] = "spline"
-    orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6, 8, 10, 14)
-    knots: Float[Array, " knot"]  # of (amplitude/scale)²
-    mix: Float[Array, "term knot"]  # from values at the knots to coefficients of 1, u and the cubes
-
-    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """See `AbstractFamily`."""
-        u = (jnp.asarray(amplitude)[..., None] / self.scale) ** 2
-        cubes = jnp.maximum(u - self.knots, 0.0) ** 3
-        terms = jnp.concatenate([jnp.ones_like(u), u, cubes], axis=-1)
-        return terms @ (self.mix @ self.parameters)
-
-    def coefficients(self) -> tuple[Coefficient, ...]:
-        """See `AbstractFamily`."""
-        n = self.parameters.shape[0]
-        return tuple(Coefficient(f"knot_{k}", 0.0, True) for k in range(n))
-
-    @classmethod
-    def starts(
-        cls,
-        order: int,
-        argument: Argument,
-        amplitude: np.ndarray,
-        values: np.ndarray,
-        weight: np.ndarray,
-    ) -> list[AbstractFamily]:
-        """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
-        scale = float(np.max(amplitude))
-        shares = np.quantile(amplitude / scale, np.linspace(0, 1, order)[1:])
-        # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
-        knots = np.concatenate([[0.0], shares**2])
-        if np.min(np.diff(knots)) < 0.02 / order:
-            knots = np.linspace(0.0, 1.0, order) ** 2
-        unit = jnp.asarray(scale, dtype=jnp.float64)
-        blank = cls.through(knots, np.zeros(order), unit, argument)
-        columns = values_and_slopes(blank, amplitude)[1]
-        start = _linear_start(columns, values, weight)
-        return [eqx.tree_at(lambda f: f.parameters, blank, jnp.asarray(start))]
-
-    @classmethod
-    def through(
-        cls,
-        knots: Float[np.ndarray, " knot"],
-        values: Float[np.ndarray, " knot"],
-        scale: Float[Array, ""],
-        argument: Argument,
-    ) -> "Spline":
-        """The spline through values at knots, which are squares of amplitude/scale."""
-        mix = jnp.asarray(_natural_mix(knots))
-        return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
-
-
-def _terms(
-    u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
-) -> Float[np.ndarray, "point term"]:
-    cubes = np.maximum(u[:, None] - knots, 0.0) ** 3
-    return np.column_stack([np.ones_like(u), u, cubes])
-
-
-def _natural_mix(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "term knot"]:
-    """Coefficients of the truncated powers of every cardinal spline, straight at both ends.
-
-    The natural basis is 1, u and differences of (cube_k − last cube)/(last knot − knot_k).
-    """
-    n = len(knots)
-    span = knots[-1] - knots[:-1]
-    natural = np.zeros((n + 2, n))
-    natural[:2, :2] = np.eye(2)
-    for k in range(n - 2):
-        natural[2 + k, 2 + k] = 1 / span[k]
-        natural[n, 2 + k] = -1 / span[-1]
-        natural[n + 1, 2 + k] = 1 / span[-1] - 1 / span[k]
-    return natural @ np.linalg.inv(_terms(knots, knots) @ natural)
-
-
 FAMILIES: dict[str, type[AbstractFamily]] = {
     family.kind: family
     for family in (
-        *(Polynomial, Spline, PowerLaw),
+        *(Polynomial, Spline, SmoothingSpline, PowerLaw),
         *(Constant, ViscousQuadratic, ViscousCoulomb, ViscousMicroslip),
     )
 }
 """Families by name."""
 
-# What "auto" tries. Constant damping is the polynomial of size 0 there: one that may grow.
-BACKBONE_FAMILIES = ("polynomial", "power_law", "spline")
+# What "auto" tries. Constant damping is the polynomial of size 0 there: one that may grow. Splines
+# with free knots are no law, and their bands hold nothing of what few knots cannot follow.
+BACKBONE_FAMILIES = ("polynomial", "power_law", "smoothing_spline")
 DAMPING_FAMILIES = (
     *("polynomial", "viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
-    *("power_law", "spline"),
+    *("power_law", "smoothing_spline"),
 )
 
 
@@ -372,7 +229,7 @@ def values_and_slopes(
     if isinstance(family, SumOfPowers):
         columns = np.stack([x**power for power in family.powers(family.order)], axis=1)
     elif isinstance(family, Spline):
-        columns = _terms(x**2, np.asarray(family.knots)) @ np.asarray(family.mix)
+        columns = spline_columns(family, amplitude)
     elif isinstance(family, PowerLaw):
         exponent = float(family.exponent)
         term, share = x**exponent, exponent / family.largest_exponent

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.backbone import BackboneValues
-from snrmjax.identify.families import AbstractCurve
+from snrmjax.identify.family_base import AbstractCurve
 from snrmjax.identify.force_balance import Unknowns
 from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import JointFit

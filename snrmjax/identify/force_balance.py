@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.backbone_points import mistrust, modal_filter, relative_errors
-from snrmjax.identify.families import AbstractCurve, AbstractFamily
+from snrmjax.identify.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -24,6 +24,8 @@ from snrmjax.simulate.compiled import compiled
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
 
+_STEPS = 4  # towards every state's likeliest errors
+_FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
 _UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
 
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
@@ -226,6 +228,28 @@ def weighing_at(
     slopes = slopes_by_error(unknowns, data, modes, spread)
     offset = -jnp.einsum("sie,se->si", slopes, data.correction)
     return Weighing(whitener(slopes, data.std), offset)
+
+
+def nearest_errors(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Float[Array, "state input"]:
+    """The likeliest errors with which every state balances, from its present correction on.
+
+    Each step solves the balance made straight at the last one's end: what is left of the balance
+    falls by the ratio of a state's error to the curves' length.
+    """
+
+    def step(errors: Array, _: None) -> tuple[Array, None]:
+        erring = eqx.tree_at(lambda d: d.correction, data, errors)
+        slopes = slopes_by_error(unknowns, erring, modes, spread)
+        whiten = whitener(slopes, data.std)
+        balance = force_balance(unknowns, data, modes, spread, errors)
+        straight = balance - jnp.einsum("sie,se->si", slopes, errors)
+        whitened = jnp.einsum("sij,sj->si", whiten, straight)
+        found = -jnp.einsum("sje,sij,si->se", slopes, whiten, whitened) * data.std**2
+        return jnp.clip(found, -_FARTHEST, _FARTHEST), None
+
+    return jax.lax.scan(step, data.correction, length=_STEPS)[0]
 
 
 def slopes_by_error(

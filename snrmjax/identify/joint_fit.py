@@ -20,8 +20,8 @@ from snrmjax.identify.force_balance import (
     Weighing,
     balance_data,
     force_balance,
+    nearest_errors,
     recorded_motion,
-    slopes_by_error,
     weighing_at,
 )
 from snrmjax.identify.free_unknowns import (
@@ -52,11 +52,10 @@ _ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
 )
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
-_ROUNDS = 3, 12  # of fitting and weighting anew: at least, at most
-_ROUGHLY = 2, 2  # the same, of a fit that is but the pilot of another
+_ROUNDS = 2, 12  # of fitting and weighting anew: at least, at most
+_ROUGHLY = 2, 6  # the same, of a fit that is but the pilot of another
 _CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
-_FARTHEST = 0.3  # relative or rad, of a state's correction: the balance is straight no farther
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
@@ -250,13 +249,18 @@ def _fitted(
     for turn in range(most):
         widened = as_noisy(scatter)
         data = eqx.tree_at(lambda d: d.std, data, stated_std * widened)
-        settings = (program.restore, data, modes, spread)
-        linear = _linearised(program.vector, *settings, none, np.array(True))
+        # What a wrong noise would take for errors can lead far away from the records.
+        trusted = stated and not scatter.contradicts_upward
+        if not trusted:
+            data = eqx.tree_at(lambda d: d.correction, data, jnp.zeros_like(data.correction))
+        settings, freed = (program.restore, data, modes, spread), np.array(trusted)
+        linear = _linearised(program.vector, *settings, none, freed, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(_TRUST / np.where(size > 0, size, 1.0))
-        vector, good = _solve(program.vector, *settings, linear.weighing, unit)
+        vector, good = _solve(program.vector, *settings, linear.weighing, freed, unit)
         program = program._replace(vector=vector)
-        answer = _linearised(vector, *settings, linear.weighing, np.array(False))
+        answer = _linearised(vector, *settings, linear.weighing, freed, freed)
+        data = eqx.tree_at(lambda d: d.correction, data, answer.correction)
         residuals = np.asarray(answer.residuals)
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
@@ -272,10 +276,6 @@ def _fitted(
         dof = max(residuals.size - _spent(jacobian, residuals.size), 1.0)
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
         scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
-        # What a wrong noise would take for errors can lead far away from the records.
-        trusted = stated and not scatter.contradicts_upward
-        correction = answer.correction if trusted else jnp.zeros_like(answer.correction)
-        data = eqx.tree_at(lambda d: d.correction, data, correction)
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
         covariance=covariance,
@@ -347,10 +347,12 @@ def all_residuals(
     spread: Spread,
     weighing: Weighing,
 ) -> Float[Array, " residual"]:
-    """Whitened residuals of the states, then the priors of levels and linear parameters."""
+    """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
     unknowns = restore(vector)
     points = whitened(unknowns, data, modes, spread, weighing).reshape(-1)
-    return jnp.concatenate([points, unknowns.level.reshape(-1), unknowns.linear])
+    curves = (unknowns.squared_frequency, unknowns.modal_damping)
+    priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
+    return jnp.concatenate([points, *priors])
 
 
 @compiled
@@ -361,28 +363,38 @@ def _linearised(
     modes: LinearModes,
     spread: Spread,
     weighing: Weighing,
+    freed: Array,
     anew: Array,
 ) -> _Linear:
     """Residuals and slopes, with the whitening given or `anew` with that of these unknowns."""
-    fresh = weighing_at(restore(vector), data, modes, spread)
-    weighing = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, weighing)
+    unknowns = restore(vector)
+    recorded = (data.correction, weighing_at(unknowns, data, modes, spread))
+    given = (data.correction, weighing)
+    fresh = jax.lax.cond(freed, lambda: _freed(unknowns, data, modes, spread), lambda: recorded)
+    errors, weighing = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, given)
+    data = eqx.tree_at(lambda d: d.correction, data, errors)
 
     def residuals(vector: Array) -> Array:
         return all_residuals(vector, restore, data, modes, spread, weighing)
 
     left, push = jax.linearize(residuals, vector)
-    n = 2 * len(data.level)
-    points = left[:n].reshape(-1, 2)
-    unweighted = points / jnp.sqrt(jnp.maximum(data.weight, 1e-12))[:, None]
-    slopes = slopes_by_error(restore(vector), data, modes, spread)
-    found = -jnp.einsum("sji,skj,sk->si", slopes, weighing.whiten, unweighted) * data.std**2
+    points = left[: 2 * len(data.level)].reshape(-1, 2)
     return _Linear(
         weighing=weighing,
         residuals=points,
         jacobian=jax.vmap(push)(jnp.eye(vector.size)).T,
         cost=jnp.sum(left**2),
-        correction=jnp.clip(found, -_FARTHEST, _FARTHEST),
+        correction=errors,
     )
+
+
+def _freed(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> tuple[Array, Weighing]:
+    """Corrections that free the states of their likeliest errors, and their weighing there."""
+    errors = nearest_errors(unknowns, data, modes, spread)
+    data = eqx.tree_at(lambda d: d.correction, data, errors)
+    return errors, weighing_at(unknowns, data, modes, spread)
 
 
 @compiled
@@ -393,14 +405,28 @@ def _solve(
     modes: LinearModes,
     spread: Spread,
     weighing: Weighing,
+    freed: Array,
     unit: Array,
 ) -> tuple[Array, Array]:
     """Levenberg–Marquardt from the present unknowns; the vector found and whether it is one.
 
-    Every unknown counts in its own `unit`, so that the solver's damping treats all alike.
+    Every unknown counts in its own `unit`, so that the solver's damping treats all alike. States
+    that are `freed` of their likeliest errors are so at every step: the residuals are then those
+    errors in units of their 1σ, and their slopes need no derivative of the errors themselves.
     """
+
+    def residuals(y: Array, _: None) -> Array:
+        errors, own = jax.lax.cond(
+            freed,
+            lambda at: _freed(restore(at), data, modes, spread),
+            lambda _: (data.correction, weighing),
+            jax.lax.stop_gradient(y * unit),
+        )
+        erring = eqx.tree_at(lambda d: d.correction, data, errors)
+        return all_residuals(y * unit, restore, erring, modes, spread, own)
+
     solution: optx.Solution = optx.least_squares(
-        lambda y, _: all_residuals(y * unit, restore, data, modes, spread, weighing),
+        residuals,
         *(_ROUND, vector / unit),
         max_steps=200,
         throw=False,

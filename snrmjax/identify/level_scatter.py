@@ -1,13 +1,17 @@
 """How large the noise is, and how far levels differ, from the residuals of a linearised fit."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 _NOTHING = 1e-9  # 1σ that stands for none at all
+_SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
+_CLEAR = 20.0  # the same of gain and phase beside a rough curve, whose bends they imitate
+_INSTRUMENTS = 2  # of the kinds of error, the first: gain and phase
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 
 
@@ -17,6 +21,7 @@ class Scatter(NamedTuple):
     noise: float  # by which the residuals exceed the stated noise
     noise_std: float
     level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
+    bends: tuple[float, ...] = ()  # of the curves whose bends were asked for
 
     @property
     def contradicts_upward(self) -> bool:
@@ -43,30 +48,47 @@ def level_columns(
     return full.reshape(n * parts, n_levels * errors)
 
 
+class Bends(NamedTuple):
+    """Unknowns of one size that has to be found, whatever levels do."""
+
+    places: Int[np.ndarray, " unknown"]
+    ends: tuple[float, float]  # between which their 1σ is
+
+
 def estimated_scatter(
-    problem: Linearised, index: Int[np.ndarray, "level error"], *, look: bool = True
+    problem: Linearised,
+    index: Int[np.ndarray, "level error"],
+    *,
+    look: bool = True,
+    bends: Sequence[Bends] = (),
 ) -> Scatter:
     """Restricted maximum likelihood of the noise and of what levels share beyond what is stated.
 
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
     `prior_std` is zero were not stated and are estimated. They enter one after the other, while
     the likelihood asks for them; with fewer than three levels, or without `look`, none does.
+    `bends` of curves are estimated along with them: rough curves and levels that differ explain
+    the same residuals.
     Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
     """
-    likelihood = _Likelihood.of(problem, index)
-    stated = problem.prior_std[index[0]]
+    n_errors = index.shape[1]
+    likelihood = _Likelihood.of(problem, (*index.T, *(some.places for some in bends)))
+    ends = (*[(_NOTHING, _LARGEST)] * n_errors, *(some.ends for some in bends))
+    present = [float(problem.prior_std[some.places[0]]) for some in bends]
+    stated = np.array([*problem.prior_std[index[0]], *present])
     look = look and len(index) > 2
-    open_kinds = [k for k in range(index.shape[1]) if stated[k] == 0] if look else []
-    found = likelihood.best(stated, np.zeros(len(stated), dtype=bool))
-    chosen = np.zeros(len(stated), dtype=bool)
+    open_kinds = [k for k in range(n_errors) if stated[k] == 0] if look else []
+    chosen = np.arange(len(stated)) >= n_errors
+    found = likelihood.best(stated, chosen, ends)
     while open_kinds:
         trials = []
         for kind in open_kinds:
             more = chosen.copy()
             more[kind] = True
-            trials.append((likelihood.best(stated, more), kind))
+            trials.append((likelihood.best(stated, more, ends), kind))
         better, kind = min(trials, key=lambda trial: trial[0].value)
-        if better.value > found.value - _WORTH:
+        of_instruments = kind < _INSTRUMENTS
+        if better.value > found.value - (_CLEAR if bends and of_instruments else _WORTH):
             break
         found = better
         chosen[kind] = True
@@ -74,14 +96,26 @@ def estimated_scatter(
     return Scatter(
         noise=found.noise,
         noise_std=found.noise / np.sqrt(2 * likelihood.dof),
-        level=tuple(float(s) for s in found.level),
+        level=tuple(found.std[:n_errors].tolist()),
+        bends=tuple(found.std[n_errors:].tolist()),
     )
+
+
+def likeliest_std(problem: Linearised, bends: Bends) -> float:
+    """Restricted maximum likelihood of the bends' 1σ, with noise as stated."""
+    likelihood = _Likelihood.of(problem, (bends.places,))
+    found = minimize_scalar(
+        lambda point: likelihood.value_and_slopes(1.0, np.exp([point]))[0],
+        bounds=tuple(np.log(bends.ends)),
+        method="bounded",
+    )
+    return float(np.exp(found.x))
 
 
 class _Best(NamedTuple):
     value: float  # −2 log likelihood
     noise: float
-    level: np.ndarray
+    std: np.ndarray  # of the groups
 
 
 class _Likelihood(NamedTuple):
@@ -91,24 +125,25 @@ class _Likelihood(NamedTuple):
     rows: int
     dof: int
     prior_std: np.ndarray
-    where: np.ndarray  # of the levels' errors, (level, error)
+    groups: tuple[np.ndarray, ...]  # of unknowns that have a 1σ in common
 
     @classmethod
-    def of(cls, problem: Linearised, index: np.ndarray) -> "_Likelihood":
+    def of(cls, problem: Linearised, groups: tuple[np.ndarray, ...]) -> "_Likelihood":
         x, std = problem.slopes, problem.prior_std
         bound = np.isfinite(std)
         # Residuals that would be left if every bound unknown went back to its prior's mean.
         residuals = problem.residuals - x[:, bound] @ problem.deviation[bound]
         n = len(residuals)
         dof = max(n - int(np.sum(~bound)), 1)
-        return cls(x.T @ x, x.T @ residuals, float(residuals @ residuals), n, dof, std, index)
+        return cls(x.T @ x, x.T @ residuals, float(residuals @ residuals), n, dof, std, groups)
 
     def value_and_slopes(
-        self, noise: float, level: np.ndarray
+        self, noise: float, of_groups: np.ndarray
     ) -> tuple[float, Float[np.ndarray, " logarithm"]]:
         """−2 log of the restricted likelihood, and slopes by the logarithms of its arguments."""
         std = self.prior_std.copy()
-        std[self.where] = level
+        for group, own in zip(self.groups, of_groups, strict=True):
+            std[group] = own
         # What moves nothing and has no prior says nothing.
         diagonal = np.diagonal(self.gram)
         keep = (std > 0) & ((diagonal > 0) | np.isfinite(std))
@@ -138,29 +173,36 @@ class _Likelihood(NamedTuple):
         )
         share = np.zeros(len(std))
         share[keep] = 1.0 - (np.sum(root**2, axis=0) + x**2) / own**2
-        return value, np.concatenate([[by_noise], 2 * np.sum(share[self.where], axis=0)])
+        return value, np.array([by_noise, *(2 * np.sum(share[group]) for group in self.groups)])
 
-    def best(self, stated: np.ndarray, chosen: Bool[np.ndarray, " error"]) -> _Best:
-        """The likeliest noise, and 1σ of the chosen kinds of error."""
+    def best(
+        self,
+        stated: np.ndarray,
+        chosen: Bool[np.ndarray, " group"],
+        ends: Sequence[tuple[float, float]],
+    ) -> _Best:
+        """The likeliest noise, and 1σ of the chosen groups."""
         asked = np.concatenate([[True], chosen])
 
         def unpacked(point: np.ndarray) -> tuple[float, np.ndarray]:
-            level = stated.copy()
-            level[chosen] = np.exp(point[1:])
-            return float(np.exp(point[0])), level
+            std = stated.copy()
+            std[chosen] = np.exp(point[1:])
+            return float(np.exp(point[0])), std
 
         def of_logarithms(point: np.ndarray) -> tuple[float, np.ndarray]:
             value, slopes = self.value_and_slopes(*unpacked(point))
             return value, slopes[asked]
 
         middle = np.log(max(np.sqrt(self.total / self.dof), 1e-12))
-        ends = np.log([_NOTHING, _LARGEST])
+        limits = [tuple(np.log(pair)) for pair, one in zip(ends, chosen, strict=True) if one]
+        # What was found before goes on from there.
+        start = np.log(np.where(stated[chosen] > 0, stated[chosen], _SMALL))
         answer = minimize(
             of_logarithms,
-            np.concatenate([[middle], np.full(chosen.sum(), np.log(0.01))]),
+            np.concatenate([[middle], start]),
             method="L-BFGS-B",
             jac=True,
-            bounds=[(middle - 30.0, middle + 3.0)] + [tuple(ends)] * int(chosen.sum()),
+            bounds=[(middle - 30.0, middle + 3.0), *limits],
             options={"ftol": 1e-9, "gtol": 1e-4},
         )
         return _Best(float(answer.fun), *unpacked(answer.x))

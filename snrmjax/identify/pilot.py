@@ -8,12 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from snrmjax.identify.families import (
-    AbstractFamily,
-    Polynomial,
-    Spline,
-    values_and_slopes,
-)
+from snrmjax.identify.families import Polynomial, values_and_slopes
+from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
@@ -21,6 +17,7 @@ from snrmjax.identify.force_balance import (
     Unknowns,
     recorded_motion,
 )
+from snrmjax.identify.splines import Spline
 from snrmjax.model.modes import LinearModes
 
 _PILOT_SIZE, _PILOT_KNOTS = 4, 10

@@ -1,5 +1,6 @@
 """Which family of curves, of which size and amplitude: the one that predicts left-out levels."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,24 +14,32 @@ from snrmjax.identify.families import (
     BACKBONE_FAMILIES,
     DAMPING_FAMILIES,
     FAMILIES,
-    AbstractFamily,
-    Argument,
-    values_and_slopes,
 )
+from snrmjax.identify.family_base import AbstractFamily, Argument
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
     Spread,
     Unknowns,
 )
-from snrmjax.identify.level_scatter import Linearised, Scatter, estimated_scatter, level_columns
+from snrmjax.identify.level_scatter import (
+    Bends,
+    Linearised,
+    Scatter,
+    estimated_scatter,
+    level_columns,
+    likeliest_std,
+)
 from snrmjax.identify.pilot import levels_apart, most_parameters
+from snrmjax.identify.smoothing import curve_columns, moved
+from snrmjax.identify.splines import SmoothingSpline
 from snrmjax.model.modes import LinearModes
 
 _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating what levels scatter
+_STRAIGHT = 1e-7  # of the largest value, a bend that is none
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
 
@@ -104,32 +113,50 @@ def select_families(
     for if `scatter_too`.
     """
 
-    def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter]:
+    def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter, Unknowns]:
         work = _Workbench(data, spread, balance_slopes(at, data, modes, spread), free)
-        scatter = work.scatter(at.squared_frequency, at.modal_damping, look=scatter_too)
+        pair = (at.squared_frequency, at.modal_damping)
+        scatter = work.scatter(*pair, look=scatter_too)
         work.use(scatter)
-        return work, scatter
+        sizes = iter(scatter.bends)
+        curves = [_bent(c, next(sizes)) if _is_smooth(c) else c for c in pair]
+        return work, scatter, _with_curves(at, curves)
 
-    def prepared(at: Unknowns) -> tuple[_Workbench, Scatter, float]:
-        work, scatter = workbench(data, at)
-        jitter = work.jitter(at)
+    def prepared(at: Unknowns) -> tuple[_Workbench, Scatter, float, Unknowns]:
+        work, scatter, found = workbench(data, at)
+        jitter = work.jitter(found)
         if jitter > 0:
             wandering = data.std.at[:, 3].set(jitter)
-            work, scatter = workbench(eqx.tree_at(lambda d: d.std, data, wandering), at)
-        return work, scatter, jitter
+            work, scatter, found = workbench(eqx.tree_at(lambda d: d.std, data, wandering), at)
+        return work, scatter, jitter, found
 
     # What the rough pilot misses looks like levels that differ: its scatter serves to choose
     # families, and theirs to choose again, until both belong together.
-    work, scatter, jitter = prepared(pilot)
+    work, scatter, jitter, pilot = prepared(pilot)
     for _ in range(_ROUNDS):
         tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, pilot.modal_damping)
         other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
-        before, pair = work, (tried.best, other.best)
-        pilot = eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), pilot, pair)
-        work, scatter, jitter = prepared(pilot)
+        before = work
+        work, scatter, jitter, pilot = prepared(_with_curves(pilot, (tried.best, other.best)))
         if np.array_equal(work.level_std > 0, before.level_std > 0):
             break
-    return Selection(tried.best, other.best, scatter, jitter, (*tried.table, *other.table))
+    pair = (pilot.squared_frequency, pilot.modal_damping)
+    return Selection(*pair, scatter, jitter, (*tried.table, *other.table))
+
+
+_Pair = tuple[AbstractFamily, AbstractFamily]
+
+
+def _with_curves(unknowns: Unknowns, pair: Sequence[AbstractFamily]) -> Unknowns:
+    return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, tuple(pair))
+
+
+def _is_smooth(curve: AbstractFamily) -> bool:
+    return isinstance(curve, SmoothingSpline)
+
+
+def _bent(curve: AbstractFamily, size: float) -> AbstractFamily:
+    return eqx.tree_at(lambda f: f.bend_std, curve, jnp.asarray(size))
 
 
 class _Compared(NamedTuple):
@@ -163,16 +190,11 @@ class _Workbench:
     def amplitude(self, argument: Argument) -> np.ndarray:
         return self.known.displacement if argument == "displacement" else self.known.speed
 
-    def evaluated(self, curve: AbstractFamily) -> tuple[np.ndarray, np.ndarray]:
-        """Values of a curve in all states and their slopes."""
-        at = self.amplitude(curve.argument)
-        return values_and_slopes(curve, at)
-
     def problem(self, squared: AbstractFamily, damping: AbstractFamily) -> Linearised:
         """The balance with these curves."""
         n, known = len(self.data.level), self.known
-        f, df = self.evaluated(squared)
-        g, dg = self.evaluated(damping)
+        f, df, f_std = curve_columns(squared, self.amplitude(squared.argument))
+        g, dg, g_std = curve_columns(damping, self.amplitude(damping.argument))
         residuals = known.balance + known.by_squared * (f - known.squared)[:, None]
         residuals = residuals + known.by_damping * (g - known.damping)[:, None]
         by_f = (known.by_squared[:, :, None] * df[:, None, :]).reshape(2 * n, -1)
@@ -180,7 +202,7 @@ class _Workbench:
         slopes = np.concatenate([by_f, by_g, self.common, self.levels], axis=1)
         std = np.concatenate(
             [
-                np.full(by_f.shape[1] + by_g.shape[1], np.inf),
+                *(f_std, g_std),
                 self.common_std,
                 np.tile(self.level_std, self.data.n_levels),
             ]
@@ -199,7 +221,9 @@ class _Workbench:
             problem.residuals * self.noise, problem.slopes * self.noise, std, problem.deviation
         )
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
-        return estimated_scatter(raw, index, look=look)
+        pair = (squared, damping)
+        bends = [self.bends(problem, pair, k) for k in range(2) if _is_smooth(pair[k])]
+        return estimated_scatter(raw, index, look=look, bends=bends)
 
     def jitter(self, pilot: Unknowns) -> float:
         """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
@@ -238,10 +262,26 @@ class _Workbench:
             change = _solved(problem)
             k = squared.parameters.shape[0]
             m = k + damping.parameters.shape[0]
-            squared = _moved(squared, change[:k])
-            damping = _moved(damping, change[k:m])
+            squared = moved(squared, change[:k])
+            damping = moved(damping, change[k:m])
         problem = self.problem(squared, damping)
         return squared, damping, problem
+
+    def smoothed(self, name: str, curve: AbstractFamily, other: AbstractFamily) -> AbstractFamily:
+        """A smoothing spline with the likeliest size of its bends; other curves as they are."""
+        if not _is_smooth(curve):
+            return curve
+        pair = (curve, other) if name == "backbone" else (other, curve)
+        problem = self.problem(*pair)
+        bends = self.bends(problem, pair, 0 if name == "backbone" else 1)
+        return _bent(curve, likeliest_std(problem, bends))
+
+    def bends(self, problem: Linearised, pair: _Pair, which: int) -> Bends:
+        """The bends of one of the curves among the unknowns."""
+        sizes = [curve.parameters.shape[0] for curve in pair]
+        own = sum(sizes[:which]) + np.arange(sizes[which])
+        largest = float(np.max(np.abs(np.asarray(pair[which].parameters))))
+        return Bends(own[np.isfinite(problem.prior_std[own])], (_STRAIGHT * largest, largest))
 
     def compare(
         self, name: str, choice: Choice, kinds: tuple[str, ...], other: AbstractFamily
@@ -260,7 +300,8 @@ class _Workbench:
             most = min(most, max(self.data.n_levels - 1, 2))
         for kind in kinds if choice.kind == "auto" else (choice.kind,):
             family = FAMILIES[kind]
-            for size in family.orders if choice.size is None else (choice.size,):
+            sizes_tried = family.sizes(len(values), self.data.n_levels)
+            for size in sizes_tried if choice.size is None else (choice.size,):
                 for argument in arguments:
                     starts = family.starts(size, argument, self.amplitude(argument), values, weight)
                     if choice.size is not None and starts[0].parameters.shape[0] >= len(values):
@@ -269,7 +310,7 @@ class _Workbench:
                             f"there are {len(values)} states only: choose a smaller family."
                         )
                     too_many = starts[0].parameters.shape[0] > most
-                    if too_many and choice.size is None and (family.orders[0] != size):
+                    if too_many and choice.size is None and (sizes_tried[0] != size):
                         continue
                     rows.append((kind, size, argument, *self._tried(name, starts, other)))
                     if starts[0].parameters.shape[0] == 1 and not choice.argument:
@@ -284,7 +325,7 @@ class _Workbench:
         best = int(np.argmax(total))
         apart = scores[best] - scores
         spread = np.sqrt(len(self.folds)) * np.std(apart, axis=1, ddof=1)
-        sizes = np.array([row[3].parameters.shape[0] for row in rows])
+        sizes = np.array([row[6] for row in rows])
         # A level that one curve misses by far makes that spread large: it must not excuse it.
         as_good = (total[best] - total) <= np.minimum(spread, _DECISIVE)
         as_good[best] = True
@@ -319,10 +360,11 @@ class _Workbench:
 
     def _tried(
         self, name: str, starts: list[AbstractFamily], other: AbstractFamily
-    ) -> tuple[AbstractFamily, np.ndarray, float]:
-        """The best of the improved starts, its score by left-out level and its error."""
+    ) -> tuple[AbstractFamily, np.ndarray, float, int]:
+        """The best of the improved starts, its score by left-out level, error and parameters."""
         found = []
-        for start in starts:
+        for given in starts:
+            start = self.smoothed(name, given, other)
             pair = (start, other) if name == "backbone" else (other, start)
             linear = len(starts) == 1
             squared, damping, problem = self.improved(*pair, steps=1 if linear else 4)
@@ -330,11 +372,17 @@ class _Workbench:
             mine = squared if name == "backbone" else damping
             found.append((cost if np.isfinite(cost) else np.inf, mine, problem))
         _, best, problem = min(found, key=lambda row: row[0])
-        return best, *_left_out(problem, self.folds)
+        first = 0 if name == "backbone" else other.parameters.shape[0]
+        own = first + np.arange(best.parameters.shape[0])
+        return best, *_left_out(problem, self.folds), int(np.ceil(_effective(problem, own)))
 
 
-def _moved(family: AbstractFamily, change: np.ndarray) -> AbstractFamily:
-    return eqx.tree_at(lambda f: f.parameters, family, family.parameters + jnp.asarray(change))
+def _effective(problem: Linearised, own: np.ndarray) -> float:
+    """Parameters that the data, and not their priors, tell, of some of the unknowns."""
+    keep, matrix, size = _normal(problem)
+    at = np.flatnonzero(np.isin(np.flatnonzero(keep), own))
+    variance = np.diagonal(np.linalg.inv(matrix))[at] / size[at] ** 2
+    return float(np.sum(1.0 - variance / problem.prior_std[keep][at] ** 2))
 
 
 def _normal(problem: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

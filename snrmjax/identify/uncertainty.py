@@ -9,6 +9,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.fitted_curves import (
     curve_values,
     displacement_near,
@@ -42,7 +43,7 @@ class Sensitivity(NamedTuple):
     """Derivatives of the free unknowns by everything that was measured or stated."""
 
     by_measurement: Float[np.ndarray, "unknown state error"]  # of `STATE_ERRORS`, relative or rad
-    by_prior: Float[np.ndarray, "unknown prior"]  # of levels and linear parameters, per 1σ
+    by_prior: Float[np.ndarray, "unknown prior"]  # levels, linear parameters, bends; per 1σ
     covariance: Float[np.ndarray, "unknown unknown"]  # what follows from both
 
 
@@ -80,7 +81,8 @@ def sensitivity(fit: JointFit) -> Sensitivity:
     p, n = len(vector), len(fit.data.level)
     by_state = -inverse @ np.asarray(mixed).reshape(p, -1)
     n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
-    by_prior = inverse[:, p - n_priors :]
+    by_bends = inverse @ _bend_slopes(fit).T
+    by_prior = np.concatenate([inverse[:, p - n_priors :], by_bends], axis=1)
     spread = by_state * np.asarray(fit.data.std).reshape(-1)
     return Sensitivity(
         by_measurement=by_state.reshape(p, n, len(STATE_ERRORS)),
@@ -100,7 +102,9 @@ def _second_order(
             unknowns = restore(vector)
             erring = eqx.tree_at(lambda d: d.correction, data, data.correction + error)
             points = whitened(unknowns, erring, modes, spread, weighing)
+            curves = (unknowns.squared_frequency, unknowns.modal_damping)
             priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
+            priors = priors + sum(jnp.sum(c.prior_residuals() ** 2) for c in curves)
             return 0.5 * (jnp.sum(points**2) + priors)
 
         return jax.grad(cost)(vector)
@@ -110,6 +114,21 @@ def _second_order(
     # Every state's errors enter its own residuals: one pull back for each unknown.
     mixed = jax.jacrev(gradient, argnums=1)(vector, none)
     return hessian, mixed
+
+
+def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
+    """Derivatives, by the unknowns, of what is expected near zero of both curves."""
+
+    def of(curve: AbstractFamily, parameters: Array) -> Array:
+        return eqx.tree_at(lambda f: f.parameters, curve, parameters).prior_residuals()
+
+    begin, blocks = 0, []
+    for curve in (fit.unknowns.squared_frequency, fit.unknowns.modal_damping):
+        slopes = np.asarray(jax.jacfwd(of, argnums=1)(curve, curve.parameters))
+        end = begin + slopes.shape[1]
+        blocks.append(np.pad(slopes, ((0, 0), (begin, len(fit.covariance) - end))))
+        begin = end
+    return np.concatenate(blocks)
 
 
 def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution]:
@@ -150,11 +169,14 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
         column = inverse[:, p - n_linear + k]
         if fit.spread.linear[k] > 0:
             rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
+    name = "smoothness of the curves"
+    rows.append((name, name, inverse @ _bend_slopes(fit).T))
     parts = np.stack([np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows])
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [
         Contribution(source, share[0], share[1], kind)
-        for (source, kind, _), share in zip(rows, shares, strict=True)
+        for (source, kind, columns), share in zip(rows, shares, strict=True)
+        if columns.shape[1]
     ]
     return sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
 

@@ -8,13 +8,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.families import FAMILIES, AbstractFamily
+from snrmjax.identify.families import FAMILIES
+from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.fitted_curves import values_to_the_largest
 from snrmjax.identify.fitted_response import FittedPoint, FittedResponse
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.joint_fit import JointFit
 from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.selection import Candidate
+from snrmjax.identify.splines import Spline
 from snrmjax.identify.uncertainty import Contribution
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
@@ -88,9 +90,9 @@ def summarise_fit(
 def described(family: AbstractFamily) -> str:
     """A family as the command takes it."""
     size = getattr(family, "order", None)
-    if family.kind == "spline":
+    if isinstance(family, Spline):
         size = family.parameters.shape[0]
-    plain = family.kind in ("polynomial", "spline")
+    plain = family.kind == "polynomial" or isinstance(family, Spline)
     return f"{family.kind}{f':{size}' if plain else ''}@{family.argument}"
 
 

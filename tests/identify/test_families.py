@@ -38,9 +38,7 @@ def test_host_values_and_slopes_are_those_of_the_program(kind):
             **{k: v for k, v in vars(curve).items() if k != "parameters"}, parameters=parameters
         )(at)
 
-    # The terms of fourteen knots cancel: the rounding of their sum is eps Σ|terms| = 2.7e-10.
-    rounding = 3e-10 if kind == "spline" else 1e-11
-    np.testing.assert_allclose(values, curve(at), rtol=rounding)
+    np.testing.assert_allclose(values, curve(at), rtol=1e-12)
     np.testing.assert_allclose(slopes, jax.jacfwd(of)(curve.parameters), rtol=1e-9, atol=1e-10)
 
 

@@ -62,7 +62,7 @@ def test_stated_scatter_is_kept_and_two_levels_say_nothing():
 
 def test_slopes_of_the_likelihood_are_those_of_differences():
     problem, index = sample(1, noise=0.7, shared=0.02)
-    likelihood = _Likelihood.of(problem, index)
+    likelihood = _Likelihood.of(problem, tuple(index.T))
     at = np.log([0.8, 0.03, 0.01])
 
     def value(point):

@@ -1,0 +1,39 @@
+"""Curves in the linear problem of a selection: their columns, and how smooth they are."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.identify.families import values_and_slopes
+from snrmjax.identify.family_base import AbstractFamily
+from snrmjax.identify.splines import SmoothingSpline, bent
+
+
+class CurveColumns(NamedTuple):
+    """A curve where its priors have it, and its derivatives by what may move it."""
+
+    values: Float[np.ndarray, " point"]
+    slopes: Float[np.ndarray, "point unknown"]
+    prior_std: Float[np.ndarray, " unknown"]  # infinite where there is no prior
+
+
+def curve_columns(curve: AbstractFamily, at: Float[np.ndarray, " point"]) -> CurveColumns:
+    """Of a smoothing spline the unknowns are a straight line and bends, else the parameters."""
+    values, slopes = values_and_slopes(curve, at)
+    if not isinstance(curve, SmoothingSpline):
+        return CurveColumns(values, slopes, np.full(slopes.shape[1], np.inf))
+    parts = bent(curve)
+    return CurveColumns(slopes @ parts.straight, slopes @ parts.both, parts.prior_std)
+
+
+def moved(curve: AbstractFamily, change: Float[np.ndarray, " unknown"]) -> AbstractFamily:
+    """A curve after a change of what `curve_columns` calls its unknowns."""
+    if isinstance(curve, SmoothingSpline):
+        parts = bent(curve)
+        values = parts.straight + parts.both @ change
+    else:
+        values = np.asarray(curve.parameters) + change
+    return eqx.tree_at(lambda f: f.parameters, curve, jnp.asarray(values))
