@@ -1,6 +1,6 @@
 """Every effect as a candidate: where its fit starts, and what tells it from the others."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -206,6 +206,17 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
         f"step through the frequency of the disturbance and record {_HARMONICS}",
     ),
 )
+
+
+_STATIC = (
+    frozenset({"force_gain_error", "sensor_gain_error"}),
+    frozenset({"linear_frequency_shift", "added_mass"}),
+)
+
+
+def needs_calibration(kinds: Iterable[str]) -> bool:
+    """Whether a class has two kinds that no test of one mode separates."""
+    return any(pair <= set(kinds) for pair in _STATIC)
 
 
 def decide_by(kinds: set[str], *, harmonics: bool) -> str:
