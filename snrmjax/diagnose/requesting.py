@@ -1,6 +1,7 @@
 """Which measurement would settle what is open: what rivals are expected to lose by it."""
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from snrmjax.diagnose.further import (
     Rows,
     foretold_states,
     predicted,
+    refitted,
     rows_of,
     separation,
 )
@@ -23,6 +25,7 @@ from snrmjax.diagnose.predictions import Predicted
 STATES = 12
 """Of a level, or off resonance, that a request is for."""
 
+_RIVALS = 4  # of a class, that are weighed
 _WITHIN = np.radians(55.0)  # phases of a further level
 _OFF = np.radians(np.linspace(30.0, 60.0, STATES // 2))
 _HIGHER, _LOWER = (1.5, 2.0), 0.5  # times the velocities of the largest and the smallest level
@@ -61,14 +64,6 @@ class Request(NamedTuple):
         return self.expected_gain >= self.needed_gain
 
 
-class _Rival(NamedTuple):
-    name: str
-    instead_of: str
-    ahead: float  # of the criterion, by which the answer leads
-    old: Rows
-    new: Predicted
-
-
 class _Option(NamedTuple):
     """Some rows of what was foretold."""
 
@@ -80,34 +75,38 @@ class _Option(NamedTuple):
 
 
 def requested(found: Named, places: tuple[int, ...]) -> Request | None:
-    """The cheapest measurement that is expected to tell an answer from all its rivals.
+    """The cheapest measurement that is expected to leave only what is true of some classes.
 
-    Of the classes at some places. Every rival is refitted to the measured and the further states
-    together, to first order: it loses what its own freedom cannot follow. Enough is what leaves
-    a class behind with 95 % probability, whichever of the two is true. Where nothing is enough,
-    what comes nearest; None where no rival can be compared.
+    Every member of a class at one of the `places` is taken for true in turn, further states are
+    foretold by it, and its rivals are refitted to the measured and the further states together, to
+    first order: they lose what their own freedom cannot follow. Enough is what leaves them behind
+    with 95 % probability. Where nothing is enough, what comes nearest; None where no rival can be
+    compared.
     """
-    bench, fit = found.bench, found.fit
+    bench = found.bench
     speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
     floor = _floor(bench)
     ordinary = floor if floor is not None else _ORDINARY * float(speed.max())
-    further = _further(bench)
-    foretold = foretold_states(bench, fit, further, ordinary)
-    truth = predicted(foretold.bench.predictions, fit)
-    rivals = list(_rivals(found, foretold, places))
-    if truth is None or not rivals:
-        return None
+    groups = [list(_rivals(found, place)) for place in places]
+    every = [rival for group in groups for rival in group]
+    hypotheses = [_Hypothesis(bench, found.fit, every, ordinary)]
+    for group in groups:
+        for truth in group:
+            others = [found.fit, *(rival for rival in group if rival is not truth)]
+            hypotheses.append(_Hypothesis(bench, truth, others, ordinary))
     best: Request | None = None
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
-        if option.floor is not None and option.floor != foretold.floor:
-            foretold = foretold.with_floor(option.floor, fit)
-        elif option.floor is None and foretold.floor != ordinary:
-            foretold = foretold.with_floor(ordinary, fit)
-        request = _request(bench, fit, foretold, truth, rivals, option, further)
-        if request is not None and request.settles:
-            return request
-        if request is not None and (best is None or _share(request) > _share(best)):
-            best = request
+        worst: Request | None = None
+        for hypothesis in hypotheses if every else []:
+            request = hypothesis.request(option)
+            if request is not None and (worst is None or _share(request) < _share(worst)):
+                worst = request
+            if worst is None or not worst.settles:
+                break
+        if worst is not None and worst.settles:
+            return worst
+        if worst is not None and (best is None or _share(worst) > _share(best)):
+            best = worst
     return best
 
 
@@ -160,24 +159,20 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
         yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
 
 
-def _rivals(found: Named, foretold: Foretold, places: tuple[int, ...]) -> Iterator[_Rival]:
-    """All that the classes have beside the answer, as the table says that they fit."""
-    bench, fit = found.bench, found.fit
-    for place in places:
-        for name in found.classes[place][1:]:
-            kinds = {name if k == place else kind for k, kind in enumerate(fit.kinds)}
-            # One effect with more parameters may stand for two.
-            other = _from_table(found, kinds) or _from_table(found, {name})
-            new = other and predicted(foretold.bench.predictions, other)
-            old = other and predicted(bench.predictions, other)
-            if other is None or new is None or old is None:
-                continue
-            rows = rows_of(bench, old)
-            if not np.all(np.isfinite(rows.left)):
-                continue
-            own = other._replace(chi_square=bench.chi_square(rows.left))
-            ahead = own.criterion(bench.n_rows) - fit.criterion(bench.n_rows)
-            yield _Rival(name, fit.kinds[place], ahead, rows, new)
+def _rivals(found: Named, place: int) -> Iterator[Fit]:
+    """What the class at a place has beside the answer, as the table says that it fits."""
+    bench = found.bench
+    for name in found.classes[place][1 : 1 + _RIVALS]:
+        kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
+        # One effect with more parameters may stand for two.
+        fit = _from_table(found, kinds) or _from_table(found, {name})
+        columns = fit and predicted(bench.predictions, fit)
+        if fit is None or columns is None:
+            continue
+        rows = rows_of(bench, columns)
+        if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
+            least = refitted(rows, bench.weighing.shared)
+            yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
 
 
 def _from_table(found: Named, kinds: set[str]) -> Fit | None:
@@ -191,44 +186,70 @@ def _from_table(found: Named, kinds: set[str]) -> Fit | None:
     return None
 
 
-def _request(
-    bench: Bench,
-    fit: Fit,
-    foretold: Foretold,
-    truth: Predicted,
-    rivals: list[_Rival],
-    option: _Option,
-    further: tuple[Further, ...],
-) -> Request | None:
-    """What an option is expected to gain over the rival that it tells least well."""
-    new = foretold.bench
-    kept = _rows(foretold, option)
-    if not kept.any():
-        return None
-    exact = Rows(fit.rows, fit.slopes), rows_of(new, truth)
-    gains = []
-    for rival in rivals:
-        gain = separation(bench, new, exact, (rival.old, rows_of(new, rival.new)), kept)
-        gains.append((gain / _needed(rival.ahead), gain, rival))
-    _, gain, closest = min(gains, key=lambda one: one[0])
-    one = further[option.place]
-    size = np.degrees(np.abs(one.phase))
-    quantity, words = _difference(foretold, truth, closest, option)
-    request = Request(
-        kind=option.kind,
-        sentence="",
-        quantity=quantity,
-        level=int(bench.level_numbers[one.level]),
-        force=foretold.force[option.place],
-        frequency=foretold.frequency[option.place] / (2 * np.pi),
-        states=len(one.phase),
-        phase=(float(size.min()), float(size.max())),
-        harmonics=option.orders if option.floor is not None else (),
-        harmonic_std=option.floor,
-        expected_gain=float(gain),
-        needed_gain=_needed(closest.ahead),
-    )
-    return request._replace(sentence=f"{_place(request, one.scale, foretold, option)}: {words}.")
+class _Hypothesis:
+    """One model that may be true, what it foretells of further states, and its rivals."""
+
+    def __init__(self, bench: Bench, truth: Fit, rivals: list[Fit], floor: float):
+        self.bench, self.truth, self.rivals = bench, truth, rivals
+        self.floor = floor  # m/s, of harmonics where none is asked for
+        self.further = _further(bench)
+
+    @cached_property
+    def _foretold(self) -> dict[float, Foretold]:
+        """By the noise of harmonics."""
+        first = foretold_states(self.bench, self.truth, self.further, self.floor)
+        return {self.floor: first}
+
+    @cached_property
+    def _predicted(self) -> list[Predicted | None]:
+        """Of the truth, then of the rivals."""
+        predictions = self._foretold[self.floor].bench.predictions
+        return [predicted(predictions, fit) for fit in (self.truth, *self.rivals)]
+
+    def request(self, option: _Option) -> Request | None:
+        """What an option is expected to gain over the rival that it tells least well."""
+        floor = self.floor if option.floor is None else option.floor
+        if floor not in self._foretold:
+            again = self._foretold[self.floor].with_floor(floor, self.truth)
+            self._foretold[floor] = again
+        foretold = self._foretold[floor]
+        kept = _rows(foretold, option)
+        exact, *others = self._predicted
+        if exact is None or not kept.any():
+            return None
+        own = Rows(self.truth.rows, self.truth.slopes), rows_of(foretold.bench, exact)
+        found = []
+        for fit, columns in zip(self.rivals, others, strict=True):
+            if columns is None:
+                continue
+            its = Rows(fit.rows, fit.slopes), rows_of(foretold.bench, columns)
+            gain = separation(self.bench, foretold.bench, own, its, kept)
+            n = self.bench.n_rows
+            needed = _needed(fit.criterion(n) - self.truth.criterion(n))
+            said = _difference(foretold, (self.truth, exact), (fit, columns), option)
+            found.append((gain, needed, *said))
+        if not found:
+            return None
+        gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
+        one = self.further[option.place]
+        size = np.degrees(np.abs(one.phase))
+        request = Request(
+            kind=option.kind,
+            sentence="",
+            quantity=quantity,
+            level=int(self.bench.level_numbers[one.level]),
+            force=foretold.force[option.place],
+            frequency=foretold.frequency[option.place] / (2 * np.pi),
+            states=len(one.phase),
+            phase=(float(size.min()), float(size.max())),
+            harmonics=option.orders if option.floor is not None else (),
+            harmonic_std=option.floor,
+            expected_gain=float(gain),
+            needed_gain=needed,
+        )
+        return request._replace(
+            sentence=f"{_place(request, one.scale, foretold, option)}: {words}."
+        )
 
 
 def _place(request: Request, scale: float, foretold: Foretold, option: _Option) -> str:
@@ -257,11 +278,11 @@ def _place(request: Request, scale: float, foretold: Foretold, option: _Option) 
 
 
 def _needed(ahead: float) -> float:
-    """Expected gain over a rival that leaves it out of the class, whichever of the two is true.
+    """Expected gain over a rival that leaves it out of the class, if the truth is now `ahead`.
 
     A gain G of χ² scatters by 2√G.
     """
-    least = AS_GOOD + abs(ahead)
+    least = max(AS_GOOD - ahead, 0.0)
     return float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
 
 
@@ -277,16 +298,24 @@ def _rows(foretold: Foretold, option: _Option) -> Bool[np.ndarray, " row"]:
 
 
 def _difference(
-    foretold: Foretold, truth: Predicted, rival: _Rival, option: _Option
+    foretold: Foretold,
+    truth: tuple[Fit, Predicted],
+    rival: tuple[Fit, Predicted],
+    option: _Option,
 ) -> tuple[str, str]:
-    """In what an answer and a rival differ most under an option, and by how much, in words."""
+    """In what two models differ most under an option, and by how much, in words."""
     states = foretold.bench.predictions.chosen.states
     velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
-    columns = rival.new.columns[0] - truth.columns[0]
+    columns = rival[1].columns[0] - truth[1].columns[0]
     apart = columns[:, 0::2] + 1j * columns[:, 1::2]
     mine = np.flatnonzero(foretold.rows_of[option.place])
     mine = mine[np.isfinite(apart[mine]).all(axis=1)]
-    one, other = rival.instead_of, rival.name
+    kinds = truth[0].kinds, rival[0].kinds
+    one, other = (
+        " and ".join(kind for kind in own if kind not in its) for own, its in (kinds, kinds[::-1])
+    )
+    if not mine.size:
+        return "velocity", f"{one} against {other}, which has no such motion"
     at = mine[np.argmin(np.abs(np.angle(velocity[mine])))]
     if option.floor is not None:
         places = [HARMONICS.index(h) for h in option.orders]
