@@ -19,7 +19,7 @@ from snrmjax.diagnose.predictions import (
     Predictions,
     whitened_states,
 )
-from snrmjax.identify.calibration_states import whitened
+from snrmjax.identify.calibration_states import Selection, whitened
 from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
 from snrmjax.model.structure import Structure
 
@@ -175,6 +175,7 @@ class Bench:
         return change
 
     def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
+        self._passed_on = by_error
         measured = whitened_states(self.predictions.chosen, by_error)
         model = self.model
         levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
@@ -207,6 +208,14 @@ class Bench:
         other = copy.copy(self)
         other._slopes = self._plain_slopes + np.where(np.isfinite(slopes), slopes, 0.0)
         other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
+        return other
+
+    def with_errors(self, chosen: Selection) -> "Bench":
+        """The same with the same states under other errors."""
+        other, predictions = copy.copy(self), copy.copy(self.predictions)
+        predictions.chosen = chosen
+        other.predictions = predictions
+        other._weigh(self._passed_on)
         return other
 
     @property

@@ -1,6 +1,5 @@
 """States that a test could add, as an answer foretells them, and what they would tell of rivals."""
 
-import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -33,14 +32,13 @@ class Foretold(NamedTuple):
     frequency: tuple[float, ...]  # rad/s at resonance
     floor: float  # m/s, noise of harmonics
 
-    def with_floor(self, floor: float, fit: Fit) -> "Foretold":
-        """The same with another noise of harmonics, and errors passed on as a fit does."""
+    def with_floor(self, floor: float) -> "Foretold":
+        """The same with another noise of harmonics."""
         chosen = self.bench.predictions.chosen
         own = chosen.states.own_std * (floor / self.floor)
-        bench, predictions = copy.copy(self.bench), copy.copy(self.bench.predictions)
-        predictions.chosen = chosen._replace(states=chosen.states._replace(own_std=own))
-        bench.predictions = predictions
-        return self._replace(bench=bench.reweighed(fit), floor=floor)
+        states = chosen.states._replace(own_std=own)
+        bench = self.bench.with_errors(chosen._replace(states=states))
+        return self._replace(bench=bench, floor=floor)
 
 
 def foretold_states(bench: Bench, fit: Fit, further: tuple[Further, ...], floor: float) -> Foretold:

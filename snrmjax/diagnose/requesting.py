@@ -210,8 +210,7 @@ class _Hypothesis:
         """What an option is expected to gain over the rival that it tells least well."""
         floor = self.floor if option.floor is None else option.floor
         if floor not in self._foretold:
-            again = self._foretold[self.floor].with_floor(floor, self.truth)
-            self._foretold[floor] = again
+            self._foretold[floor] = self._foretold[self.floor].with_floor(floor)
         foretold = self._foretold[floor]
         kept = _rows(foretold, option)
         exact, *others = self._predicted
