@@ -7,9 +7,10 @@ Run, with the sets, keys and diagnoses of a half:
     python benchmarks/blind_sets/close_loops.py score --keys DIR2/keys --diagnoses OUT2
 
 `ask` takes the ambiguous sets whose truth is in the library and whose classes have several effects,
-in the order of their names, and prints the requests of the first 20 that the generator can answer;
-on the standard error what became of all. `score` counts those that collapse: every class has one
-effect, and these are the true ones. One line a set, then the count.
+in the order of their names, and prints the requests of the first 20 that the generator can answer
+and that the program expects to be enough; on the standard error what became of all. `score` counts
+those that collapse: every class has one effect, and these are the true ones. One line a set, then
+the count.
 """
 
 import argparse
@@ -32,10 +33,11 @@ def asked(keys: Path, diagnoses: Path) -> dict[str, dict]:
         if answer["verdict"] != "ambiguous" or not several or not key["effects"]:
             continue
         request = answer["request"] or {"kind": "none"}
-        served = request["kind"] in SERVED and request["settles"] and len(found) < _MOST
+        enough = request.get("settles") and not request.get("calibration_too")
+        served = request["kind"] in SERVED and enough and len(found) < _MOST
         if served:
             found[path.stem] = request
-        word = request["kind"] if request.get("settles") else f"nothing enough: {request['kind']}"
+        word = request["kind"] if enough else f"not enough: {request['kind']}"
         truth = "+".join(key["effects"])
         print(f"{path.stem} {truth}: {word}{'' if served else ', left out'}", file=sys.stderr)
     return found

@@ -214,9 +214,9 @@ _STATIC = (
 )
 
 
-def needs_calibration(kinds: Iterable[str]) -> bool:
-    """Whether a class has two kinds that no test of one mode separates."""
-    return any(pair <= set(kinds) for pair in _STATIC)
+def only_by_calibration(kinds: Iterable[str]) -> set[str]:
+    """Those of some kinds of which another one does the same to every test of one mode."""
+    return set().union(*(pair for pair in _STATIC if pair <= set(kinds)))
 
 
 def decide_by(kinds: set[str], *, harmonics: bool) -> str:

@@ -12,7 +12,7 @@ from snrmjax.diagnose.candidates import (
     Scales,
     candidate,
     decide_by,
-    needs_calibration,
+    only_by_calibration,
 )
 from snrmjax.diagnose.doubts import Doubt, doubts
 from snrmjax.diagnose.evidence import Bench, Fit
@@ -204,13 +204,17 @@ def _named_and_noise(
 def _request(found: Named) -> Request | None:
     """The measurement that would settle the classes of several effects."""
     open_places = [k for k, group in enumerate(found.classes) if len(group) > 1]
-    places = tuple(k for k in open_places if not needs_calibration(found.classes[k]))
-    if places:
-        return requested(found, places)
+    places = tuple(
+        k for k in open_places if set(found.classes[k]) - only_by_calibration(found.classes[k])
+    )
     if not open_places:
         return None
     unclear = {kind for k in open_places for kind in found.classes[k]}
-    return Request("calibration", decide_by(unclear, harmonics=True))
+    too = any(only_by_calibration(found.classes[k]) for k in open_places)
+    request = requested(found, places) if places else None
+    if request is not None:
+        return request._replace(calibration_too=too)
+    return Request("calibration", decide_by(unclear, harmonics=True)) if too else None
 
 
 def _decide_by(found: Named, request: Request | None, open_ends: list[Doubt]) -> str | None:
@@ -221,10 +225,11 @@ def _decide_by(found: Named, request: Request | None, open_ends: list[Doubt]) ->
     if request is None or request.kind == "calibration":
         sentences += [decide_by(set().union(*groups), harmonics=harmonics)] if groups else []
     else:
-        static = [group for group in groups if needs_calibration(group)]
-        sentences += [decide_by(group, harmonics=harmonics) for group in static]
+        static = [only_by_calibration(group) for group in groups]
+        sentences += [decide_by(group, harmonics=True) for group in static if group]
         if request.kind == "harmonics" and request.settles:
-            sentences.append(decide_by(set().union(*groups), harmonics=harmonics))
+            rest = set().union(*groups) - set().union(*static)
+            sentences.append(decide_by(rest, harmonics=harmonics))
         if not request.settles:
             sentences.append("No single measurement that was weighed would settle it; the nearest:")
         sentences.append(request.sentence)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from snrmjax.diagnose.candidates import only_by_calibration
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.further import (
     HARMONICS,
@@ -55,6 +56,7 @@ class Request(NamedTuple):
     harmonic_std: float | None = None  # m/s
     expected_gain: float | None = None  # of χ², over the rival that is told least well
     needed_gain: float | None = None
+    calibration_too: bool = False  # whether two that only it separates stay open
 
     @property
     def settles(self) -> bool:
@@ -89,11 +91,12 @@ def requested(found: Named, places: tuple[int, ...]) -> Request | None:
     ordinary = floor if floor is not None else _ORDINARY * float(speed.max())
     groups = [list(_rivals(found, place)) for place in places]
     every = [rival for group in groups for rival in group]
-    hypotheses = [_Hypothesis(bench, found.fit, every, ordinary)]
-    for group in groups:
-        for truth in group:
-            others = [found.fit, *(rival for rival in group if rival is not truth)]
-            hypotheses.append(_Hypothesis(bench, truth, others, ordinary))
+    tried = [(found.fit, every)]
+    tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
+    hypotheses = [
+        _Hypothesis(bench, truth, [fit for fit in rivals if _can_be_told(truth, fit)], ordinary)
+        for truth, rivals in tried
+    ]
     best: Request | None = None
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
         worst: Request | None = None
@@ -108,6 +111,12 @@ def requested(found: Named, places: tuple[int, ...]) -> Request | None:
         if worst is not None and (best is None or _share(worst) > _share(best)):
             best = worst
     return best
+
+
+def _can_be_told(one: Fit, other: Fit) -> bool:
+    """Whether two answers are different ones that no calibration is needed for."""
+    differ = set(one.kinds) ^ set(other.kinds)
+    return bool(differ) and not only_by_calibration(differ)
 
 
 def _share(request: Request) -> float:

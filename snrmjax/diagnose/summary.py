@@ -17,7 +17,8 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
     those of `level` scaled, or a `calibration`), the force and frequency at resonance, how many
     `states` and how far off resonance in phase, the `harmonics` wanted with the noise they need,
     the `quantity` in which rivals differ most, and by how much χ² the rival that is told least well
-    is expected to lose, beside what would settle it.
+    is expected to lose, beside what would settle it; `calibration_too` if effects stay open that
+    only a calibration separates.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
@@ -96,6 +97,7 @@ def _request(request: Request | None) -> dict | None:
         "expected_gain": request.expected_gain,
         "needed_gain": request.needed_gain,
         "settles": request.settles,
+        "calibration_too": request.calibration_too,
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.diagnose.candidates import needs_calibration
+from snrmjax.diagnose.candidates import only_by_calibration
 from snrmjax.diagnose.diagnosis import _decide_by, scales_of
 from snrmjax.diagnose.evidence import Bench
 from snrmjax.diagnose.further import Further, Rows, foretold_states, refitted
@@ -153,6 +153,7 @@ def test_where_no_measurement_would_settle_it_that_is_said():
 
 
 def test_what_no_test_of_one_mode_separates_needs_a_calibration():
-    assert needs_calibration(("cubic_stiffness", "force_gain_error", "sensor_gain_error"))
-    assert not needs_calibration(("gap_stiffness", "one_sided_stop"))
+    gains = {"force_gain_error", "sensor_gain_error"}
+    assert only_by_calibration(gains | {"cubic_stiffness", "added_mass"}) == gains
+    assert not only_by_calibration(("gap_stiffness", "one_sided_stop"))
     assert Request("calibration", "").settles
