@@ -14,7 +14,6 @@ from snrmjax.diagnose.foretelling import (
     level_forces,
     level_responses,
     responses,
-    where_rivals_differ,
 )
 from snrmjax.diagnose.locating import Located
 from snrmjax.diagnose.naming import AS_GOOD, DETECTED
@@ -67,7 +66,7 @@ def write_diagnosis(
     foretold: list[LevelResponse] = []
     figures = diagnosis_figures(found, data)
     if simulate and found.effects:
-        found, foretold, figures["responses"] = with_responses(found, model, data)
+        foretold, figures["responses"] = with_responses(found, model, data)
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, foretold))
     write_model(folder / "model.toml", found.completed)
     for name, figure in figures.items():
@@ -79,19 +78,14 @@ def write_diagnosis(
 
 def with_responses(
     found: Diagnosis, model: Structure, data: SteadyStates
-) -> tuple[Diagnosis, list[LevelResponse], Figure]:
-    """What simulation adds: where rivals differ most, resonances and responses of all levels."""
+) -> tuple[list[LevelResponse], Figure]:
+    """What simulation adds: resonances and responses of all levels."""
     forces = list(level_forces(data, found.sensor).values())
     before, after = (responses(one, data, forces) for one in (model, found.completed))
     foretold = level_responses(before, after, data, found.sensor, found.blind)
-    sentences = [
-        where_rivals_differ(effect, found.completed, rival, other, data, found.sensor)
-        for effect, rival, other in found.rivals
-    ]
-    wanted = " ".join(s for s in (found.decide_by, *sentences) if s)
     old, new = ([c for one in curves for c in one] for curves in (before, after))
     figure = simulated_figure(old, new, data, found.sensor)
-    return dataclasses.replace(found, decide_by=wanted or None), foretold, figure
+    return foretold, figure
 
 
 def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:

@@ -25,6 +25,7 @@ def blind():
     names = (
         "effects",
         "forces",
+        "further",
         "integration",
         "plans",
         "records",
@@ -336,6 +337,59 @@ def test_files_hold_what_the_key_says(blind, small_sets, tmp_path):
         if not case.plan.level_errors:
             assert 0.006 < np.std(error.real) < 0.015
         assert np.abs(error).max() < 0.09
+
+
+def asked(kind, **settings):
+    """What a diagnosis asks for."""
+    nothing = {"harmonics": [], "harmonic_std_m_s": None}
+    return {"kind": kind, "level": 2, "states": 6, "phase_deg": [10.0, 50.0], **nothing, **settings}
+
+
+def test_harmonics_are_added_where_they_were_asked_for_and_nothing_else_moves(blind, small_sets):
+    case, truth = small_sets[0][1], small_sets[1][1]
+    silent = replace(case, plan=replace(case.plan, harmonics=False))
+    before, loud = blind.records.table(silent, truth), blind.records.table(case, truth)
+    floor = loud["harmonic_std_m_s"][0] / 5
+    request = asked("harmonics", harmonics=[2, 3], harmonic_std_m_s=floor)
+    columns, whole = blind.further.answered(silent, truth, request)
+    assert whole is truth
+    for name, values in before.items():
+        np.testing.assert_array_equal(columns[name], values)
+    here = before["level"] == 2
+    third = columns["velocity_h3_re_m_s"]
+    assert np.isfinite(third[here]).all()
+    assert np.isnan(third[~here]).all()
+    speed = 2 * np.pi * case.natural_frequency_hz * case.displacement * case.shape
+    own = truth.velocity[3].real * speed
+    # The noise is what was asked for; 4σ, and gain and phase errors of the harmonic itself.
+    assert np.abs(third - own)[here].max() < 4 * floor + 0.1 * np.abs(own).max()
+    np.testing.assert_allclose(columns["harmonic_std_m_s"][here], floor)
+
+
+@pytest.mark.parametrize("kind", ["higher_level", "off_resonance"])
+def test_further_states_are_of_the_same_structure_after_the_test(blind, small_sets, kind):
+    case, truth = small_sets[0][0], small_sets[1][0]  # nothing is hidden
+    before = blind.records.table(case, truth)
+    force = 1.5 * np.median(before["force_n"][before["level"] == 2])
+    request = asked(kind, force_n=force)
+    columns, whole = blind.further.answered(case, truth, request, steps=STEPS)
+    n = len(truth.level)
+    for name in set(before) - {"order"}:
+        np.testing.assert_array_equal(columns[name][:n], before[name])
+    assert len(columns["level"]) - n == request["states"]
+    assert set(columns["level"][n:]) == {3}
+    wanted = force if kind == "higher_level" else force / 1.5
+    np.testing.assert_allclose(columns["force_n"][n:], wanted, rtol=0.02)
+    phase = np.degrees(np.angle(columns["velocity_re_m_s"] + 1j * columns["velocity_im_m_s"]))[n:]
+    assert sorted(np.sign(phase)) == [-1, -1, -1, 1, 1, 1]
+    assert np.abs(phase).min() > 3
+    assert np.abs(phase).max() < 60
+    assert np.all(np.diff(whole.order) > 0)
+    assert (whole.order[0], whole.order[-1]) == (0, 1)
+    # The baseline's own balance holds for them as for the others.
+    assert max(blind.truth.measured_units(case, whole).values()) < 0.05
+    with pytest.raises(ValueError, match="calibration"):
+        blind.further.answered(case, truth, asked("calibration"))
 
 
 def test_one_seed_gives_one_set_and_halves_differ(blind, small_sets):

@@ -1,35 +1,46 @@
 """Whether the measurement that an ambiguous diagnosis asks for settles it.
 
 Run, with the sets, keys and diagnoses of a half:
-    python benchmarks/blind_sets/close_loops.py names --keys DIR/keys --diagnoses OUT
-    python benchmarks/blind_sets/generate.py --half HALF --names NAMES --with-harmonics --out DIR2
+    python benchmarks/blind_sets/close_loops.py ask --keys DIR/keys --diagnoses OUT > asked.json
+    python benchmarks/blind_sets/generate.py --half HALF --requests asked.json --out DIR2
     snrmjax diagnose DIR2/sets/*.csv --model any.toml --out OUT2
     python benchmarks/blind_sets/close_loops.py score --keys DIR2/keys --diagnoses OUT2
 
-`names` prints the sets of fundamentals whose diagnosis is ambiguous and asks for harmonics, in
-order, at most 20. `score` counts those that collapse: every class has one effect, and these are
-the true ones. One line a set, then the count.
+`ask` takes the ambiguous sets whose truth is in the library and whose classes have several effects,
+in the order of their names, and prints the requests of the first 20 that the generator can answer
+and that the program expects to be enough; on the standard error what became of all. `score` counts
+those that collapse: every class has one effect, and these are the true ones. One line a set, then
+the count.
 """
 
 import argparse
 import json
+import sys
 from pathlib import Path
+
+from further import SERVED
 
 _MOST = 20
 
 
-def names(keys: Path, diagnoses: Path) -> list[str]:
-    """Ambiguous sets of fundamentals, of effects in the library, that ask for harmonics."""
-    found = []
+def asked(keys: Path, diagnoses: Path) -> dict[str, dict]:
+    """What ambiguous sets ask for, by their names."""
+    found = {}
     for path in sorted(keys.glob("*.json")):
         key = json.loads(path.read_text(encoding="utf-8"))
         answer = json.loads((diagnoses / path.stem / "diagnosis.json").read_text(encoding="utf-8"))
-        asks = "harmonic" in (answer["decide_by"] or "").lower()
         several = any(len(group) > 1 for group in answer["candidates"])
-        fundamental = not key["harmonics"] and bool(key["effects"])
-        if answer["verdict"] == "ambiguous" and several and asks and fundamental:
-            found.append(path.stem)
-    return found[:_MOST]
+        if answer["verdict"] != "ambiguous" or not several or not key["effects"]:
+            continue
+        request = answer["request"] or {"kind": "none"}
+        enough = request.get("settles") and not request.get("calibration_too")
+        served = request["kind"] in SERVED and enough and len(found) < _MOST
+        if served:
+            found[path.stem] = request
+        word = request["kind"] if enough else f"not enough: {request['kind']}"
+        truth = "+".join(key["effects"])
+        print(f"{path.stem} {truth}: {word}{'' if served else ', left out'}", file=sys.stderr)
+    return found
 
 
 def score(keys: Path, diagnoses: Path) -> None:
@@ -43,19 +54,21 @@ def score(keys: Path, diagnoses: Path) -> None:
         right = sorted(answer["effects"]) == sorted(key["effects"])
         collapsed += alone and right
         word = "collapsed" if alone and right else "not"
-        print(f"{path.stem} {'+'.join(key['effects'])}: {word}, {answer['candidates']}")
+        kind, truth = key["request"]["kind"], "+".join(key["effects"])
+        verdict = answer["verdict"]
+        print(f"{path.stem} {truth} ({kind}): {word}, {verdict}, {answer['candidates']}")
     print(f"{collapsed} of {len(every)} collapse to the truth")
 
 
 def main() -> None:
     """One of the two."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("what", choices=("names", "score"))
+    parser.add_argument("what", choices=("ask", "score"))
     parser.add_argument("--keys", type=Path, required=True)
     parser.add_argument("--diagnoses", type=Path, required=True)
     options = parser.parse_args()
-    if options.what == "names":
-        print(",".join(names(options.keys, options.diagnoses)))
+    if options.what == "ask":
+        print(json.dumps(asked(options.keys, options.diagnoses), indent=1))
     else:
         score(options.keys, options.diagnoses)
 

@@ -1,22 +1,21 @@
 """Blind data sets for `snrmjax diagnose`: truth by integration in time, errors of a test.
 
 Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
-     [--only N] [--names NAME,NAME…] [--with-harmonics] [--seed 1]
+     [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1]
 
 Writes DIR/sets/NAME.csv and NAME.toml (the baseline, which lacks the effect) and, apart from
 them, DIR/keys/NAME.json (the truth). Nothing here shares code with the program that is judged.
-`--with-harmonics` writes what the same tests give when harmonics are recorded too: the measurement
-that an ambiguous answer to a set of fundamentals asks for. One JSON line at the end: sets, sweeps,
-seconds.
+`--requests` writes the sets named in a file of `close_loops.py`, each with the further measurement
+that the diagnosis of it asked for. One JSON line at the end: sets, sweeps, seconds.
 """
 
 import argparse
 import collections
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 
+from further import answered
 from plans import HALVES, Case, draw_cases
 from records import write_set
 from truth import Truth, calibrated
@@ -40,18 +39,25 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", type=int)
     parser.add_argument("--names", type=lambda text: text.split(","))
-    parser.add_argument("--with-harmonics", action="store_true")
+    parser.add_argument("--requests", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     begin = time.perf_counter()
     sets, keys = options.out / "sets", options.out / "keys"
     sets.mkdir(parents=True, exist_ok=True)
     keys.mkdir(parents=True, exist_ok=True)
+    requests: dict[str, dict] = {}
+    if options.requests is not None:
+        requests = json.loads(options.requests.read_text(encoding="utf-8"))
+        options.names = list(requests)
     cases, truths = generate(options.half, options.seed, options.only, options.names)
     for case, truth in zip(cases, truths, strict=True):
-        if options.with_harmonics:
-            case.plan = replace(case.plan, harmonics=True)
-        write_set(case, truth, sets, keys)
+        if case.name in requests:
+            request = requests[case.name]
+            columns, whole = answered(case, truth, request)
+            write_set(case, whole, sets, keys, columns, request)
+        else:
+            write_set(case, truth, sets, keys)
     line = {
         "half": options.half,
         "sets": len(cases),

@@ -51,6 +51,8 @@ class Case:
     noise_seed: np.random.SeedSequence
     step_deg: np.ndarray = field(default_factory=lambda: np.zeros(0))
     with_order: bool = True
+    begin: float = 0.0  # of the test's clock
+    sweeps: int = 0  # in which the clock goes from 0 to 1; 0: the case's own
 
     @property
     def on_a_beam(self) -> bool:

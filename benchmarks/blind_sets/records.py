@@ -1,6 +1,7 @@
 """What a set is written as: noise, the table, the baseline model and the key."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -186,14 +187,31 @@ def key(case: Case, truth: Truth) -> dict:
     }
 
 
-def write_set(case: Case, truth: Truth, sets: Path, keys: Path) -> None:
-    """Write one set and, apart from it, its key."""
-    columns = table(case, truth)
+def write_set(
+    case: Case,
+    truth: Truth,
+    sets: Path,
+    keys: Path,
+    columns: Mapping[str, np.ndarray] | None = None,
+    request: Mapping | None = None,
+) -> None:
+    """Write one set and, apart from it, its key.
+
+    `columns` are the table if it is another one than the truth with the errors of the test, since a
+    further measurement was asked for by `request`. What is NaN was not measured.
+    """
+    columns = table(case, truth) if columns is None else columns
     lines = [",".join(columns)]
     for row in zip(*columns.values(), strict=True):
-        lines.append(",".join(f"{v:d}" if isinstance(v, np.integer) else f"{v:.8g}" for v in row))
+        lines.append(",".join(_text(v) for v in row))
     (sets / f"{case.name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     model = tomli_w.dumps(baseline_model(case, truth))
     (sets / f"{case.name}.toml").write_text(model, encoding="utf-8")
-    text = json.dumps(key(case, truth), indent=1)
+    text = json.dumps(key(case, truth) | {"request": request}, indent=1)
     (keys / f"{case.name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _text(value: np.number) -> str:
+    if isinstance(value, np.integer):
+        return f"{value:d}"
+    return f"{value:.8g}" if np.isfinite(value) else ""

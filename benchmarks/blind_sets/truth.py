@@ -1,7 +1,9 @@
 """The true steady states of drawn cases: sweeps, instruments without noise, measured strength."""
 
 from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import forces
 import numpy as np
@@ -67,7 +69,7 @@ def system_of(case: Case) -> System:
     return System(1, fast, slider, steps=256 if fast or slider else 384)
 
 
-def _lane_table(cases: list[Case]) -> Lanes:
+def lane_table(cases: list[Case]) -> Lanes:
     """All sweeps of some cases: up and down at each level of the sequence."""
     rows: list[dict[str, float]] = []
     start, direction, step, clock, tick = [], [], [], [], []
@@ -93,8 +95,8 @@ def _lane_table(cases: list[Case]) -> Lanes:
             start.append(np.sqrt(max(stiffness - sense * lean, 0.2)))
             direction.append(sense)
             step.append(case.step_deg[k])
-            clock.append(k / n)
-            tick.append(1 / (n * TICKS))
+            clock.append(case.begin + k / (case.sweeps or n))
+            tick.append(1 / ((case.sweeps or n) * TICKS))
     names = sorted({name for row in rows for name in row})
     # Shapes (a gap, an exponent) need a harmless value in lanes without their effect.
     harmless = {name: max(row.get(name, 0.0) for row in rows) for name in names}
@@ -111,22 +113,29 @@ def _lane_table(cases: list[Case]) -> Lanes:
     )  # fmt: skip
 
 
-def _thinned(points: list[tuple[float, float]], wanted: int, rng: np.random.Generator) -> list[int]:
-    """Indices of `wanted` points (phase in degrees, clock), denser near resonance."""
-    free = list(range(len(points)))
-    chosen: list[int] = []
-    while free and len(chosen) < wanted:
+def _aims(rng: np.random.Generator) -> Iterator[float]:
+    """Phases in degrees without end, denser near resonance."""
+    while True:
         aim = rng.normal(0, 32)
-        if abs(aim) > WITHIN_DEG:
-            continue
-        best = min(free, key=lambda k: abs(points[k][0] - aim))
+        if abs(aim) <= WITHIN_DEG:
+            yield aim
+
+
+def _thinned(phases: list[float], aims: Iterable[float]) -> list[int]:
+    """Indices of the points whose phases in degrees are nearest to what is aimed at."""
+    free = list(range(len(phases)))
+    chosen: list[int] = []
+    for aim in aims:
+        if not free:
+            break
+        best = min(free, key=lambda k: abs(phases[k] - aim))
         free.remove(best)
         chosen.append(best)
     return sorted(chosen)
 
 
-def _assembled(case: Case, sweeps: list[Sweep]) -> Truth:
-    """The instruments' readings of the chosen points."""
+def assembled(case: Case, sweeps: list[Sweep], aims: Sequence[float] | None = None) -> Truth:
+    """The instruments' readings of points near phases in degrees, or near drawn ones."""
     rng = np.random.default_rng([*case.seed, 5])
     share = case.n_points / len(case.sequence)
     rows = []
@@ -143,7 +152,8 @@ def _assembled(case: Case, sweeps: list[Sweep]) -> Truth:
                 phase = float(np.degrees(np.angle(v[1, 0])))
                 if abs(phase) <= WITHIN_DEG:
                     candidates.append((phase, point, f[0], v[:, 0]))
-        keep = _thinned([(c[0], c[1].clock) for c in candidates], max(round(share), 5), rng)
+        wanted = islice(_aims(rng), max(round(share), 5)) if aims is None else aims
+        keep = _thinned([c[0] for c in candidates], wanted)
         rows += [(level + 1, *candidates[k][1:]) for k in keep]
     rows.sort(key=lambda row: row[1].clock)
     clock = np.array([row[1].clock for row in rows])
@@ -197,11 +207,11 @@ def simulate(cases: list[Case], steps: int | None = None) -> list[Truth]:
     found: dict[int, Truth] = {}
     for system, members in groups.items():
         some = [cases[k] for k in members]
-        sweeps = run_sweeps(system, _lane_table(some))
+        sweeps = run_sweeps(system, lane_table(some))
         at = 0
         for k, case in zip(members, some, strict=True):
             n = 2 * len(case.sequence)
-            truth = _assembled(case, sweeps[at : at + n])
+            truth = assembled(case, sweeps[at : at + n])
             truth.units = measured_units(case, truth)
             found[k], at = truth, at + n
     return [found[k] for k in range(len(cases))]

@@ -1,6 +1,6 @@
 """Every effect as a candidate: where its fit starts, and what tells it from the others."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -206,6 +206,17 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
         f"step through the frequency of the disturbance and record {_HARMONICS}",
     ),
 )
+
+
+_STATIC = (
+    frozenset({"force_gain_error", "sensor_gain_error"}),
+    frozenset({"linear_frequency_shift", "added_mass"}),
+)
+
+
+def only_by_calibration(kinds: Iterable[str]) -> set[str]:
+    """Those of some kinds of which another one does the same to every test of one mode."""
+    return set().union(*(pair for pair in _STATIC if pair <= set(kinds)))
 
 
 def decide_by(kinds: set[str], *, harmonics: bool) -> str:

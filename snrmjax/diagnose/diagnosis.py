@@ -1,20 +1,26 @@
 """The whole diagnosis: locate, name, add, verify, or say that there is nothing or no answer."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
+from snrmjax.diagnose.candidates import (
+    SECOND_ORDER,
+    Scales,
+    candidate,
+    decide_by,
+    only_by_calibration,
+)
 from snrmjax.diagnose.doubts import Doubt, doubts
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
 from snrmjax.diagnose.locating import Located, located
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.sidedness import acts_both_ways
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
@@ -55,7 +61,7 @@ class Diagnosis:
     notes: tuple[str, ...]
     table: tuple[tuple[Row, ...], ...]
     completed: Structure
-    rivals: tuple[tuple[str, str, Structure], ...]  # an effect, what it may be, the model with that
+    request: Request | None  # the measurement of `decide_by`, where one was weighed
     blind: dict[int, Structure]  # completed without having seen a level
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
@@ -146,14 +152,13 @@ def diagnose_model(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
             "of another mode?"
         )
-    harmonics = bool(predictions.chosen.orders)
-    unclear = {kind for group in found.classes if len(group) > 1 for kind in group}
+    request = _request(found) if verdict == "ambiguous" else None
     force = bench.weighing.column < 2
     return Diagnosis(
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
         candidates=found.classes if verdict != "none" else (),
-        decide_by=_decide_by(unclear, open_ends, harmonics=harmonics),
+        decide_by=_decide_by(found, request, open_ends),
         located=free.parts,
         parameters=values,
         gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
@@ -163,7 +168,7 @@ def diagnose_model(
         notes=tuple(notes),
         table=found.table,
         completed=_completed(model, own, fit.kinds, {name: v for name, (v, _) in values.items()}),
-        rivals=tuple(_rivals(model, own, found)),
+        request=request,
         blind=blind,
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
@@ -196,8 +201,38 @@ def _named_and_noise(
     return found, size
 
 
-def _decide_by(unclear: set[str], open_ends: list[Doubt], *, harmonics: bool) -> str | None:
-    sentences = [decide_by(unclear, harmonics=harmonics)] if unclear else []
+def _request(found: Named) -> Request | None:
+    """The measurement that would settle the classes of several effects."""
+    open_places = [k for k, group in enumerate(found.classes) if len(group) > 1]
+    places = tuple(
+        k for k in open_places if set(found.classes[k]) - only_by_calibration(found.classes[k])
+    )
+    if not open_places:
+        return None
+    unclear = {kind for k in open_places for kind in found.classes[k]}
+    too = any(only_by_calibration(found.classes[k]) for k in open_places)
+    request = requested(found, places) if places else None
+    if request is not None:
+        return request._replace(calibration_too=too)
+    return Request("calibration", decide_by(unclear, harmonics=True)) if too else None
+
+
+def _decide_by(found: Named, request: Request | None, open_ends: list[Doubt]) -> str | None:
+    """What would settle it, in words: of the classes, and of the doubts."""
+    groups = [set(group) for group in found.classes if len(group) > 1]
+    harmonics = bool(found.bench.predictions.chosen.orders)
+    sentences = []
+    if request is None or request.kind == "calibration":
+        sentences += [decide_by(set().union(*groups), harmonics=harmonics)] if groups else []
+    else:
+        static = [only_by_calibration(group) for group in groups]
+        sentences += [decide_by(group, harmonics=True) for group in static if group]
+        if request.kind == "harmonics" and request.settles:
+            rest = set().union(*groups) - set().union(*static)
+            sentences.append(decide_by(rest, harmonics=harmonics))
+        if not request.settles:
+            sentences.append("No single measurement that was weighed would settle it; the nearest:")
+        sentences.append(request.sentence)
     sentences += [f"{d.decide_by[0].upper()}{d.decide_by[1:]}." for d in open_ends]
     return " ".join(sentences) or None
 
@@ -277,16 +312,3 @@ def _completed(
     )
     moved = with_parameters(model, tuple(own), jnp.array(list(own.values()))) if own else model
     return dataclasses.replace(moved, effects=(*model.effects, *added))
-
-
-def _rivals(
-    model: Structure, own: dict[str, float], found: Named
-) -> Iterator[tuple[str, str, Structure]]:
-    """The model with the next best of every class in place of the one named."""
-    for place, group in enumerate(found.classes):
-        for rival in group[1:2]:
-            kinds = tuple(rival if k == place else kind for k, kind in enumerate(found.fit.kinds))
-            for row in (row for step in found.table[::-1] for row in step):
-                if {label.partition(".")[0] for label in row.parameters} == set(kinds):
-                    yield group[0], rival, _completed(model, own, kinds, row.parameters)
-                    break

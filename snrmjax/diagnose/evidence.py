@@ -19,7 +19,7 @@ from snrmjax.diagnose.predictions import (
     Predictions,
     whitened_states,
 )
-from snrmjax.identify.calibration_states import whitened
+from snrmjax.identify.calibration_states import Selection, whitened
 from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
 from snrmjax.model.structure import Structure
 
@@ -143,6 +143,15 @@ class Bench:
         self.predictions = predictions
         self.model = predictions.model
         group = predictions.group(PLAIN)
+        found = self._by_baseline(group, group.values)
+        self._columns, self._slopes = found.columns[0], found.slopes[0]
+        self._plain_slopes = self._slopes
+        self._by_error = predictions.by_error(group, group.values)
+        self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
+        self._weigh(self._by_error + self._of_what_is_missed())
+
+    def _by_baseline(self, group: Group, values: Float[np.ndarray, " parameter"]) -> Predicted:
+        """Columns, and slopes by the baseline's own parameters, its mode's linear ones last."""
         names = _baseline_names(self.model)
         directions = np.zeros((1, len(group.names), len(names) + 2))
         for k, name in enumerate(names):
@@ -150,11 +159,7 @@ class Bench:
         j = self.model.modes.mode_of_interest + 1
         directions[0, group.place(f"mode_{j}.natural_frequency"), -2] = 1.0
         directions[0, group.place(f"mode_{j}.damping_ratio"), -1] = 1.0
-        found = predictions.of(group, group.values[None], directions)
-        self._columns, self._slopes = found.columns[0], found.slopes[0]
-        self._by_error = predictions.by_error(group, group.values)
-        self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
-        self._weigh(self._by_error + self._of_what_is_missed())
+        return self.predictions.of(group, values[None], directions)
 
     def _of_what_is_missed(self) -> Float[np.ndarray, "state column input"]:
         """What errors of the velocity do to the force that the baseline does not know of.
@@ -170,6 +175,7 @@ class Bench:
         return change
 
     def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
+        self._passed_on = by_error
         measured = whitened_states(self.predictions.chosen, by_error)
         model = self.model
         levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
@@ -183,8 +189,11 @@ class Bench:
         self.by_linear = self.weighing.noise_units(linear).T
 
     def reweighed(self, fit: "Fit") -> "Bench":
-        """The same with the errors passed on as the fitted model passes them."""
-        change = np.zeros_like(self._by_error)
+        """The same with the errors passed on as the fitted model passes them.
+
+        Those of the baseline too: what an effect turns or scales, it turns and scales of them.
+        """
+        change, slopes = np.zeros_like(self._by_error), np.zeros_like(self._slopes)
         left = list(dict.fromkeys(fit.kinds))
         while left:
             group = self.predictions.group(max(left, key=self.predictions.is_apart))
@@ -195,8 +204,18 @@ class Bench:
             inside = [kind for kind in left if parameter_labels(kind)[0] in group.names]
             left = [kind for kind in left if kind not in inside]
             change += self.predictions.by_error(group, values) - self._by_error
+            slopes += self._by_baseline(group, values).slopes[0] - self._plain_slopes
         other = copy.copy(self)
+        other._slopes = self._plain_slopes + np.where(np.isfinite(slopes), slopes, 0.0)
         other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
+        return other
+
+    def with_errors(self, chosen: Selection) -> "Bench":
+        """The same with the same states under other errors."""
+        other, predictions = copy.copy(self), copy.copy(self.predictions)
+        predictions.chosen = chosen
+        other.predictions = predictions
+        other._weigh(self._passed_on)
         return other
 
     @property

@@ -1,4 +1,4 @@
-"""What models foretell of a test: resonances under its forces, and where rivals differ most."""
+"""What models foretell of a test: resonances under its forces."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,10 +11,7 @@ from snrmjax.simulate.forced_response import forced_response
 from snrmjax.simulate.response_curve import ResponseCurve
 
 ORDER = 5  # harmonics of the responses
-_BEYOND = 1.5  # times the largest force: one level more that a test could add
 _REACH = 0.3  # of the measured range of frequencies, added at both ends
-# What a careful test tells apart: relative velocity and frequency, share of a harmonic.
-_RESOLVED = {"velocity": 0.01, "frequency": 2e-4, "harmonic 2": 1e-3, "harmonic 3": 1e-3}
 
 
 class Resonance(NamedTuple):
@@ -23,8 +20,6 @@ class Resonance(NamedTuple):
     frequency: float  # Hz
     velocity: float  # m/s
     fold: float = np.nan  # Hz, of the branch that ends nearest above
-    harmonic_2: float = np.nan  # of the velocity, over the fundamental
-    harmonic_3: float = np.nan
 
 
 class LevelResponse(NamedTuple):
@@ -102,8 +97,7 @@ def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
         fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
-    shares = np.abs(curve.velocity[k, 2:4, sensor]) / size
-    return Resonance(float(curve.frequency[k]) / (2 * np.pi), size, fold, *shares.tolist())
+    return Resonance(float(curve.frequency[k]) / (2 * np.pi), size, fold)
 
 
 def level_responses(
@@ -134,38 +128,3 @@ def level_responses(
             )
         )
     return rows
-
-
-def where_rivals_differ(
-    name: str, model: Structure, rival: str, other: Structure, data: SteadyStates, sensor: int
-) -> str | None:
-    """The measurement at resonance in which two models differ most, in words.
-
-    Of velocity, frequency and the harmonics that were not measured, in units of what a careful
-    test resolves; None where they differ in nothing that it would see.
-    """
-    known = level_forces(data, sensor)
-    forces = [*known.values(), _BEYOND * max(known.values())]
-    places = [f"level {k} ({f:.3g} N)" for k, f in known.items()]
-    places.append(f"{forces[-1]:.3g} N, beyond the measured levels,")
-    mine, theirs = (responses(one, data, forces) for one in (model, other))
-    best: tuple[float, str] = (2.0, "")
-    for place, one, two in zip(places, mine, theirs, strict=True):
-        a, b = simulated_resonance(one, sensor), simulated_resonance(two, sensor)
-        for quantity, resolved in _RESOLVED.items():
-            share = quantity.startswith("harmonic")
-            if share and int(quantity[-1]) in data.harmonic_order:
-                continue
-            values = [getattr(r, quantity.replace(" ", "_")) for r in (a, b)]
-            apart = abs(values[0] - values[1]) / (1.0 if share else abs(values[0])) / resolved
-            if np.isfinite(apart) and apart > best[0]:
-                unit = {"velocity": "m/s", "frequency": "Hz"}.get(quantity, "% of the fundamental")
-                first, second = (
-                    f"{round(100 * v, 6):.3g}" if share else f"{v:.4g}" for v in values
-                )
-                best = (
-                    float(apart),
-                    f"They differ most at resonance under {place} near {a.frequency:.4g} Hz: "
-                    f"{quantity} {first} {unit} with {name}, {second} with {rival}.",
-                )
-    return best[1] or None

@@ -6,10 +6,20 @@ from collections.abc import Sequence
 from snrmjax.diagnose.diagnosis import Diagnosis
 from snrmjax.diagnose.foretelling import LevelResponse
 from snrmjax.diagnose.locating import Located
+from snrmjax.diagnose.requesting import Request
 
 
 def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] = ()) -> dict:
-    """A diagnosis as plain numbers and texts, in SI units; `foretold` are simulated resonances."""
+    """A diagnosis as plain numbers and texts, in SI units; `foretold` are simulated resonances.
+
+    `request` is the measurement of `decide_by` for programs: its `kind` (`harmonics` of the states
+    of `level`, states `off_resonance` at it, a `lower_level` or `higher_level` whose velocities are
+    those of `level` scaled, or a `calibration`), the force and frequency at resonance, how many
+    `states` and how far off resonance in phase, the `harmonics` wanted with the noise they need,
+    the `quantity` in which rivals differ most, and by how much χ² the rival that is told least well
+    is expected to lose, beside what would settle it; `calibration_too` if effects stay open that
+    only a calibration separates.
+    """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
     return {
@@ -17,6 +27,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
         "effects": list(diagnosis.effects),
         "candidates": [list(group) for group in diagnosis.candidates],
         "decide_by": diagnosis.decide_by,
+        "request": _request(diagnosis.request),
         "located": [_part(part) for part in diagnosis.located],
         "parameters": {
             name: {"value": value, "std": std}
@@ -47,7 +58,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
                     for name in ("measured", "before", "after")
                     for quantity, value in zip(
                         ("frequency_hz", "velocity_m_s", "fold_hz"),
-                        getattr(row, name)[:3],
+                        getattr(row, name),
                         strict=True,
                     )
                     if (name, quantity) != ("measured", "fold_hz")
@@ -67,6 +78,26 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
             ]
             for step in diagnosis.table
         ],
+    }
+
+
+def _request(request: Request | None) -> dict | None:
+    if request is None:
+        return None
+    return {
+        "kind": request.kind,
+        "level": request.level,
+        "force_n": request.force,
+        "frequency_hz": request.frequency,
+        "quantity": request.quantity,
+        "states": request.states,
+        "phase_deg": list(request.phase) if request.phase else None,
+        "harmonics": list(request.harmonics),
+        "harmonic_std_m_s": request.harmonic_std,
+        "expected_gain": request.expected_gain,
+        "needed_gain": request.needed_gain,
+        "settles": request.settles,
+        "calibration_too": request.calibration_too,
     }
 
 

@@ -131,6 +131,15 @@ def test_two_simple_effects_are_not_read_as_a_further_mode():
     assert sorted(found.effects) == sorted(key["effects"])
 
 
+def test_what_an_effect_turns_of_an_uncertain_baseline_is_no_second_effect():
+    """A phase error of 6.4° turns a tenth of a wrong cubic stiffness into damping, ∝ Q² as it is.
+
+    It passed for cubic damping, the more surely the higher the level.
+    """
+    found, key = blind("blind_17")
+    assert (found.verdict, found.effects) == ("named", tuple(key["effects"]))
+
+
 @pytest.mark.long
 def test_a_mode_close_by_is_not_taken_for_noise():
     found, key = blind("blind_14")
@@ -269,6 +278,18 @@ def test_too_few_states_and_a_model_of_something_else_are_said():
 def quadratic(velocity):
     """The change of damping that quadratic damping makes, 18 kg^-1/2 at these shapes."""
     return 8.0 * velocity
+
+
+def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
+    predictions = Predictions(linear_model(), balanced(lambda v: 0.0 * v))
+    bench = Bench(predictions)
+    turned = candidate("sensor_phase_error", scales_of(predictions))
+    fit = bench.at_start(turned._replace(starts=((10.0,),)))
+    own, other = bench._slopes, bench.reweighed(fit)._slopes
+    before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
+    # The motion is the recorded one turned back by 10°, and so is the force that it needs.
+    turn = np.exp(-1j * np.radians(10.0))
+    np.testing.assert_allclose(after, turn * before, rtol=0, atol=1e-6 * np.abs(before).max())
 
 
 def test_levels_whose_mode_differs_are_no_effect_once_that_is_stated():

@@ -1,6 +1,4 @@
-"""What models foretell of a test, against closed forms of a linear mode and of a hardening one."""
-
-import dataclasses
+"""What models foretell of a test, against closed forms of a linear mode."""
 
 import equinox as eqx
 import numpy as np
@@ -12,7 +10,6 @@ from snrmjax.diagnose.foretelling import (
     measured_resonance,
     responses,
     simulated_resonance,
-    where_rivals_differ,
 )
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
@@ -52,23 +49,6 @@ def test_resonances_of_a_linear_mode_are_its_own():
 
 def test_a_level_on_one_side_of_resonance_has_no_measured_one():
     assert np.isnan(measured_resonance(states(linear(), (10.0, 30.0)), 0, 0).frequency)
-
-
-def test_rivals_differ_in_the_harmonic_that_only_one_of_them_makes():
-    model, data = linear(), states(linear())
-    tip = SHAPE * FORCES[1] / (2 * ZETA * OMEGA**2)  # modal amplitude
-    # On one side twice as stiff: the same backbone to first order.
-    both, one = (
-        dataclasses.replace(
-            model,
-            effects=(sj.make_effect(kind, {"stiffness": stiff * OMEGA**2, "gap": 0.6 * tip}),),
-        )
-        for kind, stiff in (("gap_stiffness", 0.02), ("one_sided_stop", 0.04))
-    )
-    said = where_rivals_differ("gap_stiffness", both, "one_sided_stop", one, data, 0)
-    assert "harmonic 2 0 % of the fundamental with gap_stiffness" in said
-    same = where_rivals_differ("gap_stiffness", both, "gap_stiffness", both, data, 0)
-    assert same is None
 
 
 def test_the_force_of_a_level_is_that_at_its_resonance():
