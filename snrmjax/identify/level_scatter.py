@@ -10,8 +10,8 @@ from scipy.optimize import minimize, minimize_scalar
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
-_CLEAR = 20.0  # the same of gain and phase beside a rough curve, whose bends they imitate
-_INSTRUMENTS = 2  # of the kinds of error, the first: gain and phase
+_CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
+_PHASE = 1  # of the kinds of error
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 
 
@@ -87,8 +87,7 @@ def estimated_scatter(
             more[kind] = True
             trials.append((likelihood.best(stated, more, ends), kind))
         better, kind = min(trials, key=lambda trial: trial[0].value)
-        of_instruments = kind < _INSTRUMENTS
-        if better.value > found.value - (_CLEAR if bends and of_instruments else _WORTH):
+        if better.value > found.value - (_CLEAR if bends and kind == _PHASE else _WORTH):
             break
         found = better
         chosen[kind] = True

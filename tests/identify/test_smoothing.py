@@ -26,9 +26,8 @@ def test_a_straight_line_has_no_bends_and_a_corner_has_one():
     np.testing.assert_allclose(line.prior_residuals(), 0.0, atol=1e-12)
     corner = np.asarray(curve(np.maximum(KNOTS - 0.3, 0.0)).prior_residuals())
     assert np.flatnonzero(np.abs(corner) > 1e-9).tolist() == [3]  # the inner knot at 0.3
-    assert curve(KNOTS**2, 0.1).prior_residuals() == pytest.approx(
-        10 * curve(KNOTS**2).prior_residuals(), rel=1e-12
-    )
+    wide, narrow = (np.asarray(curve(KNOTS**2, std).prior_residuals()) for std in (1.0, 0.1))
+    np.testing.assert_allclose(narrow, 10 * wide, rtol=1e-12)
 
 
 def test_its_line_and_bends_are_the_curve():
@@ -117,7 +116,7 @@ def near_resonance(seed, n_levels=14):
 def test_bands_hold_a_curve_that_few_knots_cannot_follow():
     at = np.linspace(3.2e-4, 1.95e-3, 40)
     shares = {}
-    for family in ("auto", "spline:6@displacement"):
+    for family in ("auto", "spline:5@displacement"):
         inside = []
         for seed in range(8):
             fit = fit_jointly(near_resonance(seed), modes(), backbone=family, level_gain_std=0.01)
@@ -130,4 +129,4 @@ def test_bands_hold_a_curve_that_few_knots_cannot_follow():
                 assert not any("levels differ" in note for note in fit.notes)
         shares[family] = np.mean(inside)
     assert shares["auto"] > 0.88
-    assert shares["spline:6@displacement"] < 0.8
+    assert shares["spline:5@displacement"] < 0.8
