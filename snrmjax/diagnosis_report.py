@@ -106,7 +106,7 @@ def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
     for axes, title, misfit in zip(
         grid[0], ("Before", "After"), (diagnosis.before, diagnosis.after), strict=True
     ):
-        size = np.sqrt(np.mean(misfit**2, axis=1))
+        size = np.sqrt(np.nanmean(misfit**2, axis=1))
         marks = axes.scatter(
             frequency, speed / unit.size, c=size, cmap="viridis", vmin=0.0, vmax=_LARGEST, s=34
         )

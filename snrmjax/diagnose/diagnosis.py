@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.diagnose.amplitudes import UNSEEN, what_is_lost
 from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
 from snrmjax.diagnose.doubts import Doubt, doubts
 from snrmjax.diagnose.evidence import Bench, Fit
@@ -59,7 +60,8 @@ class Diagnosis:
     blind: dict[int, Structure]  # completed without having seen a level
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
-    before: Float[np.ndarray, "state part"]  # force misfit over noise, less what states share
+    # Force misfit over noise, less what states share; NaN where the size alone is compared.
+    before: Float[np.ndarray, "state part"]
     after: Float[np.ndarray, "state part"]
 
 
@@ -82,9 +84,11 @@ def diagnose_model(
     """
     predictions = Predictions(model, data, force_gain_std)
     n_states = len(predictions.chosen.rows)
-    if n_states < _LEAST_STATES:
+    unknown = predictions.chosen.phase_unknown[:, 0]
+    if 2 * n_states - unknown.sum() < 2 * _LEAST_STATES:
         raise ValueError(
-            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, not {n_states}."
+            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, or "
+            f"{2 * _LEAST_STATES} where phases are unknown, not {n_states}."
         )
     bench = Bench(predictions)
     if not np.isfinite(bench.base).all():
@@ -97,6 +101,8 @@ def diagnose_model(
     present = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing
         present |= {"force_gain_error", "sensor_gain_error"}
+    if unknown.all():
+        present |= set(UNSEEN)
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
     if predictions.chosen.noise_stated:
         found = named(bench, scales, kinds)
@@ -106,7 +112,7 @@ def diagnose_model(
             f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
             "radian are taken, which is what the answer leaves; how well it fits is no proof then."
         )
-    bench, fit = found.bench, found.fit
+    bench, fit = found.bench.turned(found.fit), found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
     verdict, reasons = judged(found, noise, noise_std)
@@ -139,7 +145,10 @@ def diagnose_model(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
             "the answer."
         )
-    notes = [*reasons, *notes, *predictions.chosen.notes]
+    chosen = bench.predictions.chosen
+    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
+    lost = what_is_lost(chosen, phase, bench.level_numbers)
+    notes = [*reasons, *notes, *lost, *predictions.chosen.notes]
     shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
     if abs(shift) > _ANOTHER:
         notes.append(
@@ -167,8 +176,8 @@ def diagnose_model(
         blind=blind,
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
-        before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
-        after=bench.weighing.without_shared(fit.rows)[force].reshape(-1, 2),
+        before=_of_force(bench, found.nothing),
+        after=_of_force(bench, fit),
     )
 
 
@@ -180,11 +189,12 @@ def _named_and_noise(
     It begins with what no free curves of amplitude explain, and is never below what neighbouring
     states show.
     """
-    least = max(float(np.sqrt(neighbour_noise(bench, bench.nothing())[0])), _FINEST)
+    nothing = bench.nothing()
+    least = max(float(np.sqrt(neighbour_noise(bench.turned(nothing), nothing)[0])), _FINEST)
     predictions.scale_errors(least)
     bench = Bench(predictions)
     free = located(bench, bench.nothing())
-    factor = float(np.sqrt(max(free.chi_square / free.freedom, 1.0)))
+    factor = float(np.sqrt(max(free.chi_square / max(free.freedom, 1), 1.0)))
     size = least
     for _ in range(_TURNS):
         predictions.scale_errors(factor)
@@ -228,6 +238,15 @@ def _by_amplitude(bench: Bench) -> list[int]:
     speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
     peak = [speed[level == k].max() for k in range(bench.predictions.chosen.n_levels)]
     return [int(k) for k in np.argsort(peak)]
+
+
+def _of_force(bench: Bench, fit: Fit) -> Float[np.ndarray, "state part"]:
+    """What is left of the force, in its two parts or one."""
+    weighing, chosen = bench.weighing, bench.predictions.chosen
+    mine = weighing.column < 2
+    left = np.full((len(chosen.rows), 2), np.nan)
+    left[weighing.state[mine], weighing.column[mine]] = weighing.without_shared(fit.rows)[mine]
+    return left[np.unique(weighing.state[mine])]
 
 
 def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:

@@ -1,12 +1,12 @@
 """Misfits in units of noise, with everything shared or stated marginalised, and fits to them."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
@@ -17,7 +17,6 @@ from snrmjax.diagnose.predictions import (
     Measured,
     Predicted,
     Predictions,
-    whitened_states,
 )
 from snrmjax.identify.calibration_states import whitened
 from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
@@ -152,9 +151,10 @@ class Bench:
         directions[0, group.place(f"mode_{j}.damping_ratio"), -1] = 1.0
         found = predictions.of(group, group.values[None], directions)
         self._columns, self._slopes = found.columns[0], found.slopes[0]
-        self._by_error = predictions.by_error(group, group.values)
+        self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
+        self._by_error, self._phasors = predictions.by_error(group, group.values)
         self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
-        self._weigh(self._by_error + self._of_what_is_missed())
+        self._weigh(self._by_error + self._of_what_is_missed(), self._phasors)
 
     def _of_what_is_missed(self) -> Float[np.ndarray, "state column input"]:
         """What errors of the velocity do to the force that the baseline does not know of.
@@ -167,10 +167,15 @@ class Bench:
         change = np.zeros_like(self._by_error)
         for place, part in ((1, missing), (1 + sensors, 1j * missing)):
             change[:, 0, place], change[:, 1, place] = part.real, part.imag
-        return change
+        known = np.asarray(self.predictions.chosen.states.known)
+        return np.where(known[:, :, None], change, 0.0)
 
-    def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
-        measured = whitened_states(self.predictions.chosen, by_error)
+    def _weigh(
+        self,
+        by_error: Float[np.ndarray, "state column input"],
+        phasors: Complex[np.ndarray, "state part"],
+    ) -> None:
+        measured = self.predictions.weighed(by_error, phasors)
         model = self.model
         levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
         std = np.array([float(value) for value in (*levels, model.level_damping_std)])
@@ -184,7 +189,30 @@ class Bench:
 
     def reweighed(self, fit: "Fit") -> "Bench":
         """The same with the errors passed on as the fitted model passes them."""
-        change = np.zeros_like(self._by_error)
+        by_error, phasors = self._by_error.copy(), self._phasors.copy()
+        for group, values in self._as_fitted(fit):
+            own, seen = self.predictions.by_error(group, values)
+            for total, change in (
+                (by_error, own - self._by_error),
+                (phasors, seen - self._phasors),
+            ):
+                total += np.where(np.isfinite(change), change, 0.0)
+        other = copy.copy(self)
+        other._weigh(by_error, phasors)
+        return other
+
+    def turned(self, fit: "Fit") -> "Bench":
+        """The same with velocities of unknown phase where a fit has them."""
+        force = self.force.copy()
+        for group, values in self._as_fitted(fit):
+            own = self.predictions.of(group, values[None], np.zeros((1, len(values), 0)))
+            force += own.phasors[0, :, 0] - self.force
+        other = copy.copy(self)
+        other.predictions = self.predictions.turned(-np.angle(force))
+        return other
+
+    def _as_fitted(self, fit: "Fit") -> Iterator[tuple[Group, Float[np.ndarray, " parameter"]]]:
+        """The structures that have a fit's kinds, and their parameters."""
         left = list(dict.fromkeys(fit.kinds))
         while left:
             group = self.predictions.group(max(left, key=self.predictions.is_apart))
@@ -194,10 +222,7 @@ class Bench:
                     values[group.place(label)] = value
             inside = [kind for kind in left if parameter_labels(kind)[0] in group.names]
             left = [kind for kind in left if kind not in inside]
-            change += self.predictions.by_error(group, values) - self._by_error
-        other = copy.copy(self)
-        other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
-        return other
+            yield group, values
 
     @property
     def n_rows(self) -> int:
