@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose.amplitudes import UNSEEN, what_is_lost
-from snrmjax.diagnose.candidates import SECOND_ORDER, Scales, candidate, decide_by
+from snrmjax.diagnose.candidates import SECOND_ORDER, Candidate, Scales, candidate, decide_by
 from snrmjax.diagnose.doubts import Doubt, doubts
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
@@ -27,6 +27,7 @@ from snrmjax.model.structure import Structure
 _LEAST_STATES = 6
 _ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
+_TRIALS = 4  # of a limit
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
 
 
@@ -162,7 +163,7 @@ def diagnose_model(
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
         candidates=found.classes if verdict != "none" else (),
-        decide_by=_decide_by(unclear, open_ends, harmonics=harmonics),
+        decide_by=_decide_by(unclear, open_ends, harmonics=harmonics, phases=not unknown.any()),
         located=free.parts,
         parameters=values,
         gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
@@ -206,8 +207,12 @@ def _named_and_noise(
     return found, size
 
 
-def _decide_by(unclear: set[str], open_ends: list[Doubt], *, harmonics: bool) -> str | None:
+def _decide_by(
+    unclear: set[str], open_ends: list[Doubt], *, harmonics: bool, phases: bool
+) -> str | None:
     sentences = [decide_by(unclear, harmonics=harmonics)] if unclear else []
+    if unclear and not phases:
+        sentences.insert(0, "Record the phase of the velocity relative to the force.")
     sentences += [f"{d.decide_by[0].upper()}{d.decide_by[1:]}." for d in open_ends]
     return " ".join(sentences) or None
 
@@ -277,8 +282,25 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
         need = DETECTED + len(tried.unit) * np.log(bench.n_rows)
         power = 4 if kind in SECOND_ORDER and not bench.predictions.chosen.orders else 2
         name = f"{kind}.{effect_parameters(kind)[0]}"
-        limits[name] = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+        limit = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+        limits[name] = _tried(bench, tried, limit, need)
     return limits
+
+
+def _tried(bench: Bench, one: Candidate, limit: float, need: float) -> float:
+    """A limit as trials at it correct it where sizes are compared: they are not linear in it."""
+    if not bench.predictions.sizes.alone.any():
+        return limit
+    first, *shape = one.starts[0]
+    for _ in range(_TRIALS):
+        start = (float(np.copysign(limit, first)), *shape)
+        rows = bench.at_start(one._replace(starts=(start,))).rows
+        square = bench.chi_square(rows - bench.base)
+        if not 0 < square < np.inf:
+            break
+        # χ² grows with a power between the second and the fourth.
+        limit *= float(np.clip(need / square, 0.01, 100.0)) ** (1 / 3)
+    return limit
 
 
 def _completed(
