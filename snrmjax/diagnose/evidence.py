@@ -142,6 +142,16 @@ class Bench:
         self.predictions = predictions
         self.model = predictions.model
         group = predictions.group(PLAIN)
+        found = self._by_baseline(group, group.values)
+        self._columns, self._slopes = found.columns[0], found.slopes[0]
+        self._baseline_slopes = self._slopes
+        self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
+        self._by_error, self._phasors = predictions.by_error(group, group.values)
+        self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
+        self._weigh(self._by_error + self._of_what_is_missed(), self._phasors)
+
+    def _by_baseline(self, group: Group, values: Float[np.ndarray, " parameter"]) -> Predicted:
+        """With slopes by the baseline's parameters, times 1σ, and by the linear mode's two."""
         names = _baseline_names(self.model)
         directions = np.zeros((1, len(group.names), len(names) + 2))
         for k, name in enumerate(names):
@@ -149,12 +159,7 @@ class Bench:
         j = self.model.modes.mode_of_interest + 1
         directions[0, group.place(f"mode_{j}.natural_frequency"), -2] = 1.0
         directions[0, group.place(f"mode_{j}.damping_ratio"), -1] = 1.0
-        found = predictions.of(group, group.values[None], directions)
-        self._columns, self._slopes = found.columns[0], found.slopes[0]
-        self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
-        self._by_error, self._phasors = predictions.by_error(group, group.values)
-        self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
-        self._weigh(self._by_error + self._of_what_is_missed(), self._phasors)
+        return self.predictions.of(group, values[None], directions)
 
     def _of_what_is_missed(self) -> Float[np.ndarray, "state column input"]:
         """What errors of the velocity do to the force that the baseline does not know of.
@@ -188,16 +193,21 @@ class Bench:
         self.by_linear = self.weighing.noise_units(linear).T
 
     def reweighed(self, fit: "Fit") -> "Bench":
-        """The same with the errors passed on as the fitted model passes them."""
-        by_error, phasors = self._by_error.copy(), self._phasors.copy()
+        """The same with the errors passed on as the fitted model passes them.
+
+        Those of the baseline too where sizes are compared: there it matters in which phase the
+        fitted model needs its force.
+        """
+        known = (self._by_error, self._phasors, self._baseline_slopes)
+        totals = [part.copy() for part in known]
         for group, values in self._as_fitted(fit):
-            own, seen = self.predictions.by_error(group, values)
-            for total, change in (
-                (by_error, own - self._by_error),
-                (phasors, seen - self._phasors),
-            ):
-                total += np.where(np.isfinite(change), change, 0.0)
+            own = [*self.predictions.by_error(group, values)]
+            if self.predictions.sizes.alone.any():
+                own.append(self._by_baseline(group, values).slopes[0])
+            for total, part, new in zip(totals, known, own, strict=False):
+                total += np.where(np.isfinite(new - part), new - part, 0.0)
         other = copy.copy(self)
+        by_error, phasors, other._slopes = totals
         other._weigh(by_error, phasors)
         return other
 

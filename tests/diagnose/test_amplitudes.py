@@ -8,7 +8,6 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from .test_diagnosis import HERE, KEYS, balanced, files, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.cli import diagnose
@@ -20,6 +19,8 @@ from snrmjax.diagnose.predictions import Predictions
 from snrmjax.identify.calibration import calibrate_model
 from snrmjax.identify.needed_force import needed_force
 from snrmjax.model.effects import EFFECTS
+
+from .test_diagnosis import HERE, KEYS, balanced, files, linear_model, quadratic
 
 
 def without_phases(data, rows=slice(None), seed=0):
@@ -77,7 +78,7 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
         assert not np.any(unknown.columns[:, :, 1])
         # It has strength at all, but for what acts on phases or on harmonics not seen here.
         change = np.abs(unknown.columns - none.of(none.group(kind), *nothing(none, kind)).columns)
-        assert (np.max(change) < 1e-9) == (kind == "sensor_phase_error"), kind
+        assert (np.max(change) < 1e-6) == (kind == "sensor_phase_error"), kind
 
 
 def nothing(predictions, kind):
@@ -126,18 +127,16 @@ def test_errors_are_passed_on_to_sizes():
     predictions = Predictions(model, without_phases(data))
     group = predictions.group("cubic_stiffness")
     slopes, _ = predictions.by_error(group, group.values)
-    louder = 1 + 1e-4
-    changed = dataclasses.replace(
-        without_phases(data), velocity=louder * without_phases(data).velocity
+    data, step = without_phases(data), 1e-3
+    louder, softer = (
+        Predictions(model, dataclasses.replace(data, velocity=np.exp(sign * step) * data.velocity))
+        for sign in (1, -1)
     )
-    again = Predictions(model, changed)
-    base, moved = (
-        p.of(group, *nothing(p, "cubic_stiffness")).columns[0] for p in (predictions, again)
-    )
+    ends = [p.of(group, *nothing(p, "cubic_stiffness")).columns[0, :, 0] for p in (louder, softer)]
+    slope = (ends[0] - ends[1]) / (2 * step)
     # The force's size grows with the velocity, and more where the stiffness is cubic.
-    np.testing.assert_allclose(
-        slopes[:, 0, 1], (moved - base)[:, 0] / np.log(louder), rtol=0, atol=1e-3
-    )
+    # Central differences are off by the square of the step.
+    np.testing.assert_allclose(slopes[:, 0, 1], slope, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(slopes[:, 0, 0], -1.0, atol=1e-12)
     assert not np.any(slopes[:, :, 2])
 
@@ -170,6 +169,7 @@ def test_the_hidden_damping_is_named_without_phases():
     assert np.degrees(np.abs(turned - measured)).max() < 4  # 0.7° of noise, and the model's own
 
 
+@pytest.mark.long
 def test_an_error_of_the_phase_cannot_be_seen_without_phases():
     found, key = stripped("blind_09")
     assert key["effects"] == ["sensor_phase_error"]
@@ -215,7 +215,7 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     model, data = files("blind_03")
     bench = Bench(Predictions(model, without_phases(data)))
     one = candidate("linear_damping_change", scales_of(bench.predictions))
-    limit = limits["linear_damping_change.relative_change"]
+    limit = limits[parameter_labels("linear_damping_change")[0]]
     rows = bench.at_start(one._replace(starts=((limit,),))).rows
     need = 10.0 + np.log(bench.n_rows)
     assert bench.chi_square(rows - bench.base) == pytest.approx(need, rel=0.1)
