@@ -26,12 +26,21 @@ def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
     """Variance of the force's misfit as second differences along every level show it, and 1σ.
 
     What varies smoothly from state to state, explained or not, does not enter; what baseline and
-    levels may have in common is taken out first.
+    levels may have in common is taken out first. Where phases are those of the fit, which may be
+    wrong, the order of the test counts too: noise is smooth in neither.
     """
     left = bench.weighing.without_shared(fit.rows)
+    unsure = bench.predictions.chosen.phase_unknown.any()
+    return min(_scatter(bench, left, of_test=k) for k in ((False, True) if unsure else (False,)))
+
+
+def _scatter(
+    bench: Bench, left: Float[np.ndarray, " row"], *, of_test: bool
+) -> tuple[float, float]:
+    """Variance from second differences in an order of the states, and 1σ."""
     squares = [
         (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
-        for some in _along(bench, left)
+        for some in _along(bench, left, of_test=of_test)
         if len(some) > 2
     ]
     if not squares:

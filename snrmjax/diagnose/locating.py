@@ -62,6 +62,8 @@ def located(bench: Bench, base: Fit) -> FreeFit:
     together = _curves(bench, rows, hats, [0, 1])
     fits = [force.fitted(together, start) for start in starts]
     free, values, covariance = min(fits, key=lambda fit: fit[0])
+    if np.any(together.weight > 0):  # sizes bend: what curves of few knots leave is doubt as well
+        covariance = covariance * max(free / max(int(of_force.sum()) - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
         p_value = unlikely(alone[1 - k][0] - free, _FREE)
