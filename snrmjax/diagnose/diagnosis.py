@@ -134,7 +134,8 @@ def diagnose_model(
         inner, outer = (
             held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
         )
-        missed = not_foretold(inner, outer, doubted=not all(d.twin for d in open_ends))
+        doubted, missing = not all(d.twin for d in open_ends), bool(unknown.any())
+        missed = not_foretold(inner, outer, doubted=doubted, parts_missing=missing)
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
         for place in places if fit.kinds else ():

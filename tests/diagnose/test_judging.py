@@ -154,3 +154,11 @@ def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_gu
     assert neighbour_noise(guessed, fit)[0] == pytest.approx(1.0, abs=0.3)
     # Noise that is larger than stated is so in every order.
     assert neighbour_noise(guessed, fit_to(2 * noise()))[0] == pytest.approx(4.0, rel=0.3)
+
+
+def test_open_parameters_excuse_a_level_foretold_worse_where_parts_are_missing():
+    inner, outer = HeldOut(3, 1.4, 1.8, 1e-6, 0.2), HeldOut(4, 5.0, 1.1, 0.3, 0.5)
+    assert "worse than without" in not_foretold(inner, outer, doubted=False)
+    assert not_foretold(inner, outer, doubted=False, parts_missing=True) is None
+    certain = inner._replace(uncertain_p_value=8e-4)
+    assert not_foretold(certain, outer, doubted=False, parts_missing=True) is not None
