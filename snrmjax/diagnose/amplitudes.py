@@ -142,7 +142,7 @@ def what_is_lost(
     if chosen.orders:
         notes.append(
             "of harmonics the sizes alone are compared: their signs, which tell cubic from van der "
-            "Pol damping and hardening from softening of higher order, are lost."
+            "Pol damping, are lost."
         )
     level = np.asarray(chosen.states.level)
     lacking: dict[str, list[str]] = {"at": [], "off": []}
