@@ -317,6 +317,9 @@ def diagnose(
 
     Writes diagnosis.json, figures, report.html and the completed model.toml; of several files each
     into a folder of its own, with the model of the same name beside the file if there is one.
+
+    Without phases: velocity_m_s, the amplitude of the fundamental, in place of velocity_re_m_s and
+    velocity_im_m_s; or a phase_std_deg of 60 or more. The notes say what is lost.
     """
     several = len(data) > 1
     if len({path.stem for path in data}) < len(data):

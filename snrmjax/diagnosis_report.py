@@ -100,7 +100,7 @@ def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
     for axes, title, misfit in zip(
         grid[0], ("Before", "After"), (diagnosis.before, diagnosis.after), strict=True
     ):
-        size = np.sqrt(np.mean(misfit**2, axis=1))
+        size = np.sqrt(np.nanmean(misfit**2, axis=1))
         marks = axes.scatter(
             frequency, speed / unit.size, c=size, cmap="viridis", vmin=0.0, vmax=_LARGEST, s=34
         )
@@ -205,7 +205,8 @@ def diagnosis_report(
     if diagnosis.decide_by:
         summary.append(("what would decide", diagnosis.decide_by))
     captions = {
-        "residuals": "Misfit of the force of every state. Where the model is right it is 1.",
+        "residuals": "Misfit of the force of every state, of its size alone where the phase is "
+        "unknown. Where the model is right it is 1.",
         "candidates": "Gain of Schwarz's criterion. Right of the dashed line an effect is seen; "
         "orange ones cannot be told from the best.",
         "responses": "Simulated responses under each level's force at resonance.",
@@ -249,8 +250,9 @@ def diagnosis_report(
         table = ReportTable(
             ("level", "force (N)", "measured", "model as given", "completed model"),
             [_resonances(row) for row in foretold],
-            "Resonances: frequency, velocity and, of models, where the branch ends. Levels marked "
-            "with * are foretold by a model that has not seen them.",
+            "Resonances: frequency, velocity and, of models, where the branch ends; measured "
+            "without phases, the state with the largest velocity over force. Levels marked with * "
+            "are foretold by a model that has not seen them.",
         )
         sections.append(Section("Simulated responses", tables=[table], figures=shown))
     limits = sorted(diagnosis.detection_limits.items())

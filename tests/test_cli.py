@@ -294,3 +294,16 @@ def test_diagnose_refuses_too_few_states(files, tmp_path, run_here):
     code, stderr = run_here("diagnose", str(data), "--model", str(model), "--out", str(out))
     assert code == 2
     assert "at least 6" in stderr
+
+
+def test_identify_refuses_amplitudes_alone(files, tmp_path, run_here):
+    model, data = files
+    data.write_text("level,frequency_hz,force_n,velocity_m_s\n1,62,1e-5,0.01\n1,63,1e-5,0.02\n")
+    out = tmp_path / "out"
+    for options in ((), ("--fit", "auto")):
+        command = ("identify", str(data), "--model", str(model), "--out", str(out), *options)
+        code, stderr = run_here(*command)
+        assert code == 2
+        assert "needs the phases" in stderr
+        assert "velocity_m_s" in stderr
+        assert not out.exists()

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.diagnose.amplitudes import UNSEEN, what_is_lost
 from snrmjax.diagnose.candidates import (
     SECOND_ORDER,
+    Candidate,
     Scales,
     candidate,
     decide_by,
@@ -32,6 +34,7 @@ from snrmjax.model.structure import Structure
 _LEAST_STATES = 6
 _ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
+_TRIALS = 4  # of a limit
 _FINEST = 0.03  # of the assumed error: no balance of a few harmonics is better than that
 
 
@@ -65,7 +68,8 @@ class Diagnosis:
     blind: dict[int, Structure]  # completed without having seen a level
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
-    before: Float[np.ndarray, "state part"]  # force misfit over noise, less what states share
+    # Force misfit over noise, less what states share; NaN where the size alone is compared.
+    before: Float[np.ndarray, "state part"]
     after: Float[np.ndarray, "state part"]
 
 
@@ -88,9 +92,11 @@ def diagnose_model(
     """
     predictions = Predictions(model, data, force_gain_std)
     n_states = len(predictions.chosen.rows)
-    if n_states < _LEAST_STATES:
+    unknown = predictions.chosen.phase_unknown[:, 0]
+    if 2 * n_states - unknown.sum() < 2 * _LEAST_STATES:
         raise ValueError(
-            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, not {n_states}."
+            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, or "
+            f"{2 * _LEAST_STATES} where phases are unknown, not {n_states}."
         )
     bench = Bench(predictions)
     if not np.isfinite(bench.base).all():
@@ -103,6 +109,8 @@ def diagnose_model(
     present = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing
         present |= {"force_gain_error", "sensor_gain_error"}
+    if unknown.all():
+        present |= set(UNSEEN)
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
     if predictions.chosen.noise_stated:
         found = named(bench, scales, kinds)
@@ -112,7 +120,7 @@ def diagnose_model(
             f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
             "radian are taken, which is what the answer leaves; how well it fits is no proof then."
         )
-    bench, fit = found.bench, found.fit
+    bench, fit = found.bench.turned(found.fit), found.fit
     free = located(bench, found.nothing)
     noise, noise_std = neighbour_noise(bench, fit)
     verdict, reasons = judged(found, noise, noise_std)
@@ -133,7 +141,8 @@ def diagnose_model(
         inner, outer = (
             held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
         )
-        missed = not_foretold(inner, outer, doubted=not all(d.twin for d in open_ends))
+        doubted, missing = not all(d.twin for d in open_ends), bool(unknown.any())
+        missed = not_foretold(inner, outer, doubted=doubted, parts_missing=missing)
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
         for place in places if fit.kinds else ():
@@ -145,20 +154,24 @@ def diagnose_model(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
             "the answer."
         )
-    notes = [*reasons, *notes, *predictions.chosen.notes]
+    chosen = bench.predictions.chosen
+    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
+    lost = what_is_lost(chosen, phase, bench.level_numbers)
+    notes = [*reasons, *notes, *lost, *predictions.chosen.notes]
     shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
     if abs(shift) > _ANOTHER:
         notes.append(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
             "of another mode?"
         )
-    request = _request(found) if verdict == "ambiguous" else None
+    # Without phases the first thing to measure is these.
+    request = _request(found) if verdict == "ambiguous" and not unknown.any() else None
     force = bench.weighing.column < 2
     return Diagnosis(
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
         candidates=found.classes if verdict != "none" else (),
-        decide_by=_decide_by(found, request, open_ends),
+        decide_by=_decide_by(found, request, open_ends, phases=not unknown.any()),
         located=free.parts,
         parameters=values,
         gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
@@ -172,8 +185,8 @@ def diagnose_model(
         blind=blind,
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
-        before=bench.weighing.without_shared(found.nothing.rows)[force].reshape(-1, 2),
-        after=bench.weighing.without_shared(fit.rows)[force].reshape(-1, 2),
+        before=_of_force(bench, found.nothing),
+        after=_of_force(bench, fit),
     )
 
 
@@ -185,11 +198,12 @@ def _named_and_noise(
     It begins with what no free curves of amplitude explain, and is never below what neighbouring
     states show.
     """
-    least = max(float(np.sqrt(neighbour_noise(bench, bench.nothing())[0])), _FINEST)
+    nothing = bench.nothing()
+    least = max(float(np.sqrt(neighbour_noise(bench.turned(nothing), nothing)[0])), _FINEST)
     predictions.scale_errors(least)
     bench = Bench(predictions)
     free = located(bench, bench.nothing())
-    factor = float(np.sqrt(max(free.chi_square / free.freedom, 1.0)))
+    factor = float(np.sqrt(max(free.chi_square / max(free.freedom, 1), 1.0)))
     size = least
     for _ in range(_TURNS):
         predictions.scale_errors(factor)
@@ -217,11 +231,15 @@ def _request(found: Named) -> Request | None:
     return Request("calibration", decide_by(unclear, harmonics=True)) if too else None
 
 
-def _decide_by(found: Named, request: Request | None, open_ends: list[Doubt]) -> str | None:
+def _decide_by(
+    found: Named, request: Request | None, open_ends: list[Doubt], *, phases: bool
+) -> str | None:
     """What would settle it, in words: of the classes, and of the doubts."""
     groups = [set(group) for group in found.classes if len(group) > 1]
     harmonics = bool(found.bench.predictions.chosen.orders)
     sentences = []
+    if groups and not phases:
+        sentences.append("Record the phase of the velocity relative to the force.")
     if request is None or request.kind == "calibration":
         sentences += [decide_by(set().union(*groups), harmonics=harmonics)] if groups else []
     else:
@@ -265,6 +283,15 @@ def _by_amplitude(bench: Bench) -> list[int]:
     return [int(k) for k in np.argsort(peak)]
 
 
+def _of_force(bench: Bench, fit: Fit) -> Float[np.ndarray, "state part"]:
+    """What is left of the force, in its two parts or one."""
+    weighing, chosen = bench.weighing, bench.predictions.chosen
+    mine = weighing.column < 2
+    left = np.full((len(chosen.rows), 2), np.nan)
+    left[weighing.state[mine], weighing.column[mine]] = weighing.without_shared(fit.rows)[mine]
+    return left[np.unique(weighing.state[mine])]
+
+
 def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:
     if not fit.labels:
         return {}
@@ -293,8 +320,25 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
         need = DETECTED + len(tried.unit) * np.log(bench.n_rows)
         power = 4 if kind in SECOND_ORDER and not bench.predictions.chosen.orders else 2
         name = f"{kind}.{effect_parameters(kind)[0]}"
-        limits[name] = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+        limit = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
+        limits[name] = _tried(bench, tried, limit, need)
     return limits
+
+
+def _tried(bench: Bench, one: Candidate, limit: float, need: float) -> float:
+    """A limit as trials at it correct it where sizes are compared: they are not linear in it."""
+    if not bench.predictions.sizes.alone.any():
+        return limit
+    first, *shape = one.starts[0]
+    for _ in range(_TRIALS):
+        start = (float(np.copysign(limit, first)), *shape)
+        rows = bench.at_start(one._replace(starts=(start,))).rows
+        square = bench.chi_square(rows - bench.base)
+        if not 0 < square < np.inf:
+            break
+        # χ² grows with a power between the second and the fourth.
+        limit *= float(np.clip(need / square, 0.01, 100.0)) ** (1 / 3)
+    return limit
 
 
 def _completed(

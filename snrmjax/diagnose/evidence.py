@@ -1,12 +1,12 @@
 """Misfits in units of noise, with everything shared or stated marginalised, and fits to them."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
@@ -17,7 +17,6 @@ from snrmjax.diagnose.predictions import (
     Measured,
     Predicted,
     Predictions,
-    whitened_states,
 )
 from snrmjax.identify.calibration_states import Selection, whitened
 from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
@@ -145,13 +144,14 @@ class Bench:
         group = predictions.group(PLAIN)
         found = self._by_baseline(group, group.values)
         self._columns, self._slopes = found.columns[0], found.slopes[0]
-        self._plain_slopes = self._slopes
-        self._by_error = predictions.by_error(group, group.values)
+        self._baseline_slopes = self._slopes
+        self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
+        self._by_error, self._phasors = predictions.by_error(group, group.values)
         self._changes: dict[str, np.ndarray] = {}  # columns of every start less the baseline's
-        self._weigh(self._by_error + self._of_what_is_missed())
+        self._weigh(self._by_error + self._of_what_is_missed(), self._phasors)
 
     def _by_baseline(self, group: Group, values: Float[np.ndarray, " parameter"]) -> Predicted:
-        """Columns, and slopes by the baseline's own parameters, its mode's linear ones last."""
+        """With slopes by the baseline's parameters, times 1σ, and by the linear mode's two."""
         names = _baseline_names(self.model)
         directions = np.zeros((1, len(group.names), len(names) + 2))
         for k, name in enumerate(names):
@@ -172,11 +172,16 @@ class Bench:
         change = np.zeros_like(self._by_error)
         for place, part in ((1, missing), (1 + sensors, 1j * missing)):
             change[:, 0, place], change[:, 1, place] = part.real, part.imag
-        return change
+        known = np.asarray(self.predictions.chosen.states.known)
+        return np.where(known[:, :, None], change, 0.0)
 
-    def _weigh(self, by_error: Float[np.ndarray, "state column input"]) -> None:
-        self._passed_on = by_error
-        measured = whitened_states(self.predictions.chosen, by_error)
+    def _weigh(
+        self,
+        by_error: Float[np.ndarray, "state column input"],
+        phasors: Complex[np.ndarray, "state part"],
+    ) -> None:
+        self._passed_on = (by_error, phasors)
+        measured = self.predictions.weighed(by_error, phasors)
         model = self.model
         levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
         std = np.array([float(value) for value in (*levels, model.level_damping_std)])
@@ -193,7 +198,30 @@ class Bench:
 
         Those of the baseline too: what an effect turns or scales, it turns and scales of them.
         """
-        change, slopes = np.zeros_like(self._by_error), np.zeros_like(self._slopes)
+        known = (self._by_error, self._phasors, self._baseline_slopes)
+        totals = [part.copy() for part in known]
+        for group, values in self._as_fitted(fit):
+            slopes = self._by_baseline(group, values).slopes[0]
+            own = (*self.predictions.by_error(group, values), slopes)
+            for total, part, new in zip(totals, known, own, strict=True):
+                total += np.where(np.isfinite(new - part), new - part, 0.0)
+        other = copy.copy(self)
+        by_error, phasors, other._slopes = totals
+        other._weigh(by_error, phasors)
+        return other
+
+    def turned(self, fit: "Fit") -> "Bench":
+        """The same with velocities of unknown phase where a fit has them."""
+        force = self.force.copy()
+        for group, values in self._as_fitted(fit):
+            own = self.predictions.of(group, values[None], np.zeros((1, len(values), 0)))
+            force += own.phasors[0, :, 0] - self.force
+        other = copy.copy(self)
+        other.predictions = self.predictions.turned(-np.angle(force))
+        return other
+
+    def _as_fitted(self, fit: "Fit") -> Iterator[tuple[Group, Float[np.ndarray, " parameter"]]]:
+        """The structures that have a fit's kinds, and their parameters."""
         left = list(dict.fromkeys(fit.kinds))
         while left:
             group = self.predictions.group(max(left, key=self.predictions.is_apart))
@@ -203,19 +231,14 @@ class Bench:
                     values[group.place(label)] = value
             inside = [kind for kind in left if parameter_labels(kind)[0] in group.names]
             left = [kind for kind in left if kind not in inside]
-            change += self.predictions.by_error(group, values) - self._by_error
-            slopes += self._by_baseline(group, values).slopes[0] - self._plain_slopes
-        other = copy.copy(self)
-        other._slopes = self._plain_slopes + np.where(np.isfinite(slopes), slopes, 0.0)
-        other._weigh(self._by_error + np.where(np.isfinite(change), change, 0.0))
-        return other
+            yield group, values
 
     def with_errors(self, chosen: Selection) -> "Bench":
         """The same with the same states under other errors."""
         other, predictions = copy.copy(self), copy.copy(self.predictions)
         predictions.chosen = chosen
         other.predictions = predictions
-        other._weigh(self._passed_on)
+        other._weigh(*self._passed_on)
         return other
 
     @property

@@ -37,6 +37,7 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
     """Force of every level that has a known one, N: at resonance, where its states enclose it.
 
     A test that holds the response changes the force along a level; elsewhere it is their mean.
+    Without phases it is that of the state with the largest velocity over force.
     """
     level, force = np.asarray(data.level), np.asarray(data.force)
     velocity = np.asarray(data.velocity)[:, sensor]
@@ -44,6 +45,9 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
     found = {}
     for number in np.unique(level[good]):
         mine = good & (level == number)
+        if np.asarray(data.phase_unknown)[mine, sensor].any():
+            found[int(number)] = float(force[_largest(data, mine, sensor)])
+            continue
         phase, order = np.angle(velocity[mine]), np.argsort(np.angle(velocity[mine]))
         inside = phase.min() <= 0 <= phase.max()
         own = force[mine]
@@ -66,10 +70,16 @@ def responses(
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
     """By interpolation between the states on both sides; NaN where one side is empty.
 
-    Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least.
+    Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least. Without
+    phases the state with the largest velocity over force is taken, if others enclose it.
     """
     velocity, frequency = np.asarray(data.velocity)[:, sensor], np.asarray(data.frequency)
     mine = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
+    if np.asarray(data.phase_unknown)[mine, sensor].any():
+        top = _largest(data, mine, sensor)
+        if frequency[top] in (frequency[mine].min(), frequency[mine].max()):
+            return Resonance(np.nan, np.nan)
+        return Resonance(float(frequency[top]) / (2 * np.pi), float(abs(velocity[top])))
     velocity, frequency = velocity[mine], frequency[mine]
     phase = np.angle(velocity)
     order = np.argsort(phase)
@@ -80,6 +90,12 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance
     at = np.interp(0.0, np.tan(phase), frequency)
     tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
     return Resonance(float(at) / (2 * np.pi), float(tip))
+
+
+def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
+    """Of some states the one with the largest velocity over force."""
+    ratio = np.abs(np.asarray(data.velocity)[:, sensor]) / np.asarray(data.force)
+    return int(np.argmax(np.where(mine & np.isfinite(ratio), ratio, -np.inf)))
 
 
 def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonance:

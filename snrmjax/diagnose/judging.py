@@ -26,12 +26,21 @@ def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
     """Variance of the force's misfit as second differences along every level show it, and 1σ.
 
     What varies smoothly from state to state, explained or not, does not enter; what baseline and
-    levels may have in common is taken out first.
+    levels may have in common is taken out first. Where phases are those of the fit, which may be
+    wrong, the order of the test counts too: noise is smooth in neither.
     """
     left = bench.weighing.without_shared(fit.rows)
+    unsure = bench.predictions.chosen.phase_unknown.any()
+    return min(_scatter(bench, left, of_test=k) for k in ((False, True) if unsure else (False,)))
+
+
+def _scatter(
+    bench: Bench, left: Float[np.ndarray, " row"], *, of_test: bool
+) -> tuple[float, float]:
+    """Variance from second differences in an order of the states, and 1σ."""
     squares = [
         (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
-        for some in _along(bench, left)
+        for some in _along(bench, left, of_test=of_test)
         if len(some) > 2
     ]
     if not squares:
@@ -122,11 +131,15 @@ def tolerated(noise: float, structure: str | None = None) -> float:
     return float(np.clip(noise, 1.0, _TOLERATED)) if structure is None else 1.0
 
 
-def not_foretold(inner: HeldOut, outer: HeldOut, *, doubted: bool) -> str | None:
+def not_foretold(
+    inner: HeldOut, outer: HeldOut, *, doubted: bool, parts_missing: bool = False
+) -> str | None:
     """Why held-out levels speak against an answer; None where they do not.
 
     Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
-    answer may be an imitation, which is then worth no more than what it foretells.
+    answer may be an imitation, which is then worth no more than what it foretells; with
+    `parts_missing`, of forces of which the size alone is compared, fewer levels leave parameters
+    open, and worse than nothing counts only beyond that.
     """
     for held in (inner, outer):
         if held.uncertain_p_value < UNLIKELY / 2:
@@ -134,7 +147,8 @@ def not_foretold(inner: HeldOut, outer: HeldOut, *, doubted: bool) -> str | None
                 f"level {held.level}, left out, is missed by {held.after:.2g} times the noise, "
                 "more than the uncertainty of the parameters allows: the law is another one."
             )
-    if inner.after > inner.before and inner.p_value < UNLIKELY:
+    chance = inner.uncertain_p_value if parts_missing else inner.p_value
+    if inner.after > inner.before and chance < UNLIKELY:
         return (
             f"level {inner.level}, left out, is foretold worse than without the effects: "
             f"{inner.after:.2g} times the noise, {inner.before:.2g} before."

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 
@@ -13,6 +13,7 @@ _P_VALUE = 1e-3
 _STEP = 0.01
 _POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
 _TELLING = 16.0  # of χ², that a power must explain before it is told
+_STEPS, _SETTLED = 30, 0.02  # of a fit of curves to sizes, and the change of χ² that ends it
 _STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
@@ -40,7 +41,11 @@ class FreeFit(NamedTuple):
 
 
 def located(bench: Bench, base: Fit) -> FreeFit:
-    """Fit free curves of stiffness and damping to the force, and judge every part by itself."""
+    """Fit free curves of stiffness and damping to the force, and judge every part by itself.
+
+    Where sizes alone are compared, states off resonance tell the stiffness and those near it the
+    damping: a part that hides behind the other is not told.
+    """
     weighing, states = bench.weighing, bench.predictions.states
     speed = np.abs(states[4][:, 0])
     of_force = weighing.column < 2
@@ -48,15 +53,20 @@ def located(bench: Bench, base: Fit) -> FreeFit:
     knots = np.quantile(amplitude, np.linspace(0, 1, _FREE))
     knots = knots + 1e-9 * np.arange(_FREE)
     hats = np.stack([np.interp(amplitude, knots, row) for row in np.eye(_FREE)], axis=1)
-    both = [bench.by_linear[:, [k]] * hats[weighing.state] for k in range(2)]
     rows = np.where(of_force, base.rows, 0.0)
     force = _Rows(bench, of_force)
     nothing = force.chi_square(rows, np.zeros((len(rows), 0)))[0]
-    free, values, covariance = force.chi_square(rows, np.concatenate(both, axis=1))
+    both = [_curves(bench, rows, hats, [k]) for k in range(2)]
+    alone = [force.fitted(curves, np.zeros(_FREE)) for curves in both]
+    starts = (np.append(alone[0][1], np.zeros(_FREE)), np.append(np.zeros(_FREE), alone[1][1]))
+    together = _curves(bench, rows, hats, [0, 1])
+    fits = [force.fitted(together, start) for start in starts]
+    free, values, covariance = min(fits, key=lambda fit: fit[0])
+    if np.any(together.weight > 0):  # sizes bend: what curves of few knots leave is doubt as well
+        covariance = covariance * max(free / max(int(of_force.sum()) - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
-        without = force.chi_square(rows, both[1 - k])[0]
-        p_value = unlikely(without - free, _FREE)
+        p_value = unlikely(alone[1 - k][0] - free, _FREE)
         if p_value < _P_VALUE:
             own = slice(k * _FREE, (k + 1) * _FREE)
             parts.append(
@@ -94,6 +104,39 @@ def located(bench: Bench, base: Fit) -> FreeFit:
     return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
 
 
+class _Curves(NamedTuple):
+    """Rows with free curves on top of the baseline: linear in them, but for sizes."""
+
+    rows: Float[np.ndarray, " row"]
+    arms: Float[np.ndarray, "row value"]
+    force: Complex[np.ndarray, " row"]  # the model's, over the measured one
+    by_value: Complex[np.ndarray, "row value"]
+    weight: Float[np.ndarray, " row"]  # of the force's size where that alone is compared; else 0
+
+    def at(self, values: Float[np.ndarray, " value"]) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and slopes."""
+        rows, force = self.rows + self.arms @ values, self.force + self.by_value @ values
+        size, alone = np.abs(force), self.weight > 0
+        unit = force.conj() / np.where(size > 0, size, 1.0)
+        arms = self.weight[:, None] * np.real(unit[:, None] * self.by_value)
+        of_size = self.weight * (size - 1)
+        return np.where(alone, of_size, rows), np.where(alone[:, None], arms, self.arms)
+
+
+def _curves(bench: Bench, rows: np.ndarray, hats: np.ndarray, parts: list[int]) -> _Curves:
+    """Curves of stiffness (0) or damping (1), or of both."""
+    weighing = bench.weighing
+    state, hats = weighing.state, hats[weighing.state]
+    alone = bench.predictions.sizes.alone[state, 0] & (weighing.column == 0)
+    return _Curves(
+        rows,
+        np.concatenate([bench.by_linear[:, [k]] * hats for k in parts], axis=1),
+        bench.force[state],
+        np.concatenate([bench.force_by_linear[state][:, [k]] * hats for k in parts], axis=1),
+        np.where(alone, weighing.whiten[state, 0, 0], 0.0),
+    )
+
+
 class _Rows:
     """Least squares on some of the rows."""
 
@@ -114,6 +157,31 @@ class _Rows:
         values = -inverse @ ((arms / size).T @ left)
         left = left + (arms / size) @ values
         return float(left @ left), values / size, inverse / np.outer(size, size)
+
+    def fitted(
+        self, curves: _Curves, start: Float[np.ndarray, " value"]
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """χ², values and their covariance; Levenberg–Marquardt from a start where sizes count."""
+        if not np.any(curves.weight > 0):
+            return self.chi_square(curves.rows, curves.arms)
+        values, damping = start, 1e-3
+        rows, slopes = curves.at(values)
+        left = self.root @ rows[self.keep]
+        for _ in range(_STEPS):
+            arms = self.root @ slopes[self.keep]
+            size = np.linalg.norm(arms, axis=0)
+            size = np.where(size > 0, size, 1.0)
+            matrix = (arms / size).T @ (arms / size) + damping * np.eye(len(size))
+            moved = values - np.linalg.solve(matrix, (arms / size).T @ left) / size
+            new_rows, new_slopes = curves.at(moved)
+            new = self.root @ new_rows[self.keep]
+            gained = float(left @ left - new @ new)
+            if gained > 0:
+                values, rows, slopes, left = moved, new_rows, new_slopes, new
+            damping *= 0.1 if gained > 0 else 10.0
+            if 0 < gained < _SETTLED or damping > 1e6:
+                break
+        return float(left @ left), values, self.chi_square(rows, slopes)[2]
 
 
 def _range(

@@ -18,6 +18,7 @@ _ONE = 2  # parameters of one effect; one with more is weighed against two effec
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
+_SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 
 
 class Row(NamedTuple):
@@ -137,7 +138,8 @@ def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[C
     others = [c for kind, c in every.items() if kind not in before.kinds]
     changes = [foretold(bench, c, before) for c in others]
     changes.sort(key=lambda pair: -pair[0])
-    least = max(_WORTH, _SHARE * max((gain for gain, _ in changes), default=0.0))
+    share = _SHARE_OF_SIZES if bench.predictions.sizes.alone.any() else _SHARE
+    least = max(_WORTH, share * max((gain for gain, _ in changes), default=0.0))
     worth = [_WORTH if n < _TRIED else least for n in range(len(changes))]
     return [c for (gain, c), need in zip(changes, worth, strict=True) if gain > need]
 

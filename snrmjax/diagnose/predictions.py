@@ -4,15 +4,17 @@ Effects stand in a structure without strength, so that one program answers for m
 a candidate is a vector of parameters.
 """
 
+import copy
 import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose import programs
+from snrmjax.diagnose.amplitudes import sizes_of
 from snrmjax.identify.calibration_states import (
     CalibrationStates,
     Selection,
@@ -49,11 +51,15 @@ class Predicted(NamedTuple):
     """Columns of all states for several trials, and their derivatives along given directions.
 
     NaN where no motion was found. A column is what is missed of the force, relative to the
-    measured one, or of a harmonic, relative to the measured velocity: real and imaginary parts.
+    measured one, or of a harmonic, relative to the measured velocity: real and imaginary parts, or
+    the size and nothing where the phase is unknown. The phasors are what the model has, and are
+    relative to a velocity of unknown phase.
     """
 
     columns: Float[np.ndarray, "trial state column"]
     slopes: Float[np.ndarray, "trial state column direction"]
+    phasors: Complex[np.ndarray, "trial state part"]
+    force_slopes: Complex[np.ndarray, "trial state direction"]
 
 
 class Measured(NamedTuple):
@@ -78,7 +84,10 @@ class Predictions:
         self.model = dataclasses.replace(model, name="")
         self.chosen = calibration_states(model, data, programs.HARMONICS)
         self.held = (self.chosen.sensors, self.chosen.orders, programs.HARMONICS)
-        self.states: list[np.ndarray] = [np.asarray(part) for part in self.chosen.states]
+        self.sizes = sizes_of(self.chosen)
+        # Of a phasor whose size alone counts the programs give both parts.
+        both = jnp.repeat(self.chosen.states.known[:, ::2], 2, axis=1)
+        self.states = [np.asarray(p) for p in self.chosen.states._replace(known=both)]
         self.level_numbers = np.asarray(data.level)[self.chosen.rows]
         self.force_gain_std = force_gain_std
         self._groups: dict[str, Group] = {}
@@ -108,7 +117,26 @@ class Predictions:
         """Take all errors of force, velocities and phases so many times larger."""
         states = self.chosen.states
         self.chosen = self.chosen._replace(states=states._replace(error=factor * states.error))
-        self.states = [np.asarray(part) for part in self.chosen.states]
+
+    def turned(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
+        """The same with velocities of unknown phase at these phases, rad."""
+        states, unknown = self.chosen.states, self.chosen.phase_unknown[:, :1]
+        turn = np.where(unknown, np.exp(1j * phase)[:, None], 1.0)
+        other = copy.copy(self)
+        other.chosen = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
+        return other
+
+    def weighed(
+        self,
+        by_error: Float[np.ndarray, "state column input"],
+        phasors: Complex[np.ndarray, "state part"],
+    ) -> Measured:
+        """The states with the whitening of a model that passes errors on so and has the phasors."""
+        chosen = self.chosen
+        if self.sizes.alone.any():
+            own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
+            chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
+        return whitened_states(chosen, by_error)
 
     def is_apart(self, kind: str) -> bool:
         """Whether a kind has a program of its own."""
@@ -140,20 +168,28 @@ class Predictions:
             )
             for begin in range(0, max(wanted, 1), _DIRECTIONS)
         ]
-        slopes = np.concatenate([slope for _, slope in parts], axis=3)
-        return Predicted(parts[0][0], slopes[..., :wanted])
+        slopes = np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
+        columns, phasors = parts[0][0], self.sizes.phasors(parts[0][0])
+        force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
+        return Predicted(*self.sizes.compared(columns, slopes), phasors, force_slopes)
 
     def by_error(
         self, group: Group, values: Float[np.ndarray, " parameter"]
-    ) -> Float[np.ndarray, "state column input"]:
-        """Derivatives by the states' errors, as a model with these parameters passes them on."""
+    ) -> tuple[Float[np.ndarray, "state column input"], Complex[np.ndarray, "state part"]]:
+        """Derivatives by the states' errors, as a model with these parameters passes them on.
+
+        Returns the model's phasors too.
+        """
         inputs = self.states[6].shape[1]
         none = np.zeros((1, len(values), _DIRECTIONS))
-        slopes = [
-            self._answers(group, values[None], none, _filled(some))[1][0]
+        parts = [
+            self._answers(group, values[None], none, _filled(some))
             for some in np.split(np.eye(inputs), range(_DIRECTIONS, inputs, _DIRECTIONS), axis=1)
         ]
-        return np.concatenate(slopes, axis=2)[:, :, :inputs]
+        slopes = np.concatenate([slope for _, slope in parts], axis=3)[..., :inputs]
+        columns = parts[0][0]
+        found = self.sizes.compared(columns, slopes, of_errors=True)[1]
+        return found[0], self.sizes.phasors(columns)[0]
 
     def _answers(
         self,

@@ -14,7 +14,8 @@ def acts_both_ways(bench: Bench, fit: Fit, kind: str) -> bool:
 
     Where it does, its force c|q̇|ⁿ⁻¹q̇ has an even part c|q̇|ⁿ beside it (n = 2 or 3).
     """
-    if kind not in DIRECTED or 2 not in bench.predictions.chosen.orders:
+    chosen = bench.predictions.chosen
+    if kind not in DIRECTED or 2 not in chosen.orders or chosen.phase_unknown.any():
         return False
     share, std = even_share(bench, fit, kind)
     return abs(share) < _SEEN * std and abs(share) + _EXCLUDED * std < 1

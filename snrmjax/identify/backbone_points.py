@@ -12,7 +12,7 @@ from snrmjax.identify.points import PointStatus, SnrmPoints, invert_one, invert_
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 AmplitudeArgument = Literal["displacement", "velocity"]
@@ -87,8 +87,8 @@ def identify_points(
     is the paper's choice. `measure` is the amplitude put into Eq. (12): of the fundamental, or
     the peak of the time signal with all measured harmonics.
     Returns `BackbonePoints`; every state has a status and NaN where there is no answer.
-    Raises `ValueError` when the peak is asked for without harmonics, when the force is unknown,
-    or when the sensors are not those of the modes.
+    Raises `ValueError` when the peak is asked for without harmonics, when the force or a phase is
+    unknown, or when the sensors are not those of the modes.
     Reference: Kwarta & Allen, section 2.2; the displacement argument is this package's own.
     """
     if data.sensors != modes.sensors:
@@ -101,6 +101,7 @@ def identify_points(
         raise ValueError(f'`measure` must be "fundamental" or "peak", not {measure!r}.')
     if data.n_states == 0:
         raise ValueError("`data` has no steady states.")
+    check_phases(data, "an identification")
     if not bool(jnp.any(jnp.isfinite(data.force))):
         raise ValueError(
             "the force is unknown (only a drive voltage is given): calibrate it first, with "

@@ -25,7 +25,7 @@ from snrmjax.identify.calibration_states import (
     whitened,
 )
 from snrmjax.identify.needed_force import held_state, missed_columns
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
     parameter_value,
@@ -145,7 +145,7 @@ def calibrate_model(
     named in the notes. Where errors of velocity are not stated for all states, equal relative ones
     are taken for all and their size found from the residuals.
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
-    unknown force, for levels' errors below zero and for too few data.
+    unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
     an internal resonance several motions have one fundamental; the one that grows from small
     amplitudes is taken.
@@ -156,6 +156,7 @@ def calibrate_model(
     for name, value in level_std.items():
         if not 0 <= value < np.inf:
             raise ValueError(f"`level_{name}_std` must be zero or positive, but is {value}.")
+    check_phases(data, "a calibration")
     chosen = calibration_states(model, data, harmonic_order)
     shared = tuple(name for name, value in level_std.items() if value > 0)
     picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)

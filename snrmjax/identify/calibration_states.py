@@ -43,6 +43,7 @@ class Selection(NamedTuple):
     n_levels: int
     sensors: tuple[int, ...]  # in the order of the states' sensors
     orders: tuple[int, ...]  # harmonics that are compared
+    phase_unknown: Bool[np.ndarray, "state sensor"]
     noise_stated: bool
     notes: tuple[str, ...]
 
@@ -51,7 +52,9 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     """The states that the reference sensor measured under a known force.
 
     Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
-    compared where their error is stated.
+    compared where their error is stated. A velocity of unknown phase, and its harmonics, are real
+    and positive, and the imaginary part of what they are compared by is not known; where it is
+    that of the reference sensor, the phases of the whole state count as unknown.
     Raises `ValueError` for sensors other than the model's and where no force is known.
     """
     if data.sensors != model.modes.sensors:
@@ -83,11 +86,18 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     harmonics = np.asarray(data.harmonics)[rows][:, sensors][..., places]
     std = np.asarray(data.harmonic_std)[rows][:, sensors] / np.abs(velocity[:, :1])
     there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
+    unknown = np.asarray(data.phase_unknown)[rows][:, sensors]
+    unknown = measured & (unknown | unknown[:, :1])
+    velocity = np.where(unknown, np.abs(velocity), velocity)
+    harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
+    errors[..., 2] = np.where(unknown, 0.0, errors[..., 2])
     if places and not there.any():
         notes.append("harmonics are left out: no error is stated for them.")
         harmonics, there, places = harmonics[..., :0], there[..., :0], []
     n = len(rows)
-    known = [np.ones((n, 1), dtype=bool), measured[:, 1:], there.reshape(n, -1)]
+    real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], there.reshape(n, -1)], axis=1)
+    alone = [unknown, np.repeat(unknown, len(places), axis=1)]
+    known = np.stack([real, real & ~np.concatenate(alone, axis=1)], axis=2).reshape(n, -1)
     # Each part of a complex error has half its square.
     own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
     order = np.asarray(data.order)[rows]
@@ -101,10 +111,11 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
         harmonics=jnp.asarray(np.where(there, harmonics, 0.0)),
         error=jnp.asarray(np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1)),
         own_std=jnp.asarray(np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1)),
-        known=jnp.asarray(np.repeat(np.concatenate(known, axis=1), 2, axis=1)),
+        known=jnp.asarray(known),
     )
     orders = tuple(data.harmonic_order[k] for k in places)
-    return Selection(parts, rows, len(levels), tuple(sensors), orders, stated, tuple(notes))
+    own_places = (tuple(sensors), orders, unknown)
+    return Selection(parts, rows, len(levels), *own_places, stated, tuple(notes))
 
 
 @compiled

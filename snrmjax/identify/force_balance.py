@@ -17,7 +17,7 @@ from jaxtyping import Array, Complex, Float, Int
 from snrmjax.identify.backbone_points import mistrust, modal_filter, relative_errors
 from snrmjax.identify.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.simulate.compiled import compiled
 
@@ -76,7 +76,9 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     off resonance (`mistrust`); the fit then finds its size. Without an error of the force a state
     near a fold would be exact in one direction, since amplitude and phase there move the balance
     in the other: a force of which no error is stated gets a tenth of the velocity's.
+    Raises `ValueError` where phases are unknown.
     """
+    check_phases(data, "a joint fit")
     r = reference_sensor(modes)
     stated = relative_errors(data)
     combined, share, std, _ = modal_filter(data, modes, r, data.velocity, stated)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibration_states import CalibrationStates, calibration_states
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import mapped
 from snrmjax.simulate.compiled import compiled
@@ -34,7 +34,7 @@ def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 
 
     Returns a `NeededForce`, NaN where no motion was found and for states that the reference sensor
     did not measure. It is the measured force where model and measurement are right.
-    Raises `ValueError` for sensors other than the model's and for an unknown force.
+    Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj
     >>> linear = sj.structure(sj.linear_modes([500.0], [0.01], [[2.0]], [3.0]))
@@ -42,6 +42,7 @@ def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 
     >>> needed_force(linear, data).force.round(6)
     Array([1.5+0.j], dtype=complex128)
     """
+    check_phases(data, "a needed force")
     chosen = calibration_states(model, data, harmonic_order)
     found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
     n, rows = data.n_states, chosen.rows

@@ -8,6 +8,12 @@ from snrmjax.io.files import near_miss, shown, suggestion
 REQUIRED = ("level", "frequency_hz", "velocity_re_m_s", "velocity_im_m_s")
 """Columns that every table has, beside `force_n` or `drive_v`."""
 
+PHASOR = ("velocity_re_m_s", "velocity_im_m_s")
+"""Those of the fundamental."""
+
+AMPLITUDE = "velocity_m_s"
+"""The amplitude of the fundamental: in place of both parts of the phasor, and only then."""
+
 FORCES = ("force_n", "drive_v")
 """Columns of which a table has exactly one."""
 
@@ -98,6 +104,8 @@ def read_header(names: list[str], file: str) -> Header:
         else:
             position[name] = k
     used = {name: k for name, k in position.items() if name in KNOWN or _HARMONIC.fullmatch(name)}
+    if AMPLITUDE in position and not any(name in position for name in PHASOR):
+        used[AMPLITUDE] = position[AMPLITUDE]
     further = [name for name in position if name not in used]
     for name in further:
         expected = _misnamed(name)
@@ -117,7 +125,7 @@ def read_header(names: list[str], file: str) -> Header:
 def _require(used: dict[str, int], further: list[str], file: str) -> None:
     """Refuse a header that lacks a column or has both force and drive."""
     for name in REQUIRED:
-        if name not in used:
+        if name not in used and not (name in PHASOR and AMPLITUDE in used):
             raise ValueError(f"{file} lacks the column `{name}`{_instead(name, further)}.")
     forces = [name for name in FORCES if name in used]
     if not forces:
@@ -134,7 +142,7 @@ def _harmonic_orders(used: dict[str, int], file: str) -> tuple[int, ...]:
     """The harmonics of a table, each complete."""
     orders = set()
     for name in used:
-        if name in KNOWN:
+        if name in KNOWN or name == AMPLITUDE:
             continue
         match = _HARMONIC.fullmatch(name)
         order = 0 if match is None or match[1] is None else int(match[1])

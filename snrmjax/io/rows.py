@@ -20,6 +20,7 @@ _RULES: dict[str, tuple[Rule, ...]] = {
     "frequency_hz": (POSITIVE, IN_RANGE_HZ),
     "force_n": (POSITIVE,),
     "drive_v": (POSITIVE,),
+    "velocity_m_s": (POSITIVE,),
     "velocity_std_m_s": (NOT_NEGATIVE,),
     "phase_std_deg": (NOT_NEGATIVE,),
     "force_std_n": (NOT_NEGATIVE,),

@@ -9,11 +9,19 @@ from typing import NamedTuple, SupportsFloat
 import jax
 import numpy as np
 
-from snrmjax.io.columns import FORCES, OPTIONAL, REQUIRED, harmonic_columns, read_header
+from snrmjax.io.columns import (
+    AMPLITUDE,
+    FORCES,
+    OPTIONAL,
+    PHASOR,
+    REQUIRED,
+    harmonic_columns,
+    read_header,
+)
 from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
 from snrmjax.io.rows import Cells, split_rows
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.steady_states import NO_PHASE, SteadyStates, steady_states
 
 
 class TableReading(NamedTuple):
@@ -28,7 +36,9 @@ def read_steady_states(path: FilePath, *, sensors: tuple[str, ...] | None = None
 
     Rows of the same level, frequency, force (or drive voltage) and test order are one state seen
     by several sensors; a sensor that comes again starts a new state. Files are in Hz and degrees,
-    the result is in rad/s and rad. An empty field in an optional column is "not stated".
+    the result is in rad/s and rad. An empty field in an optional column is "not stated". In place
+    of the two parts of the velocity's phasor a table may have `velocity_m_s`, the amplitude of its
+    fundamental: the phases are then unknown (`SteadyStates.phase_unknown`).
 
     Arguments: `sensors` are the model's; without them the sensors are those of the table, in the
     order in which they appear. Returns the steady states, at `sensors` in their order, and one
@@ -61,7 +71,7 @@ def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> TableReading
 def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
     header, file = cells.header, cells.file
     notes = list(header.notes)
-    columns = {name: cells.numbers(name) for name in REQUIRED}
+    columns = {name: cells.numbers(name) for name in REQUIRED if name in header.position}
     for name in FORCES:
         if name in header.position:
             columns[name] = cells.numbers(name)
@@ -76,7 +86,9 @@ def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
                 )
     if "harmonic_std_m_s" in columns and not header.harmonic_order:
         notes.append(f"`harmonic_std_m_s` of {file} is not used: the table has no harmonics.")
-    velocity = _phasors(columns["velocity_re_m_s"], columns["velocity_im_m_s"])
+    if AMPLITUDE in header.position:
+        notes += _without_phases(cells, columns)
+    velocity = _phasors(*(columns[name] for name in PHASOR))
     if not np.any(velocity):
         raise ValueError(f"{file} has nothing but zero velocities.")
 
@@ -119,6 +131,20 @@ def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
         harmonic_order=header.harmonic_order,
     )
     return TableReading(data, tuple(notes))
+
+
+def _without_phases(cells: Cells, columns: dict[str, np.ndarray]) -> list[str]:
+    """Put amplitudes in place of phasors, with phases of which nothing is known; notes on it."""
+    size = cells.numbers(AMPLITUDE)
+    notes = [
+        f"{cells.file} has the amplitude of the velocity alone: its phase is unknown, and that of "
+        "harmonics is not used."
+    ]
+    if "phase_std_deg" in columns:
+        notes.append(f"`phase_std_deg` of {cells.file} is not used: the table has no phases.")
+    columns["phase_std_deg"] = np.full(len(size), NO_PHASE / DEGREE)
+    columns |= dict(zip(PHASOR, (size, np.zeros(len(size))), strict=True))
+    return notes
 
 
 def _harmonic(cells: Cells, columns: Mapping[str, np.ndarray], order: int) -> np.ndarray:

@@ -6,14 +6,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+PHASE_UNKNOWN = np.pi / 3
+"""1σ of a phase, rad, from which on it counts as unknown.
+
+Errors are carried to first order, which at a radian says nothing any more: a velocity at
+resonance would pass for anything from cos 60° of its size on.
+"""
+
+NO_PHASE = np.pi
+"""1σ, rad, that stands for a phase that was not measured."""
+
 
 class SteadyStates(eqx.Module):
     """Steady states, each measured by one or several sensors.
 
     Phasors e^{+iΩt} relative to the force (velocity phase 0 = phase resonance), peak amplitudes.
     A sensor that did not measure a state has `measured` False and velocity 0. A standard
-    deviation that nobody stated is NaN. A force known only as a drive voltage is in `drive`
-    and `force` is NaN.
+    deviation that nobody stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
+    of such a velocity and of its harmonics the amplitudes alone count. A force known only as a
+    drive voltage is in `drive` and `force` is NaN.
     """
 
     level: Int[Array, " state"]
@@ -35,6 +46,11 @@ class SteadyStates(eqx.Module):
     def n_states(self) -> int:
         """Number of steady states."""
         return self.frequency.shape[0]
+
+    @property
+    def phase_unknown(self) -> Bool[Array, "state sensor"]:
+        """Where a velocity was measured whose amplitude alone is known."""
+        return self.measured & (self.phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
 
     def renumbered(self, offset: int) -> "SteadyStates":
         """The same states with `offset` added to their levels, before joining tests."""
@@ -116,6 +132,19 @@ def steady_states(
         harmonic_order=tuple(harmonic_order),
         sensors=tuple(sensors),
     )
+
+
+def check_phases(data: SteadyStates, purpose: str) -> None:
+    """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
+    unknown = np.any(np.asarray(data.phase_unknown), axis=1)
+    if unknown.any():
+        raise ValueError(
+            f"{purpose} needs the phases of all velocities relative to the force, but those of "
+            f"{int(unknown.sum())} of {data.n_states} steady states are unknown (`velocity_m_s` "
+            f"in place of real and imaginary part, or `phase_std_deg` of "
+            f"{np.degrees(PHASE_UNKNOWN):.0f} or more): leave these out; a diagnosis works with "
+            "amplitudes alone."
+        )
 
 
 def join_steady_states(*parts: SteadyStates) -> SteadyStates:

@@ -38,14 +38,13 @@ class HeldMotion(eqx.Module):
     def equations(self, point: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
         """What is left of the balance and of the fundamental."""
         residual = self.balance.residual(self._balance_point(point))
-        return jnp.concatenate([residual - point[-2:] @ self._loads(), self._miss(point)])
+        return jnp.concatenate([residual - self._load(point[-2:]), self._miss(point)])
 
     def linearised(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
         """The equations and their exact Jacobian."""
         residual, jacobian = self.balance.linearised(self._balance_point(point))
-        loads = self._loads()
-        left = jnp.concatenate([residual - point[-2:] @ loads, self._miss(point)])
-        wide = jnp.concatenate([jacobian[:, :-1], -loads.T], axis=1)
+        left = jnp.concatenate([residual - self._load(point[-2:]), self._miss(point)])
+        wide = jnp.concatenate([jacobian[:, :-1], -jax.jacfwd(self._load)(point[-2:])], axis=1)
         return left, jnp.concatenate([wide, jax.jacrev(self._miss)(point)])
 
     def recorded(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
@@ -159,15 +158,18 @@ class HeldMotion(eqx.Module):
     def _balance_point(self, point: Array) -> Array:
         return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)
 
-    def _loads(self) -> Float[Array, "part equation"]:
-        """Scaled loads of the measured force's cosine and sine.
+    def _load(self, parts: Float[Array, " part"]) -> Float[Array, " equation"]:
+        """Scaled load of a force with this cosine and sine.
 
-        A force of another phase turns its harmonics h times as far, to first order.
+        Another phase turns its harmonics h times as far.
         """
         cosine = self.balance.load().reshape(self.balance.n_coefficients, -1)
-        order = jnp.arange(1, self.balance.harmonic_order + 1)[:, None]
-        sine = jnp.zeros_like(cosine).at[2::2].set(order * cosine[1::2])
-        return self.force * jnp.stack([cosine.reshape(-1), sine.reshape(-1)])
+        phasor = self.force * (parts[0] - 1j * parts[1])
+        there = jnp.where(phasor != 0, phasor, 1.0)
+        turned = phasor * jnp.exp(1j * jnp.angle(there) * jnp.arange(self.balance.harmonic_order))
+        load = cosine.at[1::2].multiply(turned.real[:, None])
+        load = load.at[2::2].set(-turned.imag[:, None] * cosine[1::2])
+        return load.at[0].multiply(jnp.abs(there)).reshape(-1)
 
     def _miss(self, point: Array) -> Float[Array, " part"]:
         velocity = self.recorded(point)[1][1, self.sensor]

@@ -59,3 +59,24 @@ def test_the_force_of_a_level_is_that_at_its_resonance():
     assert found == pytest.approx({0: 1.1 * FORCES[0], 1: 1.1 * FORCES[1]})
     aside = states(linear(), (10.0, 40.0))
     assert level_forces(aside) == pytest.approx(dict(enumerate(FORCES)))
+
+
+def test_without_phases_a_resonance_is_the_largest_velocity_over_force():
+    model = linear()
+    known = states(model, phases=(-40.0, -15.0, 5.0, 45.0))
+    blind = dataclasses.replace(
+        known,
+        velocity=np.abs(known.velocity) + 0j,
+        phase_std=np.full(known.velocity.shape, np.pi),
+    )
+    assert level_forces(blind) == dict(enumerate(FORCES))
+    for level, force in enumerate(FORCES):
+        found = measured_resonance(blind, level, 0)
+        # The state 5° off resonance: |V| is that at resonance times cos 5°.
+        tip = SHAPE**2 * force / (2 * ZETA * OMEGA)
+        assert found.velocity == pytest.approx(tip * np.cos(np.radians(5)), rel=1e-9)
+        assert found.frequency == pytest.approx(OMEGA / (2 * np.pi), rel=1e-3)
+    # One side alone says nothing of where the resonance is.
+    side = states(model, phases=(10.0, 30.0, 50.0))
+    side = dataclasses.replace(side, phase_std=np.full(side.velocity.shape, np.pi))
+    assert np.isnan(measured_resonance(side, 0, 0).frequency)

@@ -24,7 +24,7 @@ def fit_to(rows, slopes=None, kinds=()):
     return Fit(kinds, (), values, square, rows, slopes, -bounds, bounds)
 
 
-def bench_of(order=None, shared=None):
+def bench_of(order=None, shared=None, phase_unknown=False):
     """Evidence of states in a given order, with real and imaginary part of the force each."""
     order = np.arange(len(LEVEL)) if order is None else order
     shared = np.zeros((N_ROWS, 0)) if shared is None else shared
@@ -36,6 +36,7 @@ def bench_of(order=None, shared=None):
     chosen = SimpleNamespace(
         states=states, rows=np.arange(len(LEVEL)), n_levels=LEVELS, noise_stated=True
     )
+    chosen.phase_unknown = np.full((len(LEVEL), 1), phase_unknown)
     return SimpleNamespace(
         weighing=Weighing(whiten, known, shared, lower, state, column),
         predictions=SimpleNamespace(chosen=chosen),
@@ -140,3 +141,24 @@ FINE = HeldOut(3, 5.0, 1.0, 0.5, 0.5)
 def test_levels_left_out_speak_against_an_answer(inner, outer, doubted, word):
     reason = not_foretold(inner, outer, doubted=doubted)
     assert reason is None if word is None else word in reason
+
+
+def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_guessed():
+    """Phases of a wrong model shuffle the states: neighbours then differ by more than noise."""
+    shuffled = np.random.default_rng(3).permutation(PER_LEVEL)
+    order = (np.arange(LEVELS)[:, None] * PER_LEVEL + shuffled).reshape(-1)
+    smooth = 5 * np.repeat(np.tile(np.linspace(-1.0, 1.0, PER_LEVEL) ** 2, LEVELS), 2)
+    fit = fit_to(smooth + noise())
+    known, guessed = (bench_of(order, phase_unknown=k) for k in (False, True))
+    assert neighbour_noise(known, fit)[0] > 2
+    assert neighbour_noise(guessed, fit)[0] == pytest.approx(1.0, abs=0.3)
+    # Noise that is larger than stated is so in every order.
+    assert neighbour_noise(guessed, fit_to(2 * noise()))[0] == pytest.approx(4.0, rel=0.3)
+
+
+def test_open_parameters_excuse_a_level_foretold_worse_where_parts_are_missing():
+    inner, outer = HeldOut(3, 1.4, 1.8, 1e-6, 0.2), HeldOut(4, 5.0, 1.1, 0.3, 0.5)
+    assert "worse than without" in not_foretold(inner, outer, doubted=False)
+    assert not_foretold(inner, outer, doubted=False, parts_missing=True) is None
+    certain = inner._replace(uncertain_p_value=8e-4)
+    assert not_foretold(certain, outer, doubted=False, parts_missing=True) is not None

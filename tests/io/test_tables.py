@@ -175,6 +175,25 @@ level,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s,sensor
 GROUPED = [[0.01, 0.02], [0.0, 0.03], [0.04, 0.05], [0.06, 0.0]]
 
 
+def test_an_amplitude_alone_has_no_phase(tmp_path):
+    header = "level,frequency_hz,force_n,velocity_m_s,phase_std_deg"
+    table = f"{header}\n1,79,0.1,0.2,1\n1,80,0.1,0.3,1\n"
+    reading = read(tmp_path, table)
+    states = reading.steady_states
+    np.testing.assert_array_equal(states.velocity[:, 0], [0.2, 0.3])
+    assert np.all(states.phase_unknown)
+    assert any("amplitude of the velocity alone" in note for note in reading.notes)
+    assert any("`phase_std_deg`" in note for note in reading.notes)
+    # What is written is read as the same.
+    write_steady_states(tmp_path / "again.csv", states)
+    assert np.all(read_steady_states(tmp_path / "again.csv").steady_states.phase_unknown)
+
+
+def test_phases_that_are_hardly_known_are_unknown(tmp_path):
+    states = read(tmp_path, with_column("phase_std_deg", [59.9, 60, ""])).steady_states
+    np.testing.assert_array_equal(states.phase_unknown[:, 0], [False, True, False])
+
+
 def test_sensors_of_one_state_share_it(tmp_path):
     data = read(tmp_path, SENSORS).steady_states
     assert data.sensors == ("a", "b")
@@ -267,9 +286,21 @@ BAD = {
         swapped("velocity_im_m_s", "velocity_im"),
         ["`velocity_im`", "expected `velocity_im_m_s`"],
     ),
-    "amplitude only": (
-        "level,frequency_hz,force_n,velocity_m_s\n1,79,0.1,0.1\n",
+    "amplitude and real part": (
+        "level,frequency_hz,force_n,velocity_m_s,velocity_re_m_s\n1,79,0.1,0.1,0.1\n",
+        ["lacks", "`velocity_im_m_s`", "is it `velocity_m_s`"],
+    ),
+    "amplitude and imaginary part": (
+        "level,frequency_hz,force_n,velocity_m_s,velocity_im_m_s\n1,79,0.1,0.1,0.1\n",
         ["lacks", "`velocity_re_m_s`", "is it `velocity_m_s`"],
+    ),
+    "zero amplitude": (
+        "level,frequency_hz,force_n,velocity_m_s\n1,79,0.1,0.1\n1,80,0.1,0\n",
+        ["`velocity_m_s`", "positive", "row 3"],
+    ),
+    "negative amplitude": (
+        "level,frequency_hz,force_n,velocity_m_s\n1,79,0.1,-0.1\n",
+        ["`velocity_m_s`", "positive", "row 2"],
     ),
     "std in percent": (
         with_column("velocity_std_percent", [1, 1, 1]),
