@@ -27,7 +27,8 @@ from scipy.optimize import least_squares
 import snrmjax as sj
 from snrmjax.identify.fitted_curves import values_with_slopes
 from snrmjax.identify.force_balance import weighing_at
-from snrmjax.identify.joint_fit import JointFit, _solve, all_residuals
+from snrmjax.identify.joint_fit import JointFit, _solve
+from snrmjax.identify.residuals import all_residuals
 from snrmjax.identify.uncertainty import sensitivity
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states

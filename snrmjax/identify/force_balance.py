@@ -223,7 +223,8 @@ def weighing_at(
 
     The balance is straight between a record and its corrected state, which lies on the curves:
     there its slopes do not go up and down with the noise, as they do at the record, where they
-    pull every curve to one side.
+    pull every curve to one side. With `nearest_errors` as corrections the whitened balance is as
+    long as these are in units of their 1σ.
     Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
     8 (1987) 1052, doi:10.1137/0908085.
     """

@@ -19,8 +19,6 @@ from snrmjax.identify.force_balance import (
     Unknowns,
     Weighing,
     balance_data,
-    force_balance,
-    nearest_errors,
     recorded_motion,
     weighing_at,
 )
@@ -34,6 +32,7 @@ from snrmjax.identify.free_unknowns import (
 from snrmjax.identify.joint_notes import notes_on_noise, notes_on_reach
 from snrmjax.identify.level_scatter import Scatter
 from snrmjax.identify.pilot import pilot_start
+from snrmjax.identify.residuals import all_residuals, freed_of_errors, freed_residuals
 from snrmjax.identify.selection import (
     Candidate,
     Selection,
@@ -52,7 +51,7 @@ _ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
 )
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
-_ROUNDS = 2, 12  # of fitting and weighting anew: at least, at most
+_ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
 _ROUGHLY = 2, 6  # the same, of a fit that is but the pilot of another
 _CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
@@ -88,6 +87,11 @@ class JointFit(eqx.Module):
         motion = self.motion()
         speed = np.abs(np.asarray(motion.velocity))
         return float(np.max(np.asarray(motion.displacement))), float(np.max(speed))
+
+    @property
+    def freed(self) -> bool:
+        """Whether states are freed of their likeliest errors, as the noise was believed."""
+        return bool(np.any(np.asarray(self.data.correction) != 0))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
@@ -129,8 +133,9 @@ def fit_jointly(
     deviation of stiffness and damping from level to level is estimated too (restricted maximum
     likelihood) and enters the bands. Both families and that scatter are chosen at a first fit that
     knows no scatter, or at the pilot where that leads to clearly less noise. Where the stated noise
-    is believed, slopes are taken at the states freed of their likeliest errors (orthogonal distance
-    regression). The other modes' frequencies and dampings stay inside their stated errors.
+    is believed, every step frees the states of their likeliest errors (orthogonal distance
+    regression), and what is small in the end are those. The other modes' frequencies and
+    dampings stay inside their stated errors.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
@@ -327,34 +332,6 @@ class _Linear(NamedTuple):
     correction: Array  # of every state's record: its likeliest error, taken back
 
 
-def whitened(
-    unknowns: Unknowns,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    weighing: Weighing,
-) -> Float[Array, "state part"]:
-    """Residuals of the states, of unit variance where the noise is as stated."""
-    balance = force_balance(unknowns, data, modes, spread, data.correction) + weighing.offset
-    return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", weighing.whiten, balance)
-
-
-def all_residuals(
-    vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    weighing: Weighing,
-) -> Float[Array, " residual"]:
-    """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
-    unknowns = restore(vector)
-    points = whitened(unknowns, data, modes, spread, weighing).reshape(-1)
-    curves = (unknowns.squared_frequency, unknowns.modal_damping)
-    priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
-    return jnp.concatenate([points, *priors])
-
-
 @compiled
 def _linearised(
     vector: Array,
@@ -370,7 +347,8 @@ def _linearised(
     unknowns = restore(vector)
     recorded = (data.correction, weighing_at(unknowns, data, modes, spread))
     given = (data.correction, weighing)
-    fresh = jax.lax.cond(freed, lambda: _freed(unknowns, data, modes, spread), lambda: recorded)
+    settings = (unknowns, data, modes, spread)
+    fresh = jax.lax.cond(freed, lambda: freed_of_errors(*settings), lambda: recorded)
     errors, weighing = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, given)
     data = eqx.tree_at(lambda d: d.correction, data, errors)
 
@@ -386,15 +364,6 @@ def _linearised(
         cost=jnp.sum(left**2),
         correction=errors,
     )
-
-
-def _freed(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> tuple[Array, Weighing]:
-    """Corrections that free the states of their likeliest errors, and their weighing there."""
-    errors = nearest_errors(unknowns, data, modes, spread)
-    data = eqx.tree_at(lambda d: d.correction, data, errors)
-    return errors, weighing_at(unknowns, data, modes, spread)
 
 
 @compiled
@@ -415,18 +384,8 @@ def _solve(
     errors in units of their 1σ, and their slopes need no derivative of the errors themselves.
     """
 
-    def residuals(y: Array, _: None) -> Array:
-        errors, own = jax.lax.cond(
-            freed,
-            lambda at: _freed(restore(at), data, modes, spread),
-            lambda _: (data.correction, weighing),
-            jax.lax.stop_gradient(y * unit),
-        )
-        erring = eqx.tree_at(lambda d: d.correction, data, errors)
-        return all_residuals(y * unit, restore, erring, modes, spread, own)
-
     solution: optx.Solution = optx.least_squares(
-        residuals,
+        lambda y, _: freed_residuals(y * unit, *(restore, data, modes, spread, weighing, freed)),
         *(_ROUND, vector / unit),
         max_steps=200,
         throw=False,

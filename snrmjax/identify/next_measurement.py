@@ -24,7 +24,8 @@ from snrmjax.identify.force_balance import (
     weighing_at,
 )
 from snrmjax.identify.free_unknowns import Restore
-from snrmjax.identify.joint_fit import JointFit, whitened
+from snrmjax.identify.joint_fit import JointFit
+from snrmjax.identify.residuals import whitened
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 

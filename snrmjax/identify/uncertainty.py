@@ -28,10 +28,9 @@ from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import (
     SOLVER,
     JointFit,
-    all_residuals,
     inverse_of,
-    whitened,
 )
+from snrmjax.identify.residuals import all_residuals, freed_residuals, whitened
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -211,7 +210,7 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
     cost = np.asarray(
         _pinned(
             *(vector, restore, fit.data, fit.modes, fit.spread),
-            *(jnp.asarray(std), np.array(index), jnp.asarray(values)),
+            *(np.array(fit.freed), jnp.asarray(std), np.array(index), jnp.asarray(values)),
         )
     )
     rise = cost - cost[len(cost) // 2]
@@ -228,6 +227,7 @@ def _pinned(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
+    freed: Array,
     std: Array,
     index: Array,
     values: Array,
@@ -238,7 +238,7 @@ def _pinned(
     def one(value: Array) -> Array:
         def residuals(y: Array, _: None = None) -> Array:
             point = vector + y * unit
-            free = all_residuals(point, restore, data, modes, spread, weighing)
+            free = freed_residuals(point, restore, data, modes, spread, weighing, freed)
             held = _PIN * (point[index] - value) / unit[index]
             return jnp.append(free, held)
 
@@ -274,7 +274,7 @@ def bootstrap(
     vector, restore = fit.vector()
     std = jnp.asarray(np.sqrt(np.diag(fit.covariance)))
     weights = weights * np.asarray(fit.data.weight)
-    settings = (vector, restore, fit.data, fit.modes, fit.spread, std)
+    settings = (vector, restore, fit.data, fit.modes, fit.spread, np.array(fit.freed), std)
     return np.asarray(_resampled(*settings, jnp.asarray(weights)))
 
 
@@ -285,6 +285,7 @@ def _resampled(
     data: BalanceData,
     modes: LinearModes,
     spread: Spread,
+    freed: Array,
     std: Array,
     weights: Array,
 ) -> Float[Array, "sample unknown"]:
@@ -292,9 +293,9 @@ def _resampled(
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(weight: Array) -> Array:
-        drawn = eqx.tree_at(lambda d: d.weight, data, weight)
+        given = (eqx.tree_at(lambda d: d.weight, data, weight), modes, spread, weighing, freed)
         found: optx.Solution = optx.least_squares(
-            lambda y, _: all_residuals(vector + y * unit, restore, drawn, modes, spread, weighing),
+            lambda y, _: freed_residuals(vector + y * unit, restore, *given),
             *(SOLVER, jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
@@ -324,7 +325,8 @@ def sample_posterior(
 
     def potential(z: Array) -> Array:
         point = vector + root @ z
-        residuals = all_residuals(point, restore, fit.data, fit.modes, fit.spread, weighing)
+        given = (fit.data, fit.modes, fit.spread, weighing, jnp.asarray(fit.freed))
+        residuals = freed_residuals(point, restore, *given)
         return 0.5 * jnp.sum(residuals**2)
 
     chain = MCMC(

@@ -1,5 +1,7 @@
 """What models foretell of a test, against closed forms of a linear mode."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 import pytest

@@ -146,10 +146,10 @@ def test_where_no_measurement_would_settle_it_that_is_said():
     found = named(Bench(predictions), scales_of(predictions), tuple(THIRD))
     request = requested(found, (0,))
     weak = request._replace(expected_gain=0.5 * request.needed_gain)
-    said = _decide_by(found, weak, [])
+    said = _decide_by(found, weak, [], phases=True)
     assert said.startswith("No single measurement")
     assert request.sentence in said
-    assert "No single" not in _decide_by(found, request, [])
+    assert "No single" not in _decide_by(found, request, [], phases=True)
 
 
 def test_what_no_test_of_one_mode_separates_needs_a_calibration():

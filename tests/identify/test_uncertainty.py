@@ -28,7 +28,10 @@ def fit():
 def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 
-    from snrmjax.identify.joint_fit import SOLVER, Restore, all_residuals, weighing_at
+    from snrmjax.identify.force_balance import weighing_at
+    from snrmjax.identify.free_unknowns import Restore
+    from snrmjax.identify.joint_fit import SOLVER
+    from snrmjax.identify.residuals import all_residuals
 
     slopes = sensitivity(fit).by_measurement
     vector, restore = fit.vector()
