@@ -167,8 +167,10 @@ def fit_jointly(
     wanted = parse_family(backbone), parse_family(damping)
 
     def select(pilot: Unknowns, data: BalanceData, *, scatter_too: bool) -> Selection:
-        settings = (*wanted, released)
-        return select_families(data, modes, spread, pilot, *settings, scatter_too=scatter_too)
+        # Where no noise is stated a smooth curve would bend for levels whose gains differ.
+        smooth, settings = stated or scatter_too, (*wanted, released)
+        given = (data, modes, spread, pilot, *settings)
+        return select_families(*given, scatter_too=scatter_too, smooth=smooth)
 
     def fitted(
         chosen: Selection, pilot: Unknowns, data: BalanceData, rounds: tuple[int, int]

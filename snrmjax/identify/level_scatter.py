@@ -12,6 +12,7 @@ _SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
 _CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
 _PHASE = 1  # of the kinds of error
+_STIFF = 10.0  # times the smallest bends, that a curve has which is straight at first
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 
 
@@ -78,20 +79,33 @@ def estimated_scatter(
     stated = np.array([*problem.prior_std[index[0]], *present])
     look = look and len(index) > 2
     open_kinds = [k for k in range(n_errors) if stated[k] == 0] if look else []
-    chosen = np.arange(len(stated)) >= n_errors
-    found = likelihood.best(stated, chosen, ends)
-    while open_kinds:
-        trials = []
-        for kind in open_kinds:
-            more = chosen.copy()
-            more[kind] = True
-            trials.append((likelihood.best(stated, more, ends), kind))
-        better, kind = min(trials, key=lambda trial: trial[0].value)
-        if better.value > found.value - (_CLEAR if bends and kind == _PHASE else _WORTH):
-            break
-        found = better
-        chosen[kind] = True
-        open_kinds.remove(kind)
+    price = np.where(np.arange(n_errors) == _PHASE, _CLEAR if bends else _WORTH, _WORTH)
+
+    def forward(stated: np.ndarray, chosen: np.ndarray) -> tuple[_Best, np.ndarray]:
+        found, left = likelihood.best(stated, chosen, ends), list(open_kinds)
+        while left:
+            trials = []
+            for kind in left:
+                more = chosen.copy()
+                more[kind] = True
+                trials.append((likelihood.best(stated, more, ends), kind))
+            better, kind = min(trials, key=lambda trial: trial[0].value)
+            if better.value > found.value - price[kind]:
+                break
+            found, chosen = better, chosen | (np.arange(len(stated)) == kind)
+            left.remove(kind)
+        return found, chosen
+
+    is_bend = np.arange(len(stated)) >= n_errors
+    found, chosen = forward(stated, is_bend)
+    if bends and look:
+        # Levels that differ look like bends to whom bends come first: here they come last.
+        straight = np.where(is_bend, _STIFF * np.array([e[0] for e in ends]), stated)
+        _, kinds = forward(straight, np.zeros(len(stated), dtype=bool))
+        other = likelihood.best(straight, kinds | is_bend, ends)
+        cost, other_cost = (float(price[mask[:n_errors]].sum()) for mask in (chosen, kinds))
+        if other.value + other_cost < found.value + cost:
+            found = other
     return Scatter(
         noise=found.noise,
         noise_std=found.noise / np.sqrt(2 * likelihood.dof),

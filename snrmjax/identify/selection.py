@@ -39,6 +39,7 @@ _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating what levels scatter
+_SMOOTH = "smoothing_spline"
 _STRAIGHT = 1e-7  # of the largest value, a bend that is none
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
@@ -102,6 +103,7 @@ def select_families(
     free: tuple[str, ...],
     *,
     scatter_too: bool,
+    smooth: bool = True,
 ) -> Selection:
     """Try families on the balance linearised at the pilot, and take the simplest good one.
 
@@ -110,8 +112,12 @@ def select_families(
     there. Of the candidates within one standard error of the best, and not clearly worse, the one
     with the fewest parameters is taken. The pilot's deviations of levels are in their own units;
     states are taken as `data` corrects them. What levels scatter beyond what is stated is looked
-    for if `scatter_too`.
+    for if `scatter_too`; without `smooth`, splines with few free knots stand in for smooth ones.
     """
+    kinds = [
+        tuple("spline" if kind == _SMOOTH and not smooth else kind for kind in those)
+        for those in (BACKBONE_FAMILIES, DAMPING_FAMILIES)
+    ]
 
     def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter, Unknowns]:
         work = _Workbench(data, spread, balance_slopes(at, data, modes, spread), free)
@@ -134,8 +140,8 @@ def select_families(
     # families, and theirs to choose again, until both belong together.
     work, scatter, jitter, pilot = prepared(pilot)
     for _ in range(_ROUNDS):
-        tried = work.compare("backbone", backbone, BACKBONE_FAMILIES, pilot.modal_damping)
-        other = work.compare("damping", damping, DAMPING_FAMILIES, tried.best)
+        tried = work.compare("backbone", backbone, kinds[0], pilot.modal_damping)
+        other = work.compare("damping", damping, kinds[1], tried.best)
         before = work
         work, scatter, jitter, pilot = prepared(_with_curves(pilot, (tried.best, other.best)))
         if np.array_equal(work.level_std > 0, before.level_std > 0):

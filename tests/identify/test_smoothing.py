@@ -9,6 +9,8 @@ from snrmjax.identify.joint_fit import fit_jointly
 from snrmjax.identify.level_scatter import Bends, Linearised, estimated_scatter, likeliest_std
 from snrmjax.identify.smoothing import curve_columns, moved
 from snrmjax.identify.splines import SmoothingSpline
+from snrmjax.identify.uncertainty import sensitivity
+from snrmjax.io.joint_results import described, read_joint_fit, write_joint_fit
 
 from .exact_states import CONSTANT, NOISE, OMEGA, modes, stated
 
@@ -113,11 +115,16 @@ def near_resonance(seed, n_levels=14):
     return stated(level, omega, force, velocity * np.exp(gain + own))
 
 
-def test_bands_hold_a_curve_that_few_knots_cannot_follow():
+@pytest.fixture(scope="module")
+def fits():
+    """Three noisy tests of a curve that few knots cannot follow, families chosen by the data."""
+    return [fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01) for seed in range(3)]
+
+
+def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
     at = np.linspace(3.2e-4, 1.95e-3, 40)
     inside = []
-    for seed in range(3):
-        fit = fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01)
+    for fit in fits:
         assert fit.converged
         assert isinstance(fit.unknowns.squared_frequency, SmoothingSpline)
         assert not any("levels differ" in note for note in fit.notes)
@@ -126,3 +133,20 @@ def test_bands_hold_a_curve_that_few_knots_cannot_follow():
         inside.append(np.abs(off / np.asarray(values.natural_frequency_std)) < 1.96)
     # Four free knots leave 38 % of these amplitudes outside.
     assert np.mean(inside) > 0.9
+
+
+def test_implicit_derivatives_know_how_smooth_a_curve_is_expected_to_be(fits):
+    std = np.sqrt(np.diag(sensitivity(fits[0]).covariance))
+    # The residuals' curvature moves them by some per cent; without the bends half would be lost.
+    n = len(fits[0].unknowns.squared_frequency.parameters)
+    assert std[:n] == pytest.approx(np.sqrt(np.diag(fits[0].covariance))[:n], rel=0.2)
+
+
+def test_a_smoothing_spline_comes_back_from_its_file(fits, tmp_path):
+    write_joint_fit(tmp_path / "fit.json", fits[0])
+    again = read_joint_fit(tmp_path / "fit.json")
+    curve = fits[0].unknowns.squared_frequency
+    same = again.unknowns.squared_frequency
+    np.testing.assert_array_equal(same.prior_residuals(), curve.prior_residuals())
+    assert again.freed
+    assert described(same) == f"smoothing_spline:{len(curve.parameters)}@displacement"
