@@ -123,9 +123,7 @@ headline["the level held out is foretold to within its noise"] = found.gap.inter
 
 # %%
 figures = diagnosis_report.diagnosis_figures(found, test.steady_states)
-found, foretold, figures["responses"] = diagnosis_report.with_responses(
-    found, model, test.steady_states
-)
+foretold, figures["responses"] = diagnosis_report.with_responses(found, model, test.steady_states)
 show(figures["residuals"], "residuals")
 
 # %%
