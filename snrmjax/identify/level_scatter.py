@@ -10,10 +10,10 @@ from scipy.optimize import minimize, minimize_scalar
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
+_WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 _CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
 _PHASE = 1  # of the kinds of error
-_STIFF = 10.0  # times the smallest bends, that a curve has which is straight at first
-_WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
+_STIFF = 10.0  # times the smallest bends, of a curve that is straight at first
 
 
 class Scatter(NamedTuple):
