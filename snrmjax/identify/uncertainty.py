@@ -21,6 +21,7 @@ from snrmjax.identify.force_balance import (
     STATE_ERRORS,
     BalanceData,
     Spread,
+    Unknowns,
     slopes_by_error,
     weighing_at,
 )
@@ -30,7 +31,12 @@ from snrmjax.identify.joint_fit import (
     JointFit,
     inverse_of,
 )
-from snrmjax.identify.residuals import all_residuals, freed_residuals, whitened
+from snrmjax.identify.residuals import (
+    all_residuals,
+    freed_of_errors,
+    freed_residuals,
+    whitened,
+)
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -70,12 +76,14 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 
     At the minimum of χ²(θ, data) the implicit function theorem gives dθ/dy = −H⁻¹ ∂²χ²/∂θ∂y with
     the whole Hessian H, where Gauss and Newton leave out the residuals' curvature; the covariance
-    of independent errors of the stated size follows. Weights count as given.
+    of independent errors of the stated size follows. Where states are freed of their errors, they
+    are so anew; else weights count as given.
 
     Returns a `Sensitivity`. One call costs about as much as a fit.
     """
     vector, restore = fit.vector()
-    hessian, mixed = _second_order(vector, restore, fit.data, fit.modes, fit.spread)
+    settings = (vector, restore, fit.data, fit.modes, fit.spread)
+    hessian, mixed = _second_order(*settings, np.array(fit.freed))
     inverse = np.linalg.pinv(np.asarray(hessian), rcond=1e-13, hermitian=True)
     p, n = len(vector), len(fit.data.level)
     by_state = -inverse @ np.asarray(mixed).reshape(p, -1)
@@ -92,15 +100,32 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 
 @compiled
 def _second_order(
-    vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
+    vector: Array,
+    restore: Restore,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    freed: Array,
 ) -> tuple[Array, Array]:
     weighing = weighing_at(restore(vector), data, modes, spread)
+
+    def anew(unknowns: Unknowns, error: Array) -> Array:
+        """Records that err by so much, freed of their likeliest errors again."""
+        velocity = data.velocity * jnp.exp(error[:, 1] + 1j * error[:, 2])
+        records = (data.force * jnp.exp(error[:, 0]), velocity, data.correction - error)
+        erring = eqx.tree_at(lambda d: (d.force, d.velocity, d.correction), data, records)
+        errors, own = freed_of_errors(unknowns, erring, modes, spread)
+        erring = eqx.tree_at(lambda d: d.correction, erring, errors)
+        return whitened(unknowns, erring, modes, spread, own)
+
+    def as_it_is(unknowns: Unknowns, error: Array) -> Array:
+        erring = eqx.tree_at(lambda d: d.correction, data, data.correction + error)
+        return whitened(unknowns, erring, modes, spread, weighing)
 
     def gradient(vector: Array, error: Array) -> Array:
         def cost(vector: Array) -> Array:
             unknowns = restore(vector)
-            erring = eqx.tree_at(lambda d: d.correction, data, data.correction + error)
-            points = whitened(unknowns, erring, modes, spread, weighing)
+            points = jax.lax.cond(freed, anew, as_it_is, unknowns, error)
             curves = (unknowns.squared_frequency, unknowns.modal_damping)
             priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
             priors = priors + sum(jnp.sum(c.prior_residuals() ** 2) for c in curves)

@@ -83,9 +83,10 @@ def test_a_rough_curve_does_not_pass_for_levels_that_differ():
 def test_levels_that_differ_are_found_beside_a_smooth_curve():
     found = [
         estimated_scatter(problem, index, bends=[bends]).level[0]
-        for problem, bends, index in (drawn(seed, 1e-4, 0.02, shared=0.2) for seed in range(8))
+        for problem, bends, index in (drawn(seed, 1e-4, 0.02, shared=0.2) for seed in range(12))
     ]
-    assert sum(size > 0 for size in found) >= 7
+    # Of one of them bends would take the place, did they always come first.
+    assert all(size > 0 for size in found)
     assert np.mean(found) == pytest.approx(0.2, rel=0.25)
 
 
@@ -137,7 +138,7 @@ def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
 
 def test_implicit_derivatives_know_how_smooth_a_curve_is_expected_to_be(fits):
     std = np.sqrt(np.diag(sensitivity(fits[0]).covariance))
-    # The residuals' curvature moves them by some per cent; without the bends half would be lost.
+    # The residuals' curvature moves them by some per cent; without bends a knot would be unknown.
     n = len(fits[0].unknowns.squared_frequency.parameters)
     assert std[:n] == pytest.approx(np.sqrt(np.diag(fits[0].covariance))[:n], rel=0.2)
 

@@ -31,7 +31,7 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
     from snrmjax.identify.force_balance import weighing_at
     from snrmjax.identify.free_unknowns import Restore
     from snrmjax.identify.joint_fit import SOLVER
-    from snrmjax.identify.residuals import all_residuals
+    from snrmjax.identify.residuals import freed_residuals
 
     slopes = sensitivity(fit).by_measurement
     vector, restore = fit.vector()
@@ -48,8 +48,9 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
         }[kind]
         data = eqx.tree_at(lambda d: getattr(d, name), fit.data, getattr(fit.data, name) * by)
         found = optx.least_squares(
-            lambda y, _: all_residuals(
-                vector + y * unit, Restore(fit.unknowns, ()), data, fit.modes, fit.spread, weighing
+            lambda y, _: freed_residuals(
+                *(vector + y * unit, Restore(fit.unknowns, ()), data, fit.modes, fit.spread),
+                *(weighing, jnp.asarray(True)),
             ),
             *(SOLVER, jnp.zeros_like(vector)),
         )
