@@ -21,6 +21,7 @@ from snrmjax.diagnose.predictions import (
 from snrmjax.identify.calibration_states import Selection, whitened
 from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
 from snrmjax.model.structure import Structure
+from snrmjax.simulate.blocks import over_cores
 
 _STEPS = 9  # of a fit
 _SCREENED, _KEPT = 2, 2  # steps of all starts, and how many of them go on
@@ -361,6 +362,10 @@ class Bench:
             (lower * unit)[order],
             (upper * unit)[order],
         )
+
+    def all_fitted(self, jobs: Sequence[tuple[Candidate, Fit]]) -> list[Fit]:
+        """The best fit of every candidate beside what is found already, over the cores."""
+        return over_cores(lambda job: self.fitted(*job), jobs)
 
     def _together(self, candidate: Candidate, before: Fit) -> _Evaluation:
         """Rows and slopes by a candidate's parameters and those of what is there before.

@@ -7,6 +7,7 @@ import numpy as np
 from snrmjax.diagnose.candidates import Candidate, Scales, candidate
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.screening import foretold, foretold_pairs
+from snrmjax.simulate.blocks import over_cores
 
 DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
 AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
@@ -56,7 +57,7 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     best = _simplest(bench, singles) if singles else nothing
     if _gain(bench, nothing, best) <= DETECTED:
         return Named(bench, nothing, nothing, (), tuple(table))
-    pairs = [bench.fitted(c, best) for c in _promising(bench, every, best)]
+    pairs = bench.all_fitted([(c, best) for c in _promising(bench, every, best)])
     twins: list[Fit] = []
     if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
         twins = _pairs(bench, every, most=len(best.values))
@@ -77,7 +78,8 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     simple = min(alone, key=lambda fit: fit.criterion(bench.n_rows))
     if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
         # What two seemed to be is one that no start had come near to.
-        fits = [bench.fitted(_from(every, f)) for f in singles if f.kinds != simple.kinds]
+        others = [f for f in singles if f.kinds != simple.kinds]
+        fits = bench.all_fitted([(_from(every, f), nothing) for f in others])
         one = _simplest(bench, [simple, *fits])
         answers = (_class(bench, [simple, *fits], one.kinds[0]),)
         return Named(bench, one, nothing, answers, tuple(table))
@@ -86,10 +88,10 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     kind, other = pair.kinds[0], alone[1]
     for place in range(2):
         rivals = [c for c in _promising(bench, every, other) if c.kind != kind]
-        fits = [bench.fitted(c, other) for c in rivals]
+        fits = bench.all_fitted([(c, other) for c in rivals])
         # Beside the other one fitted alone the pair itself may be far away.
         begun = bench.at_start(_where(every, pair, other.kinds[0]))
-        own = [bench.fitted(_where(every, pair, kind), start) for start in (begun, other)]
+        own = bench.all_fitted([(_where(every, pair, kind), start) for start in (begun, other)])
         fits.append(min(own, key=lambda fit: fit.criterion(bench.n_rows)))
         table.append(_table(bench, other, fits))
         pair = _simplest(bench, fits)
@@ -104,7 +106,7 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     if _is_below(bench, pair, _REFUTED) and of_one.p_value > _REFUTED:
         return of_one  # weighed with its own way of passing on errors the pair is worse
     if _is_below(bench, pair, _REFUTED):
-        thirds = [bench.fitted(c, pair) for c in _promising(bench, every, pair)]
+        thirds = bench.all_fitted([(c, pair) for c in _promising(bench, every, pair)])
         third = min(thirds, key=lambda fit: fit.criterion(bench.n_rows), default=pair)
         if _gain(bench, pair, third) > DETECTED:
             table.append(_table(bench, pair, thirds))
@@ -123,7 +125,7 @@ def _pairs(bench: Bench, every: dict[str, Candidate], most: int | None = None) -
         for _, one, two in foretold_pairs(bench, list(every.values()))
         if most is None or len(one.unit) + len(two.unit) <= most
     ]
-    return [bench.fitted(two, bench.at_start(one)) for one, two in promised[:_PAIRS]]
+    return bench.all_fitted([(two, bench.at_start(one)) for one, two in promised[:_PAIRS]])
 
 
 def _is_below(bench: Bench, fit: Fit, probability: float) -> bool:
@@ -136,6 +138,7 @@ def _promising(bench: Bench, every: dict[str, Candidate], before: Fit) -> list[C
     Starts are coarse: what explains a quarter of what the best one explains may yet win.
     """
     others = [c for kind, c in every.items() if kind not in before.kinds]
+    over_cores(bench.started, others)  # many short programs
     changes = [foretold(bench, c, before) for c in others]
     changes.sort(key=lambda pair: -pair[0])
     share = _SHARE_OF_SIZES if bench.predictions.sizes.alone.any() else _SHARE
@@ -151,7 +154,7 @@ def _tried(
 
     Returns all of them as rows for a report too, in the weighing that all share.
     """
-    fits = [bench.fitted(c, before) for c in _promising(bench, every, before)]
+    fits = bench.all_fitted([(c, before) for c in _promising(bench, every, before)])
     fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     rows = _table(bench, before, fits)
     if not fits:
@@ -163,7 +166,8 @@ def _tried(
     again = bench.reweighed(best)
     reach = least + max(_PROMISING, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(bench.n_rows) < reach]
-    return again, [again.fitted(_from(every, fit), again.nothing()) for fit in near], rows
+    nothing = again.nothing()
+    return again, again.all_fitted([(_from(every, fit), nothing) for fit in near]), rows
 
 
 def _also_from(one: Candidate, pair: Fit) -> Candidate:

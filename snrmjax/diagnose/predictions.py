@@ -30,7 +30,6 @@ from snrmjax.simulate.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
 _DIRECTIONS = 3  # derivatives that a call gives
-_ACTIVE = 4  # effects at once, at most
 _TRIALS = _BLOCK  # that may meet in a block, at most
 
 
@@ -200,9 +199,8 @@ class Predictions:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Columns and slopes: friction by its formulas, and marching where they fail."""
         used = np.any(values != group.values, axis=0) | np.any(by_value, axis=(0, 2))
-        forces = np.unique(group.force[used & (group.force >= 0)])
-        active = np.full(_ACTIVE, -1)
-        active[: len(forces)] = forces
+        active = np.zeros(group.force.max() + 1, dtype=bool)
+        active[group.force[used & (group.force >= 0)]] = True
         fixed = (group.model, group.names, self.held, len(self.model.effects))
         n, trials = len(self.chosen.rows), len(values)
         state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)

@@ -6,7 +6,7 @@ ask for are passed over.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import ClassVar, NamedTuple, cast
@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.identify.calibration_states import CalibrationStates
 from snrmjax.identify.needed_force import held_state, missed_columns
@@ -89,7 +89,7 @@ def missed(
     held: Held,
     own: int,
     swings: bool,
-    active: Int[Array, " place"],
+    active: Bool[Array, " force"],
     stored: Stored,
     trials: Trials,
     state: Int[Array, " row"],
@@ -99,8 +99,7 @@ def missed(
 
     Arguments: the first `own` effects are the baseline's; with `swings` friction is taken by
     formulas for cycles that turn only twice, and others give NaN; of the added `forces_of` only
-    those count whose numbers stand in `active` before a negative one; a row is a state and a
-    trial by their numbers.
+    the `active` count; a row is a state and a trial by their numbers.
     """
 
     def one(state: Array, trial: Array) -> tuple[Array, Array]:
@@ -140,34 +139,49 @@ class _ForcedBalance(HarmonicBalance):
     """A balance with further forces, each sampled as it needs; few of them count."""
 
     forces: tuple[AbstractForce, ...] = ()
-    active: Int[Array, " place"] = eqx.field(default_factory=lambda: jnp.zeros(0, dtype=int))
+    active: Bool[Array, " force"] = eqx.field(default_factory=lambda: jnp.zeros(0, dtype=bool))
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
         """See `HarmonicBalance.residual`."""
         j = self.model.modes.mode_of_interest
         x, omega = self.coefficients(point)[:, j], point[-1] * self.frequency_scale
-        branches = [partial(_harmonics, force) for force in self.forces]
-
-        def more(k: Array, total: Array) -> Array:
-            return total + jax.lax.switch(self.active[k], branches, x, omega)
-
-        count = jnp.sum(self.active >= 0)
-        added = jax.lax.fori_loop(0, count, more, jnp.zeros_like(x))
+        added = jnp.zeros_like(x)
+        for n_samples in sorted({_samples(force) for force in self.forces}):
+            mine = [k for k, force in enumerate(self.forces) if _samples(force) == n_samples]
+            some = jnp.any(self.active[jnp.array(mine)])
+            added = added + _where(some, partial(self._harmonics, mine, n_samples), x, omega)
         unit = self.frequency_scale**2 * self.displacement_scale
         left = super().residual(point).reshape(self.n_coefficients, -1)
         return left.at[:, j].add(added / unit).reshape(-1)
 
+    def _harmonics(
+        self, mine: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
+    ) -> Float[Array, " coefficient"]:
+        """Coefficients of some of the forces over the cycle of a mode's coefficients."""
+        basis = harmonic_basis(HARMONICS, n_samples)
+        q = jnp.asarray(basis.synthesis) @ x
+        v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
+        force = jnp.zeros_like(q)
+        for k in mine:
+            force = force + _where(self.active[k], self.forces[k].cycle_force, q, v)
+        return jnp.asarray(basis.analysis) @ force
 
-def _harmonics(
-    effect: AbstractForce, x: Float[Array, " coefficient"], omega: Array
-) -> Float[Array, " coefficient"]:
-    """Coefficients of a force over the cycle of a mode's coefficients."""
-    memoryless = isinstance(effect, AbstractMemoryless)
-    n_samples = 512 if isinstance(effect, AbstractKinked) else 128 if memoryless else 256
-    basis = harmonic_basis(HARMONICS, n_samples)
-    q = jnp.asarray(basis.synthesis) @ x
-    v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
-    return jnp.asarray(basis.analysis) @ effect.cycle_force(q, v)
+
+def _where(
+    counts: Bool[Array, ""], function: Callable[[Array, Array], Array], first: Array, second: Array
+) -> Array:
+    """A function of two arrays of the first one's shape where it counts, else nothing."""
+    # A method of a module with arrays has no hash.
+    taken = jax.lax.cond(
+        counts, lambda a, b: function(a, b), lambda a, _: jnp.zeros_like(a), first, second
+    )
+    return taken
+
+
+def _samples(force: AbstractForce) -> int:
+    if isinstance(force, AbstractKinked):
+        return 512
+    return 128 if isinstance(force, AbstractMemoryless) else 256
 
 
 def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:

@@ -119,10 +119,11 @@ class HeldMotion(eqx.Module):
 
         def going(state: tuple) -> Array:
             *_, count, size = state
-            return (count < _SECANTS) & (size > _CLOSE)  # false for NaN
+            return (count < 2) | ((count <= _SECANTS) & (size > _CLOSE))  # false for NaN
 
         start = jax.lax.stop_gradient(start)
-        first = (start, fixed.equations(start), inverse, jnp.array(0), jnp.array(jnp.inf))
+        # The first step goes nowhere: the equations are then compiled once.
+        first = (start, jnp.zeros_like(start), inverse, jnp.array(0), jnp.array(0.0))
         point, *_, size = jax.lax.while_loop(going, step, first)
         point = jnp.where(size <= _CLOSE, point, jnp.nan)
         # In a loop the equations are compiled once.
