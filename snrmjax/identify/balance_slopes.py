@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.identify.any_family import in_one_form
 from snrmjax.identify.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
@@ -18,6 +17,7 @@ from snrmjax.identify.force_balance import (
     motion_of,
     weighing_at,
 )
+from snrmjax.identify.free_unknowns import programmed, with_room
 from snrmjax.model.modes import LinearModes
 from snrmjax.simulate.compiled import compiled
 
@@ -44,8 +44,10 @@ def balance_slopes(
     Deviations of levels are in their own units here, not of some 1σ. What has a prior counts from
     its prior's mean: the balance is that of levels and linear modes without deviations.
     """
-    parts = _slopes(in_one_form(unknowns), data, modes, spread.linear)
-    return BalanceSlopes(*(np.asarray(part) for part in parts))
+    n, room = len(data.level), with_room(data)
+    restore = programmed(unknowns, (), room.n_levels).restore
+    parts = _slopes(restore.unknowns, room, modes, spread.linear)
+    return BalanceSlopes(*(np.asarray(part)[:n] for part in parts))
 
 
 @compiled

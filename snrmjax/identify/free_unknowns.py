@@ -1,5 +1,6 @@
 """The unknowns that a fit may change as one vector, in the order that their names have."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.any_family import in_one_form
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Unknowns
+
+_FEWEST_STATES, _LEVELS = 48, 8  # that there is room for; levels come in so many
 
 FREE = ("force_gain", "force_offset", "instrument_phase")
 """Unknowns of the measurement that a fit may free."""
@@ -50,16 +53,41 @@ class Programmed(NamedTuple):
         return full
 
 
-def programmed(unknowns: Unknowns, free: tuple[str, ...]) -> Programmed:
-    """Unknowns for a program that serves every family."""
-    whole = in_one_form(unknowns)
+def programmed(
+    unknowns: Unknowns, free: tuple[str, ...], n_levels: int | None = None
+) -> Programmed:
+    """Unknowns for a program that serves every family, and so many levels."""
+    whole, present = in_one_form(unknowns), len(unknowns.level)
+    if n_levels is not None:
+        whole = eqx.tree_at(lambda u: u.level, whole, filled(unknowns.level, n_levels, 0.0))
     vector = Restore(whole, free).vector()
     (n, m), (size, other) = (
         (u.squared_frequency.parameters.shape[0], u.modal_damping.parameters.shape[0])
         for u in (unknowns, whole)
     )
-    own = [*range(n), *range(size, size + m), *range(size + other, len(vector))]
+    linear = len(vector) - len(unknowns.linear)
+    spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
+    rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
+    own = [*range(n), *range(size, size + m), *rest]
     return Programmed(vector, Restore(whole, free), np.array(own))
+
+
+def with_room(data: BalanceData) -> BalanceData:
+    """The data with spare states that weigh nothing and spare levels: few sizes compile."""
+    n, levels = len(data.level), data.n_levels
+    power = 1 << (n - 1).bit_length()
+    size = max(n, _FEWEST_STATES, 3 * power // 4 if n <= 3 * power // 4 else power)
+    roomy = jax.tree.map(lambda a: filled(a, size, None), data)
+    weight = filled(data.weight, size, 0.0)
+    n_levels = _LEVELS * -(-levels // _LEVELS)
+    return dataclasses.replace(roomy, weight=weight, n_levels=n_levels)
+
+
+def filled(rows: Array, size: int, spare: float | None) -> np.ndarray:
+    """Rows and spare ones, of one number or, without it, copies of the last."""
+    known = np.asarray(rows)
+    missing = np.repeat(known[-1:], size - len(known), axis=0)
+    return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
 
 
 def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:

@@ -28,6 +28,7 @@ from snrmjax.identify.free_unknowns import (
     Restore,
     named_unknowns,
     programmed,
+    with_room,
 )
 from snrmjax.identify.joint_notes import notes_on_noise, notes_on_reach
 from snrmjax.identify.level_scatter import Scatter
@@ -244,12 +245,13 @@ def _fitted(
     rounds: tuple[int, int],
 ) -> _Fitted:
     """Fit, estimate what levels scatter and how large the noise is, and fit again."""
-    program, stated_std, n = programmed(start, free), data.std, len(data.level)
+    stated_std, n, room = data.std, len(data.level), with_room(data)
+    program = programmed(start, free, room.n_levels)
 
     def as_noisy(scatter: Scatter) -> float:
         return scatter.noise if not stated or scatter.contradicts_upward else 1.0
 
-    none = Weighing(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
+    none = Weighing(jnp.zeros((len(room.level), 2, 2)), jnp.zeros((len(room.level), 2)))
     fewest, most = rounds
     # An outlier has widened the noise at first: its weight falls round by round.
     fewest, most = (2 * fewest, max(2 * fewest, most)) if robust else (fewest, most)
@@ -260,15 +262,15 @@ def _fitted(
         trusted = stated and not scatter.contradicts_upward
         if not trusted:
             data = eqx.tree_at(lambda d: d.correction, data, jnp.zeros_like(data.correction))
-        settings, freed = (program.restore, data, modes, spread), np.array(trusted)
+        settings, freed = (program.restore, with_room(data), modes, spread), np.array(trusted)
         linear = _linearised(program.vector, *settings, none, freed, np.array(True))
         size = np.linalg.norm(np.asarray(linear.jacobian), axis=0)
         unit = jnp.asarray(_TRUST / np.where(size > 0, size, 1.0))
         vector, good = _solve(program.vector, *settings, linear.weighing, freed, unit)
         program = program._replace(vector=vector)
         answer = _linearised(vector, *settings, linear.weighing, freed, freed)
-        data = eqx.tree_at(lambda d: d.correction, data, answer.correction)
-        residuals = np.asarray(answer.residuals)
+        data = eqx.tree_at(lambda d: d.correction, data, answer.correction[:n])
+        residuals = np.asarray(answer.residuals)[:n]
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
         jacobian = np.asarray(answer.jacobian)[:, program.own]
