@@ -16,10 +16,10 @@ from snrmjax.diagnose.candidates import (
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.doubts import Doubt, doubts
+from snrmjax.diagnose.doubts import Doubt, doubts, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
-from snrmjax.diagnose.locating import Located, located
+from snrmjax.diagnose.locating import Located, located, own_power
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
 from snrmjax.diagnose.requesting import Request, requested
@@ -127,7 +127,9 @@ def diagnose_model(
     open_ends: list[Doubt] = []
     if verdict in ("named", "ambiguous"):
         both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
-        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways)
+        part = part_of(fit.kinds)
+        power = own_power(bench, found.nothing, fit, part) if part else None
+        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways, power)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.evidence import Fit, Weighing
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, pattern
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold
 from snrmjax.diagnose.naming import Named
+from snrmjax.diagnose.patterns import pattern
 from snrmjax.diagnose.verifying import HeldOut, held_out
 
 LEVELS, PER_LEVEL = 4, 15
@@ -41,6 +42,7 @@ def bench_of(order=None, shared=None, phase_unknown=False):
         weighing=Weighing(whiten, known, shared, lower, state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
+        by_linear=np.tile(np.eye(2), (len(LEVEL), 1)),
         n_rows=N_ROWS,
     )
 
@@ -78,6 +80,22 @@ def test_what_neighbours_along_the_resonance_share_is_no_noise():
     verdict, reasons = verdict_on(bench_of(shuffled), mixed)
     assert verdict == "unknown"
     assert "along the resonance" in reasons[1]
+
+
+def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
+    """Too little for all of χ², and all of it in one curve: a jump, in units of noise."""
+    jump = np.zeros(N_ROWS)
+    jump[::2] = np.where(np.arange(len(LEVEL)) < len(LEVEL) / 2, -0.8, 0.8)
+    slopes = np.zeros((N_ROWS, 0))
+    fit = fit_to(noise(1) + jump, slopes, kinds=("cubic_stiffness",))
+    bench = bench_of()
+    found = Named(bench, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
+    assert found.p_value > 1e-3
+    verdict, reasons = judged(found, 1.0, 0.2)
+    assert verdict == "unknown"
+    assert "order of the test" in reasons[0]
+    plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
+    assert judged(plain, 1.0, 0.2) == ("named", [])
 
 
 def test_what_neighbours_in_the_test_share_is_no_noise():
