@@ -101,6 +101,15 @@ def test_a_law_of_another_power_leaves_a_curve_of_amplitude(part, name):
     assert f"the {name} as a free function of the amplitude" in reason
 
 
+def test_what_the_answer_itself_could_still_do_is_no_curve():
+    """A fit a little away from its best is no other law."""
+    bench = bench_of()
+    fit = fitted(bench, noise(), SIZE**2)
+    away = fit._replace(rows=fit.rows + misfit(bench, 2e-3 * (SIZE / SIZE.max()) ** 2))
+    assert left_curve(bench, away) is None
+    assert left_curve(bench, away._replace(slopes=np.zeros((2 * N, 0)))) is not None
+
+
 def test_states_at_temperatures_of_their_own_are_no_noise():
     """Every state has a natural frequency of its own: misfits have one direction."""
     bench = bench_of()
