@@ -108,10 +108,10 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     assert own_power(bench, nothing, fit, "damping") is None
     assert abs(part.exponent - 2) > 4 * part.exponent_std
     assert abs(part.exponent - own) < 2 * part.exponent_std
-    # What noise has left is no part of the answer's own: a step of the powers tried.
-    other = np.random.default_rng(1).normal(size=2 * n)
-    again = nothing._replace(rows=other - law), fit._replace(rows=other)
-    assert own_power(bench, *again, "stiffness") == pytest.approx(own, abs=0.01)
+    for seed in range(1, 5):  # what noise leaves is no part of the answer's own
+        other = np.random.default_rng(seed).normal(size=2 * n)
+        again = nothing._replace(rows=other - law), fit._replace(rows=other)
+        assert own_power(bench, *again, "stiffness") == own
     (doubt,) = doubts(fit.kinds, parts)
     assert doubt.refutes
     assert doubts(fit.kinds, parts, own_power=own) == []
