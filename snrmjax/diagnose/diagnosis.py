@@ -143,8 +143,13 @@ def diagnose_model(
         inner, outer = (
             held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
         )
-        doubted, missing = not all(d.twin for d in open_ends), bool(unknown.any())
-        missed = not_foretold(inner, outer, doubted=doubted, parts_missing=missing)
+        missed = not_foretold(
+            inner,
+            outer,
+            doubted=not all(d.twin for d in open_ends),
+            unclear=any(len(group) > 1 for group in found.classes),
+            parts_missing=bool(unknown.any()),
+        )
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
         for place in places if fit.kinds else ():

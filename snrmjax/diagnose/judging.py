@@ -14,6 +14,7 @@ from snrmjax.diagnose.patterns import UNLIKELY, along, left_curve, pattern
 from snrmjax.diagnose.verifying import HeldOut
 
 _MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
+_MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
@@ -101,12 +102,18 @@ def tolerated(noise: float, structure: str | None = None) -> float:
 
 
 def not_foretold(
-    inner: HeldOut, outer: HeldOut, *, doubted: bool, parts_missing: bool = False
+    inner: HeldOut,
+    outer: HeldOut,
+    *,
+    doubted: bool,
+    unclear: bool = False,
+    parts_missing: bool = False,
 ) -> str | None:
     """Why held-out levels speak against an answer; None where they do not.
 
     Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
-    answer may be an imitation, which is then worth no more than what it foretells; with
+    answer may be an imitation, which is then worth no more than what it foretells; `unclear` that several
+    effects fit, any of which should foretell a level between those it was fitted to; with
     `parts_missing`, of forces of which the size alone is compared, fewer levels leave parameters
     open, and worse than nothing counts only beyond that.
     """
@@ -126,5 +133,10 @@ def not_foretold(
         return (
             f"the answer may be an imitation, and level {inner.level}, left out, is missed by "
             f"{inner.after:.2g} times the noise."
+        )
+    if unclear and inner.uncertain_p_value < _MISSED_BY_ONE:
+        return (
+            "several effects fit and may all be imitations: level "
+            f"{inner.level}, left out, is missed by {inner.after:.2g} times the noise."
         )
     return None
