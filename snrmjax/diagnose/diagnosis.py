@@ -18,7 +18,7 @@ from snrmjax.diagnose.candidates import (
 )
 from snrmjax.diagnose.doubts import Doubt, doubts, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
@@ -152,6 +152,10 @@ def diagnose_model(
         )
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
+        open_end = unproved(outer) if verdict in ("named", "ambiguous") else None
+        if open_end is not None:
+            verdict, reasons = "ambiguous", [*reasons, open_end.reason]
+            open_ends.append(open_end)
         for place in places if fit.kinds else ():
             unseen = without_level(bench, fit, place)
             mine = dict(zip(fit.labels, unseen.values.tolist(), strict=True))

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from snrmjax.diagnose.doubts import Doubt
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.naming import Named
 from snrmjax.diagnose.patterns import UNLIKELY, along, left_curve, pattern
@@ -15,6 +16,7 @@ from snrmjax.diagnose.verifying import HeldOut
 
 _MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
 _MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
+_FAR = 2.0  # times the noise, that the top level is missed by
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
@@ -112,8 +114,8 @@ def not_foretold(
     """Why held-out levels speak against an answer; None where they do not.
 
     Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
-    answer may be an imitation, which is then worth no more than what it foretells; `unclear` that several
-    effects fit, any of which should foretell a level between those it was fitted to; with
+    answer may be an imitation, which is then worth no more than what it foretells; `unclear` that
+    several effects fit, any of which should foretell a level between those it was fitted to; with
     `parts_missing`, of forces of which the size alone is compared, fewer levels leave parameters
     open, and worse than nothing counts only beyond that.
     """
@@ -140,3 +142,20 @@ def not_foretold(
             f"{inner.level}, left out, is missed by {inner.after:.2g} times the noise."
         )
     return None
+
+
+def unproved(outer: HeldOut) -> Doubt | None:
+    """The doubt that stays where the top level is not foretold for want of certain parameters.
+
+    That it is not missed by more than they leave open refutes no answer, and proves none: beyond
+    the levels that put the parameters the law may be another one, as that of a contact is which
+    stiffens on after it has closed.
+    """
+    if outer.after < _FAR or outer.p_value >= UNLIKELY:
+        return None
+    return Doubt(
+        f"level {outer.level}, left out, is missed by {outer.after:.2g} times the noise, which "
+        "what the other levels leave open of the parameters allows: nothing proves the law there.",
+        f"measure levels between level {outer.level} and the one below it, or above it",
+        twin=True,
+    )

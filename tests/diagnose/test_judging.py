@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.evidence import Fit, Weighing
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, unproved
 from snrmjax.diagnose.naming import Named
 from snrmjax.diagnose.patterns import pattern
 from snrmjax.diagnose.verifying import HeldOut, held_out
@@ -169,6 +169,17 @@ def test_one_of_several_that_fit_should_foretell_a_level_between_others():
     # By noise alone one level in twenty is missed so, and what parameters leave open excuses more.
     for held in (missed._replace(uncertain_p_value=0.05), FINE):
         assert not_foretold(held, FINE, doubted=False, unclear=True) is None
+
+
+def test_a_top_level_that_open_parameters_excuse_proves_nothing():
+    """A contact's law beyond the levels that put its parameters is anybody's guess."""
+    assert unproved(FINE) is None
+    assert unproved(FINE._replace(after=1.4, p_value=1e-4)) is None
+    doubt = unproved(FINE._replace(after=13.0, p_value=1e-9, uncertain_p_value=0.3))
+    assert doubt.twin
+    assert not doubt.refutes
+    assert "nothing proves" in doubt.reason
+    assert "level 3" in doubt.decide_by
 
 
 def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_guessed():
