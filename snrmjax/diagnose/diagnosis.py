@@ -16,7 +16,7 @@ from snrmjax.diagnose.candidates import (
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.doubts import Doubt, doubts, part_of
+from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
@@ -129,7 +129,9 @@ def diagnose_model(
         both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
         part = part_of(fit.kinds)
         power = own_power(bench, found.nothing, fit, part) if part else None
-        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways, power)
+        feeding = frozenset(k for k in fit.kinds if k in GROWING and fit.of_kind(k)[0] < 0)
+        orders = predictions.chosen.orders
+        open_ends = doubts(fit.kinds, free.parts, orders, both_ways, power, feeding)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]

@@ -49,6 +49,8 @@ _SAME_PART = (
 )
 DIRECTED = ("quadratic_damping", "cubic_damping")
 """Damping as of a fluid, which a valve may let pass in one direction only."""
+GROWING = (*DIRECTED, "van_der_pol_damping")
+"""Damping that grows with the amplitude and takes energy out where its coefficient is positive."""
 _RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
@@ -59,14 +61,27 @@ def doubts(
     orders: tuple[int, ...] = (),
     both_ways: frozenset[str] = frozenset(),
     own_power: float | None = None,
+    feeding: frozenset[str] = frozenset(),
 ) -> list[Doubt]:
     """Reasons to doubt the effects that were found, from what was located before any name.
 
     `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
     shows to act in both directions; `own_power` is the power of amplitude that one effect, as
-    fitted, has at the states, which is that of its law to lowest order only.
+    fitted, has at the states, which is that of its law to lowest order only; `feeding` are kinds
+    of damping that were found to put energy in.
     """
     found = _of_harmonics(effects, orders, both_ways)
+    # Nothing passive does so; what does has a source, and the law of a loop need not be this one.
+    found += [
+        Doubt(
+            f"{kind} below zero feeds the motion: a feedback or a force that lags behind the "
+            "displacement does the same.",
+            "measure with every feedback off, or record the force of the loop",
+            twin=True,
+        )
+        for kind in effects
+        if kind in feeding
+    ]
     if len(effects) == 1:
         found += _of_exponent(effects[0], located, own_power)
     if "iwan_microslip" in effects:
