@@ -68,7 +68,7 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
     structure = curve = None
     if misfit:
         structure = pattern(found.bench, found.fit)
-    elif found.fit.kinds:
+    elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
         curve = left_curve(found.bench, found.fit)
     loud = noise - 1 > (0.5 if misfit else 1.0) * _WRONG_NOISE * noise_std
     if stated and loud and structure is None:

@@ -104,7 +104,7 @@ def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     along = np.sum(force * unit, axis=1)
     across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
     ratio = float(np.sum(along**2) / np.sum(across**2))
-    if fisher.sf(ratio, len(along), len(along)) >= UNLIKELY:
+    if not fisher.sf(ratio, len(along), len(along)) < UNLIKELY:
         return None
     return (
         f"what is left is {np.sqrt(ratio):.2g} times as large along a change of the natural "

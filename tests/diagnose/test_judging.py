@@ -94,6 +94,9 @@ def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
     verdict, reasons = judged(found, 1.0, 0.2)
     assert verdict == "unknown"
     assert "order of the test" in reasons[0]
+    bench.predictions.chosen.noise_stated = False  # then it counts as noise
+    assert judged(found, 1.0, 0.2) == ("named", [])
+    bench.predictions.chosen.noise_stated = True
     plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
     assert judged(plain, 1.0, 0.2) == ("named", [])
 
