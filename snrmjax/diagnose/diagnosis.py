@@ -16,10 +16,10 @@ from snrmjax.diagnose.candidates import (
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.doubts import Doubt, doubts
+from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated
-from snrmjax.diagnose.locating import Located, located
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
+from snrmjax.diagnose.locating import Located, located, own_power
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions
 from snrmjax.diagnose.requesting import Request, requested
@@ -127,7 +127,11 @@ def diagnose_model(
     open_ends: list[Doubt] = []
     if verdict in ("named", "ambiguous"):
         both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
-        open_ends = doubts(fit.kinds, free.parts, predictions.chosen.orders, both_ways)
+        part = part_of(fit.kinds)
+        power = own_power(bench, found.nothing, fit, part) if part else None
+        feeding = frozenset(k for k in fit.kinds if k in GROWING and fit.of_kind(k)[0] < 0)
+        orders = predictions.chosen.orders
+        open_ends = doubts(fit.kinds, free.parts, orders, both_ways, power, feeding)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
@@ -141,10 +145,19 @@ def diagnose_model(
         inner, outer = (
             held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
         )
-        doubted, missing = not all(d.twin for d in open_ends), bool(unknown.any())
-        missed = not_foretold(inner, outer, doubted=doubted, parts_missing=missing)
+        missed = not_foretold(
+            inner,
+            outer,
+            doubted=not all(d.twin for d in open_ends),
+            unclear=any(len(group) > 1 for group in found.classes),
+            parts_missing=bool(unknown.any()),
+        )
         if verdict in ("named", "ambiguous") and missed is not None:
             verdict, reasons = "unknown", [missed, *reasons]
+        open_end = unproved(outer) if verdict in ("named", "ambiguous") else None
+        if open_end is not None:
+            verdict, reasons = "ambiguous", [*reasons, open_end.reason]
+            open_ends.append(open_end)
         for place in places if fit.kinds else ():
             unseen = without_level(bench, fit, place)
             mine = dict(zip(fit.labels, unseen.values.tolist(), strict=True))

@@ -49,6 +49,8 @@ _SAME_PART = (
 )
 DIRECTED = ("quadratic_damping", "cubic_damping")
 """Damping as of a fluid, which a valve may let pass in one direction only."""
+GROWING = (*DIRECTED, "van_der_pol_damping")
+"""Damping that grows with the amplitude and takes energy out where its coefficient is positive."""
 _RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
@@ -58,15 +60,30 @@ def doubts(
     located: tuple[Located, ...],
     orders: tuple[int, ...] = (),
     both_ways: frozenset[str] = frozenset(),
+    own_power: float | None = None,
+    feeding: frozenset[str] = frozenset(),
 ) -> list[Doubt]:
     """Reasons to doubt the effects that were found, from what was located before any name.
 
     `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
-    shows to act in both directions.
+    shows to act in both directions; `own_power` is the power of amplitude that one effect, as
+    fitted, has at the states, which is that of its law to lowest order only; `feeding` are kinds
+    of damping that were found to put energy in.
     """
     found = _of_harmonics(effects, orders, both_ways)
+    # Nothing passive does so; what does has a source, and the law of a loop need not be this one.
+    found += [
+        Doubt(
+            f"{kind} below zero feeds the motion: a feedback or a force that lags behind the "
+            "displacement does the same.",
+            "measure with every feedback off, or record the force of the loop",
+            twin=True,
+        )
+        for kind in effects
+        if kind in feeding
+    ]
     if len(effects) == 1:
-        found += _of_exponent(effects[0], located)
+        found += _of_exponent(effects[0], located, own_power)
     if "iwan_microslip" in effects:
         found.append(
             Doubt(
@@ -123,11 +140,17 @@ def _of_harmonics(
     return found
 
 
-def _of_exponent(effect: str, located: tuple[Located, ...]) -> list[Doubt]:
+def part_of(effects: tuple[str, ...]) -> str | None:
+    """The part that a single effect changes with a power of amplitude; None for others."""
+    return _EXPONENTS[effects[0]][0] if len(effects) == 1 and effects[0] in _EXPONENTS else None
+
+
+def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | None) -> list[Doubt]:
     """The power of amplitude that was located, against that of the law that was named."""
     if effect not in _EXPONENTS:
         return []
     part, expected = _EXPONENTS[effect]
+    expected = expected if own_power is None else own_power
     mine = [p for p in located if p.part == part and p.exponent is not None]
     if not mine or mine[0].exponent is None or mine[0].exponent_std is None:
         return []
@@ -135,7 +158,7 @@ def _of_exponent(effect: str, located: tuple[Located, ...]) -> list[Doubt]:
     if abs(exponent - expected) > _CONTRADICTED * std:
         reason = (
             f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
-            f"which is not the {expected:g} of {effect}."
+            f"which is not the {expected:.3g} of {effect}."
         )
         return [Doubt(reason, _WIDER, refutes=True)]
     if effect == "coulomb_friction" and abs(exponent + 0.5) < 2 * std:

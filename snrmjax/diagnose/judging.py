@@ -4,19 +4,19 @@ Noise that is stated too small makes every misfit larger by one factor, everywhe
 order. What grows with the level, or what neighbours along the resonance share, is physics.
 """
 
-from collections.abc import Iterator, Sequence
-
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.stats import chi2, norm
-from scipy.stats import f as fisher
+from jaxtyping import Float
+from scipy.stats import chi2
 
+from snrmjax.diagnose.doubts import Doubt
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.naming import Named
+from snrmjax.diagnose.patterns import UNLIKELY, along, left_curve, pattern
 from snrmjax.diagnose.verifying import HeldOut
 
-UNLIKELY = 1e-3
 _MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
+_MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
+_FAR = 2.0  # times the noise, that the top level is missed by
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
@@ -40,7 +40,7 @@ def _scatter(
     """Variance from second differences in an order of the states, and 1σ."""
     squares = [
         (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
-        for some in _along(bench, left, of_test=of_test)
+        for some in along(bench, left, of_test=of_test)
         if len(some) > 2
     ]
     if not squares:
@@ -51,40 +51,6 @@ def _scatter(
     # Neighbouring differences share states: about half as many are independent.
     value = float(np.mean(np.minimum(every, limit)))
     return value, value * float(np.sqrt(2 / (0.51 * len(every))))
-
-
-def pattern(bench: Bench, fit: Fit) -> str | None:
-    """Why what is left cannot be noise of any one size; None where it can."""
-    left = bench.weighing.without_shared(fit.rows)
-    level = np.asarray(bench.predictions.chosen.states.level)[bench.weighing.state]
-    of_force = bench.weighing.column < 2
-    groups = [
-        (level == k) & (of_force == force) for k in np.unique(level) for force in (True, False)
-    ]
-    groups = [mine for mine in groups if mine.any() and not mine.all()]
-    for mine in groups:
-        ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
-        if fisher.sf(ratio, mine.sum(), (~mine).sum()) < UNLIKELY / len(groups):
-            name = bench.level_numbers[int(level[mine][0])]
-            what = "the force" if of_force[mine][0] else "the harmonics"
-            return (
-                f"what is left of {what} at level {name} is {np.sqrt(ratio):.2g} times as large as "
-                "elsewhere: noise of one size it is not."
-            )
-    for of_test in (True, False):
-        parts = list(_along(bench, left, of_test=of_test))
-        number = sum(max(len(some) - 1, 0) for some in parts)
-        if not number:
-            continue
-        square = np.mean(np.concatenate(parts) ** 2)
-        common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
-        if norm.sf(common * np.sqrt(number)) < UNLIKELY / 2:
-            order = "in the order of the test" if of_test else "along the resonance"
-            return (
-                f"neighbours {order} are left with like misfits (correlation {common:.2f}): noise "
-                "has none."
-            )
-    return None
 
 
 def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]]:
@@ -99,7 +65,11 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
             "smaller effects may be hidden by it."
         ]
     misfit = found.p_value < UNLIKELY
-    structure = pattern(found.bench, found.fit) if misfit else None
+    structure = curve = None
+    if misfit:
+        structure = pattern(found.bench, found.fit)
+    elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
+        curve = left_curve(found.bench, found.fit)
     loud = noise - 1 > (0.5 if misfit else 1.0) * _WRONG_NOISE * noise_std
     if stated and loud and structure is None:
         return "noise_rejected", [
@@ -117,6 +87,8 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
                 "diagnose again."
             )
         return "unknown", reasons
+    if curve is not None:
+        return "unknown", [curve]
     if not found.fit.kinds:
         return "none", []
     unclear = any(len(group) > 1 for group in found.classes)
@@ -132,12 +104,18 @@ def tolerated(noise: float, structure: str | None = None) -> float:
 
 
 def not_foretold(
-    inner: HeldOut, outer: HeldOut, *, doubted: bool, parts_missing: bool = False
+    inner: HeldOut,
+    outer: HeldOut,
+    *,
+    doubted: bool,
+    unclear: bool = False,
+    parts_missing: bool = False,
 ) -> str | None:
     """Why held-out levels speak against an answer; None where they do not.
 
     Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
-    answer may be an imitation, which is then worth no more than what it foretells; with
+    answer may be an imitation, which is then worth no more than what it foretells; `unclear` that
+    several effects fit, any of which should foretell a level between those it was fitted to; with
     `parts_missing`, of forces of which the size alone is compared, fewer levels leave parameters
     open, and worse than nothing counts only beyond that.
     """
@@ -158,23 +136,26 @@ def not_foretold(
             f"the answer may be an imitation, and level {inner.level}, left out, is missed by "
             f"{inner.after:.2g} times the noise."
         )
+    if unclear and inner.uncertain_p_value < _MISSED_BY_ONE:
+        return (
+            "several effects fit and may all be imitations: level "
+            f"{inner.level}, left out, is missed by {inner.after:.2g} times the noise."
+        )
     return None
 
 
-def _along(
-    bench: Bench, rows: Float[np.ndarray, " row"], *, of_test: bool = False
-) -> Iterator[Float[np.ndarray, " state"]]:
-    """Rows of the force, level by level, along the resonance or in the order of the test.
+def unproved(outer: HeldOut) -> Doubt | None:
+    """The doubt that stays where the top level is not foretold for want of certain parameters.
 
-    Along a resonance that bends over the phase of the velocity is what never turns back.
+    That it is not missed by more than they leave open refutes no answer, and proves none: beyond
+    the levels that put the parameters the law may be another one, as that of a contact is which
+    stiffens on after it has closed.
     """
-    weighing, chosen = bench.weighing, bench.predictions.chosen
-    level = np.asarray(chosen.states.level)
-    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
-    for column in range(2):
-        mine = weighing.column == column
-        values, states = rows[mine], weighing.state[mine]
-        for number in range(chosen.n_levels):
-            some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
-            keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]
-            yield values[some[np.argsort(keys, kind="stable")]]
+    if outer.after < _FAR or outer.p_value >= UNLIKELY:
+        return None
+    return Doubt(
+        f"level {outer.level}, left out, is missed by {outer.after:.2g} times the noise, which "
+        "what the other levels leave open of the parameters allows: nothing proves the law there.",
+        f"measure levels between level {outer.level} and the one below it, or above it",
+        twin=True,
+    )

@@ -104,6 +104,19 @@ def located(bench: Bench, base: Fit) -> FreeFit:
     return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
 
 
+def own_power(bench: Bench, nothing: Fit, fit: Fit, part: str) -> float | None:
+    """The power of amplitude that a fitted answer itself has, located as in what was measured.
+
+    A law has its power to lowest order only: softening by q² has terms of the fourth power of the
+    amplitude too. None where the answer follows no power or does not change the part.
+    """
+    if bench.predictions.chosen.phase_unknown.any():
+        return None  # sizes are not linear in what an answer changes
+    alone = nothing._replace(rows=nothing.rows - fit.rows)
+    powers = [one.exponent for one in located(bench, alone).parts if one.part == part]
+    return powers[0] if powers else None
+
+
 class _Curves(NamedTuple):
     """Rows with free curves on top of the baseline: linear in them, but for sizes."""
 

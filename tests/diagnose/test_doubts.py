@@ -1,5 +1,6 @@
 """Answers that a law outside the library could imitate are marked."""
 
+import numpy as np
 import pytest
 
 from snrmjax.diagnose.candidates import decide_by
@@ -56,6 +57,19 @@ def test_damping_of_one_direction_is_a_twin_until_harmonic_2_excludes_it(orders)
     assert doubt.twin
     assert "one direction" in doubt.reason
     assert ("less noise" in doubt.decide_by) == bool(orders)
+
+
+def test_damping_that_feeds_the_motion_may_be_a_loop():
+    """A loop with the force cos³(θ − 90°) = sin³θ has the fundamental of a cubic damping."""
+    angle = np.linspace(0.0, 2 * np.pi, 65)[:-1]
+    lagging, speed = np.cos(angle - np.pi / 2) ** 3, -np.sin(angle)
+    fed = -np.mean(lagging * speed) / np.mean(speed**4)
+    assert fed == pytest.approx(1.0)  # q̇³ with the coefficient −1
+    feeding = frozenset({"van_der_pol_damping"})
+    (doubt,) = doubts(("van_der_pol_damping",), (), (2, 3), feeding=feeding)
+    assert doubt.twin
+    assert "feedback" in doubt.reason
+    assert doubts(("van_der_pol_damping",), (), (2, 3)) == []
 
 
 def test_a_sensor_that_saturates_is_told_by_harmonic_3():

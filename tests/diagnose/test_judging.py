@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.evidence import Fit, Weighing
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, pattern
+from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, unproved
 from snrmjax.diagnose.naming import Named
+from snrmjax.diagnose.patterns import pattern
 from snrmjax.diagnose.verifying import HeldOut, held_out
 
 LEVELS, PER_LEVEL = 4, 15
@@ -41,6 +42,7 @@ def bench_of(order=None, shared=None, phase_unknown=False):
         weighing=Weighing(whiten, known, shared, lower, state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
+        by_linear=np.tile(np.eye(2), (len(LEVEL), 1)),
         n_rows=N_ROWS,
     )
 
@@ -78,6 +80,25 @@ def test_what_neighbours_along_the_resonance_share_is_no_noise():
     verdict, reasons = verdict_on(bench_of(shuffled), mixed)
     assert verdict == "unknown"
     assert "along the resonance" in reasons[1]
+
+
+def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
+    """Too little for all of χ², and all of it in one curve: a jump, in units of noise."""
+    jump = np.zeros(N_ROWS)
+    jump[::2] = np.where(np.arange(len(LEVEL)) < len(LEVEL) / 2, -0.8, 0.8)
+    slopes = np.zeros((N_ROWS, 0))
+    fit = fit_to(noise(1) + jump, slopes, kinds=("cubic_stiffness",))
+    bench = bench_of()
+    found = Named(bench, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
+    assert found.p_value > 1e-3
+    verdict, reasons = judged(found, 1.0, 0.2)
+    assert verdict == "unknown"
+    assert "order of the test" in reasons[0]
+    bench.predictions.chosen.noise_stated = False  # then it counts as noise
+    assert judged(found, 1.0, 0.2) == ("named", [])
+    bench.predictions.chosen.noise_stated = True
+    plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
+    assert judged(plain, 1.0, 0.2) == ("named", [])
 
 
 def test_what_neighbours_in_the_test_share_is_no_noise():
@@ -141,6 +162,27 @@ FINE = HeldOut(3, 5.0, 1.0, 0.5, 0.5)
 def test_levels_left_out_speak_against_an_answer(inner, outer, doubted, word):
     reason = not_foretold(inner, outer, doubted=doubted)
     assert reason is None if word is None else word in reason
+
+
+def test_one_of_several_that_fit_should_foretell_a_level_between_others():
+    missed = FINE._replace(after=1.45, p_value=0.006, uncertain_p_value=0.006)
+    assert not_foretold(missed, FINE, doubted=False) is None
+    reason = not_foretold(missed, FINE, doubted=False, unclear=True)
+    assert "level 3" in reason
+    # By noise alone one level in twenty is missed so, and what parameters leave open excuses more.
+    for held in (missed._replace(uncertain_p_value=0.05), FINE):
+        assert not_foretold(held, FINE, doubted=False, unclear=True) is None
+
+
+def test_a_top_level_that_open_parameters_excuse_proves_nothing():
+    """A contact's law beyond the levels that put its parameters is anybody's guess."""
+    assert unproved(FINE) is None
+    assert unproved(FINE._replace(after=1.4, p_value=1e-4)) is None
+    doubt = unproved(FINE._replace(after=13.0, p_value=1e-9, uncertain_p_value=0.3))
+    assert doubt.twin
+    assert not doubt.refutes
+    assert "nothing proves" in doubt.reason
+    assert "level 3" in doubt.decide_by
 
 
 def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_guessed():
