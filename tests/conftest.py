@@ -5,10 +5,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
 
 _STORE = "JAX_COMPILATION_CACHE_DIR"
+_ROOM = 3 * 2**30  # bytes of a worker, beyond which it forgets its programs
 _QUICK = "--xla_cpu_use_fusion_emitters=false"  # compiles in two thirds of the time
 
 
@@ -50,7 +52,16 @@ def quick_compilation(request: pytest.FixtureRequest):
     yield
     jax.config.update("jax_disable_most_optimizations", before)
     # The programs of all modules together would fill gigabytes; the store has them on disk.
-    jax.clear_caches()
+    if _memory() > _ROOM:
+        jax.clear_caches()
+
+
+def _memory() -> float:
+    """Bytes that this process holds; without end where that cannot be read."""
+    status = Path("/proc/self/statm")
+    if not status.exists():
+        return float("inf")
+    return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def pytest_collection_modifyitems(items):

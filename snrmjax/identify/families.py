@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import expit
 
 from snrmjax.identify.family_base import AbstractFamily, Argument, Coefficient, linear_start
 from snrmjax.identify.splines import SmoothingSpline, Spline, spline_columns
@@ -231,7 +232,7 @@ def values_and_slopes(
     elif isinstance(family, Spline):
         columns = spline_columns(family, amplitude)
     elif isinstance(family, PowerLaw):
-        exponent = float(family.exponent)
+        exponent = float(family.largest_exponent * expit(parameters[2]))
         term, share = x**exponent, exponent / family.largest_exponent
         by_logit = exponent * (1 - share) * parameters[1] * term * np.log(x)
         values = parameters[0] + parameters[1] * term

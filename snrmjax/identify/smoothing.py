@@ -1,8 +1,8 @@
 """Curves in the linear problem of a selection: their columns, and how smooth they are."""
 
+import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -36,4 +36,4 @@ def moved(curve: AbstractFamily, change: Float[np.ndarray, " unknown"]) -> Abstr
         values = parts.straight + parts.both @ change
     else:
         values = np.asarray(curve.parameters) + change
-    return eqx.tree_at(lambda f: f.parameters, curve, jnp.asarray(values))
+    return dataclasses.replace(curve, parameters=jnp.asarray(values))

@@ -1,7 +1,7 @@
 """Curves through values at knots: natural cubic splines of the squared amplitude."""
 
 import itertools
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -183,17 +183,18 @@ def _bends(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
     return matrix / np.sqrt(reach / np.mean(reach))[:, None]
 
 
-def hats(u: Array, knots: Float[Array, " knot"]) -> tuple[Array, Array]:
+def hats(u: Array | np.ndarray, knots: Float[Array | np.ndarray, " knot"]) -> tuple[Array, Array]:
     """Functions whose second derivative is a hat over three successive knots, and their slopes.
 
     Straight outside of their hat and made of clipped differences: nothing large cancels, as it
-    does in sums of truncated powers.
+    does in sums of truncated powers. On the host for arrays of the host.
     """
+    xp: Any = np if isinstance(u, np.ndarray) else jnp
     u = u[..., None]
     left, middle, right = knots[:-2], knots[1:-1], knots[2:]
     rise, fall = middle - left, right - middle
-    up, down = jnp.clip(u - left, 0.0, rise), jnp.clip(u - middle, 0.0, fall)
-    past, beyond = jnp.maximum(u - middle, 0.0), jnp.maximum(u - right, 0.0)
+    up, down = xp.clip(u - left, 0.0, rise), xp.clip(u - middle, 0.0, fall)
+    past, beyond = xp.maximum(u - middle, 0.0), xp.maximum(u - right, 0.0)
     value = up**3 / (6 * rise) + 0.5 * (rise * past + down**2 + fall * beyond)
     value = value - down**3 / (6 * fall)
     return value, 0.5 * up**2 / rise + down - 0.5 * down**2 / fall
@@ -202,5 +203,4 @@ def hats(u: Array, knots: Float[Array, " knot"]) -> tuple[Array, Array]:
 def _terms(
     u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
 ) -> Float[np.ndarray, "point term"]:
-    bent = np.asarray(hats(jnp.asarray(u), jnp.asarray(knots))[0])
-    return np.column_stack([np.ones_like(u), u, bent])
+    return np.column_stack([np.ones_like(u), u, hats(u, knots)[0]])

@@ -47,14 +47,19 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
             2: ("velocity", factor.astype(complex) ** 1j),
         }[kind]
         data = eqx.tree_at(lambda d: getattr(d, name), fit.data, getattr(fit.data, name) * by)
+        return np.asarray(refitted(data))
+
+    @eqx.filter_jit
+    def refitted(data):
         found = optx.least_squares(
-            lambda y, _: freed_residuals(
-                *(vector + y * unit, Restore(fit.unknowns, ()), data, fit.modes, fit.spread),
+            lambda y, own: freed_residuals(
+                *(vector + y * unit, Restore(fit.unknowns, ()), own, fit.modes, fit.spread),
                 *(weighing, jnp.asarray(True)),
             ),
             *(SOLVER, jnp.zeros_like(vector)),
+            args=data,
         )
-        return np.asarray(vector + found.value * unit)
+        return vector + found.value * unit
 
     for state, kind in ((3, 0), (20, 1), (41, 2)):
         step = 1e-4
