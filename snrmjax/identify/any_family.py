@@ -112,7 +112,7 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
         exponents[:n] = family.powers(family.order)
         mix[:n, :n] = np.eye(n)
     elif isinstance(family, PowerLaw):
-        free[1], largest = True, family.largest_exponent
+        free[1], largest, prior[0, 2] = True, family.largest_exponent, 1 / family.odds_std
         mix[:2, :2] = np.eye(2)
     elif isinstance(family, Spline):
         exponents[1] = 2.0

@@ -140,8 +140,13 @@ class ViscousCoulomb(SumOfPowers):
 
 
 class PowerLaw(AbstractFamily):
-    """A value at zero and a power of amplitude whose positive exponent is free."""
+    """A value at zero and a power of amplitude whose positive exponent is free.
 
+    The exponent may be anywhere in its range: the logarithm of its odds is expected within
+    `odds_std` of zero, or it would run away where data want it at an end, and take the bands along.
+    """
+
+    odds_std: ClassVar[float] = 5.0  # an exponent of 99 % of its range is at one of these
     kind: ClassVar[str] = "power_law"
     orders: ClassVar[tuple[int, ...]] = (1,)
     largest_exponent: ClassVar[float] = 6.0
@@ -153,6 +158,10 @@ class PowerLaw(AbstractFamily):
         known = x > 0
         power = jnp.exp(self.exponent * jnp.log(jnp.where(known, x, 1.0)))
         return self.parameters[0] + self.parameters[1] * jnp.where(known, power, 0.0)
+
+    def prior_residuals(self) -> Float[Array, " row"]:
+        """See `AbstractCurve`."""
+        return self.parameters[2:] / self.odds_std
 
     @property
     def exponent(self) -> Float[Array, ""]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.families import values_and_slopes
+from snrmjax.identify.families import PowerLaw, values_and_slopes
 from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.splines import SmoothingSpline, bent
 
@@ -21,8 +21,14 @@ class CurveColumns(NamedTuple):
 
 
 def curve_columns(curve: AbstractFamily, at: Float[np.ndarray, " point"]) -> CurveColumns:
-    """Of a smoothing spline the unknowns are a straight line and bends, else the parameters."""
+    """Of a smoothing spline the unknowns are a straight line and bends, else the parameters.
+
+    A power law is straightened where it is, and drawn for the mean of what its exponent may be.
+    """
     values, slopes = values_and_slopes(curve, at)
+    if isinstance(curve, PowerLaw):
+        middle = values - slopes[:, 2] * float(curve.parameters[2])
+        return CurveColumns(middle, slopes, np.array([np.inf, np.inf, curve.odds_std]))
     if not isinstance(curve, SmoothingSpline):
         return CurveColumns(values, slopes, np.full(slopes.shape[1], np.inf))
     parts = bent(curve)
@@ -35,5 +41,6 @@ def moved(curve: AbstractFamily, change: Float[np.ndarray, " unknown"]) -> Abstr
         parts = bent(curve)
         values = parts.straight + parts.both @ change
     else:
-        values = np.asarray(curve.parameters) + change
+        known = [1.0, 1.0, 0.0] if isinstance(curve, PowerLaw) else 1.0
+        values = np.asarray(curve.parameters) * np.array(known) + change
     return dataclasses.replace(curve, parameters=jnp.asarray(values))

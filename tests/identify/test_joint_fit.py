@@ -230,6 +230,23 @@ def test_auto_finds_the_families_that_made_the_data():
     assert all(c.score_std >= 0 for c in found.candidates)
 
 
+def test_an_exponent_at_the_end_of_its_range_leaves_the_bands_alone():
+    # The law is a power of one, the largest that microslip may have; this noise asks for more.
+    data = noisy(3, gain=0.01)
+    free, fixed = (
+        fit_jointly(data, modes(), level_gain_std=0.01, **{**TRUE, "damping": damping})
+        for damping in ("viscous_microslip@velocity", "viscous_quadratic@velocity")
+    )
+    at = np.linspace(0.1, 1.0, 5) * fixed.largest[1]
+    wide, narrow = (sj.fitted_values(fit, at) for fit in (free, fixed))
+    ratio = np.asarray(wide.natural_frequency_std / narrow.natural_frequency_std)
+    assert np.all((ratio > 0.99) & (ratio < 1.1))
+    ratio = np.asarray(wide.modal_damping_std / narrow.modal_damping_std)
+    assert np.all((ratio > 0.99) & (ratio < 1.7))  # what an exponent more does where data are few
+    off = (wide.modal_damping - narrow.modal_damping) / narrow.modal_damping_std
+    assert np.max(np.abs(off)) < 0.5
+
+
 def test_a_robust_loss_shrugs_off_an_outlier():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(5)))
     force = force.copy()
