@@ -107,7 +107,7 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
     mix, free = np.zeros((2 * size, size)), np.zeros(size, dtype=bool)
     largest, prior = 1.0, np.zeros((size, size))
     if isinstance(family, SmoothingSpline):
-        prior[: n - 2, :n] = np.asarray(family.bends) / float(family.bend_std)
+        prior[: n - 2, :n] = np.asarray(family.bends) / np.asarray(family.bend_std)[..., None]
     if isinstance(family, SumOfPowers):
         exponents[:n] = family.powers(family.order)
         mix[:n, :n] = np.eye(n)

@@ -31,7 +31,8 @@ from snrmjax.identify.level_scatter import (
     likeliest_std,
 )
 from snrmjax.identify.pilot import levels_apart, most_parameters
-from snrmjax.identify.smoothing import curve_columns, moved
+from snrmjax.identify.roughness import sizes_along
+from snrmjax.identify.smoothing import curve_columns, moved, places_of_bends
 from snrmjax.identify.splines import SmoothingSpline
 from snrmjax.model.modes import LinearModes
 
@@ -112,7 +113,8 @@ def select_families(
     there. Of the candidates within one standard error of the best, and not clearly worse, the one
     with the fewest parameters is taken. The pilot's deviations of levels are in their own units;
     states are taken as `data` corrects them. What levels scatter beyond what is stated is looked
-    for if `scatter_too`; without `smooth`, splines with few free knots stand in for smooth ones.
+    for if `scatter_too`, and how the size of bends changes along a smooth curve: a rough pilot does
+    not tell. Without `smooth`, splines with few free knots stand in for smooth ones.
     """
     kinds = [
         tuple("spline" if kind == _SMOOTH and not smooth else kind for kind in those)
@@ -124,8 +126,7 @@ def select_families(
         pair = (at.squared_frequency, at.modal_damping)
         scatter = work.scatter(*pair, look=scatter_too)
         work.use(scatter)
-        sizes = iter(scatter.bends)
-        curves = [_bent(c, next(sizes)) if _is_smooth(c) else c for c in pair]
+        curves = work.bending(pair, scatter.bends, alike=not scatter_too)
         return work, scatter, _with_curves(at, curves)
 
     def prepared(at: Unknowns) -> tuple[_Workbench, Scatter, float, Unknowns]:
@@ -161,8 +162,13 @@ def _is_smooth(curve: AbstractFamily) -> bool:
     return isinstance(curve, SmoothingSpline)
 
 
-def _bent(curve: AbstractFamily, size: float) -> AbstractFamily:
+def _bent(curve: AbstractFamily, size: float | np.ndarray) -> AbstractFamily:
     return eqx.tree_at(lambda f: f.bend_std, curve, jnp.asarray(size))
+
+
+def _with_bends(pair: _Pair, sizes: Sequence[float | np.ndarray]) -> list[AbstractFamily]:
+    left = iter(sizes)
+    return [_bent(curve, next(left)) if _is_smooth(curve) else curve for curve in pair]
 
 
 class _Compared(NamedTuple):
@@ -281,6 +287,17 @@ class _Workbench:
         problem = self.problem(*pair)
         bends = self.bends(problem, pair, 0 if name == "backbone" else 1)
         return _bent(curve, likeliest_std(problem, bends))
+
+    def bending(self, pair: _Pair, sizes: Sequence[float], *, alike: bool) -> list[AbstractFamily]:
+        """Curves with bends of the sizes found, of each curve's `alike` or changing along it."""
+        curves = _with_bends(pair, sizes)
+        smooth = [k for k in range(2) if _is_smooth(pair[k])]
+        if alike or not smooth:
+            return curves
+        problem, seen = self.problem(*curves), (self.known.displacement, self.known.speed)
+        bends = [self.bends(problem, pair, k) for k in smooth]
+        places = [places_of_bends(pair[k], *seen) for k in smooth]
+        return _with_bends(pair, sizes_along(problem, bends, places))
 
     def bends(self, problem: Linearised, pair: _Pair, which: int) -> Bends:
         """The bends of one of the curves among the unknowns."""

@@ -35,6 +35,20 @@ def curve_columns(curve: AbstractFamily, at: Float[np.ndarray, " point"]) -> Cur
     return CurveColumns(slopes @ parts.straight, slopes @ parts.both, parts.prior_std)
 
 
+def places_of_bends(
+    curve: AbstractFamily,
+    displacement: Float[np.ndarray, " point"],
+    speed: Float[np.ndarray, " point"],
+) -> Float[np.ndarray, " bend"]:
+    """Displacements where a curve may bend; those of one of velocity by the states near them."""
+    assert isinstance(curve, SmoothingSpline)
+    at = float(curve.scale) * np.sqrt(np.asarray(curve.knots)[1:-1])
+    if curve.argument == "velocity":
+        order = np.argsort(speed)
+        return np.interp(at, speed[order], displacement[order])
+    return at
+
+
 def moved(curve: AbstractFamily, change: Float[np.ndarray, " unknown"]) -> AbstractFamily:
     """A curve after a change of what `curve_columns` calls its unknowns."""
     if isinstance(curve, SmoothingSpline):

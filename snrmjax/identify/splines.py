@@ -77,8 +77,9 @@ class SmoothingSpline(Spline):
     """A natural cubic spline with a knot at every level that is as smooth as the data ask for.
 
     Its bends, what a value differs from the straight line between its neighbours' by, are expected
-    to be of one size, which the restricted likelihood finds. A band then holds what the curve may
-    do between levels; with few free knots it holds nothing of what they cannot follow. Levels lie
+    to be of a size that the restricted likelihood finds: one for all while families are compared,
+    then one that changes along the curve (`sizes_along`). A band then holds what the curve may do
+    between levels; with few free knots it holds nothing of what they cannot follow. Levels lie
     denser where a curve is rougher, so that bends from level to level are more alike than
     curvature is.
     Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.
@@ -88,7 +89,7 @@ class SmoothingSpline(Spline):
     orders: ClassVar[tuple[int, ...]] = (12,)
     largest_size: ClassVar[int] = 24
     bends: Float[Array, "bend knot"]  # from values at the knots
-    bend_std: Float[Array, ""]  # 1σ of a bend
+    bend_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
 
     def prior_residuals(self) -> Float[Array, " row"]:
         """See `AbstractCurve`."""
@@ -156,7 +157,7 @@ def bent(curve: SmoothingSpline) -> Bent:
     values, knots = np.asarray(curve.parameters), np.asarray(curve.knots)
     back = np.linalg.pinv(of_bends)
     both = np.column_stack([np.ones_like(knots), knots, back])
-    prior = np.concatenate([[np.inf, np.inf], np.full(len(of_bends), float(curve.bend_std))])
+    prior = np.concatenate([[np.inf, np.inf], np.full(len(of_bends), np.asarray(curve.bend_std))])
     return Bent(both, values - back @ (of_bends @ values), prior)
 
 

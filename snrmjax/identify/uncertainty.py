@@ -84,7 +84,11 @@ def sensitivity(fit: JointFit) -> Sensitivity:
     vector, restore = fit.vector()
     settings = (vector, restore, fit.data, fit.modes, fit.spread)
     hessian, mixed = _second_order(*settings, np.array(fit.freed))
-    inverse = np.linalg.pinv(np.asarray(hessian), rcond=1e-13, hermitian=True)
+    # In units of the unknowns' own curvature: a value at rest may be known a million times worse.
+    curvature = np.diagonal(np.asarray(hessian))
+    unit = 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0))
+    scaled = np.asarray(hessian) * np.outer(unit, unit)
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(unit, unit)
     p, n = len(vector), len(fit.data.level)
     by_state = -inverse @ np.asarray(mixed).reshape(p, -1)
     n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
