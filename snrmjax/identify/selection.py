@@ -291,12 +291,12 @@ class _Workbench:
     def bending(self, pair: _Pair, sizes: Sequence[float], *, alike: bool) -> list[AbstractFamily]:
         """Curves with bends of the sizes found, of each curve's `alike` or changing along it."""
         curves = _with_bends(pair, sizes)
-        smooth = [k for k in range(2) if _is_smooth(pair[k])]
+        smooth = {k: c for k, c in enumerate(pair) if isinstance(c, SmoothingSpline)}
         if alike or not smooth:
             return curves
         problem, seen = self.problem(*curves), (self.known.displacement, self.known.speed)
         bends = [self.bends(problem, pair, k) for k in smooth]
-        places = [places_of_bends(pair[k], *seen) for k in smooth]
+        places = [places_of_bends(curve, *seen) for curve in smooth.values()]
         return _with_bends(pair, sizes_along(problem, bends, places))
 
     def bends(self, problem: Linearised, pair: _Pair, which: int) -> Bends:

@@ -36,12 +36,11 @@ def curve_columns(curve: AbstractFamily, at: Float[np.ndarray, " point"]) -> Cur
 
 
 def places_of_bends(
-    curve: AbstractFamily,
+    curve: SmoothingSpline,
     displacement: Float[np.ndarray, " point"],
     speed: Float[np.ndarray, " point"],
 ) -> Float[np.ndarray, " bend"]:
     """Displacements where a curve may bend; those of one of velocity by the states near them."""
-    assert isinstance(curve, SmoothingSpline)
     at = float(curve.scale) * np.sqrt(np.asarray(curve.knots)[1:-1])
     if curve.argument == "velocity":
         order = np.argsort(speed)
