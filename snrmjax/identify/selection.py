@@ -412,10 +412,10 @@ def _normal(problem: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unknowns that may move, JᵀJ with priors, and their units."""
     keep = problem.prior_std > 0
     x = problem.slopes[:, keep]
-    size = np.linalg.norm(x, axis=0)
+    prior = 1.0 / problem.prior_std[keep]
+    size = np.hypot(np.linalg.norm(x, axis=0), prior)
     size = np.where(size > 0, size, 1.0)
-    prior = np.where(np.isfinite(problem.prior_std[keep]), problem.prior_std[keep], np.inf)
-    matrix = (x / size).T @ (x / size) + np.diag(1.0 / (prior * size) ** 2)
+    matrix = (x / size).T @ (x / size) + np.diag((prior / size) ** 2)
     return keep, matrix + 1e-12 * np.eye(len(matrix)), size
 
 
