@@ -30,6 +30,7 @@ from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structure import Structure
+from snrmjax.simulate.blocks import on_one_core
 
 _LEAST_STATES = 6
 _ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
@@ -73,6 +74,7 @@ class Diagnosis:
     after: Float[np.ndarray, "state part"]
 
 
+@on_one_core
 def diagnose_model(
     model: Structure, data: SteadyStates, *, force_gain_std: float = 0.0
 ) -> Diagnosis:

@@ -42,6 +42,7 @@ from snrmjax.identify.selection import (
 )
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.modes import LinearModes
+from snrmjax.simulate.blocks import on_one_core
 from snrmjax.simulate.compiled import compiled
 
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
@@ -116,6 +117,7 @@ class JointFit(eqx.Module):
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
 
 
+@on_one_core
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes,

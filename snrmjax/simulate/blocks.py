@@ -3,12 +3,15 @@
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -103,6 +106,21 @@ def over_cores(
             if progress is not None:
                 progress(done + 1, len(jobs))
     return results
+
+
+def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
+    """A function whose linear algebra on the host does not spread over the cores.
+
+    Of matrices of a hundred rows threads cost more than they save, and where `over_cores` is at
+    work they take the cores from it: a diagnosis takes half as long again.
+    """
+
+    @wraps(function)
+    def alone(*arguments: P.args, **named: P.kwargs) -> R:
+        with threadpool_limits(limits=1, user_api="blas"):
+            return function(*arguments, **named)
+
+    return alone
 
 
 def as_arrays(tree: T) -> T:
