@@ -293,7 +293,10 @@ headline["tuned to resonance: ambiguous, both in the class"] = all(
     one.verdict == "ambiguous" and set(one.candidates[0]) == BOTH for one in tuned
 )
 headline["there the program asks for 30° and more off"] = all(
-    "30° and more" in one.decide_by for one in tuned
+    one.request is not None
+    and one.request.kind == "off_resonance"
+    and round(one.request.phase[0]) >= 30
+    for one in tuned
 )
 headline["18° to 34° and 30° to 60°: an offset is named alone, friction alone"] = all(
     one.candidates == (FRICTION if what == "friction" else OFFSET)
