@@ -8,7 +8,9 @@ import pytest
 from scipy.optimize import least_squares
 
 import snrmjax as sj
-from snrmjax.identify.joint_fit import fit_jointly
+from snrmjax.identify.force_balance import Weighing
+from snrmjax.identify.free_unknowns import programmed, with_room
+from snrmjax.identify.joint_fit import _linearised, fit_jointly
 from snrmjax.identify.selection import parse_family
 from snrmjax.io.joint_results import (
     read_joint_fit,
@@ -142,6 +144,35 @@ def test_without_the_levels_error_bands_are_too_narrow(fit):
     blind = fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=1e-9, **TRUE)
     narrow, wide = (sj.fitted_values(f, SPEEDS).modal_damping_std for f in (blind, fit))
     assert np.all(np.asarray(narrow) < 0.8 * np.asarray(wide))
+
+
+def test_spare_states_and_levels_tell_nothing(fit):
+    def normal(data):
+        """The fit's own unknowns: JᵀJ, Jᵀr of the states, and the cost."""
+        program = programmed(fit.unknowns, fit.free, data.n_levels)
+        settings = (data, fit.modes, fit.spread)
+        n, no, anew = len(data.level), np.array(False), np.array(True)
+        none = Weighing(np.zeros((n, 2, 2)), np.zeros((n, 2)))
+        found = _linearised(program.vector, program.restore, *settings, none, no, anew)
+        slopes, left = np.asarray(found.jacobian), np.asarray(found.residuals).reshape(-1)
+        pull = slopes[: 2 * n].T @ left
+        return slopes.T @ slopes, pull, program.own, float(found.cost)
+
+    room = with_room(fit.data)
+    assert len(room.level) > len(fit.data.level)
+    assert room.n_levels > fit.data.n_levels
+    gram, pull, own, square = normal(room)
+    known = normal(fit.data)
+    mine = known[2]
+    scale = np.sqrt(np.diag(known[0]))[mine]
+    np.testing.assert_allclose(
+        gram[np.ix_(own, own)] / np.outer(scale, scale),
+        known[0][np.ix_(mine, mine)] / np.outer(scale, scale),
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(pull[own] / scale, known[1][mine] / scale, atol=1e-9)
+    assert square == pytest.approx(known[3], rel=1e-12)
+    assert len(own) == len(fit.names())
 
 
 def test_order_of_rows_and_units_do_not_matter(fit):
