@@ -101,10 +101,10 @@ def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
         return None
     force, unit = force[whole], unit[whole]
     unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-    along = np.sum(force * unit, axis=1)
+    with_it = np.sum(force * unit, axis=1)
     across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
-    ratio = float(np.sum(along**2) / np.sum(across**2))
-    if not fisher.sf(ratio, len(along), len(along)) < UNLIKELY:
+    ratio = float(np.sum(with_it**2) / np.sum(across**2))
+    if not fisher.sf(ratio, len(with_it), len(with_it)) < UNLIKELY:
         return None
     return (
         f"what is left is {np.sqrt(ratio):.2g} times as large along a change of the natural "
