@@ -94,8 +94,8 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     coefficients = mix @ parameters
     share = jax.nn.sigmoid(parameters[2])
     by_logit = (basis.by_exponent @ coefficients) * shape[2] * share * (1 - share)
-    slope = (basis.by_x @ coefficients) * by_x
-    slope = slope + basis.value @ (mix @ by_parameters) + by_logit * by_parameters[2]
+    columns = (basis.value @ mix).at[..., 2].add(by_logit)
+    slope = (basis.by_x @ coefficients) * by_x + columns @ by_parameters
     return _value(x, parameters, shape), slope
 
 

@@ -33,6 +33,12 @@ class Restore(eqx.Module):
         moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
         return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
 
+    @property
+    def level_places(self) -> Int[np.ndarray, "level error"]:
+        """Where in the vector the deviations of levels are."""
+        level, end = self.unknowns.level, self.vector().size - self.unknowns.linear.size
+        return end - level.size + np.arange(level.size).reshape(level.shape)
+
 
 class Programmed(NamedTuple):
     """The free unknowns as compiled programs take them: with curves of one form and size.

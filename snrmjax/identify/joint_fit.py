@@ -32,6 +32,7 @@ from snrmjax.identify.free_unknowns import (
 )
 from snrmjax.identify.joint_notes import notes_on_noise, notes_on_reach
 from snrmjax.identify.level_scatter import Scatter
+from snrmjax.identify.level_slopes import LevelPattern, on_levels
 from snrmjax.identify.pilot import pilot_start
 from snrmjax.identify.residuals import all_residuals, freed_of_errors, freed_residuals
 from snrmjax.identify.selection import (
@@ -362,11 +363,12 @@ def _linearised(
         return all_residuals(vector, restore, data, modes, spread, weighing)
 
     left, push = jax.linearize(residuals, vector)
+    pattern = LevelPattern.of(restore, data)
     points = left[: 2 * len(data.level)].reshape(-1, 2)
     return _Linear(
         weighing=weighing,
         residuals=points,
-        jacobian=jax.vmap(push)(jnp.eye(vector.size)).T,
+        jacobian=pattern.jacobian(pattern.pushed(push)),
         cost=jnp.sum(left**2),
         correction=errors,
     )
@@ -392,7 +394,7 @@ def _solve(
 
     solution: optx.Solution = optx.least_squares(
         lambda y, _: freed_residuals(y * unit, *(restore, data, modes, spread, weighing, freed)),
-        *(_ROUND, vector / unit),
+        *(on_levels(_ROUND, restore, data), vector / unit),
         max_steps=200,
         throw=False,
     )

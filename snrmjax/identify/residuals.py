@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.force_balance import (
     BalanceData,
@@ -44,6 +44,16 @@ def all_residuals(
     curves = (unknowns.squared_frequency, unknowns.modal_damping)
     priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
     return jnp.concatenate([points, *priors])
+
+
+def level_of_residuals(restore: Restore, data: BalanceData) -> Int[Array, " residual"]:
+    """Whose deviations move each of `all_residuals`; −1 where it is no level's."""
+    unknowns = restore.unknowns
+    curves = (unknowns.squared_frequency, unknowns.modal_damping)
+    n_levels, n_errors = unknowns.level.shape
+    nobody = unknowns.linear.size + sum(c.prior_residuals().size for c in curves)
+    own = (jnp.repeat(data.level, 2), jnp.repeat(jnp.arange(n_levels), n_errors))
+    return jnp.concatenate([*own, jnp.full(nobody, -1)])
 
 
 def freed_of_errors(

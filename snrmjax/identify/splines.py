@@ -4,6 +4,7 @@ import itertools
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,9 +30,7 @@ class Spline(AbstractFamily):
     def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """See `AbstractFamily`."""
         u = (jnp.asarray(amplitude) / self.scale) ** 2
-        line = jnp.stack([jnp.ones_like(u), u], axis=-1)
-        terms = jnp.concatenate([line, hats(u, self.knots)[0]], axis=-1)
-        return terms @ (self.mix @ self.parameters)
+        return _drawn(u, self.mix @ self.parameters, self.knots)
 
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
@@ -71,6 +70,21 @@ class Spline(AbstractFamily):
         """The spline through values at knots, which are squares of amplitude/scale."""
         mix = jnp.asarray(np.linalg.inv(_terms(knots, knots)))
         return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
+
+
+@jax.custom_jvp
+def _drawn(u: Array, coefficients: Array, knots: Array) -> Array:
+    line = jnp.stack([jnp.ones_like(u), u], axis=-1)
+    return jnp.concatenate([line, hats(u, knots)[0]], axis=-1) @ coefficients
+
+
+@_drawn.defjvp
+def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """One set of hats serves all directions, where automatic rules would draw them for each."""
+    u, coefficients, knots = primals
+    by_u, by_coefficients, _ = tangents
+    slope = coefficients[1] + hats(u, knots)[1] @ coefficients[2:]
+    return _drawn(u, coefficients, knots), slope * by_u + _drawn(u, by_coefficients, knots)
 
 
 class SmoothingSpline(Spline):

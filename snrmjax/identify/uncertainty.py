@@ -31,6 +31,7 @@ from snrmjax.identify.joint_fit import (
     JointFit,
     inverse_of,
 )
+from snrmjax.identify.level_slopes import on_levels
 from snrmjax.identify.residuals import (
     all_residuals,
     freed_of_errors,
@@ -325,7 +326,7 @@ def _resampled(
         given = (eqx.tree_at(lambda d: d.weight, data, weight), modes, spread, weighing, freed)
         found: optx.Solution = optx.least_squares(
             lambda y, _: freed_residuals(vector + y * unit, restore, *given),
-            *(SOLVER, jnp.zeros_like(vector)),
+            *(on_levels(SOLVER, restore, data), jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
         )
