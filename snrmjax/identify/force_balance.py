@@ -19,6 +19,7 @@ from snrmjax.identify.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.simulate.blocks import mapped
 from snrmjax.simulate.compiled import compiled
 
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
@@ -205,8 +206,7 @@ def error_slopes(
     """
     n_states, kinds = at.shape
     directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
-    slopes = jax.vmap(lambda d: jax.jvp(balance, (at,), (d,))[1])(directions)
-    return jnp.moveaxis(slopes, 0, 2)
+    return jnp.moveaxis(mapped(jax.linearize(balance, at)[1], directions), 0, 2)
 
 
 class Weighing(NamedTuple):

@@ -277,7 +277,6 @@ def _fitted(
         if not np.isfinite(float(answer.cost)):
             raise ValueError("the fit ran into numbers that are not finite: try other families.")
         jacobian = np.asarray(answer.jacobian)[:, program.own]
-        covariance = inverse_of(jacobian)
         if robust:
             weight = np.sqrt(np.asarray(data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
@@ -290,7 +289,7 @@ def _fitted(
         scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
-        covariance=covariance,
+        covariance=inverse_of(jacobian),
         spread=spread,
         data=data,
         scatter=scatter,
