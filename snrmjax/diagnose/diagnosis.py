@@ -21,7 +21,7 @@ from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
 from snrmjax.diagnose.naming import DETECTED, Named, Row, named
-from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.sidedness import acts_both_ways
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
@@ -268,26 +268,6 @@ def _decide_by(
         sentences.append(request.sentence)
     sentences += [f"{d.decide_by[0].upper()}{d.decide_by[1:]}." for d in open_ends]
     return " ".join(sentences) or None
-
-
-def scales_of(predictions: Predictions) -> Scales:
-    """What is typical of the measured motions."""
-    modes, j = predictions.model.modes, predictions.model.modes.mode_of_interest
-    states = predictions.chosen.states
-    speed, omega, force = (
-        np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
-    )
-    shape = abs(float(modes.mode_shape[predictions.chosen.sensors[0], j]))
-    amplitude = speed / omega / shape
-    return Scales(
-        amplitude=float(np.median(amplitude)),
-        largest=float(np.max(amplitude)),
-        frequency=float(modes.natural_frequency[j]),
-        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
-        receptance=float(np.median(speed / omega / force)),
-        smallest_force=float(np.min(force)),
-        damping_ratio=float(modes.damping_ratio[j]),
-    )
 
 
 def _by_amplitude(bench: Bench) -> list[int]:

@@ -19,8 +19,6 @@ from snrmjax.diagnose.predictions import (
     Predictions,
 )
 from snrmjax.identify.calibration_states import Selection, whitened
-from snrmjax.model.parameters import parameter_names, parameter_value, stated_std
-from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import over_cores
 
 _STEPS = 9  # of a fit
@@ -144,7 +142,9 @@ class Bench:
         self.model = predictions.model
         group = predictions.group(PLAIN)
         found = self._by_baseline(group, group.values)
-        self._columns, self._slopes = found.columns[0], found.slopes[0]
+        # As closely as the changes are found that are compared with them.
+        self._columns = predictions.of(group, group.values[None]).columns[0]
+        self._slopes = found.slopes[0]
         self._baseline_slopes = self._slopes
         self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
         self._by_error, self._phasors = predictions.by_error(group, group.values)
@@ -153,14 +153,11 @@ class Bench:
 
     def _by_baseline(self, group: Group, values: Float[np.ndarray, " parameter"]) -> Predicted:
         """With slopes by the baseline's parameters, times 1σ, and by the linear mode's two."""
-        names = _baseline_names(self.model)
-        directions = np.zeros((1, len(group.names), len(names) + 2))
-        for k, name in enumerate(names):
-            directions[0, group.place(name), k] = stated_std(self.model, name)
-        j = self.model.modes.mode_of_interest + 1
-        directions[0, group.place(f"mode_{j}.natural_frequency"), -2] = 1.0
-        directions[0, group.place(f"mode_{j}.damping_ratio"), -1] = 1.0
-        return self.predictions.of(group, values[None], directions)
+        stated, j = self.predictions.stated, self.model.modes.mode_of_interest + 1
+        two = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
+        found = self.predictions.of(group, values[None], (*stated, *two))
+        std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
+        return found._replace(slopes=found.slopes * std, force_slopes=found.force_slopes * std)
 
     def _of_what_is_missed(self) -> Float[np.ndarray, "state column input"]:
         """What errors of the velocity do to the force that the baseline does not know of.
@@ -215,7 +212,7 @@ class Bench:
         """The same with velocities of unknown phase where a fit has them."""
         force = self.force.copy()
         for group, values in self._as_fitted(fit):
-            own = self.predictions.of(group, values[None], np.zeros((1, len(values), 0)))
+            own = self.predictions.of(group, values[None])
             force += own.phasors[0, :, 0] - self.force
         other = copy.copy(self)
         other.predictions = self.predictions.turned(-np.angle(force))
@@ -266,11 +263,13 @@ class Bench:
         if candidate.kind not in self._changes:
             group, labels = self.predictions.group(candidate.kind), parameter_labels(candidate.kind)
             starts = np.array(candidate.starts)
-            changes = self._predicted(group, labels, starts).columns - self._columns
+            found = self._predicted(group, labels, starts, slopes=False)
+            changes = found.columns - self._columns
             lost = ~np.isfinite(self.weighing.noise_units(changes)).all(axis=1)
             if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
                 starts[:, 0] *= _WEAK
-                weak = self._predicted(group, labels, starts[lost]).columns - self._columns
+                found = self._predicted(group, labels, starts[lost], slopes=False)
+                weak = found.columns - self._columns
                 changes[lost] = weak / _WEAK ** (2 if candidate.kind in SECOND_ORDER else 1)
             self._changes[candidate.kind] = changes
         return self._changes[candidate.kind]
@@ -287,10 +286,12 @@ class Bench:
         Of the data the rows `kept`, or all.
         """
         moved = self.weighing.likeliest(fit.rows, kept)
-        names = _baseline_names(self.model)
+        stated = self.predictions.stated
         return {
-            name: float(parameter_value(self.model, name)) + stated_std(self.model, name) * step
-            for name, step in zip(names, moved[: len(names)].tolist(), strict=True)
+            name: value + std * step
+            for (name, (value, std)), step in zip(
+                stated.items(), moved[: len(stated)].tolist(), strict=True
+            )
         }
 
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
@@ -397,21 +398,22 @@ class Bench:
     def _evaluated(
         self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
     ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
-        found = self._predicted(group, labels, values)
+        found = self._predicted(group, labels, values, slopes=True)
         rows = self.weighing.noise_units(found.columns)
         slopes = self.weighing.noise_units(np.moveaxis(found.slopes, 3, 0))
         return rows, np.moveaxis(slopes, 0, 2)
 
     def _predicted(
-        self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
+        self,
+        group: Group,
+        labels: Sequence[str],
+        values: Float[np.ndarray, "trial parameter"],
+        *,
+        slopes: bool,
     ) -> Predicted:
-        trials, n = values.shape
-        every = np.tile(group.values, (trials, 1))
-        directions = np.zeros((trials, len(group.names), n))
-        for k, label in enumerate(labels):
-            every[:, group.place(label)] = values[:, k]
-            directions[:, group.place(label), k] = 1.0
-        return self.predictions.of(group, every, directions)
+        every = np.tile(group.values, (len(values), 1))
+        every[:, [group.place(label) for label in labels]] = values
+        return self.predictions.of(group, every, labels if slopes else ())
 
 
 def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:
@@ -420,11 +422,6 @@ def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:
     scaled = arms / size
     matrix = scaled.T @ scaled + damping * np.eye(len(size))
     return -np.linalg.solve(matrix, scaled.T @ left) / size
-
-
-def _baseline_names(model: Structure) -> list[str]:
-    """The baseline's parameters that have a stated error."""
-    return [name for name in parameter_names(model) if stated_std(model, name) > 0]
 
 
 def unlikely(chi_square: float, freedom: int) -> float:

@@ -141,8 +141,7 @@ def _needed(
     values, own = group.values.copy(), bench.baseline(fit)
     for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
         values[group.place(name)] = value
-    nothing = np.zeros((1, len(values), 0))
-    columns = predictions.of(group, values[None], nothing).columns[0]
+    columns = predictions.of(group, values[None]).columns[0]
     parts = columns[:, 0::2] + 1j * columns[:, 1::2]
     first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
     higher = parts[:, first : first + len(HARMONICS)]
@@ -156,11 +155,8 @@ def predicted(predictions: Predictions, fit: Fit) -> Predicted | None:
     if not set(fit.labels) <= set(group.names):
         return None
     values = group.values.copy()
-    directions = np.zeros((1, len(values), len(fit.labels)))
-    for k, label in enumerate(fit.labels):
-        values[group.place(label)] = fit.values[k]
-        directions[0, group.place(label), k] = 1.0
-    return predictions.of(group, values[None], directions)
+    values[[group.place(label) for label in fit.labels]] = fit.values
+    return predictions.of(group, values[None], fit.labels)
 
 
 class Rows(NamedTuple):

@@ -6,6 +6,7 @@ a candidate is a vector of parameters.
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose import programs
 from snrmjax.diagnose.amplitudes import sizes_of
+from snrmjax.diagnose.candidates import Scales, candidate, parameter_labels
 from snrmjax.identify.calibration_states import (
     CalibrationStates,
     Selection,
@@ -24,12 +26,13 @@ from snrmjax.identify.calibration_states import (
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.parameters import parameter_names, parameter_value
+from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
-_DIRECTIONS = 3  # derivatives that a call gives
+_DIRECTIONS = 8  # derivatives that a call gives, at most
+_ERROR = 0.1  # of which a slope takes a thousandth: of a logarithm, or rad
 _TRIALS = _BLOCK  # that may meet in a block, at most
 
 
@@ -39,11 +42,21 @@ class Group(NamedTuple):
     model: Structure
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
+    unit: Float[np.ndarray, " parameter"]  # a change that is plainly seen, or smaller
+    is_strength: Bool[np.ndarray, " parameter"]  # of an added effect
     force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
 
     def place(self, name: str) -> int:
         """Where a parameter is."""
         return self.names.index(name)
+
+
+class _Steps(NamedTuple):
+    """Directions of slopes: a parameter each, or errors of the states where there is none (−1)."""
+
+    place: Int[np.ndarray, " direction"]
+    length: Float[np.ndarray, "trial direction"]
+    by_error: Float[np.ndarray, "input direction"]
 
 
 class Predicted(NamedTuple):
@@ -89,6 +102,9 @@ class Predictions:
         self.states = [np.asarray(p) for p in self.chosen.states._replace(known=both)]
         self.level_numbers = np.asarray(data.level)[self.chosen.rows]
         self.force_gain_std = force_gain_std
+        numbers = parameter_values(self.model)
+        # What is stated of the baseline: numbers and their 1σ.
+        self.stated = {k: (numbers[k], std) for k, std in stated_stds(self.model).items()}
         self._groups: dict[str, Group] = {}
         found = by_blocks(self._baseline_motions, _BLOCK, *self.states)
         # Room for a power of two of states: few sizes compile.
@@ -145,32 +161,38 @@ class Predictions:
         present = [effect.kind for effect in self.model.effects]
         added = tuple(_without_strength(k, self.model) for k in kinds if k not in present)
         model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
-        names = parameter_names(model)
-        values = np.array([float(parameter_value(model, name)) for name in names])
+        numbers, stds = parameter_values(model), stated_stds(model)
+        names, values = tuple(numbers), np.array(list(numbers.values()))
         kinds = [added[k].kind for k in programs.forces_of(added)]
         owner = [name.split(".")[0] for name in names]
         force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
-        return Group(model, names, values, force)
+        std = np.array([stds.get(name, 0.0) for name in names])
+        unit = np.where(values != 0, 0.01 * np.abs(values), np.where(std > 0, std, 1.0))
+        scales, where = scales_of(self), {name: k for k, name in enumerate(names)}
+        is_strength = np.zeros(len(names), dtype=bool)
+        for effect in added:
+            places = [where[label] for label in parameter_labels(effect.kind)]
+            unit[places] = candidate(effect.kind, scales).unit
+            is_strength[places[0]] = True
+        return Group(model, names, values, unit, is_strength, force)
 
     def of(
         self,
         group: Group,
         values: Float[np.ndarray, "trial parameter"],
-        directions: Float[np.ndarray, "trial parameter direction"],
+        along: Sequence[str] = (),
     ) -> Predicted:
-        """What the states miss under every trial's parameters."""
-        none = np.zeros((self.states[6].shape[1], _DIRECTIONS))
-        wanted = directions.shape[2]
-        parts = [
-            self._answers(
-                group, values, _filled(directions[:, :, begin : begin + _DIRECTIONS]), none
-            )
-            for begin in range(0, max(wanted, 1), _DIRECTIONS)
-        ]
-        slopes = np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
-        columns, phasors = parts[0][0], self.sizes.phasors(parts[0][0])
+        """What the states miss under every trial's parameters, and slopes along some of these."""
+        places = np.array([group.place(name) for name in along], dtype=int)
+        # Slopes are differences, over a small share of what is plainly seen.
+        strength = np.where(group.is_strength, np.abs(values), 0.0)
+        length = np.maximum(group.unit, strength)[:, places]
+        steps = _Steps(places, length, np.zeros((self.states[6].shape[1], len(places))))
+        columns, slopes = self._in_turn(group, values, steps)
+        slopes = slopes / length[:, None, None]
         force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
-        return Predicted(*self.sizes.compared(columns, slopes), phasors, force_slopes)
+        compared = self.sizes.compared(columns, slopes)
+        return Predicted(*compared, self.sizes.phasors(columns), force_slopes)
 
     def by_error(
         self, group: Group, values: Float[np.ndarray, " parameter"]
@@ -180,25 +202,33 @@ class Predictions:
         Returns the model's phasors too.
         """
         inputs = self.states[6].shape[1]
-        none = np.zeros((1, len(values), _DIRECTIONS))
-        parts = [
-            self._answers(group, values[None], none, _filled(some))
-            for some in np.split(np.eye(inputs), range(_DIRECTIONS, inputs, _DIRECTIONS), axis=1)
-        ]
-        slopes = np.concatenate([slope for _, slope in parts], axis=3)[..., :inputs]
-        columns = parts[0][0]
-        found = self.sizes.compared(columns, slopes, of_errors=True)[1]
+        none = (np.full(inputs, -1), np.zeros((1, inputs)))
+        steps = _Steps(*none, _ERROR * np.eye(inputs))
+        columns, slopes = self._in_turn(group, values[None], steps)
+        found = self.sizes.compared(columns, slopes / _ERROR, of_errors=True)[1]
         return found[0], self.sizes.phasors(columns)[0]
+
+    def _in_turn(
+        self, group: Group, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns, and slopes along some directions after the other."""
+        wanted, parts = len(steps.place), []
+        for begin in range(0, max(wanted, 1), _DIRECTIONS):
+            some = slice(begin, begin + _DIRECTIONS)
+            own = _Steps(*(_filled(a[..., some]) for a in steps))
+            parts.append(self._answers(group, values, own, min(wanted - begin, _DIRECTIONS)))
+        return parts[0][0], np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
 
     def _answers(
         self,
         group: Group,
         values: Float[np.ndarray, "trial parameter"],
-        by_value: Float[np.ndarray, "trial parameter direction"],
-        by_error: Float[np.ndarray, "input direction"],
+        steps: "_Steps",
+        wanted: int,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Columns and slopes: friction by its formulas, and marching where they fail."""
-        used = np.any(values != group.values, axis=0) | np.any(by_value, axis=(0, 2))
+        used = np.any(values != group.values, axis=0)
+        used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
         active = np.zeros(group.force.max() + 1, dtype=bool)
         active[group.force[used & (group.force >= 0)]] = True
         fixed = (group.model, group.names, self.held, len(self.model.effects))
@@ -210,10 +240,10 @@ class Predictions:
                 at = padded(some, _BLOCK)
                 first = int(trial[some[0]])
                 near = slice(first, first + _TRIALS)
-                ours = [padded(a[near], _TRIALS) for a in (values, by_value)]
-                table = programs.Trials(*jax.device_put((*ours, by_error)))
-                arrays = (active, self._stored, table, state[at], trial[at] - first)
-                found = programs.missed(*fixed, swings, *arrays)
+                ours = [padded(a[near], _TRIALS) for a in (values, steps.length)]
+                table = programs.Trials(*jax.device_put((*ours, steps.place, steps.by_error)))
+                which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
+                found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
                 return [np.asarray(a)[: len(some)] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
@@ -230,8 +260,8 @@ class Predictions:
         return columns, slopes
 
 
-def _filled(directions: Float[np.ndarray, "*entry some"]) -> np.ndarray:
-    room = np.zeros((*directions.shape[:-1], _DIRECTIONS))
+def _filled(directions: np.ndarray) -> np.ndarray:
+    room = np.zeros((*directions.shape[:-1], _DIRECTIONS), dtype=directions.dtype)
     room[..., : directions.shape[-1]] = directions
     return room
 
@@ -243,6 +273,26 @@ def whitened_states(
     whiten = np.asarray(state_whitener(chosen.states, jnp.asarray(by_error), jnp.zeros(())))
     used = np.any(whiten != 0, axis=(1, 2))
     return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
+
+
+def scales_of(predictions: Predictions) -> Scales:
+    """What is typical of the measured motions."""
+    modes, j = predictions.model.modes, predictions.model.modes.mode_of_interest
+    states = predictions.chosen.states
+    speed, omega, force = (
+        np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
+    )
+    shape = abs(float(modes.mode_shape[predictions.chosen.sensors[0], j]))
+    amplitude = speed / omega / shape
+    return Scales(
+        amplitude=float(np.median(amplitude)),
+        largest=float(np.max(amplitude)),
+        frequency=float(modes.natural_frequency[j]),
+        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        receptance=float(np.median(speed / omega / force)),
+        smallest_force=float(np.min(force)),
+        damping_ratio=float(modes.damping_ratio[j]),
+    )
 
 
 PLAIN = "cubic_stiffness"

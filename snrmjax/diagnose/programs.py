@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.identify.calibration_states import CalibrationStates
-from snrmjax.identify.needed_force import held_state, missed_columns
+from snrmjax.identify.needed_force import Erring, held_state, missed_columns
 from snrmjax.model.effect_base import (
     AbstractEffect,
     AbstractForce,
@@ -32,10 +32,14 @@ from snrmjax.simulate.blocks import mapped
 from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.harmonics import displacement_phasors, harmonic_basis
-from snrmjax.simulate.held_motion import HeldMotion
+from snrmjax.simulate.held_motion import Secants, start_of
 
 HARMONICS = 5
 """Of the motions: one sees three of them, and two more bend those."""
+
+_STEP = 2.5e-4  # of a direction, between the two ends of a slope
+_NOTHING = 1e-9  # relative difference of columns that solutions may have by chance
+_CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
 
 Held = tuple[tuple[int, ...], tuple[int, ...], int]
 """The sensors (the reference first), the harmonics compared and the harmonics of a motion."""
@@ -75,10 +79,11 @@ class Stored(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Parameters of some trials, and directions for derivatives, of the errors for all alike."""
+    """Parameters of some trials, and the steps of slopes: of one parameter, or of errors."""
 
     values: Float[Array, "trial parameter"]
-    by_value: Float[Array, "trial parameter direction"]
+    length: Float[Array, "trial direction"]
+    place: Int[Array, " direction"]
     by_error: Float[Array, "input direction"]
 
 
@@ -90,41 +95,55 @@ def missed(
     own: int,
     swings: bool,
     active: Bool[Array, " force"],
+    wanted: Int[Array, ""],
     stored: Stored,
     trials: Trials,
     state: Int[Array, " row"],
     trial: Int[Array, " row"],
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
-    """What every row misses, and its derivatives; NaN where no motion was found.
+    """What every row misses, and its slopes along the directions `wanted`, else zero.
 
+    NaN where no motion was found. Slopes are differences between motions a small step apart: the
+    second is a step or two from the first, and the equations are compiled but once.
     Arguments: the first `own` effects are the baseline's; with `swings` friction is taken by
     formulas for cycles that turn only twice, and others give NaN; of the added `forces_of` only
     the `active` count; a row is a state and a trial by their numbers.
     """
+    n_directions = len(trials.place)
+    close = jnp.where(wanted > 0, _CLOSER, _CLOSE)
 
     def one(state: Array, trial: Array) -> tuple[Array, Array]:
         measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
-        values, by_value = trials.values[trial], trials.by_value[trial]
+        values, length = trials.values[trial], trials.length[trial]
 
-        def of(change: Array) -> tuple[Array, Array]:
-            changed = with_parameters(model, names, values + by_value @ change)
+        def found(
+            number: Array, start: Secants, columns: Float[Array, "column direction"]
+        ) -> tuple[Secants, Float[Array, "column direction"]]:
+            along = jnp.where(jnp.arange(n_directions) == number - 1, _STEP, 0.0)
+            mine = trials.place[number - 1] == jnp.arange(len(names))
+            changed = with_parameters(model, names, values + (length @ along) * mine)
             added = changed.effects[own:]
             forces = [_quick(added[k], swings=swings) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
+            erring = Erring(measured, 1.0, trials.by_error @ along)
+            motion = erring.motion(changed, held[0][0], held[2])
+            parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
+            balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
+            motion = dataclasses.replace(motion, balance=balance)
+            end = motion.solved_by_secants(inverse, start, close)
+            own_columns = missed_columns(erring, motion, end.point, *held[:2])
+            start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
+            place = jnp.arange(n_directions + 1) == number
+            return start, jnp.where(place, own_columns[:, None], columns)
 
-            def solved(motion: HeldMotion) -> Array:
-                parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
-                balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
-                forced = dataclasses.replace(motion, balance=balance)
-                return forced.solved_by_secants(near, inverse)
-
-            error = trials.by_error @ change
-            found = missed_columns(changed, measured, held, 1.0, error, solved)[0]
-            return found, found
-
-        slopes, columns = jax.jacfwd(of, has_aux=True)(jnp.zeros(by_value.shape[1]))
-        return columns, slopes
+        none = jnp.zeros((measured.known.shape[0], n_directions + 1))
+        columns = jax.lax.fori_loop(
+            0, wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
+        )[1]
+        change = columns[:, 1:] - columns[:, :1]
+        seen = (jnp.arange(n_directions) < wanted) & ~(jnp.abs(change) < _NOTHING)
+        return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
 
     return jax.vmap(one)(state, trial)
 
@@ -151,8 +170,8 @@ class _ForcedBalance(HarmonicBalance):
             some = jnp.any(self.active[jnp.array(mine)])
             added = added + _where(some, partial(self._harmonics, mine, n_samples), x, omega)
         unit = self.frequency_scale**2 * self.displacement_scale
-        left = super().residual(point).reshape(self.n_coefficients, -1)
-        return left.at[:, j].add(added / unit).reshape(-1)
+        own = jnp.asarray(self.model.own_mode)
+        return super().residual(point) + jnp.outer(added / unit, own).reshape(-1)
 
     def _harmonics(
         self, mine: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array

@@ -24,7 +24,7 @@ from snrmjax.identify.calibration_states import (
     state_whitener,
     whitened,
 )
-from snrmjax.identify.needed_force import held_state, missed_columns
+from snrmjax.identify.needed_force import Erring, held_state, missed_columns
 from snrmjax.measure.steady_states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
@@ -212,8 +212,10 @@ def _columns(
     level = unknowns[p:].reshape(settings.n_levels, len(settings.shared))[state.level]
     shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
     factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
-    held = (settings.sensors, settings.orders, settings.harmonic_order)
-    return missed_columns(model, state, held, factor, error, lambda held: held.solved(near))
+    erring = Erring(state, factor, error)
+    motion = erring.motion(model, settings.sensors[0], settings.harmonic_order)
+    point = motion.solved(near)
+    return missed_columns(erring, motion, point, settings.sensors, settings.orders), point
 
 
 @compiled

@@ -1,6 +1,6 @@
 """The force that a measured motion needs: one value however the response folds."""
 
-from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -71,35 +71,48 @@ def held_state(
     )
 
 
-def missed_columns(
-    model: Structure,
-    state: CalibrationStates,
-    held: tuple[tuple[int, ...], tuple[int, ...], int],
-    factor: Complex[Array, ""] | float,
-    error: Float[Array, " input"],
-    solved: Callable[[HeldMotion], Float[Array, " entry"]],
-) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
-    """What a model misses of one state's force, other sensors and harmonics.
+class Erring(NamedTuple):
+    """A state whose record is taken to err."""
 
-    Arguments: `held` has the sensors (the reference first), the harmonics that are compared and
-    the harmonic order; all velocities are taken times `factor`; `error` adds to the logarithms of
-    force and velocities and to the phases, for derivatives; `solved` finds the motion.
+    state: CalibrationStates
+    factor: Complex[Array, ""] | float  # of all velocities
+    error: Float[Array, " input"]  # of the logarithms of force and velocities, and of the phases
+
+    def velocities(self) -> tuple[Complex[Array, " sensor"], Complex[Array, "sensor harmonic"]]:
+        """Fundamentals and harmonics freed of the errors, in m/s."""
+        state, n = self.state, self.state.velocity.shape[0]
+        own = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        return state.velocity * own, state.harmonics * own[:, None]
+
+    def motion(self, model: Structure, sensor: int, harmonic_order: int) -> HeldMotion:
+        """The equations of its motion."""
+        return held_state(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
+
+
+def missed_columns(
+    erring: Erring,
+    motion: HeldMotion,
+    point: Float[Array, " entry"],
+    sensors: tuple[int, ...],
+    orders: tuple[int, ...],
+) -> Float[Array, " column"]:
+    """What a state's motion misses of the force, other sensors and harmonics.
+
+    Arguments: `motion` is that of `erring`, and `point` its solution; `sensors` has the reference
+    first; `orders` are the harmonics that are compared.
     Returns real and imaginary parts, of the force over the measured one and of the rest over the
-    measured velocity, and the motion.
+    measured velocity.
     """
-    sensors, orders, harmonic_order = held
-    n = len(sensors)
-    own = factor * jnp.exp(error[1 : n + 1] + 1j * error[n + 1 :])
-    velocity, harmonics = state.velocity * own, state.harmonics * own[:, None]
-    motion = held_state(model, state, velocity[0], sensors[0], harmonic_order)
-    point = solved(motion)
+    state = erring.state
+    velocity, harmonics = erring.velocities()
     force, seen = motion.recorded(point)
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics
     missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
-    each = jnp.append((force - state.force * jnp.exp(error[0])) / state.force, missed)
+    own = (force - state.force * jnp.exp(erring.error[0])) / state.force
+    each = jnp.append(own, missed)
     parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
-    return jnp.where(state.known, parts, 0.0), point
+    return jnp.where(state.known, parts, 0.0)
 
 
 @compiled

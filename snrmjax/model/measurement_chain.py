@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
@@ -98,7 +99,8 @@ class ResidualMode(AbstractMeasurementEffect):
     ) -> tuple[Amplitude, Velocity]:
         """See `AbstractMeasurementEffect.recorded`."""
         added = 1j * frequency * self.receptance * force
-        return force, velocity.at[..., 1, :].add(added[..., None])
+        fundamental = np.eye(velocity.shape[-2])[1][:, None]
+        return force, velocity + added[..., None, None] * fundamental
 
 
 class ModeShapeChange(AbstractMeasurementEffect):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.effects import effect_parameters
@@ -55,6 +56,33 @@ def parameter_value(model: Structure, name: str) -> Float[Array, ""]:
     return getattr(getattr(model, part), field)[entry]
 
 
+def parameter_values(model: Structure) -> dict[str, float]:
+    """All numbers by their names."""
+    places = _places(model)
+    parts = {(p.part, p.field) for p in places.values() if p.part != "effects"}
+    arrays = {
+        (part, field): np.asarray(getattr(getattr(model, part), field)) for part, field in parts
+    }
+    return {
+        name: float(
+            getattr(model.effects[entry], field)
+            if part == "effects"
+            else arrays[part, field][entry]
+        )
+        for name, (part, entry, field) in places.items()
+    }
+
+
+def stated_stds(model: Structure) -> dict[str, float]:
+    """1σ of the numbers for which the model states one."""
+    found = {}
+    for name, (part, entry, field) in _places(model).items():
+        std = getattr(getattr(model, part), f"{field}_std", None)
+        if std is not None and (own := float(np.asarray(std)[entry])) > 0:
+            found[name] = own
+    return found
+
+
 def stated_std(model: Structure, name: str) -> float:
     """1σ that the model states for a number, 0 where it states none."""
     part, entry, field = _places(model)[name]
@@ -67,9 +95,7 @@ def with_parameters(
 ) -> Structure:
     """The model with other numbers under some names."""
     places = _places(model)
-    for k, name in enumerate(names):
-        model = _replaced(model, places[name], values[k])
-    return model
+    return _replaced(model, [places[name] for name in names], values)
 
 
 def with_stated_std(
@@ -77,12 +103,10 @@ def with_stated_std(
 ) -> Structure:
     """The model with other stated 1σ of named numbers, where it has a place for them."""
     places = _places(model)
-    for k, name in enumerate(names):
-        place = places[name]
-        of_std = place._replace(field=f"{place.field}_std")
-        if hasattr(getattr(model, place.part), of_std.field):
-            model = _replaced(model, of_std, std[k])
-    return model
+    wanted = [places[name] for name in names]
+    wanted = [place._replace(field=f"{place.field}_std") for place in wanted]
+    known = [k for k, p in enumerate(wanted) if hasattr(getattr(model, p.part), p.field)]
+    return _replaced(model, [wanted[k] for k in known], jnp.asarray(std)[np.array(known, int)])
 
 
 class _Place(NamedTuple):
@@ -111,13 +135,23 @@ def _places(model: Structure) -> dict[str, _Place]:
     return places
 
 
-def _replaced(model: Structure, place: _Place, value: Float[Array, ""]) -> Structure:
-    part, entry, field = place
-    if part == "effects":
-        effect = dataclasses.replace(model.effects[entry], **{field: jnp.asarray(value)})
-        effects = (*model.effects[:entry], effect, *model.effects[entry + 1 :])
-        return dataclasses.replace(model, effects=effects)
-    owner = getattr(model, part)
-    array = jnp.asarray(getattr(owner, field)).at[entry].set(value)
-    changed = {part: dataclasses.replace(owner, **{field: array})}
-    return dataclasses.replace(model, **changed)
+def _replaced(
+    model: Structure, places: Sequence[_Place], values: Float[Array, " place"]
+) -> Structure:
+    effects = list(model.effects)
+    entries: dict[tuple[str, str], dict[int, int]] = {}
+    for k, (part, entry, field) in enumerate(places):
+        if part == "effects":
+            number = {field: jnp.asarray(values[k])}
+            effects[entry] = dataclasses.replace(effects[entry], **number)
+        else:
+            entries.setdefault((part, field), {})[entry] = k
+    changed = {part: getattr(model, part) for part, _ in entries}
+    for (part, field), numbers in entries.items():
+        array = jnp.asarray(getattr(changed[part], field))
+        # All at once: a program with a step for every entry is slow to compile and to run.
+        source = np.arange(array.shape[0])
+        source[list(numbers)] = array.shape[0] + np.array(list(numbers.values()))
+        both = jnp.concatenate([array, jnp.asarray(values)])
+        changed[part] = dataclasses.replace(changed[part], **{field: both[source]})
+    return dataclasses.replace(model, effects=tuple(effects), **changed)

@@ -58,6 +58,14 @@ class Structure(eqx.Module):
         return self.modes.n_modes
 
     @property
+    def own_mode(self) -> Float[np.ndarray, " mode"]:
+        """One for the mode of interest, zero for others.
+
+        What adds to that mode is multiplied by it: a `vmap` makes a loop of writing to an entry.
+        """
+        return np.eye(self.n_modes)[self.modes.mode_of_interest]
+
+    @property
     def memoryless(self) -> tuple[AbstractMemoryless, ...]:
         """The effects whose force depends on the present state alone."""
         return tuple(e for e in self.effects if isinstance(e, AbstractMemoryless))
@@ -90,13 +98,13 @@ class Structure(eqx.Module):
     def linear_terms(self) -> LinearTerms:
         """Mass 1, damping 2ζω and stiffness ω² of every mode, with the linear changes."""
         modes, j = self.modes, self.modes.mode_of_interest
-        frequency, ratio = modes.natural_frequency, modes.damping_ratio
+        frequency, ratio, own = modes.natural_frequency, modes.damping_ratio, self.own_mode
         terms = LinearTerms(jnp.ones(self.n_modes), 2 * ratio * frequency, frequency**2)
         for effect in self.effects:
             if isinstance(effect, AbstractLinearChange):
                 added = effect.linear_terms(frequency[j], ratio[j], self.test_order)
                 terms = LinearTerms(
-                    *(term.at[j].add(change) for term, change in zip(terms, added, strict=True))
+                    *(term + own * change for term, change in zip(terms, added, strict=True))
                 )
         return terms
 
@@ -120,7 +128,7 @@ class Structure(eqx.Module):
         for effect in self.effects:
             if isinstance(effect, AbstractForce):
                 values = effect.cycle_force(displacement[:, j], velocity[:, j])
-                force = force.at[:, j].add(values)
+                force = force + values[:, None] * self.own_mode
         return force
 
     def memoryless_force(
@@ -130,7 +138,7 @@ class Structure(eqx.Module):
         force, j = self.potential.force(displacement), self.modes.mode_of_interest
         for effect in self.memoryless:
             values = jax.vmap(effect.force)(displacement[:, j], velocity[:, j])
-            force = force.at[:, j].add(values)
+            force = force + values[:, None] * self.own_mode
         return force
 
     def potential_energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:

@@ -63,12 +63,12 @@ class HarmonicBalance(eqx.Module):
     def load(self) -> Float[Array, " equation"]:
         """Scaled force of one newton: the right-hand side for `force` = 1."""
         model = self.model
-        load = jnp.zeros((self.n_coefficients, model.n_modes))
-        if not self.cosine_only:
-            spectrum = model.load_orders()
-            orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
-            rows = np.maximum(2 * orders - 1, 0)
-            load = load.at[rows].set(spectrum[orders, None] * model.modes.participation)
+        if self.cosine_only:
+            return jnp.zeros(self.size)
+        spectrum = model.load_orders()
+        orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
+        cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * orders - 1, 0)]
+        load = jnp.outer(cosines @ spectrum[: len(orders)], model.modes.participation)
         return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
 
     def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:

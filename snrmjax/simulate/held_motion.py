@@ -4,11 +4,13 @@ At a given frequency a force may have several motions or, beyond a fold, none; a
 force. So a measured motion is put into the harmonic balance, and the force is solved for.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.model.structure import Structure, simulated_structure
 from snrmjax.simulate.harmonic_balance import HarmonicBalance, harmonic_balance
@@ -19,6 +21,32 @@ _SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
 _NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
 _SECANTS = 20  # steps with one Jacobian that is brought up to date, at most
 _CLOSE = 1e-5  # relative size of such a step after which the error is far below all noise
+
+
+class Secants(NamedTuple):
+    """A point, and the steps towards it: all that Broyden's method keeps of its updates.
+
+    Reference: C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations (1995), section
+    7.3, doi:10.1137/1.9781611970944.
+    """
+
+    point: Float[Array, " unknown"]
+    moves: Float[Array, "step unknown"]
+    taken: Int[Array, ""]
+
+    def updated(self, move: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """A step by the inverse Jacobian at the start, as one by that after all steps but one."""
+
+        def update(k: Array, move: Array) -> Array:
+            now, further = self.moves[k], self.moves[k + 1]
+            return move + (now @ move) / (now @ now) * further
+
+        return jax.lax.fori_loop(0, self.taken - 1, update, move)
+
+
+def start_of(point: Float[Array, " unknown"]) -> Secants:
+    """A point of whose neighbourhood nothing is known."""
+    return Secants(point, jnp.zeros((_SECANTS, point.shape[0])), jnp.array(0))
 
 
 class HeldMotion(eqx.Module):
@@ -59,8 +87,8 @@ class HeldMotion(eqx.Module):
         velocity = velocity * phase.conj() ** order
         if modes.rigid_body_shape.shape[1]:
             spectrum = self.model.load_orders()[1 : velocity.shape[0]]
-            rows = np.arange(1, 1 + spectrum.shape[0])
-            share = jnp.zeros(velocity.shape[0]).at[rows].set(spectrum / rows)
+            share = spectrum / np.arange(1, 1 + spectrum.shape[0])
+            share = jnp.pad(share, (1, velocity.shape[0] - 1 - spectrum.shape[0]))
             per_force = modes.rigid_body_shape @ modes.rigid_body_participation
             rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
             velocity = velocity + rigid
@@ -96,39 +124,33 @@ class HeldMotion(eqx.Module):
         return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan)
 
     def solved_by_secants(
-        self, start: Float[Array, " unknown"], inverse: Float[Array, "unknown unknown"]
-    ) -> Float[Array, " unknown"]:
-        """The solution near `start`, from an inverse Jacobian there; NaN without one.
+        self, inverse: Float[Array, "unknown unknown"], near: Secants, close: Float[Array, ""]
+    ) -> Secants:
+        """The solution near a point, from an inverse Jacobian and what is known of it there.
 
-        Broyden's method: no step needs another Jacobian. Derivatives are what three steps with
-        the first one carry: off by the cube of what the effects change in it.
+        Broyden's method: no step needs another Jacobian. It ends with a step below `close`, and
+        counts as a solution below 1e-5; else its point is NaN.
         """
-        fixed = jax.lax.stop_gradient(self)
+        place = jnp.arange(_SECANTS)
 
-        def step(state: tuple) -> tuple:
-            point, left, inverse, count, _ = state
-            move = -inverse @ left
-            new = fixed.equations(point + move)
-            back = inverse @ (new - left)
-            length, size = move @ back, jnp.linalg.norm(move)
+        def step(state: tuple[Secants, Array]) -> tuple[Secants, Array]:
+            now, _ = state
+            move = now.updated(near.updated(-(inverse @ self.equations(now.point))))
+            last = now.moves[jnp.maximum(now.taken - 1, 0)]
+            back = last - move
+            length, size = last @ back, jnp.linalg.norm(last)
             # What rounding makes of a step says nothing.
-            sure = (jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)) & (size > _NEAR)
-            change = jnp.outer(move - back, move @ inverse) / jnp.where(sure, length, 1.0)
-            inverse = inverse + jnp.where(sure, change, 0.0)
-            return point + move, new, inverse, count + 1, jnp.max(jnp.abs(move))
+            sure = jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)
+            move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
+            moves = jnp.where((place == now.taken)[:, None], move, now.moves)
+            return Secants(now.point + move, moves, now.taken + 1), jnp.max(jnp.abs(move))
 
-        def going(state: tuple) -> Array:
-            *_, count, size = state
-            return (count < 2) | ((count <= _SECANTS) & (size > _CLOSE))  # false for NaN
+        def going(state: tuple[Secants, Array]) -> Array:
+            now, size = state
+            return (now.taken < 1) | ((now.taken < _SECANTS) & (size > close))  # false for NaN
 
-        start = jax.lax.stop_gradient(start)
-        # The first step goes nowhere: the equations are then compiled once.
-        first = (start, jnp.zeros_like(start), inverse, jnp.array(0), jnp.array(0.0))
-        point, *_, size = jax.lax.while_loop(going, step, first)
-        point = jnp.where(size <= _CLOSE, point, jnp.nan)
-        # In a loop the equations are compiled once.
-        moved = jax.lax.fori_loop(0, 3, lambda _, p: p - inverse @ self.equations(p), point)
-        return point + (moved - jax.lax.stop_gradient(moved))
+        found, size = jax.lax.while_loop(going, step, (start_of(near.point), jnp.array(0.0)))
+        return found._replace(point=jnp.where(size <= _CLOSE, found.point, jnp.nan))
 
     def grown(self) -> Float[Array, " unknown"]:
         """The solution that grows from small amplitudes, as a start for `solved`; else NaN.
@@ -168,9 +190,9 @@ class HeldMotion(eqx.Module):
         phasor = self.force * (parts[0] - 1j * parts[1])
         there = jnp.where(phasor != 0, phasor, 1.0)
         turned = phasor * jnp.exp(1j * jnp.angle(there) * jnp.arange(self.balance.harmonic_order))
-        load = cosine.at[1::2].multiply(turned.real[:, None])
-        load = load.at[2::2].set(-turned.imag[:, None] * cosine[1::2])
-        return load.at[0].multiply(jnp.abs(there)).reshape(-1)
+        parts = jnp.stack([turned.real, -turned.imag], axis=1)
+        oscillating = (parts[:, :, None] * cosine[1::2, None]).reshape(-1)
+        return jnp.concatenate([jnp.abs(there) * cosine[0], oscillating])
 
     def _miss(self, point: Array) -> Float[Array, " part"]:
         velocity = self.recorded(point)[1][1, self.sensor]

@@ -13,9 +13,8 @@ import snrmjax as sj
 from snrmjax.cli import diagnose
 from snrmjax.diagnose.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.candidates import candidate, parameter_labels
-from snrmjax.diagnose.diagnosis import scales_of
 from snrmjax.diagnose.evidence import Bench
-from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.identify.calibration import calibrate_model
 from snrmjax.identify.needed_force import needed_force
 from snrmjax.model.effects import EFFECTS
@@ -51,16 +50,16 @@ def at_starts(predictions, kind):
     group, labels = predictions.group(kind), parameter_labels(kind)
     values = group.values.copy()
     values[[group.place(label) for label in labels]] = one.starts[0]
-    direction = np.zeros((1, len(values), 1))
-    direction[0, group.place(labels[0]), 0] = one.unit[0]
-    return predictions.of(group, values[None], direction)
+    found = predictions.of(group, values[None], labels[:1])
+    slopes = (one.unit[0] * found.slopes, one.unit[0] * found.force_slopes)
+    return found._replace(slopes=slopes[0], force_slopes=slopes[1])
 
 
 def test_every_effect_has_the_same_sizes_whatever_the_phases():
     """A motion has its force, whatever the time is counted from."""
     model, data = files("blind_03")
     measured, none = Predictions(model, data), Predictions(model, without_phases(data))
-    base = none.of(none.group("cubic_stiffness"), *nothing(none, "cubic_stiffness")).columns
+    base = alone(none).columns
     for kind in EFFECTS:
         known, unknown = at_starts(measured, kind), at_starts(none, kind)
         # Friction is sampled at other instants of the cycle.
@@ -82,10 +81,10 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
         assert (np.max(change) < 1e-6) == (kind == "sensor_phase_error"), kind
 
 
-def nothing(predictions, kind):
-    """Arguments of the baseline by itself."""
-    values = predictions.group(kind).values[None]
-    return values, np.zeros((*values.shape, 0))
+def alone(predictions):
+    """The baseline by itself."""
+    group = predictions.group("cubic_stiffness")
+    return predictions.of(group, group.values[None])
 
 
 def test_given_phases_of_unknown_worth_are_not_used():
@@ -133,13 +132,14 @@ def test_errors_are_passed_on_to_sizes():
         Predictions(model, dataclasses.replace(data, velocity=np.exp(sign * step) * data.velocity))
         for sign in (1, -1)
     )
-    ends = [p.of(group, *nothing(p, "cubic_stiffness")).columns[0, :, 0] for p in (louder, softer)]
+    ends = [alone(p).columns[0, :, 0] for p in (louder, softer)]
     slope = (ends[0] - ends[1]) / (2 * step)
     # The force's size grows with the velocity, and more where the stiffness is cubic.
     # Central differences are off by the square of the step.
     np.testing.assert_allclose(slopes[:, 0, 1], slope, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(slopes[:, 0, 0], -1.0, atol=1e-12)
-    np.testing.assert_allclose(slopes[:, :, 2], 0.0, atol=1e-12)
+    # Differences over a step of 2.5e-5 are off by as much.
+    np.testing.assert_allclose(slopes[:, 0, 0], -1.0, atol=4e-5)
+    np.testing.assert_allclose(slopes[:, :, 2], 0.0, atol=4e-5)
 
 
 def test_the_hidden_damping_is_named_without_phases():

@@ -12,7 +12,6 @@ from jaxtyping import Array
 
 import snrmjax as sj
 from snrmjax.diagnose.candidates import candidate
-from snrmjax.diagnose.diagnosis import scales_of
 from snrmjax.diagnose.evidence import Bench
 from snrmjax.diagnose.foretelling import (
     level_forces,
@@ -21,7 +20,7 @@ from snrmjax.diagnose.foretelling import (
     simulated_resonance,
 )
 from snrmjax.diagnose.naming import named
-from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.sidedness import acts_both_ways, even_share
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states

@@ -10,11 +10,11 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.diagnose.candidates import only_by_calibration
-from snrmjax.diagnose.diagnosis import _decide_by, scales_of
+from snrmjax.diagnose.diagnosis import _decide_by
 from snrmjax.diagnose.evidence import Bench
 from snrmjax.diagnose.further import Further, Rows, foretold_states, refitted
 from snrmjax.diagnose.naming import named
-from snrmjax.diagnose.predictions import Predictions
+from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.summary import summarise_diagnosis
 
