@@ -7,7 +7,7 @@ a candidate is a vector of parameters.
 import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -241,7 +241,8 @@ class Predictions:
                 first = int(trial[some[0]])
                 near = slice(first, first + _TRIALS)
                 ours = [padded(a[near], _TRIALS) for a in (values, steps.length)]
-                table = programs.Trials(*jax.device_put((*ours, steps.place, steps.by_error)))
+                parts: list[Any] = [*ours, steps.place, steps.by_error]
+                table = programs.Trials(*parts)
                 which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
                 found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
                 return [np.asarray(a)[: len(some)] for a in found]

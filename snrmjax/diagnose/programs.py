@@ -38,6 +38,7 @@ HARMONICS = 5
 """Of the motions: one sees three of them, and two more bend those."""
 
 _STEP = 2.5e-4  # of a direction, between the two ends of a slope
+_SHARE = 1e-2  # of a slope's first step, below which the last one is
 _NOTHING = 1e-9  # relative difference of columns that solutions may have by chance
 _CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
 
@@ -131,8 +132,12 @@ def missed(
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
             balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
             motion = dataclasses.replace(motion, balance=balance)
-            end = motion.solved_by_secants(inverse, start, close)
-            own_columns = missed_columns(erring, motion, end.point, *held[:2])
+            share = jnp.where(number > 0, _SHARE, 0.0)
+            end = motion.solved_by_secants(inverse, start, close, share)
+            # Where the second motion is not found, the first step towards it is its slope.
+            lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
+            point = jnp.where(lost, start.point + end.moves[0], end.point)
+            own_columns = missed_columns(erring, motion, point, *held[:2])
             start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
             place = jnp.arange(n_directions + 1) == number
             return start, jnp.where(place, own_columns[:, None], columns)

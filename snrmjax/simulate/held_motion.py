@@ -124,17 +124,21 @@ class HeldMotion(eqx.Module):
         return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan)
 
     def solved_by_secants(
-        self, inverse: Float[Array, "unknown unknown"], near: Secants, close: Float[Array, ""]
+        self,
+        inverse: Float[Array, "unknown unknown"],
+        near: Secants,
+        close: Float[Array, ""],
+        share: Float[Array, ""],
     ) -> Secants:
         """The solution near a point, from an inverse Jacobian and what is known of it there.
 
-        Broyden's method: no step needs another Jacobian. It ends with a step below `close`, and
-        counts as a solution below 1e-5; else its point is NaN.
+        Broyden's method: no step needs another Jacobian. It ends with a step below `close` or below
+        a share of the first one, and counts as a solution below 1e-5; else its point is NaN.
         """
         place = jnp.arange(_SECANTS)
 
-        def step(state: tuple[Secants, Array]) -> tuple[Secants, Array]:
-            now, _ = state
+        def step(state: tuple[Secants, Array, Array]) -> tuple[Secants, Array, Array]:
+            now, _, enough = state
             move = now.updated(near.updated(-(inverse @ self.equations(now.point))))
             last = now.moves[jnp.maximum(now.taken - 1, 0)]
             back = last - move
@@ -143,14 +147,17 @@ class HeldMotion(eqx.Module):
             sure = jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)
             move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
             moves = jnp.where((place == now.taken)[:, None], move, now.moves)
-            return Secants(now.point + move, moves, now.taken + 1), jnp.max(jnp.abs(move))
+            far = jnp.max(jnp.abs(move))
+            enough = jnp.where(now.taken == 0, jnp.maximum(close, share * far), enough)
+            return Secants(now.point + move, moves, now.taken + 1), far, enough
 
-        def going(state: tuple[Secants, Array]) -> Array:
-            now, size = state
-            return (now.taken < 1) | ((now.taken < _SECANTS) & (size > close))  # false for NaN
+        def going(state: tuple[Secants, Array, Array]) -> Array:
+            now, far, enough = state
+            return (now.taken < 1) | ((now.taken < _SECANTS) & (far > enough))  # false for NaN
 
-        found, size = jax.lax.while_loop(going, step, (start_of(near.point), jnp.array(0.0)))
-        return found._replace(point=jnp.where(size <= _CLOSE, found.point, jnp.nan))
+        first = (start_of(near.point), jnp.array(0.0), jnp.array(0.0))
+        found, far, _ = jax.lax.while_loop(going, step, first)
+        return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
 
     def grown(self) -> Float[Array, " unknown"]:
         """The solution that grows from small amplitudes, as a start for `solved`; else NaN.
