@@ -4,7 +4,6 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.linalg import solve_triangular
@@ -103,7 +102,7 @@ def weighing(
         if std > 0
     ]
     every = np.concatenate([baseline, *parts], axis=2)
-    own = np.asarray(whitened(jnp.asarray(measured.whiten), jnp.asarray(every)))[known]
+    own = np.asarray(whitened(measured.whiten, every))[known]
     state, column = np.nonzero(known)
     lower = np.linalg.cholesky(np.eye(len(own)) + own @ own.T)
     return Weighing(measured.whiten, known, own, lower, state, column)

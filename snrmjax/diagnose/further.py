@@ -7,9 +7,10 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.predictions import Predicted, Predictions
+from snrmjax.diagnose.programs import COMPARED
 from snrmjax.measure.steady_states import SteadyStates, steady_states
 
-HARMONICS = (2, 3)
+HARMONICS = COMPARED
 """That are foretold of further states."""
 
 _RESOLUTION = 1e-12  # of singular values: what further states do not see at all stays open

@@ -95,11 +95,9 @@ class Predictions:
         # Its name would be a part of the programs.
         self.model = dataclasses.replace(model, name="")
         self.chosen = calibration_states(model, data, programs.HARMONICS)
-        self.held = (self.chosen.sensors, self.chosen.orders, programs.HARMONICS)
         self.sizes = sizes_of(self.chosen)
-        # Of a phasor whose size alone counts the programs give both parts.
-        both = jnp.repeat(self.chosen.states.known[:, ::2], 2, axis=1)
-        self.states = [np.asarray(p) for p in self.chosen.states._replace(known=both)]
+        self.states, orders, self._own_columns = _widened(self.chosen)
+        self.held = (self.chosen.sensors, orders, programs.HARMONICS)
         self.level_numbers = np.asarray(data.level)[self.chosen.rows]
         self.force_gain_std = force_gain_std
         numbers = parameter_values(self.model)
@@ -245,7 +243,7 @@ class Predictions:
                 table = programs.Trials(*parts)
                 which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
                 found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
-                return [np.asarray(a)[: len(some)] for a in found]
+                return [np.asarray(a)[: len(some), self._own_columns] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
             parts = over_cores(block, blocks)
@@ -261,6 +259,29 @@ class Predictions:
         return columns, slopes
 
 
+def _widened(chosen: Selection) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
+    """The states as the programs take them, their harmonics, and which columns are the states' own.
+
+    Harmonics that the states lack have room: further states that are asked for have them, and one
+    program answers for both.
+    """
+    n, n_sensors = chosen.states.velocity.shape
+    orders = tuple(sorted({*programs.COMPARED, *chosen.orders}))
+    places = np.array([orders.index(h) for h in chosen.orders], dtype=int)
+    harmonics = np.zeros((n, n_sensors, len(orders)), dtype=complex)
+    harmonics[:, :, places] = chosen.states.harmonics
+    first = n_sensors + len(orders) * np.arange(n_sensors)[:, None]
+    parts = np.append(np.arange(n_sensors), first + places)
+    columns = (2 * parts[:, None] + np.arange(2)).reshape(-1)
+    wide = np.zeros((2, n, 2 * n_sensors * (1 + len(orders))))
+    # Of a phasor whose size alone counts the programs give both parts.
+    known = np.asarray(chosen.states.known)[:, ::2]
+    wide[:, :, columns] = chosen.states.own_std, np.repeat(known, 2, axis=1)
+    own = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
+    states = (chosen.states._asdict() | own).values()
+    return [np.asarray(part) for part in states], orders, columns
+
+
 def _filled(directions: np.ndarray) -> np.ndarray:
     room = np.zeros((*directions.shape[:-1], _DIRECTIONS), dtype=directions.dtype)
     room[..., : directions.shape[-1]] = directions
@@ -271,7 +292,10 @@ def whitened_states(
     chosen: Selection, by_error: Float[np.ndarray, "state column input"]
 ) -> Measured:
     """The states with the whitening that follows from their errors."""
-    whiten = np.asarray(state_whitener(chosen.states, jnp.asarray(by_error), jnp.zeros(())))
+    parts = [padded(np.asarray(part)) for part in (*chosen.states, by_error)]
+    arrays = jax.device_put(parts)
+    states = CalibrationStates(*arrays[:-1])
+    whiten = np.asarray(state_whitener(states, arrays[-1], jnp.zeros(())))[: len(by_error)]
     used = np.any(whiten != 0, axis=(1, 2))
     return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
 

@@ -37,6 +37,9 @@ from snrmjax.simulate.held_motion import Secants, start_of
 HARMONICS = 5
 """Of the motions: one sees three of them, and two more bend those."""
 
+COMPARED = (2, 3)
+"""Harmonics that have room in the programs, measured or not."""
+
 _STEP = 2.5e-4  # of a direction, between the two ends of a slope
 _SHARE = 1e-2  # of a slope's first step, below which the last one is
 _NOTHING = 1e-9  # relative difference of columns that solutions may have by chance

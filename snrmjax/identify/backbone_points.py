@@ -1,6 +1,6 @@
 """From measured steady states to points of the backbone and of the damping, with errors."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -180,22 +180,17 @@ def _ratios_std(
 def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
     """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
 
-    A state for which nothing is stated has NaN throughout.
+    A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
     """
-    amplitude = jnp.abs(data.velocity)
-    stated = jnp.stack(
-        [
-            jnp.broadcast_to((data.force_std / data.force)[:, None], amplitude.shape),
-            data.velocity_std / jnp.where(amplitude > 0, amplitude, jnp.nan),
-            data.phase_std,
-        ],
-        axis=2,
-    )
+    xp: Any = data.velocity.__array_namespace__()
+    amplitude = xp.abs(data.velocity)
+    force = xp.broadcast_to((data.force_std / data.force)[:, None], amplitude.shape)
+    velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
     # A velocity error without a phase error is taken as a circle in the complex plane.
-    phase = jnp.where(jnp.isfinite(stated[..., 2]), stated[..., 2], stated[..., 1])
-    stated = stated.at[..., 2].set(phase)
-    something = jnp.any(jnp.isfinite(stated), axis=2, keepdims=True)
-    return jnp.where(jnp.isfinite(stated), stated, jnp.where(something, 0.0, jnp.nan))
+    phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
+    stated = xp.stack([force, velocity, phase], axis=2)
+    something = xp.any(xp.isfinite(stated), axis=2, keepdims=True)
+    return xp.where(xp.isfinite(stated), stated, xp.where(something, 0.0, xp.nan))
 
 
 def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:

@@ -316,7 +316,7 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
         slopes, good = _slopes(*subject, aim, unknowns, near), bool(ended)
     return _Fitted(
         unknowns=np.asarray(unknowns),
-        residuals=np.asarray(whitened(whiten, slopes.columns)),
+        residuals=whitened(*map(np.asarray, (whiten, slopes.columns))),
         jacobian=_jacobian(whiten, slopes, aim, unknowns),
         usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
         good=good,
@@ -324,7 +324,8 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
 
 
 def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim, unknowns: Array) -> np.ndarray:
-    of_states = np.asarray(whitened(whiten, slopes.by_unknown)).reshape(-1, unknowns.shape[0])
+    own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
+    of_states = whitened(own, by_unknown).reshape(-1, unknowns.shape[0])
     return np.concatenate([of_states, np.asarray(_own_slopes(aim, unknowns))])
 
 

@@ -1,6 +1,6 @@
 """Measured states as a calibration compares them with a model."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,10 @@ from snrmjax.identify.backbone_points import relative_errors
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
+from snrmjax.simulate.blocks import taken
 from snrmjax.simulate.compiled import compiled
+
+OneKind = TypeVar("OneKind", Array, np.ndarray)
 
 ASSUMED_ERROR = 0.01
 """Relative and rad, of velocities where nobody stated any noise: a fit then finds its size."""
@@ -68,25 +71,28 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
             "`calibrate_force` and `apply_calibration`."
         )
     notes: list[str] = []
+    # Operations of JAX compile for every number of states.
+    told: Any = jax.tree.map(np.asarray, data)
     r = reference_sensor(model.modes)
-    sensors = [r, *(s for s in range(len(data.sensors)) if s != r)]
-    velocity = np.asarray(data.velocity)[:, sensors]
+    sensors = [r, *(s for s in range(len(told.sensors)) if s != r)]
+    velocity = told.velocity[:, sensors]
     size = np.abs(velocity)
-    measured = np.asarray(data.measured)[:, sensors] & np.isfinite(size) & (size > 0)
-    force, frequency = np.asarray(data.force), np.asarray(data.frequency)
+    measured = told.measured[:, sensors] & np.isfinite(size) & (size > 0)
+    force, frequency = told.force, told.frequency
     rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
     velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
-    errors = np.asarray(relative_errors(data))[rows][:, sensors]
+    told = taken(told, rows)
+    errors = np.asarray(relative_errors(told))[:, sensors]
     stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
     if not stated:
         errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
         notes.append("some errors are not stated: equal relative errors are taken for all states.")
     errors = np.where(measured[..., None], errors, 0.0)
-    places = [k for k, h in enumerate(data.harmonic_order) if 1 < h <= harmonic_order]
-    harmonics = np.asarray(data.harmonics)[rows][:, sensors][..., places]
-    std = np.asarray(data.harmonic_std)[rows][:, sensors] / np.abs(velocity[:, :1])
+    places = [k for k, h in enumerate(told.harmonic_order) if 1 < h <= harmonic_order]
+    harmonics = told.harmonics[:, sensors][..., places]
+    std = told.harmonic_std[:, sensors] / np.abs(velocity[:, :1])
     there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
-    unknown = np.asarray(data.phase_unknown)[rows][:, sensors]
+    unknown = np.asarray(told.phase_unknown)[:, sensors]
     unknown = measured & (unknown | unknown[:, :1])
     velocity = np.where(unknown, np.abs(velocity), velocity)
     harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
@@ -100,12 +106,12 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     known = np.stack([real, real & ~np.concatenate(alone, axis=1)], axis=2).reshape(n, -1)
     # Each part of a complex error has half its square.
     own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
-    order = np.asarray(data.order)[rows]
-    levels, level = np.unique(np.asarray(data.level)[rows], return_inverse=True)
+    order = told.order
+    levels, level = np.unique(told.level, return_inverse=True)
     parts = CalibrationStates(
         level=jnp.asarray(level),
-        frequency=jnp.asarray(frequency[rows]),
-        force=jnp.asarray(force[rows]),
+        frequency=jnp.asarray(told.frequency),
+        force=jnp.asarray(told.force),
         order=jnp.asarray(np.where(np.isfinite(order), order, np.asarray(model.test_order))),
         velocity=jnp.asarray(velocity),
         harmonics=jnp.asarray(np.where(there, harmonics, 0.0)),
@@ -113,7 +119,7 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
         own_std=jnp.asarray(np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1)),
         known=jnp.asarray(known),
     )
-    orders = tuple(data.harmonic_order[k] for k in places)
+    orders = tuple(told.harmonic_order[k] for k in places)
     own_places = (tuple(sensors), orders, unknown)
     return Selection(parts, rows, len(levels), *own_places, stated, tuple(notes))
 
@@ -146,8 +152,12 @@ def state_whitener(
 
 
 def whitened(
-    whitener: Float[Array, "state column column"], columns: Float[Array, "state column *entry"]
-) -> Float[Array, "state column *entry"]:
-    """Columns of all states, or their derivatives, made independent; zero without weight."""
-    used = jnp.any(whitener != 0, axis=(1, 2)).reshape(-1, *(1,) * (columns.ndim - 1))
-    return jnp.einsum("sij,sj...->si...", whitener, jnp.where(used, columns, 0.0))
+    whitener: Float[OneKind, "state column column"], columns: Float[OneKind, "state column *entry"]
+) -> Float[OneKind, "state column *entry"]:
+    """Columns of all states, or their derivatives, made independent; zero without weight.
+
+    NumPy's arrays stay so.
+    """
+    xp: Any = columns.__array_namespace__()
+    used = xp.any(whitener != 0, axis=(1, 2)).reshape(-1, *(1,) * (columns.ndim - 1))
+    return xp.einsum("sij,sj...->si...", whitener, xp.where(used, columns, 0.0))

@@ -1,6 +1,7 @@
 """The single nonlinear resonant mode function: one mode with amplitude-dependent properties."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -54,4 +55,4 @@ def snrm_velocity(
 
 def reference_sensor(modes: LinearModes) -> int:
     """The sensor that sees the mode of interest best: amplitudes are given there."""
-    return int(jnp.argmax(jnp.abs(modes.mode_shape[:, modes.mode_of_interest])))
+    return int(np.argmax(np.abs(np.asarray(modes.mode_shape)[:, modes.mode_of_interest])))
