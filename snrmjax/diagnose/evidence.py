@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from snrmjax.diagnose.candidates import SECOND_ORDER, Candidate, parameter_labels
 from snrmjax.diagnose.predictions import (
@@ -424,5 +424,5 @@ def _damped(arms: np.ndarray, left: np.ndarray, damping: float) -> np.ndarray:
 
 
 def unlikely(chi_square: float, freedom: int) -> float:
-    """Probability of at least this χ²."""
-    return float(chi2.sf(chi_square, max(freedom, 1)))
+    """Probability of at least this χ²; rounding may have made it negative."""
+    return float(chdtrc(max(freedom, 1), np.maximum(chi_square, 0.0)))

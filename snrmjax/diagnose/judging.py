@@ -6,7 +6,7 @@ order. What grows with the level, or what neighbours along the resonance share, 
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import chdtr
 
 from snrmjax.diagnose.doubts import Doubt
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
@@ -57,7 +57,7 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
     """Verdict and reasons from the fit; `noise` and 1σ are as neighbours show it."""
     n = found.bench.n_rows - len(found.fit.values)
     reduced = found.fit.chi_square / n
-    too_good = float(chi2.cdf(found.fit.chi_square, n))
+    too_good = float(chdtr(n, found.fit.chi_square))
     stated = found.bench.predictions.chosen.noise_stated
     if stated and too_good < UNLIKELY:
         return "noise_rejected", [

@@ -4,8 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import f as fisher
-from scipy.stats import norm
+from scipy.special import fdtrc, ndtr
 
 from snrmjax.diagnose.evidence import Bench, Fit
 
@@ -54,7 +53,8 @@ def left_curve(bench: Bench, fit: Fit) -> str | None:
         rest = float(left @ left - np.sum((left @ basis) ** 2))
         gain = float(np.sum((left @ basis) ** 2) - np.sum((left @ own) ** 2))
         if n_own > 0 and n_free > 0:
-            found.append((float(fisher.sf(gain / n_own / (rest / n_free), n_own, n_free)), name))
+            ratio = max(gain, 0.0) / n_own / (rest / n_free)
+            found.append((float(fdtrc(n_own, n_free, ratio)), name))
     chance, name = min(found, default=(1.0, ""))
     if chance * len(curves) >= UNLIKELY:
         return None
@@ -74,7 +74,7 @@ def _by_level(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     groups = [mine for mine in groups if mine.any() and not mine.all()]
     for mine in groups:
         ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
-        if fisher.sf(ratio, mine.sum(), (~mine).sum()) < UNLIKELY / len(groups):
+        if fdtrc(mine.sum(), (~mine).sum(), ratio) < UNLIKELY / len(groups):
             name = bench.level_numbers[int(level[mine][0])]
             what = "the force" if of_force[mine][0] else "the harmonics"
             return (
@@ -104,7 +104,7 @@ def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     with_it = np.sum(force * unit, axis=1)
     across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
     ratio = float(np.sum(with_it**2) / np.sum(across**2))
-    if not fisher.sf(ratio, len(with_it), len(with_it)) < UNLIKELY:
+    if not fdtrc(len(with_it), len(with_it), ratio) < UNLIKELY:
         return None
     return (
         f"what is left is {np.sqrt(ratio):.2g} times as large along a change of the natural "
@@ -122,7 +122,7 @@ def _of_neighbours(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
             continue
         square = np.mean(np.concatenate(parts) ** 2)
         common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
-        if norm.sf(common * np.sqrt(number)) < UNLIKELY / 2:
+        if ndtr(-common * np.sqrt(number)) < UNLIKELY / 2:
             order = "in the order of the test" if of_test else "along the resonance"
             return (
                 f"neighbours {order} are left with like misfits (correlation {common:.2f}): noise "

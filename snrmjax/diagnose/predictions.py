@@ -111,9 +111,7 @@ class Predictions:
         self._stored = programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:])
 
     def _baseline_motions(self, *rows: Array) -> tuple[Array, Array]:
-        states = CalibrationStates(*rows)
-        near = programs.grown(self.model, states, self.held)
-        return near, programs.inverse_jacobian(self.model, states, near, self.held)
+        return programs.grown(self.model, CalibrationStates(*rows), self.held)
 
     def group(self, kind: str) -> Group:
         """The structure that has this kind of effect.

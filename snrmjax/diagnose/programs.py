@@ -50,28 +50,21 @@ Held = tuple[tuple[int, ...], tuple[int, ...], int]
 
 
 @compiled
-def grown(model: Structure, states: CalibrationStates, held: Held) -> Float[Array, "row entry"]:
-    """Motions grown from small amplitudes; NaN where none was found."""
+def grown(
+    model: Structure, states: CalibrationStates, held: Held
+) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
+    """Motions grown from small amplitudes, and the equations' inverse Jacobians there.
 
-    def one(*row: Array) -> Array:
-        state = CalibrationStates(*row)
-        return held_state(model, state, state.velocity[0], held[0][0], held[2]).grown()
+    NaN where none was found.
+    """
 
-    return mapped(one, *states)
-
-
-@compiled
-def inverse_jacobian(
-    model: Structure, states: CalibrationStates, near: Float[Array, "row entry"], held: Held
-) -> Float[Array, "row entry entry"]:
-    """Of the equations of every state, at a motion."""
-
-    def one(near: Array, *row: Array) -> Array:
+    def one(*row: Array) -> tuple[Array, Array]:
         state = CalibrationStates(*row)
         motion = held_state(model, state, state.velocity[0], held[0][0], held[2])
-        return jnp.linalg.inv(motion.linearised(near)[1])
+        point, jacobian = motion.grown_with_jacobian()
+        return point, jnp.linalg.inv(jacobian)
 
-    return mapped(one, near, *states)
+    return mapped(one, *states)
 
 
 class Stored(NamedTuple):

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
-from scipy.stats import rankdata
 
 from snrmjax.identify.level_scatter import Bends, Linearised
 
@@ -36,6 +35,8 @@ def sizes_along(
     places = np.concatenate([some.places for some in bends])
     common = problem.prior_std[places]
     gram, pull = _of_bends(problem, places, common)
+    from scipy.stats import rankdata  # takes as long to import as JAX
+
     # Counted in bends: levels lie closer where more happens.
     spread = _process(rankdata(np.concatenate(at)) / len(bends))
     columns = np.column_stack([of_curve[:, None] == np.arange(len(bends)), spread])

@@ -103,6 +103,10 @@ class HeldMotion(eqx.Module):
 
         The last step is taken with what the equations depend on: it carries the derivatives.
         """
+        return self._solved(start)[0]
+
+    def _solved(self, start: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """The solution as `solved` finds it, and the Jacobian of its last step."""
         fixed = jax.lax.stop_gradient(self)
 
         def step(state: tuple) -> tuple:
@@ -121,7 +125,7 @@ class HeldMotion(eqx.Module):
         point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
         last = jnp.linalg.solve(jacobian, self.equations(point))
         left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
-        return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan)
+        return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
 
     def solved_by_secants(
         self,
@@ -164,26 +168,31 @@ class HeldMotion(eqx.Module):
 
         Steps are halved where Newton's method fails.
         """
+        return self.grown_with_jacobian()[0]
+
+    def grown_with_jacobian(self) -> tuple[Array, Array]:
+        """The solution as `grown` finds it, and the equations' Jacobian there."""
         fixed = jax.lax.stop_gradient(self)
         first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
 
         def larger(state: tuple) -> tuple:
-            point, share, step = state
+            before, share, step = state
             aim = jnp.minimum(share + step, 1.0)
             held = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
-            found = held.solved(point * (aim / share))
-            good = jnp.all(jnp.isfinite(found))
-            point, share = (jnp.where(good, *pair) for pair in ((found, point), (aim, share)))
-            return point, share, jnp.where(good, 1.5 * step, 0.5 * step)
+            after = held._solved(before[0] * (aim / share))
+            good = jnp.all(jnp.isfinite(after[0]))
+            now, share = jax.tree.map(
+                lambda a, b: jnp.where(good, a, b), (after, aim), (before, share)
+            )
+            return now, share, jnp.where(good, 1.5 * step, 0.5 * step)
 
         def going(state: tuple) -> Array:
             _, share, step = state
             return (share < 1.0) & (step > _SHORTEST)
 
-        point, share, _ = jax.lax.while_loop(
-            going, larger, (first, jnp.array(_SMALL), jnp.array(_FIRST))
-        )
-        return jnp.where(share >= 1.0, point, jnp.nan)
+        small = ((first, jnp.eye(first.shape[0])), jnp.array(_SMALL), jnp.array(_FIRST))
+        (point, jacobian), share, _ = jax.lax.while_loop(going, larger, small)
+        return jnp.where(share >= 1.0, point, jnp.nan), jacobian
 
     def _balance_point(self, point: Array) -> Array:
         return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)
