@@ -31,6 +31,7 @@ from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
+_GROWN = 16  # of those that are grown, one after the other
 _DIRECTIONS = 8  # derivatives that a call gives, at most
 _ERROR = 0.1  # of which a slope takes a thousandth: of a logarithm, or rad
 _TRIALS = _BLOCK  # that may meet in a block, at most
@@ -104,7 +105,7 @@ class Predictions:
         # What is stated of the baseline: numbers and their 1σ.
         self.stated = {k: (numbers[k], std) for k, std in stated_stds(self.model).items()}
         self._groups: dict[str, Group] = {}
-        found = by_blocks(self._baseline_motions, _BLOCK, *self.states)
+        found = by_blocks(self._baseline_motions, _GROWN, *self.states)
         # Room for a power of two of states: few sizes compile.
         room = [padded(rows) for rows in (*self.states, *found)]
         arrays = jax.device_put(room)
@@ -154,8 +155,11 @@ class Predictions:
         return kind not in _LIBRARY
 
     def _prepared(self, kinds: list[str]) -> Group:
-        present = [effect.kind for effect in self.model.effects]
-        added = tuple(_without_strength(k, self.model) for k in kinds if k not in present)
+        present, modes = [effect.kind for effect in self.model.effects], self.model.modes
+        j = modes.mode_of_interest
+        own = (np.asarray(a)[j] for a in (modes.natural_frequency, modes.damping_ratio))
+        frequency, ratio = (float(number) for number in own)
+        added = tuple(_without_strength(k, frequency, ratio) for k in kinds if k not in present)
         model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
         numbers, stds = parameter_values(model), stated_stds(model)
         names, values = tuple(numbers), np.array(list(numbers.values()))
@@ -325,10 +329,11 @@ _LIBRARY = frozenset(EFFECTS)
 _SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
 
 
-def _without_strength(kind: str, model: Structure) -> AbstractEffect:
-    """An effect that does nothing, with shapes that no rule forbids."""
-    frequency = float(model.modes.natural_frequency[model.modes.mode_of_interest])
-    ratio = float(model.modes.damping_ratio[model.modes.mode_of_interest])
+def _without_strength(kind: str, frequency: float, ratio: float) -> AbstractEffect:
+    """An effect that does nothing, with shapes that no rule forbids.
+
+    Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
+    """
     shapes = {
         "gap_stiffness": {"gap": 1.0},
         "one_sided_stop": {"gap": 1.0},

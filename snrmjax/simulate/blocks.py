@@ -27,14 +27,16 @@ def by_blocks(
 ) -> tuple[np.ndarray, ...]:
     """A compiled function of rows, called with blocks of `size` rows, the last one filled up."""
     n = len(rows[0])
-    parts = []
-    for begin in range(0, max(n, 1), size):
+
+    def answered(begin: int) -> list[np.ndarray]:
         block = []
         for row in rows:
             some = row[begin : begin + size]
             fill = ((0, size - len(some)), *((0, 0),) * (row.ndim - 1))
             block.append(np.pad(some, fill))
-        parts.append([np.asarray(a)[: n - begin] for a in function(*block)])
+        return [np.asarray(a)[: n - begin] for a in function(*block)]
+
+    parts = over_cores(answered, range(0, max(n, 1), size))
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
