@@ -1,7 +1,7 @@
 """Figures and report of a diagnosis."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,16 @@ from snrmjax.diagnose.naming import AS_GOOD, DETECTED
 from snrmjax.diagnose.summary import summarise_diagnosis
 from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, unit_for
 from snrmjax.identify.joint_fit import fit_jointly
+from snrmjax.io.files import write_atomically
 from snrmjax.io.models import write_model
 from snrmjax.io.results import write_summary
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
-from snrmjax.plot import save_figure
+from snrmjax.plot import png_bytes
 from snrmjax.presentation import corrected
 from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
+from snrmjax.simulate.blocks import over_cores
 from snrmjax.simulate.response_curve import ResponseCurve
 
 _SHOWN = 10  # candidates
@@ -69,9 +71,10 @@ def write_diagnosis(
         foretold, figures["responses"] = with_responses(found, model, data)
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, foretold))
     write_model(folder / "model.toml", found.completed)
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
-    report = diagnosis_report(found, title.replace("_", " "), figures, foretold)
+    drawn = {name: png_bytes(figure) for name, figure in figures.items()}
+    for name, png in drawn.items():
+        write_atomically(folder / f"{name}.png", png)
+    report = diagnosis_report(found, title.replace("_", " "), figures, foretold, drawn)
     write_report(folder / "report.html", report)
     return found
 
@@ -81,7 +84,8 @@ def with_responses(
 ) -> tuple[list[LevelResponse], Figure]:
     """What simulation adds: resonances and responses of all levels."""
     forces = list(level_forces(data, found.sensor).values())
-    before, after = (responses(one, data, forces) for one in (model, found.completed))
+    # Side by side: the first time, both compile.
+    before, after = over_cores(lambda one: responses(one, data, forces), (model, found.completed))
     foretold = level_responses(before, after, data, found.sensor, found.blind)
     old, new = ([c for one in curves for c in one] for curves in (before, after))
     figure = simulated_figure(old, new, data, found.sensor)
@@ -184,8 +188,13 @@ def diagnosis_report(
     title: str,
     figures: dict[str, Figure],
     foretold: Sequence[LevelResponse] = (),
+    drawn: Mapping[str, bytes] | None = None,
 ) -> Report:
-    """The report of a diagnosis; `foretold` are resonances of the simulated responses."""
+    """The report of a diagnosis; `foretold` are resonances of the simulated responses.
+
+    `drawn` are the figures as PNG, where they are drawn already.
+    """
+    png = drawn or {}
     gap = diagnosis.gap
     answers = [
         (effect, " or ".join(group))
@@ -211,13 +220,17 @@ def diagnosis_report(
         "orange ones cannot be told from the best.",
         "responses": "Simulated responses under each level's force at resonance.",
     }
+    pictured = {
+        name: ReportFigure(figure, captions[name], png.get(name))
+        for name, figure in figures.items()
+    }
     sections = [
         Section(
             "Where model and data disagree",
             tables=[
                 ReportTable(("part", "velocities", "p", "exponent"), _parts(diagnosis.located))
             ],
-            figures=[ReportFigure(figures["residuals"], captions["residuals"])],
+            figures=[pictured["residuals"]],
         ),
         Section(
             "What explains it",
@@ -242,11 +255,10 @@ def diagnosis_report(
                     for number, step in enumerate(diagnosis.table)
                 ),
             ],
-            figures=[ReportFigure(figures["candidates"], captions["candidates"])],
+            figures=[pictured["candidates"]],
         ),
     ]
     if "responses" in figures:
-        shown = [ReportFigure(figures["responses"], captions["responses"])]
         table = ReportTable(
             ("level", "force (N)", "measured", "model as given", "completed model"),
             [_resonances(row) for row in foretold],
@@ -254,7 +266,9 @@ def diagnosis_report(
             "without phases, the state with the largest velocity over force. Levels marked with * "
             "are foretold by a model that has not seen them.",
         )
-        sections.append(Section("Simulated responses", tables=[table], figures=shown))
+        sections.append(
+            Section("Simulated responses", tables=[table], figures=[pictured["responses"]])
+        )
     limits = sorted(diagnosis.detection_limits.items())
     sections.append(
         Section(

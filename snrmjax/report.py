@@ -69,6 +69,7 @@ class ReportFigure(NamedTuple):
 
     figure: Figure
     caption: str
+    png: bytes | None = None  # the same where it is drawn already
 
 
 class ReportTable(NamedTuple):
@@ -284,7 +285,8 @@ def _beside(
 
 
 def _embedded(one: ReportFigure) -> dict[str, str]:
-    png = base64.b64encode(png_bytes(one.figure, dots_per_inch=130.0)).decode("ascii")
+    drawn = one.png or png_bytes(one.figure, dots_per_inch=130.0)
+    png = base64.b64encode(drawn).decode("ascii")
     width = f"{_REM_PER_INCH * one.figure.get_figwidth():g}"
     return {"png": png, "width": width, "alt": one.caption.split(". ")[0], "caption": one.caption}
 
