@@ -32,7 +32,7 @@ from snrmjax.simulate.blocks import mapped
 from snrmjax.simulate.compiled import compiled
 from snrmjax.simulate.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.harmonics import displacement_phasors, harmonic_basis
-from snrmjax.simulate.held_motion import Secants, start_of
+from snrmjax.simulate.held_motion import Secants, nothing_of, start_of
 
 HARMONICS = 5
 """Of the motions: one sees three of them, and two more bend those."""
@@ -138,7 +138,7 @@ def missed(
             place = jnp.arange(n_directions + 1) == number
             return start, jnp.where(place, own_columns[:, None], columns)
 
-        none = jnp.zeros((measured.known.shape[0], n_directions + 1))
+        none = nothing_of(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
         columns = jax.lax.fori_loop(
             0, wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
         )[1]

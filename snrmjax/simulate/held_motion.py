@@ -46,7 +46,17 @@ class Secants(NamedTuple):
 
 def start_of(point: Float[Array, " unknown"]) -> Secants:
     """A point of whose neighbourhood nothing is known."""
-    return Secants(point, jnp.zeros((_SECANTS, point.shape[0])), jnp.array(0))
+    none = nothing_of(point)
+    return Secants(point, none + jnp.zeros((_SECANTS, point.shape[0])), none.astype(int))
+
+
+def nothing_of(point: Float[Array, " unknown"]) -> Float[Array, ""]:
+    """Zero, a number of every point.
+
+    A loop of many points whose first state is theirs throughout is traced once; else again and
+    again until it is known what is.
+    """
+    return jnp.where(point[0] == 0, 0.0, 0.0)
 
 
 class HeldMotion(eqx.Module):
@@ -159,7 +169,8 @@ class HeldMotion(eqx.Module):
             now, far, enough = state
             return (now.taken < 1) | ((now.taken < _SECANTS) & (far > enough))  # false for NaN
 
-        first = (start_of(near.point), jnp.array(0.0), jnp.array(0.0))
+        none = nothing_of(near.point)
+        first = (start_of(near.point), none, none)
         found, far, _ = jax.lax.while_loop(going, step, first)
         return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
 
