@@ -30,9 +30,14 @@ from snrmjax.identify.free_unknowns import (
     programmed,
     with_room,
 )
-from snrmjax.identify.joint_notes import notes_on_noise, notes_on_reach
+from snrmjax.identify.joint_notes import notes_on_neighbours, notes_on_noise, notes_on_reach
 from snrmjax.identify.level_scatter import Scatter
 from snrmjax.identify.level_slopes import LevelPattern, on_levels
+from snrmjax.identify.neighbours import (
+    added_covariance,
+    along_resonance,
+    neighbour_correlation,
+)
 from snrmjax.identify.pilot import pilot_start
 from snrmjax.identify.residuals import all_residuals, freed_of_errors, freed_residuals
 from snrmjax.identify.selection import (
@@ -64,8 +69,8 @@ _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 class JointFit(eqx.Module):
     """Two curves, what else was unknown, and how well all of it is known.
 
-    `covariance` belongs to the free unknowns in the order of `names`; `level_std` to
-    `LEVEL_ERRORS`, stated or found.
+    `covariance` belongs to the free unknowns in the order of `names`, and includes what the
+    residuals of neighbouring states have in common; `level_std` to `LEVEL_ERRORS`, stated or found.
     """
 
     unknowns: Unknowns
@@ -77,6 +82,7 @@ class JointFit(eqx.Module):
     noise_scale_std: float
     level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
     residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
+    neighbour_correlation: Float[np.ndarray, " part"]  # of residuals, 0 where it may be chance
     drive_known_only: bool = eqx.field(static=True)
     noise_stated: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
@@ -204,6 +210,7 @@ def fit_jointly(
         notes = ("the fit did not converge: try a simpler family.",)
     told = (best.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
     notes += notes_on_noise(*told, stated=stated)
+    notes += notes_on_neighbours(best.neighbours)
     motion = recorded_motion(in_one_form(best.unknowns), best.data, modes, best.spread)
     notes += notes_on_reach(motion, np.asarray(best.data.level))
     return JointFit(
@@ -216,6 +223,7 @@ def fit_jointly(
         noise_scale_std=best.scatter.noise_std,
         level_std=np.asarray(best.spread.level),
         residuals=best.residuals,
+        neighbour_correlation=best.neighbours,
         drive_known_only=driven,
         noise_stated=stated,
         free=released,
@@ -232,6 +240,7 @@ class _Fitted(NamedTuple):
     data: BalanceData
     scatter: Scatter
     residuals: np.ndarray
+    neighbours: np.ndarray
     converged: bool
 
 
@@ -287,13 +296,17 @@ def _fitted(
         dof = max(residuals.size - _spent(jacobian, residuals.size), 1.0)
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
         scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
+    levels = along_resonance(np.asarray(data.level), np.asarray(data.frequency))
+    alike, inverse = neighbour_correlation(residuals, levels), inverse_of(jacobian)
+    rows = jacobian[: 2 * len(room.level)].reshape(-1, 2, len(inverse))[:n]
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
-        covariance=inverse_of(jacobian),
+        covariance=inverse + added_covariance(inverse, rows, alike, levels),
         spread=spread,
         data=data,
         scatter=scatter,
         residuals=residuals,
+        neighbours=alike,
         converged=bool(good) and settled,
     )
 

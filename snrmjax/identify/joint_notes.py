@@ -60,6 +60,19 @@ def notes_on_noise(
     return tuple(notes)
 
 
+def notes_on_neighbours(correlation: Float[np.ndarray, " part"]) -> tuple[str, ...]:
+    """That states are left with misfits that their neighbours share."""
+    if not np.any(correlation > 0):
+        return ()
+    found = " and ".join(f"{value:.2g}" for value in correlation if value > 0)
+    worth = float(np.max((1 + correlation) / (1 - correlation)))
+    return (
+        f"neighbours along a resonance are left with like misfits (correlation {found}): noise has "
+        "none, so that the curves are not followed there, or the motion was not steady. About "
+        f"{worth:.0f} states tell as much as one, and the bands are widened accordingly.",
+    )
+
+
 def notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:
     """What states on one side of resonance, or of one amplitude, leave open."""
     notes = []

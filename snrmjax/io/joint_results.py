@@ -71,6 +71,7 @@ def summarise_fit(
             "stated": fit.noise_stated,
             "scale": fit.noise_scale,
             "scale_std": fit.noise_scale_std,
+            "correlation_of_neighbours": float(np.max(fit.neighbour_correlation)),
             "wandering_of_natural_frequency": 0.5 * float(fit.data.std[0, 3]),
         },
         "levels": {
@@ -126,6 +127,7 @@ def write_joint_fit(path: FilePath, fit: JointFit) -> None:
         "modes": vars(fit.modes),
         "residuals": fit.residuals,
         "level_std": fit.level_std,
+        "neighbour_correlation": fit.neighbour_correlation,
         "candidates": [candidate._asdict() for candidate in fit.candidates],
         **{name: getattr(fit, name) for name in _PLAIN},
     }
@@ -169,6 +171,7 @@ def read_joint_fit(path: FilePath) -> JointFit:
         modes=rebuilt,
         level_std=np.asarray(content["level_std"]),
         residuals=np.asarray(content["residuals"]),
+        neighbour_correlation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
         candidates=tuple(Candidate(**row) for row in content["candidates"]),
         **plain,
     )

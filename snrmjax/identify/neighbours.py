@@ -1,0 +1,83 @@
+"""What neighbouring states of a level share that no model explains, and what it does to a band.
+
+Noise of its own in every state averages out over many; what neighbours along a resonance share does
+not. A curve that the data do not follow, or a motion that was not steady, leaves such misfits.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
+_LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
+
+
+def along_resonance(
+    level: Int[np.ndarray, " state"], frequency: Float[np.ndarray, " state"]
+) -> list[Int[np.ndarray, " place"]]:
+    """The states of every level in the order of their frequencies."""
+    order = np.argsort(frequency, kind="stable")
+    return [order[level[order] == number] for number in np.unique(level)]
+
+
+def neighbour_correlation(
+    residuals: Float[np.ndarray, "state part"], levels: list[Int[np.ndarray, " place"]]
+) -> Float[np.ndarray, " part"]:
+    """Correlation of a residual with the next one along its level, of both parts.
+
+    Where slow misfits hide under noise, neighbours are less alike than their distance from others
+    tells: that of a first-order process with the same sum of correlations counts if it is larger.
+    Zero where white noise may well have it. Arguments: whitened `residuals`; `levels` from
+    `along_resonance`.
+    Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,
+    doi:10.1214/ss/1177011137.
+    """
+    found = []
+    for part in residuals.T:
+        neighbours, pairs = _correlation(part, levels, 1)
+        if neighbours * np.sqrt(pairs) <= _CERTAIN:
+            found.append(0.0)
+            continue
+        total, lag, own = 1.0, 1, neighbours
+        while own > 0:
+            total, lag = total + 2 * own, lag + 1
+            own = _correlation(part, levels, lag)[0]
+        found.append(min(max(neighbours, (total - 1) / (total + 1)), _LARGEST))
+    return np.array(found)
+
+
+def _correlation(
+    residuals: Float[np.ndarray, " state"], levels: list[Int[np.ndarray, " place"]], lag: int
+) -> tuple[float, int]:
+    """Correlation of residuals so many states apart, and the pairs that tell it.
+
+    The sum is divided by all states, as is usual: few pairs far apart weigh little.
+    """
+    pairs = sum(max(len(some) - lag, 0) for some in levels)
+    product = sum(float(residuals[a[:-lag]] @ residuals[a[lag:]]) for a in levels)
+    square = float(residuals @ residuals)
+    return (product / square if square > 0 else 0.0), pairs
+
+
+def added_covariance(
+    inverse: Float[np.ndarray, "unknown unknown"],
+    jacobian: Float[np.ndarray, "state part unknown"],
+    correlation: Float[np.ndarray, " part"],
+    levels: list[Int[np.ndarray, " place"]],
+) -> Float[np.ndarray, "unknown unknown"]:
+    """What correlated residuals add to the covariance (JᵀJ)⁻¹ of a least-squares fit.
+
+    The fit is the same, and its covariance (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with residuals k states apart
+    correlated by the k-th power of that of neighbours.
+    Arguments: `inverse` (JᵀJ)⁻¹; `jacobian` of the whitened residuals of the states.
+    Reference: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610, with an
+    autoregressive process of first order in place of their weights.
+    """
+    added = np.zeros_like(inverse)
+    for part, rho in enumerate(correlation):
+        if rho == 0:
+            continue
+        for some in levels:
+            arms = jacobian[some, part] @ inverse
+            apart = np.abs(np.subtract.outer(np.arange(len(some)), np.arange(len(some))))
+            added += arms.T @ (rho**apart - np.eye(len(some))) @ arms
+    return added
