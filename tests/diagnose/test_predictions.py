@@ -86,3 +86,17 @@ def missed_by(ours):
     group = ours.group("cubic_stiffness")
     found = ours.of(group, group.values[None])
     return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
+
+
+def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions):
+    ours, _ = predictions
+    group, label = ours.group("cubic_stiffness"), "cubic_stiffness.coefficient"
+    usual = ours.of(group, group.values[None], [label]).slopes[0, :, :2, 0]
+    far = group._replace(unit=1e7 * group.unit)
+    there = group.values.copy()
+    there[group.place(label)] = 2.5e-4 * far.unit[group.place(label)]
+    lost = ~np.isfinite(ours.of(group, there[None]).columns).all(axis=(0, 2))
+    assert lost[4:].all()  # the larger motions
+    slopes = ours.of(far, group.values[None], [label]).slopes[0, :, :2, 0]
+    # What holds the motion is linear in the coefficient, and so is the first step.
+    np.testing.assert_allclose(slopes[lost], usual[lost], rtol=0, atol=1e-2 * np.abs(usual).max())
