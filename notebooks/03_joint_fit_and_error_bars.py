@@ -271,7 +271,8 @@ headline |= {
 # Measured by Brack and colleagues (Nature Physics 18 (2022) 952): a beam hung in vacuum, 42.8 Hz,
 # four drive levels of 40 states each. The gain from voltage to force and the turn of phase in the
 # instruments are unknowns of the fit. The stated noise is the scatter of ten readings at one
-# setting, and the residuals are forty times as large: the program widens the bands and says so.
+# setting; the residuals are sixteen times as large, and those of neighbouring states are alike: the
+# program widens the bands for both and says so.
 #
 # The measurements of sections 3 and 4 are not part of this project. Without them, in a folder
 # `shared/data` beside it, these sections are skipped and say so.

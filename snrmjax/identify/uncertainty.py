@@ -388,6 +388,7 @@ def compare_bands(
     """The band of both curves by covariance, implicit derivatives, bootstrap and NUTS.
 
     The bootstrap knows nothing of errors that a level shares: where those rule, it is narrower.
+    Only the fit's own covariance includes what the residuals of neighbouring states share.
     """
     at = np.asarray(velocity, dtype=np.float64)
     values, slopes = values_with_slopes(fit, at)
