@@ -69,7 +69,7 @@ class ReportFigure(NamedTuple):
 
     figure: Figure
     caption: str
-    png: bytes | None = None  # the same where it is drawn already
+    png: bytes | None = None  # the file to show, where it is drawn already
 
 
 class ReportTable(NamedTuple):

@@ -141,9 +141,7 @@ class Bench:
         self.model = predictions.model
         group = predictions.group(PLAIN)
         found = self._by_baseline(group, group.values)
-        # As closely as the changes are found that are compared with them.
-        self._columns = predictions.of(group, group.values[None]).columns[0]
-        self._slopes = found.slopes[0]
+        self._columns, self._slopes = found.columns[0], found.slopes[0]
         self._baseline_slopes = self._slopes
         self.force, self.force_by_linear = found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
         self._by_error, self._phasors = predictions.by_error(group, group.values)

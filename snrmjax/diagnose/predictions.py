@@ -33,6 +33,7 @@ from snrmjax.simulate.blocks import by_blocks, over_cores, padded
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
 _GROWN = 16  # of those that are grown, one after the other
 _DIRECTIONS = 8  # derivatives that a call gives, at most
+_LEAST = 1e-6  # of its unit, that a shape counts for at least
 _ERROR = 0.1  # of which a slope takes a thousandth: of a logarithm, or rad
 _TRIALS = _BLOCK  # that may meet in a block, at most
 
@@ -44,7 +45,8 @@ class Group(NamedTuple):
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
     unit: Float[np.ndarray, " parameter"]  # a change that is plainly seen, or smaller
-    is_strength: Bool[np.ndarray, " parameter"]  # of an added effect
+    is_strength: Bool[np.ndarray, " parameter"]  # the first of an added effect
+    is_shape: Bool[np.ndarray, " parameter"]  # another one of it
     force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
 
     def place(self, name: str) -> int:
@@ -167,14 +169,15 @@ class Predictions:
         owner = [name.split(".")[0] for name in names]
         force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
         std = np.array([stds.get(name, 0.0) for name in names])
-        unit = np.where(values != 0, 0.01 * np.abs(values), np.where(std > 0, std, 1.0))
+        unit = np.maximum(0.01 * np.abs(values), std)
+        unit[unit == 0] = 1.0
         scales, where = scales_of(self), {name: k for k, name in enumerate(names)}
-        is_strength = np.zeros(len(names), dtype=bool)
+        is_strength, is_shape = np.zeros((2, len(names)), dtype=bool)
         for effect in added:
             places = [where[label] for label in parameter_labels(effect.kind)]
             unit[places] = candidate(effect.kind, scales).unit
-            is_strength[places[0]] = True
-        return Group(model, names, values, unit, is_strength, force)
+            is_strength[places[0]], is_shape[places[1:]] = True, True
+        return Group(model, names, values, unit, is_strength, is_shape, force)
 
     def of(
         self,
@@ -184,9 +187,12 @@ class Predictions:
     ) -> Predicted:
         """What the states miss under every trial's parameters, and slopes along some of these."""
         places = np.array([group.place(name) for name in along], dtype=int)
-        # Slopes are differences, over a small share of what is plainly seen.
-        strength = np.where(group.is_strength, np.abs(values), 0.0)
-        length = np.maximum(group.unit, strength)[:, places]
+        # Slopes are differences, over a small share of what is plainly seen. The unit of a shape
+        # may be a guess: its own size counts, unless that is nothing.
+        size = np.abs(values)
+        length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
+        own = np.clip(size, _LEAST * group.unit, group.unit)
+        length = np.where(group.is_shape & (size > 0), own, length)[:, places]
         steps = _Steps(places, length, np.zeros((self.states[6].shape[1], len(places))))
         columns, slopes = self._in_turn(group, values, steps)
         slopes = slopes / length[:, None, None]
@@ -252,7 +258,8 @@ class Predictions:
             return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
         found = answered(True, np.arange(n * trials))
-        left = np.flatnonzero(~np.isfinite(found[0]).all(axis=1))
+        good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in found]
+        left = np.flatnonzero(~(good[0] & good[1]))
         slides = any(group.names[k].split(".")[0] in _SLIDING for k in np.flatnonzero(used))
         if left.size and slides:
             for part, own in zip(found, answered(False, left), strict=True):

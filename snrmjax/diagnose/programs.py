@@ -53,10 +53,7 @@ Held = tuple[tuple[int, ...], tuple[int, ...], int]
 def grown(
     model: Structure, states: CalibrationStates, held: Held
 ) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
-    """Motions grown from small amplitudes, and the equations' inverse Jacobians there.
-
-    NaN where none was found.
-    """
+    """Motions grown from small amplitudes, NaN where none was found, and inverse Jacobians."""
 
     def one(*row: Array) -> tuple[Array, Array]:
         state = CalibrationStates(*row)

@@ -184,7 +184,8 @@ def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
     """
     xp: Any = data.velocity.__array_namespace__()
     amplitude = xp.abs(data.velocity)
-    force = xp.broadcast_to((data.force_std / data.force)[:, None], amplitude.shape)
+    force = data.force_std / xp.where(data.force > 0, data.force, xp.nan)
+    force = xp.broadcast_to(force[:, None], amplitude.shape)
     velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
     # A velocity error without a phase error is taken as a circle in the complex plane.
     phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)

@@ -58,7 +58,8 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     compared where their error is stated. A velocity of unknown phase, and its harmonics, are real
     and positive, and the imaginary part of what they are compared by is not known; where it is
     that of the reference sensor, the phases of the whole state count as unknown.
-    Raises `ValueError` for sensors other than the model's and where no force is known.
+    Raises `ValueError` for sensors other than the model's, where no force is known and where no
+    state is left.
     """
     if data.sensors != model.modes.sensors:
         raise ValueError(
@@ -80,6 +81,11 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     measured = told.measured[:, sensors] & np.isfinite(size) & (size > 0)
     force, frequency = told.force, told.frequency
     rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
+    if not rows.size:
+        raise ValueError(
+            f"no state has a force above zero and a velocity of {data.sensors[r]!r}, the sensor "
+            "that sees the mode of interest best."
+        )
     velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
     told = taken(told, rows)
     errors = np.asarray(relative_errors(told))[:, sensors]

@@ -209,7 +209,7 @@ def fit_jointly(
     if not best.converged:
         notes = ("the fit did not converge: try a simpler family.",)
     told = (best.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
-    notes += notes_on_noise(*told, stated=stated)
+    notes += notes_on_noise(*told, stated=stated, alike=bool(best.neighbours.any()))
     notes += notes_on_neighbours(best.neighbours)
     motion = recorded_motion(in_one_form(best.unknowns), best.data, modes, best.spread)
     notes += notes_on_reach(motion, np.asarray(best.data.level))
@@ -297,11 +297,11 @@ def _fitted(
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
         scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
     levels = along_resonance(np.asarray(data.level), np.asarray(data.frequency))
-    alike, inverse = neighbour_correlation(residuals, levels), inverse_of(jacobian)
-    rows = jacobian[: 2 * len(room.level)].reshape(-1, 2, len(inverse))[:n]
+    alike, root = neighbour_correlation(residuals, levels), root_of_inverse(jacobian)
+    rows = jacobian[: 2 * len(room.level)].reshape(-1, 2, len(root))[:n]
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
-        covariance=inverse + added_covariance(inverse, rows, alike, levels),
+        covariance=root @ root.T + added_covariance(root, rows, alike, levels),
         spread=spread,
         data=data,
         scatter=scatter,
@@ -327,11 +327,16 @@ def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
 
 def inverse_of(jacobian: np.ndarray) -> np.ndarray:
     """(JᵀJ)⁻¹, by singular values of the scaled columns."""
+    root = root_of_inverse(jacobian)
+    return root @ root.T
+
+
+def root_of_inverse(jacobian: np.ndarray) -> np.ndarray:
+    """K with (JᵀJ)⁻¹ = KKᵀ."""
     size = np.linalg.norm(jacobian, axis=0)
     size = np.where(size > 0, size, 1.0)
     _, values, rows = np.linalg.svd(jacobian / size, full_matrices=False)
-    root = (rows.T / values) / size[:, None]
-    return root @ root.T
+    return (rows.T / values) / size[:, None]
 
 
 def _spent(jacobian: np.ndarray, n_rows: int) -> float:

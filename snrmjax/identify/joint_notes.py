@@ -17,11 +17,13 @@ def notes_on_noise(
     n_levels: int,
     *,
     stated: bool,
+    alike: bool,
 ) -> tuple[str, ...]:
     """Where noise and levels are not as stated.
 
     Arguments: `jitter` 1σ of relative stiffness from state to state, in units of the noise where
-    none is stated; `given` the stated 1σ of levels' errors.
+    none is stated; `given` the stated 1σ of levels' errors; `alike` whether neighbouring states
+    have misfits in common.
     """
     notes = []
     if stated and scatter.contradicts_upward:
@@ -30,9 +32,10 @@ def notes_on_noise(
             "the noise is understated or the model is wrong; the bands are widened accordingly."
         )
     if stated and scatter.noise + 3 * scatter.noise_std < 1:
+        more = "" if alike else ", and the bands are wider than need be"
         notes.append(
             f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
-            "noise: it is overstated, and the bands are wider than need be."
+            f"noise: it is overstated{more}."
         )
     units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
     found_only = np.where(given > 0, 0.0, scatter.level)

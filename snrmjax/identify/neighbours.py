@@ -59,7 +59,7 @@ def _correlation(
 
 
 def added_covariance(
-    inverse: Float[np.ndarray, "unknown unknown"],
+    root: Float[np.ndarray, "unknown unknown"],
     jacobian: Float[np.ndarray, "state part unknown"],
     correlation: Float[np.ndarray, " part"],
     levels: list[Int[np.ndarray, " place"]],
@@ -67,17 +67,20 @@ def added_covariance(
     """What correlated residuals add to the covariance (JᵀJ)⁻¹ of a least-squares fit.
 
     The fit is the same, and its covariance (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with residuals k states apart
-    correlated by the k-th power of that of neighbours.
-    Arguments: `inverse` (JᵀJ)⁻¹; `jacobian` of the whitened residuals of the states.
+    correlated by the k-th power of that of neighbours. What this process has less of than white
+    noise, differences between neighbours, does not make a band narrower.
+    Arguments: `root` K with (JᵀJ)⁻¹ = KKᵀ; `jacobian` of the whitened residuals of the states.
     Reference: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610, with an
     autoregressive process of first order in place of their weights.
     """
-    added = np.zeros_like(inverse)
+    excess = np.zeros((root.shape[1], root.shape[1]))
     for part, rho in enumerate(correlation):
         if rho == 0:
             continue
         for some in levels:
-            arms = jacobian[some, part] @ inverse
+            arms = jacobian[some, part] @ root
             apart = np.abs(np.subtract.outer(np.arange(len(some)), np.arange(len(some))))
-            added += arms.T @ (rho**apart - np.eye(len(some))) @ arms
-    return added
+            excess += arms.T @ (rho**apart - np.eye(len(some))) @ arms
+    values, directions = np.linalg.eigh(excess)
+    arms = root @ directions * np.sqrt(np.maximum(values, 0.0))
+    return arms @ arms.T

@@ -1,5 +1,6 @@
 """The single nonlinear resonant mode function: one mode with amplitude-dependent properties."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -55,4 +56,5 @@ def snrm_velocity(
 
 def reference_sensor(modes: LinearModes) -> int:
     """The sensor that sees the mode of interest best: amplitudes are given there."""
-    return int(np.argmax(np.abs(np.asarray(modes.mode_shape)[:, modes.mode_of_interest])))
+    shape = np.asarray(jax.lax.stop_gradient(modes.mode_shape))
+    return int(np.argmax(np.abs(shape[:, modes.mode_of_interest])))

@@ -80,7 +80,10 @@ def _drawn(u: Array, coefficients: Array, knots: Array) -> Array:
 
 @_drawn.defjvp
 def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """One set of hats serves all directions, where automatic rules would draw them for each."""
+    """One set of hats serves all directions, where automatic rules would draw them for each.
+
+    Knots have no derivative: they are chosen, not fitted.
+    """
     u, coefficients, knots = primals
     by_u, by_coefficients, _ = tangents
     slope = coefficients[1] + hats(u, knots)[1] @ coefficients[2:]

@@ -80,6 +80,8 @@ def sensitivity(fit: JointFit) -> Sensitivity:
     of independent errors of the stated size follows. Where states are freed of their errors, they
     are so anew; else weights count as given.
 
+    What the residuals of neighbours have in common is not in it.
+
     Returns a `Sensitivity`. One call costs about as much as a fit.
     """
     vector, restore = fit.vector()
@@ -164,7 +166,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error; and what the residuals of
+    neighbours have in common adds to it.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
@@ -200,6 +203,12 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
             rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
+    if np.any(fit.neighbour_correlation > 0):
+        name = "misfits that neighbours share"
+        unit = np.sqrt(np.diagonal(inverse))
+        added = (fit.covariance - inverse) / np.outer(unit, unit)
+        values, directions = np.linalg.eigh(added)
+        rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
     parts = np.stack([np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows])
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [
@@ -225,7 +234,9 @@ def _first_order(
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
     """χ² against one unknown, everything else fitted anew at each of its values.
 
-    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile.
+    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile. It
+    takes states for independent, though: where the residuals of neighbours are alike
+    (`fit.neighbour_correlation`), it is too narrow, and ±1.96σ is right.
 
     Arguments: `name` one of `fit.names()`; `reach` in standard deviations on either side.
     Raises `ValueError` for a name that the fit does not have.

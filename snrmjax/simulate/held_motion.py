@@ -162,7 +162,7 @@ class HeldMotion(eqx.Module):
             move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
             moves = jnp.where((place == now.taken)[:, None], move, now.moves)
             far = jnp.max(jnp.abs(move))
-            enough = jnp.where(now.taken == 0, jnp.maximum(close, share * far), enough)
+            enough = jnp.where(now.taken == 0, jnp.clip(share * far, close, _CLOSE), enough)
             return Secants(now.point + move, moves, now.taken + 1), far, enough
 
         def going(state: tuple[Secants, Array, Array]) -> Array:
@@ -182,7 +182,7 @@ class HeldMotion(eqx.Module):
         return self.grown_with_jacobian()[0]
 
     def grown_with_jacobian(self) -> tuple[Array, Array]:
-        """The solution as `grown` finds it, and the equations' Jacobian there."""
+        """The solution as `grown` finds it, and the equations' Jacobian at the last one found."""
         fixed = jax.lax.stop_gradient(self)
         first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
 

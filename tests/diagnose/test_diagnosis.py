@@ -287,7 +287,7 @@ def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
     own, other = bench._slopes, bench.reweighed(fit)._slopes
     before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
     # The motion is the recorded one turned back by 10°, and so is the force that it needs. Slopes
-    # are differences over 2.5e-6 of a parameter: 1e-5 of one is 2.5e-11 of the force.
+    # are differences over 2.5e-6 of a parameter: 1e-5 of each is 2.5e-11 of the force.
     turn = np.exp(-1j * np.radians(10.0))
     np.testing.assert_allclose(after, turn * before, rtol=0, atol=2e-5 * np.abs(before).max())
 

@@ -1,9 +1,12 @@
 """Predictions of the quick programs against Newton's method and finite differences."""
 
 import dataclasses
+from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
 import snrmjax as sj
 from snrmjax.diagnose.candidates import candidate, parameter_labels
@@ -28,6 +31,28 @@ def predictions():
     level = np.repeat([1, 2], 4)
     data = sj.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
     return Predictions(model, data), data
+
+
+class SmoothFriction(sj.AbstractMemoryless):
+    """f = c tanh(q̇/knee): an effect of a user, who says nothing of what is typical."""
+
+    kind: ClassVar[str] = "smooth_friction"
+    coefficient: Array
+    knee: Array
+
+    def force(self, displacement, velocity):
+        """See `AbstractMemoryless.force`."""
+        return self.coefficient * jnp.tanh(velocity / self.knee)
+
+
+@pytest.fixture
+def own_friction(predictions):
+    """Predictions with an effect of one's own, its structure and its parameters."""
+    ours, data = predictions
+    sj.register_effect(SmoothFriction)
+    own = Predictions(ours.model, data)
+    yield own, own.group("smooth_friction"), parameter_labels("smooth_friction")
+    del EFFECTS["smooth_friction"]
 
 
 def moderate(kind, scales):
@@ -100,3 +125,32 @@ def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions
     slopes = ours.of(far, group.values[None], [label]).slopes[0, :, :2, 0]
     # What holds the motion is linear in the coefficient, and so is the first step.
     np.testing.assert_allclose(slopes[lost], usual[lost], rtol=0, atol=1e-2 * np.abs(usual).max())
+
+
+def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions):
+    """A coefficient is 1e-3 of its own 1σ: the slope is that of the force of a cubic spring."""
+    _, data = predictions
+    linear = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    potential = sj.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
+    ours = Predictions(dataclasses.replace(sj.structure(linear, potential), name=""), data)
+    group = ours.group("cubic_stiffness")
+    slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
+    frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
+    # ∂V/∂q = 4 a q³, whose fundamental is 3 a |q|² q.
+    q = velocity / (2j * frequency)
+    expected = 3 * np.abs(q) ** 2 * q / 3.0 / np.asarray(data.force)
+    np.testing.assert_allclose(slopes[:, 0] + 1j * slopes[:, 1], expected[:, None], rtol=1e-2)
+
+
+def test_shapes_of_ones_own_effect_have_slopes_whatever_their_size(own_friction):
+    """A knee of 3e-4 m/s, of which nothing says that one is no unit for it."""
+    ours, group, labels = own_friction
+    values = group.values.copy()
+    places = [group.place(label) for label in labels]
+    values[places] = 0.3 * group.unit[places[0]], 3e-4
+    slopes = ours.of(group, values[None], labels).slopes[0, :, :, 1]
+    ends = np.stack([values, values])
+    ends[:, places[1]] += np.array([1e-3, -1e-3]) * 3e-4
+    columns = ours.of(group, ends).columns
+    expected = (columns[0] - columns[1]) / (2e-3 * 3e-4)
+    np.testing.assert_allclose(slopes, expected, atol=0.03 * np.abs(expected).max())

@@ -129,6 +129,19 @@ def test_derivatives_of_the_needed_force_are_those_of_central_differences(exact)
     np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-9)
 
 
+def test_the_needed_force_has_slopes_by_the_mode_shape():
+    modes = sj.linear_modes([300.0], [0.01], [[2.0]], [3.0])
+    data = sj.steady_states([1, 1], [295.0, 305.0], [1.0, 1.0], [0.1 + 0.05j, 0.1 - 0.05j])
+
+    def force(shape):
+        changed = dataclasses.replace(modes, mode_shape=shape)
+        return jnp.sum(needed_force(sj.structure(changed), data).force.real)
+
+    # A linear mode of half the shape has to move twice as far.
+    slope = jax.grad(force)(modes.mode_shape)
+    np.testing.assert_allclose(slope, -force(modes.mode_shape) / 2.0, rtol=1e-9)
+
+
 # Parameters
 
 

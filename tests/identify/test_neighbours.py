@@ -60,9 +60,21 @@ def test_the_covariance_is_that_of_repeated_straight_lines():
     noise = drawn(rng, rho, 20000, 3, 30).reshape(20000, -1)
     fits = np.linalg.lstsq(jacobian, noise.T, rcond=None)[0]
     inverse = np.linalg.inv(jacobian.T @ jacobian)
-    rows = np.stack([jacobian, 0 * jacobian], axis=1)
-    found = inverse + added_covariance(inverse, rows, np.array([rho, 0.0]), levels)
+    rows, root = np.stack([jacobian, 0 * jacobian], axis=1), np.linalg.cholesky(inverse)
+    found = inverse + added_covariance(root, rows, np.array([rho, 0.0]), levels)
     np.testing.assert_allclose(found, np.cov(fits), rtol=0.05, atol=0.02 * found.max())
+
+
+def test_no_band_becomes_narrower():
+    jacobian = np.vander(np.linspace(-1, 1, 25), 5)
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    levels, rows = [np.arange(25)], jacobian[:, None, :]
+    added = added_covariance(np.linalg.cholesky(inverse), rows, np.array([0.98]), levels)
+    # Of differences between neighbours this process has far less than white noise.
+    along = np.random.default_rng(6).normal(size=(5, 1000))
+    more = np.sum(along * (added @ along), axis=0) / np.sum(along * (inverse @ along), axis=0)
+    assert more.min() > -1e-9
+    assert more.max() > 1
 
 
 def test_bands_hold_curves_under_misfits_that_neighbours_share():
