@@ -299,9 +299,11 @@ def _fitted(
     levels = along_resonance(np.asarray(data.level), np.asarray(data.frequency))
     alike, root = neighbour_correlation(residuals, levels), root_of_inverse(jacobian)
     rows = jacobian[: 2 * len(room.level)].reshape(-1, 2, len(root))[:n]
+    # What is left of overstated noise shares no more than it has.
+    size = scatter.noise**2 if stated and scatter.contradicts_downward else 1.0
     return _Fitted(
         unknowns=Restore(start, free)(program.vector[program.own]),
-        covariance=root @ root.T + added_covariance(root, rows, alike, levels),
+        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels),
         spread=spread,
         data=data,
         scatter=scatter,

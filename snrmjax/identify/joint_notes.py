@@ -31,7 +31,7 @@ def notes_on_noise(
             f"residuals are {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated noise: "
             "the noise is understated or the model is wrong; the bands are widened accordingly."
         )
-    if stated and scatter.noise + 3 * scatter.noise_std < 1:
+    if stated and scatter.contradicts_downward:
         more = "" if alike else ", and the bands are wider than need be"
         notes.append(
             f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "

@@ -29,6 +29,11 @@ class Scatter(NamedTuple):
         """Whether the residuals are too large for the stated noise."""
         return self.noise - 3 * self.noise_std > 1
 
+    @property
+    def contradicts_downward(self) -> bool:
+        """Whether they are too small for it."""
+        return self.noise + 3 * self.noise_std < 1
+
 
 class Linearised(NamedTuple):
     """A fit near its solution: residuals + slopes·change, priors on some of the unknowns."""

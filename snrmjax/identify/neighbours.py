@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
+_NOTHING = 0.1  # of the noise: what residuals that are smaller have in common is of no account
 _LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
 
 
@@ -26,15 +27,15 @@ def neighbour_correlation(
 
     Where slow misfits hide under noise, neighbours are less alike than their distance from others
     tells: that of a first-order process with the same sum of correlations counts if it is larger.
-    Zero where white noise may well have it. Arguments: whitened `residuals`; `levels` from
-    `along_resonance`.
+    Zero where white noise may well have it, or residuals are far below the noise.
+    Arguments: whitened `residuals`; `levels` from `along_resonance`.
     Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,
     doi:10.1214/ss/1177011137.
     """
     found = []
     for part in residuals.T:
         neighbours, pairs = _correlation(part, levels, 1)
-        if neighbours * np.sqrt(pairs) <= _CERTAIN:
+        if neighbours * np.sqrt(pairs) <= _CERTAIN or np.mean(part**2) < _NOTHING**2:
             found.append(0.0)
             continue
         total, lag, own = 1.0, 1, neighbours

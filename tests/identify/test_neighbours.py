@@ -52,6 +52,13 @@ def test_white_noise_is_seldom_correlated():
     assert np.sum(parts > 0) <= 2
 
 
+def test_what_is_left_of_exact_states_is_no_matter():
+    levels = [np.arange(60)]
+    slow = drawn(np.random.default_rng(7), 0.95, 1, 60).T
+    assert neighbour_correlation(slow, levels) > 0
+    assert neighbour_correlation(1e-6 * slow, levels) == 0
+
+
 def test_the_covariance_is_that_of_repeated_straight_lines():
     rng, rho = np.random.default_rng(4), 0.8
     at = np.tile(np.linspace(-1, 1, 30), 3)
