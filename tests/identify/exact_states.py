@@ -7,6 +7,7 @@ import snrmjax as sj
 SHAPE, PARTICIPATION = 2.0, 3.0
 CONSTANT = SHAPE * PARTICIPATION
 OMEGA, LEVELS = 500.0, 5
+TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
 
 def squared(x):
@@ -17,6 +18,16 @@ def squared(x):
 def damping(v):
     """2ζ̃ω̃ against velocity (m/s)."""
     return 12.0 + 6.0 * v
+
+
+def truth_at(speeds):
+    """ω̃² and 2ζ̃ω̃ where X ω̃(X) is the velocity, by bisection."""
+    low, high = np.zeros(len(speeds)), np.full(len(speeds), 1e-2)
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        below = middle * np.sqrt(squared(middle)) < speeds
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return squared(low), damping(speeds)
 
 
 def modes():

@@ -25,26 +25,17 @@ from .exact_states import (
     LEVELS,
     NOISE,
     OMEGA,
+    TRUE,
     damping,
     exact,
     modes,
     noisy,
     squared,
     stated,
+    truth_at,
 )
 
-TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 SPEEDS = np.linspace(0.2, 0.9, 8)
-
-
-def truth_at(speeds):
-    """ω̃² and 2ζ̃ω̃ where X ω̃(X) is the velocity, by bisection."""
-    low, high = np.zeros(len(speeds)), np.full(len(speeds), 1e-2)
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        below = middle * np.sqrt(squared(middle)) < speeds
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return squared(low), damping(speeds)
 
 
 @pytest.fixture(scope="module")

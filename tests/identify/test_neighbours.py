@@ -12,9 +12,7 @@ from snrmjax.identify.neighbours import (
     neighbour_correlation,
 )
 
-from .exact_states import LEVELS, NOISE, damping, exact, modes, squared, stated
-
-TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
+from .exact_states import LEVELS, NOISE, TRUE, exact, modes, stated, truth_at
 
 
 def drawn(rng, rho, *shape):
@@ -87,12 +85,8 @@ def test_no_band_becomes_narrower():
 def test_bands_hold_curves_under_misfits_that_neighbours_share():
     level, omega, force, velocity = exact(per_level=25)
     speeds = np.linspace(0.3, 0.9, 4)
-    low, high = np.zeros(4), np.full(4, 1e-2)
-    for _ in range(60):  # displacement at these velocities, by bisection
-        middle = 0.5 * (low + high)
-        below = middle * np.sqrt(squared(middle)) < speeds
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    want = np.stack([np.sqrt(squared(low)), damping(speeds)])
+    natural, modal_damping = truth_at(speeds)
+    want = np.stack([np.sqrt(natural), modal_damping])
     rng, scores, notes = np.random.default_rng(5), [], 0
     for _ in range(30):
         error = drawn(rng, 0.9, 2, LEVELS, 25).reshape(2, -1)

@@ -14,9 +14,7 @@ from snrmjax.identify.uncertainty import (
     sensitivity,
 )
 
-from .exact_states import CONSTANT, NOISE, OMEGA, modes, noisy, stated
-
-TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
+from .exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
 
 
 @pytest.fixture(scope="module")
