@@ -10,12 +10,14 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
 from snrmjax.diagnose.candidates import SECOND_ORDER, Candidate, parameter_labels
+from snrmjax.diagnose.coordinates import coordinates
 from snrmjax.diagnose.predictions import (
     PLAIN,
     Group,
     Measured,
     Predicted,
     Predictions,
+    scales_of,
 )
 from snrmjax.identify.calibration_states import Selection, whitened
 from snrmjax.simulate.blocks import over_cores
@@ -308,14 +310,19 @@ class Bench:
         """
         before = beside or self.nothing()
         together = self._together(candidate, before)
+        labels = (*parameter_labels(candidate.kind), *before.labels)
+        law = coordinates(labels, scales_of(self.predictions).amplitude)
         n, m = len(candidate.unit), len(before.values)
-        unit = np.concatenate([candidate.unit, np.where(before.values, np.abs(before.values), 1)])
+        own = np.where(before.values, np.abs(before.values), 1)
+        unit = law.inward(np.concatenate([candidate.unit, own]))
         starts = np.array(candidate.starts)
         trials = len(starts)
-        point = np.concatenate([starts, np.tile(before.values, (trials, 1))], axis=1) / unit
-        lower = np.concatenate([candidate.lower, before.lower]) / unit
-        upper = np.concatenate([candidate.upper, before.upper]) / unit
-        rows, slopes = together(point * unit)
+        every = np.concatenate([starts, np.tile(before.values, (trials, 1))], axis=1)
+        point = law.inward(every) / unit
+        # Of what the coordinates scale, bounds are zero and infinity.
+        lower = np.concatenate([candidate.lower, before.lower])
+        upper = np.concatenate([candidate.upper, before.upper])
+        rows, slopes = together(every)
         damping = np.full(trials, 1e-2)
         cost = np.array([self._cost(row) for row in rows])
         for _ in range(_WEAKER):
@@ -323,11 +330,12 @@ class Bench:
             if not lost.size:
                 break
             point[lost, 0] *= 0.3  # too strong to have a motion
-            rows[lost], slopes[lost] = together(point[lost] * unit)
+            every[lost] = law.outward(point[lost] * unit)
+            rows[lost], slopes[lost] = together(every[lost])
             cost[lost] = [self._cost(row) for row in rows[lost]]
         active = np.isfinite(cost)
-        for turn in range(_STEPS):
-            if turn == _SCREENED:  # the most promising go on
+        for step in range(_STEPS):
+            if step == _SCREENED:  # the most promising go on
                 active &= cost <= np.sort(cost)[min(_KEPT, trials) - 1]
             at = np.flatnonzero(active)
             if not at.size:
@@ -335,14 +343,16 @@ class Bench:
             moved = point.copy()
             for t in at:
                 left = self.weighing.decorrelated(rows[t])
-                arms = self.weighing.decorrelated((slopes[t] * unit).T).T
-                moved[t] = np.clip(point[t] + _damped(arms, left, damping[t]), lower, upper)
-            new_rows, new_slopes = together(moved[at] * unit)
+                arms = self.weighing.decorrelated((law.slopes(every[t], slopes[t]) * unit).T).T
+                aim = point[t] + _damped(arms, left, damping[t])
+                moved[t] = np.clip(aim, lower / unit, upper / unit)
+            values = law.outward(moved[at] * unit)
+            new_rows, new_slopes = together(values)
             for place, t in enumerate(at):
                 new = self._cost(new_rows[place])
                 if new < cost[t]:
                     active[t] = cost[t] - new > _SETTLED
-                    point[t], cost[t] = moved[t], new
+                    point[t], every[t], cost[t] = moved[t], values[place], new
                     rows[t], slopes[t] = new_rows[place], new_slopes[place]
                     damping[t] *= 0.1
                 else:
@@ -353,12 +363,12 @@ class Bench:
         return Fit(
             (*before.kinds, candidate.kind),
             (*before.labels, *parameter_labels(candidate.kind)),
-            (point[best] * unit)[order],
+            every[best][order],
             float(cost[best]),
             rows[best],
             slopes[best][:, order],
-            (lower * unit)[order],
-            (upper * unit)[order],
+            lower[order],
+            upper[order],
         )
 
     def all_fitted(self, jobs: Sequence[tuple[Candidate, Fit]]) -> list[Fit]:
