@@ -1,4 +1,4 @@
-"""How rough curves are along their amplitude: sizes of bends that change from one to the next."""
+"""How rough curves are along their amplitude: bends that are alike, of sizes that change."""
 
 from collections.abc import Sequence
 
@@ -10,6 +10,7 @@ from snrmjax.identify.level_scatter import Bends, Linearised
 
 _VARIETY = 1.0  # 1σ of a size's logarithm about that of its curve, along the amplitude
 _REACH = 2.0  # bends of a curve, over which sizes are alike
+_ALIKE = 0.8  # bends, over which those of a curve are alike
 _NONE = 1e-6  # of the largest variance, a direction of the sizes that counts for nothing
 
 
@@ -20,13 +21,15 @@ def sizes_along(
 ) -> list[Float[np.ndarray, " bend"]]:
     """1σ of every bend, curve by curve: the restricted likelihood's, with noise as stated.
 
-    The logarithms of the sizes are each curve's own number plus a Gaussian process from bend to
-    bend that all curves share: where the motion makes one of them turn, it does so with the
-    others, and bends of two curves tell more of it than those of one. A curve's number and the
-    process are the likeliest. A bend whose size is uncertain is expected to have the mean of the
+    Bends that are neighbours are alike (`likeness`). The logarithms of their sizes are each curve's
+    own number plus a Gaussian process from bend to bend that all curves share: where the motion
+    makes one of them turn, it does so with the others, and bends of two curves tell more of it
+    than those of one. A curve's number and the process are the likeliest. A bend whose size is
+    uncertain is expected to have the mean of the
     variances that it may have, so that little knowledge of the sizes does not narrow a band.
-    Arguments: `problem` with a common size of the bends of a curve as their prior; `at` is the
-    amplitude of every bend, in one unit for all curves, of which only the order counts.
+    Arguments: `problem` with a common size of the bends of a curve as their prior; `bends` of a
+    curve by rising amplitude; `at` is the amplitude of every bend, in one unit for all curves, of
+    which only the order counts.
     Reference: for the process, Goldberg, Williams & Bishop, Adv. Neural Inf. Process. Syst. 10
     (1997) 493; for bends of a size that varies, Ruppert & Carroll, Aust. N. Z. J. Stat. 42 (2000)
     205, doi:10.1111/1467-842X.00119.
@@ -42,13 +45,21 @@ def sizes_along(
     columns = np.column_stack([of_curve[:, None] == np.arange(len(bends)), spread])
     n = len(bends)
 
+    alike = np.zeros((len(places), len(places)))
+    for k, some in enumerate(bends):
+        alike[np.ix_(of_curve == k, of_curve == k)] = likeness(len(some.places))
+    unlike = np.linalg.inv(alike)
+
     def criterion(point: np.ndarray) -> tuple[float, np.ndarray]:
-        precision = np.exp(-2 * (columns @ point))
-        inverse = np.linalg.inv(gram + np.diag(precision))
+        logarithm = columns @ point
+        precision = unlike * np.exp(-logarithm[:, None] - logarithm)
+        inverse = np.linalg.inv(gram + precision)
         bend = inverse @ pull
-        determinant = np.linalg.slogdet(gram + np.diag(precision))[1]
-        value = determinant - np.sum(np.log(precision)) - pull @ bend + point[n:] @ point[n:]
-        slopes = 2 * columns.T @ (1 - (np.diagonal(inverse) + bend**2) * precision)
+        determinant = np.linalg.slogdet(gram + precision)[1] + 2 * np.sum(logarithm)
+        value = determinant - pull @ bend + point[n:] @ point[n:]
+        # Columns of a symmetric matrix: the diagonal of a product.
+        known = np.sum(inverse * precision, axis=1)
+        slopes = 2 * columns.T @ (1 - known - bend * (precision @ bend))
         slopes[n:] += 2 * point[n:]
         return float(value), slopes
 
@@ -61,12 +72,20 @@ def sizes_along(
     logarithm = columns @ found
     size = np.exp(logarithm)
     # Fisher's information of the logarithms: that of a Gaussian's variances.
-    told = np.eye(len(size)) - np.linalg.inv(gram * np.outer(size, size) + np.eye(len(size)))
-    information = spread.T @ (2 * told**2) @ spread + np.eye(spread.shape[1])
+    told = unlike - unlike @ np.linalg.inv(gram * np.outer(size, size) + unlike) @ unlike
+    share = alike @ told
+    information = spread.T @ (share * share.T + told * (share @ alike)) @ spread
+    information += np.eye(spread.shape[1])
     variance = np.einsum("bi,ij,bj->b", spread, np.linalg.inv(information), spread)
     # The mean of the square of what is lognormal.
     expected = common * np.exp(logarithm + variance)
     return [expected[of_curve == k] for k in range(n)]
+
+
+def likeness(n_bends: int) -> Float[np.ndarray, "bend bend"]:
+    """Correlation of the bends of one curve: what makes it bend does not end at the next level."""
+    apart = np.subtract.outer(np.arange(n_bends), np.arange(n_bends)) / _ALIKE
+    return np.exp(-0.5 * apart**2)
 
 
 def _of_bends(

@@ -32,7 +32,7 @@ from snrmjax.identify.level_scatter import (
 )
 from snrmjax.identify.pilot import levels_apart, most_parameters
 from snrmjax.identify.roughness import sizes_along
-from snrmjax.identify.smoothing import curve_columns, moved, places_of_bends
+from snrmjax.identify.smoothing import curve_columns, moved, places_of_bends, with_sizes
 from snrmjax.identify.splines import SmoothingSpline
 from snrmjax.model.modes import LinearModes
 
@@ -297,7 +297,8 @@ class _Workbench:
         problem, seen = self.problem(*curves), (self.known.displacement, self.known.speed)
         bends = [self.bends(problem, pair, k) for k in smooth]
         places = [places_of_bends(curve, *seen) for curve in smooth.values()]
-        return _with_bends(pair, sizes_along(problem, bends, places))
+        found = iter(sizes_along(problem, bends, places))
+        return [with_sizes(c, next(found)) if isinstance(c, SmoothingSpline) else c for c in pair]
 
     def bends(self, problem: Linearised, pair: _Pair, which: int) -> Bends:
         """The bends of one of the curves among the unknowns."""

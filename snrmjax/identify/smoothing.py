@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.families import PowerLaw, values_and_slopes
 from snrmjax.identify.family_base import AbstractFamily
+from snrmjax.identify.roughness import likeness
 from snrmjax.identify.splines import SmoothingSpline, bent
 
 
@@ -46,6 +47,16 @@ def places_of_bends(
         order = np.argsort(speed)
         return np.interp(at, speed[order], displacement[order])
     return at
+
+
+def with_sizes(curve: SmoothingSpline, size: Float[np.ndarray, " bend"]) -> SmoothingSpline:
+    """A curve with bends of these sizes, alike from one to the next, and not yet otherwise.
+
+    Its bends are then combinations of them that are independent, each in its own 1σ.
+    """
+    root = np.linalg.cholesky(likeness(len(size))) * size[:, None]
+    bends = np.linalg.solve(root, np.asarray(curve.bends))
+    return dataclasses.replace(curve, bends=jnp.asarray(bends), bend_std=jnp.ones(len(size)))
 
 
 def moved(curve: AbstractFamily, change: Float[np.ndarray, " unknown"]) -> AbstractFamily:

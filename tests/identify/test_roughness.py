@@ -5,7 +5,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import minimize
 
 from snrmjax.identify.level_scatter import Bends, Linearised
-from snrmjax.identify.roughness import sizes_along
+from snrmjax.identify.roughness import likeness, sizes_along
 
 N = 12
 AT = np.linspace(-2.5, 0.0, N)  # logarithms of amplitude
@@ -26,7 +26,7 @@ def linearised(seed, sizes, noise, units=(1.0, 1.0)):
     bent = np.maximum(place[:, None] - np.linspace(0.05, 0.9, N), 0.0) * 6
     shared = np.eye(3)[np.arange(2 * n_rows) % 3]
     first, second = (np.column_stack([line, bent * unit]) for unit in units)
-    bends = [rng.normal(size=N) * sizes for _ in range(2)]
+    bends = [np.linalg.cholesky(likeness(N)) @ rng.normal(size=N) * sizes for _ in range(2)]
     read = np.r_[bent @ bends[0], bent @ bends[1]] + shared @ (0.1 * rng.normal(size=3))
     read += noise * rng.normal(size=2 * n_rows)
     slopes = np.hstack([block_diag(first, second), shared]) / noise
@@ -59,20 +59,23 @@ def written_out(problem, bends):
         start = np.log([problem.prior_std[some.places[0]] for some in bends])
         return [start[k] + point[k] + root @ point[2:] for k in range(2)]
 
+    def own(size):
+        return likeness(N) * np.outer(size, size)
+
     def covariance(sizes):
-        return rest + sum((a * s**2) @ a.T for a, s in zip(arms, sizes, strict=True))
+        return rest + sum(a @ own(s) @ a.T for a, s in zip(arms, sizes, strict=True))
 
     def criterion(point):
         v = covariance(np.exp(logarithms(point)))
-        own = data @ np.linalg.solve(v, data) + np.linalg.slogdet(v)[1]
-        return own + point[2:] @ point[2:]
+        value = data @ np.linalg.solve(v, data) + np.linalg.slogdet(v)[1]
+        return value + point[2:] @ point[2:]
 
     point = minimize(criterion, np.zeros(2 + N), method="BFGS", options={"gtol": 1e-5}).x
     sizes = np.exp(logarithms(point))
     inverse = np.linalg.inv(covariance(sizes))
     by = [
-        sum(2 * root[b, j] * s[b] ** 2 * np.outer(a[:, b], a[:, b])
-            for a, s in zip(arms, sizes, strict=True) for b in range(N))
+        sum(a @ (own(s) * np.add.outer(root[:, j], root[:, j])) @ a.T
+            for a, s in zip(arms, sizes, strict=True))
         for j in range(N)
     ]  # fmt: skip
     half = [inverse @ slope for slope in by]

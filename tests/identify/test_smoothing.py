@@ -7,7 +7,7 @@ import pytest
 import snrmjax as sj
 from snrmjax.identify.joint_fit import fit_jointly
 from snrmjax.identify.level_scatter import Bends, Linearised, estimated_scatter, likeliest_std
-from snrmjax.identify.smoothing import curve_columns, moved
+from snrmjax.identify.smoothing import curve_columns, moved, with_sizes
 from snrmjax.identify.splines import SmoothingSpline
 from snrmjax.identify.uncertainty import sensitivity
 from snrmjax.io.joint_results import described, read_joint_fit, write_joint_fit
@@ -43,6 +43,17 @@ def test_its_line_and_bends_are_the_curve():
     again = moved(smooth, change)
     np.testing.assert_allclose(again.parameters, values, atol=1e-12)
     np.testing.assert_allclose(columns.values + columns.slopes @ change, smooth(at), atol=1e-12)
+
+
+def test_bends_of_their_own_sizes_are_alike_from_one_to_the_next():
+    size = np.linspace(0.5, 2.0, len(KNOTS) - 2)
+    blank = curve(np.cos(3 * KNOTS))
+    bends = np.asarray(blank.bends @ blank.parameters)
+    apart = np.subtract.outer(np.arange(len(size)), np.arange(len(size)))
+    covariance = np.exp(-0.5 * (apart / 0.8) ** 2) * np.outer(size, size)
+    found = np.sum(np.asarray(with_sizes(blank, size).prior_residuals()) ** 2)
+    # Rounding of a matrix whose eigenvalues differ by a factor of 200.
+    assert found == pytest.approx(bends @ np.linalg.solve(covariance, bends), rel=1e-10)
 
 
 def drawn(seed, bend_std, noise, shared=0.0):
