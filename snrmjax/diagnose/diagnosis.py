@@ -109,7 +109,7 @@ def diagnose_model(
     notes: list[str] = []
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
-    if force_gain_std > 0:  # of a gain that is not known, nor of the modal mass, none can be missing
+    if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
         present |= {"force_gain_error", "sensor_gain_error", "added_mass"}
     if unknown.all():
         present |= set(UNSEEN)
