@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.identify.backbone_points import relative_errors
 from snrmjax.identify.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, relative_errors
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import taken
 from snrmjax.simulate.compiled import compiled

@@ -1,5 +1,7 @@
 """A table of measured steady states: the input of every identification."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -166,3 +168,20 @@ def join_steady_states(*parts: SteadyStates) -> SteadyStates:
                 f"{list(parts[0].sensors)} and {list(parts[0].harmonic_order)}."
             )
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+
+
+def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
+    """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
+
+    A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
+    """
+    xp: Any = data.velocity.__array_namespace__()
+    amplitude = xp.abs(data.velocity)
+    force = data.force_std / xp.where(data.force > 0, data.force, xp.nan)
+    force = xp.broadcast_to(force[:, None], amplitude.shape)
+    velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
+    # A velocity error without a phase error is taken as a circle in the complex plane.
+    phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
+    stated = xp.stack([force, velocity, phase], axis=2)
+    something = xp.any(xp.isfinite(stated), axis=2, keepdims=True)
+    return xp.where(xp.isfinite(stated), stated, xp.where(something, 0.0, xp.nan))
