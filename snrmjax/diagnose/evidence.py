@@ -336,7 +336,16 @@ class Bench:
             for t in at:
                 left = self.weighing.decorrelated(rows[t])
                 arms = self.weighing.decorrelated((slopes[t] * unit).T).T
-                moved[t] = np.clip(point[t] + _damped(arms, left, damping[t]), lower, upper)
+                step = _damped(arms, left, damping[t])
+                moved[t] = np.clip(point[t] + step, lower, upper)
+                promised = float(left @ left - np.sum((left + arms @ step) ** 2))
+                if promised < _SETTLED and np.array_equal(moved[t], point[t] + step):
+                    # So short a step is straight: what it does need not be looked at.
+                    rows[t] = rows[t] + slopes[t] @ (step * unit)
+                    point[t], cost[t], active[t] = moved[t], self._cost(rows[t]), False
+            at = at[active[at]]
+            if not at.size:
+                break
             new_rows, new_slopes = together(moved[at] * unit)
             for place, t in enumerate(at):
                 new = self._cost(new_rows[place])

@@ -91,34 +91,34 @@ def steady_states(
         raise ValueError(f"`frequency` must be a vector, but has shape {omega.shape}.")
     n_states, n_sensors = omega.size, len(sensors)
 
-    def per_state(name: str, value: object, dtype: type = np.float64) -> Array:
+    def per_state(name: str, value: object, dtype: type = np.float64) -> Any:
         array = np.full(n_states, np.nan) if value is None else np.asarray(value, dtype=dtype)
         if array.shape != (n_states,):
             raise ValueError(f"`{name}` must have shape ({n_states},), but has {array.shape}.")
-        return jnp.asarray(array)
+        return array
 
-    def per_sensor(name: str, value: object, dtype: type = np.float64) -> Array:
+    def per_sensor(name: str, value: object, dtype: type = np.float64) -> Any:
         shape = (n_states, n_sensors)
         array = np.full(shape, np.nan) if value is None else np.asarray(value, dtype=dtype)
         if array.ndim == 1 and n_sensors == 1:
             array = array[:, None]
         if array.shape != shape:
             raise ValueError(f"`{name}` must have shape {shape}, but has {array.shape}.")
-        return jnp.asarray(array)
+        return array
 
     if harmonics is None:
         harmonics = np.zeros((n_states, n_sensors, 0), dtype=np.complex128)
         if harmonic_order:
             raise ValueError("`harmonic_order` is given without `harmonics`.")
-    harmonics = np.asarray(harmonics, dtype=np.complex128)
-    if harmonics.shape != (n_states, n_sensors, len(harmonic_order)):
+    told: Any = np.asarray(harmonics, dtype=np.complex128)
+    if told.shape != (n_states, n_sensors, len(harmonic_order)):
         raise ValueError(
             f"`harmonics` must have shape {(n_states, n_sensors, len(harmonic_order))}, "
-            f"but has {harmonics.shape}."
+            f"but has {told.shape}."
         )
-    return SteadyStates(
+    states = SteadyStates(
         level=per_state("level", level, np.int64),
-        frequency=jnp.asarray(omega),
+        frequency=per_state("frequency", omega),
         force=per_state("force", force),
         velocity=per_sensor("velocity", velocity, np.complex128),
         measured=per_sensor(
@@ -129,11 +129,13 @@ def steady_states(
         force_std=per_state("force_std", force_std),
         drive=per_state("drive", drive),
         order=per_state("order", order),
-        harmonics=jnp.asarray(harmonics),
+        harmonics=told,
         harmonic_std=per_sensor("harmonic_std", harmonic_std),
         harmonic_order=tuple(harmonic_order),
         sensors=tuple(sensors),
     )
+    # All at once: one by one they compile, a copy of every shape.
+    return jax.device_put(states, may_alias=False)
 
 
 def check_phases(data: SteadyStates, purpose: str) -> None:
