@@ -1,4 +1,7 @@
-"""The commands: demo, simulate, nnm, identify, diagnose."""
+"""The commands: demo, simulate, nnm, identify, diagnose.
+
+Each imports what it needs by itself: none waits for the imports of another.
+"""
 
 import os
 import shutil
@@ -7,7 +10,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -18,23 +20,10 @@ import typer
 from rich.console import Console
 
 import snrmjax as sj
-from snrmjax.diagnosis_report import write_diagnosis
-from snrmjax.io import joint_results, results
 from snrmjax.io.models import read_model, write_model
 from snrmjax.io.tables import read_steady_states, write_steady_states
 from snrmjax.io.units import HERTZ
 from snrmjax.model.beams import FLAT_BEAM_FORCES
-from snrmjax.plot import normal_mode_figure, save_figure, simulated_response_figure
-from snrmjax.presentation import (
-    Presentation,
-    corrected,
-    equilibria_notes,
-    fit_as_asked,
-    identification_figures,
-    present_identification,
-    presentation_report,
-)
-from snrmjax.report import write_report
 from snrmjax.simulate.continuation import STATUS_MESSAGE
 
 app = typer.Typer(
@@ -88,6 +77,10 @@ def demo(out: Out) -> None:
     Writes the model, the simulated responses, the normal mode, a virtual measurement with noise,
     what `identify` makes of it, figures and report.html.
     """
+    from snrmjax.io import results
+    from snrmjax.plot import save_figure, simulated_response_figure
+    from snrmjax.presentation import present_identification, write_identification
+
     with _staged(out) as folder:
         model = sj.flat_beam()
         write_model(folder / "model.toml", model)
@@ -112,7 +105,7 @@ def demo(out: Out) -> None:
         _say("identifying backbone and damping, predicting responses")
         told = present_identification(data, model, FLAT_BEAM_FORCES, truth=branch, simulated=curves)
         done = {"data": "a virtual test with seeded noise", "model": model.name}
-        _write_identification(folder, told, "The chain on the flat beam", done, ())
+        write_identification(folder, told, "The chain on the flat beam", done, ())
         save_figure(simulated_response_figure(curves), folder / "response.png")
     _say(f"done: open {out / 'report.html'}")
 
@@ -134,6 +127,9 @@ def simulate(
 
     Writes response.csv and response.png.
     """
+    from snrmjax.io import results
+    from snrmjax.plot import save_figure, simulated_response_figure
+
     with _staged(out) as folder:
         structure = read_model(model)
         _report_equilibria(structure)
@@ -175,6 +171,9 @@ def nnm(
 
     Writes nnm.csv and nnm.png.
     """
+    from snrmjax.io import results
+    from snrmjax.plot import normal_mode_figure, save_figure
+
     with _staged(out) as folder:
         structure = read_model(model)
         _report_equilibria(structure)
@@ -248,6 +247,14 @@ def identify(
     also prediction.csv; with --fit the fitted curves, their residuals, what their bands are made of
     and fit.json, and with --next also next.csv.
     """
+    from snrmjax.io import joint_results
+    from snrmjax.presentation import (
+        corrected,
+        fit_as_asked,
+        present_identification,
+        write_identification,
+    )
+
     with _staged(out) as folder:
         structure = read_model(model)
         reading = read_steady_states(data, sensors=structure.modes.sensors)
@@ -291,7 +298,7 @@ def identify(
             for one in advice:
                 hertz = f"{one.frequency / HERTZ:.6g} Hz"
                 _say(f"{one.rank}. {one.force:.4g} N at {hertz}: {one.reason}")
-        _write_identification(
+        write_identification(
             *(folder, told, data.stem.replace("_", " "), done, reading.notes), further
         )
         if joint is not None:
@@ -321,6 +328,8 @@ def diagnose(
     Without phases: velocity_m_s, the amplitude of the fundamental, in place of velocity_re_m_s and
     velocity_im_m_s; or a phase_std_deg of 60 or more. The notes say what is lost.
     """
+    from snrmjax.diagnosis_report import write_diagnosis
+
     several = len(data) > 1
     if len({path.stem for path in data}) < len(data):
         raise ValueError("two of the data files have the same name: they would share a folder.")
@@ -363,32 +372,6 @@ def main() -> None:
         sys.exit(2)
 
 
-def _write_identification(
-    folder: Path,
-    told: Presentation,
-    title: str,
-    done: dict[str, str],
-    notes: tuple[str, ...],
-    further: dict[str, object] | None = None,
-) -> None:
-    identification = told.identification
-    results.write_points(folder / "points.csv", identification)
-    results.write_backbone(folder / "backbone.csv", identification)
-    if told.predictions:
-        responses = [response for one in told.predictions for response in one.responses]
-        results.write_prediction(folder / "prediction.csv", responses)
-    pairs = [(one.force, one.resonances) for one in told.predictions]
-    summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
-    summary |= results.summarise(identification, pairs)
-    summary |= {"notes": [*notes, *told.notes], **(further or {})}
-    results.write_summary(folder / "summary.json", summary)
-    figures = identification_figures(told)
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
-    report = presentation_report(told, title, done, notes, figures)
-    write_report(folder / "report.html", report)
-
-
 def _sensor(structure: sj.Structure) -> str:
     return structure.modes.sensors[sj.reference_sensor(structure.modes)]
 
@@ -407,6 +390,8 @@ def _report_truncation(curves: list[sj.ResponseCurve], harmonics: int) -> None:
 
 
 def _report_equilibria(structure: sj.Structure) -> None:
+    from snrmjax.presentation import equilibria_notes
+
     for note in equilibria_notes(structure):
         _warn(note)
 

@@ -11,25 +11,19 @@ from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
 from snrmjax.diagnose.foretelling import (
     LevelResponse,
     Resonance,
-    level_forces,
     level_responses,
-    responses,
+    level_simulations,
 )
 from snrmjax.diagnose.locating import Located
 from snrmjax.diagnose.naming import AS_GOOD, DETECTED
 from snrmjax.diagnose.summary import summarise_diagnosis
-from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, unit_for
-from snrmjax.identify.joint_fit import fit_jointly
-from snrmjax.io.files import write_atomically
+from snrmjax.drawing import IDENTIFIED, MEASURED, SERIES, name_axes, panels, png_bytes, unit_for
+from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
-from snrmjax.io.results import write_summary
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
-from snrmjax.plot import png_bytes
-from snrmjax.presentation import corrected
 from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
-from snrmjax.simulate.blocks import over_cores
 from snrmjax.simulate.response_curve import ResponseCurve
 
 _SHOWN = 10  # candidates
@@ -55,6 +49,10 @@ def write_diagnosis(
     notes: tuple[str, ...] = ()
     gain_std = 0.0
     if not np.any(np.isfinite(np.asarray(data.force))):
+        # Few need them, and they take as long to import as half the others.
+        from snrmjax.identify.joint_fit import fit_jointly
+        from snrmjax.presentation import corrected
+
         fit = fit_jointly(data, model.modes, free=("force_gain",))
         data = corrected(data, fit)
         gain = float(np.exp(fit.unknowns.log_force_gain))
@@ -83,11 +81,9 @@ def with_responses(
     found: Diagnosis, model: Structure, data: SteadyStates
 ) -> tuple[list[LevelResponse], Figure]:
     """What simulation adds: resonances and responses of all levels."""
-    forces = list(level_forces(data, found.sensor).values())
-    # Side by side: the first time, both compile.
-    before, after = over_cores(lambda one: responses(one, data, forces), (model, found.completed))
-    foretold = level_responses(before, after, data, found.sensor, found.blind)
-    old, new = ([c for one in curves for c in one] for curves in (before, after))
+    simulated = level_simulations(model, found.completed, found.blind, data, found.sensor)
+    foretold = level_responses(simulated, data, found.sensor)
+    old, new = ([c for one in curves for c in one] for curves in simulated[:2])
     figure = simulated_figure(old, new, data, found.sensor)
     return foretold, figure
 

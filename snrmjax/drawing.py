@@ -3,6 +3,7 @@
 Everything is set on the figures themselves: matplotlib's settings stay as they are.
 """
 
+import io
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,6 +61,13 @@ def with_unit(value: float, base: str) -> str:
 def plain(text: str) -> str:
     """A user's text as a label: no mathematics in it, and not hidden from legends."""
     return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
+    """A figure as the content of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dots_per_inch)
+    return buffer.getvalue()
 
 
 def panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, np.ndarray]:

@@ -5,7 +5,6 @@ unstable and pale ones lie beyond the measured amplitudes. Axes are in Hz, degre
 critical damping. Figures need no display and change none of matplotlib's settings.
 """
 
-import io
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -32,6 +31,7 @@ from snrmjax.drawing import (
     panels,
     phase_axis,
     plain,
+    png_bytes,
     response_line,
     stars,
     unit_for,
@@ -76,13 +76,6 @@ def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 200.0)
     if not file_name(path).lower().endswith(".png"):
         raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
     write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
-
-
-def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
-    """A figure as the content of a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dots_per_inch)
-    return buffer.getvalue()
 
 
 def backbone_figure(

@@ -1,6 +1,8 @@
 """What a result is told with: predictions beside an identification, its figures, its report."""
 
 from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax import plot
+from snrmjax.identification_report import identification_report
 from snrmjax.identify.backbone import BackboneFit
 from snrmjax.identify.fitted_response import as_backbone
 from snrmjax.identify.identification import Identification, identify_backbone
@@ -21,10 +24,12 @@ from snrmjax.identify.prediction import (
     predict_response,
     resonances,
 )
+from snrmjax.io import results
+from snrmjax.io.files import write_summary
 from snrmjax.joint_report import ToldFit, joint_figures, joint_sections, tell_fit
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure, equilibria
-from snrmjax.report import Report, ReportFigure, Section, identification_report
+from snrmjax.report import Report, ReportFigure, Section, write_report
 from snrmjax.simulate.forced_response import ResponseCurve
 from snrmjax.simulate.normal_modes import NormalModeBranch
 
@@ -252,3 +257,30 @@ def fit_as_asked(
         level_phase_std=float(structure.level_phase_std),
         robust=robust,
     )
+
+
+def write_identification(
+    folder: Path,
+    told: Presentation,
+    title: str,
+    done: dict[str, str],
+    notes: tuple[str, ...],
+    further: dict[str, object] | None = None,
+) -> None:
+    """Write what `identify` found into a folder: tables, summary, figures and report."""
+    identification = told.identification
+    results.write_points(folder / "points.csv", identification)
+    results.write_backbone(folder / "backbone.csv", identification)
+    if told.predictions:
+        responses = [response for one in told.predictions for response in one.responses]
+        results.write_prediction(folder / "prediction.csv", responses)
+    pairs = [(one.force, one.resonances) for one in told.predictions]
+    summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
+    summary |= results.summarise(identification, pairs)
+    summary |= {"notes": [*notes, *told.notes], **(further or {})}
+    write_summary(folder / "summary.json", summary)
+    figures = identification_figures(told)
+    for name, figure in figures.items():
+        plot.save_figure(figure, folder / f"{name}.png")
+    report = presentation_report(told, title, done, notes, figures)
+    write_report(folder / "report.html", report)

@@ -13,6 +13,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax import drawing, plot
+from snrmjax.drawing import png_bytes
 from snrmjax.io.units import DEGREE, HERTZ
 
 FORCES = (4.0e-5, 8.0e-5, 1.334e-4)
@@ -254,7 +255,7 @@ def test_names_of_sensors_are_shown_as_they_are(virtual):
     odd = r"$\frac{1_$"
     curves = [curve._replace(sensors=(odd,)) for curve in virtual.curves]
     figure = plot.simulated_response_figure(curves, sensor=odd)
-    assert plot.png_bytes(figure, dots_per_inch=40)
+    assert png_bytes(figure, dots_per_inch=40)
     assert figure.axes[0].get_title(loc="left") == r"(a) amplitude at \$\frac{1_\$"
 
 
@@ -482,7 +483,7 @@ def test_figures_are_saved_whole_or_not_at_all(tmp_path, mode, monkeypatch):
 
 def test_matplotlib_is_left_as_it_was(identification, backbone):
     before = dict(mpl.rcParams)
-    plot.png_bytes(plot.backbone_figure(identification.points, backbone), dots_per_inch=40)
+    png_bytes(plot.backbone_figure(identification.points, backbone), dots_per_inch=40)
     assert dict(mpl.rcParams) == before
 
 

@@ -13,6 +13,11 @@ from matplotlib.figure import Figure
 
 import snrmjax as sj
 from snrmjax import report as reports
+from snrmjax.identification_report import (
+    identification_report,
+    identification_summary,
+    resonance_table,
+)
 from snrmjax.io.units import HERTZ
 from snrmjax.report import Report, ReportFigure, ReportTable, Section, write_report
 
@@ -83,7 +88,7 @@ def simulated(force, velocities, frequencies_hz, events):
 
 @pytest.fixture(scope="module")
 def report(identification, modes):
-    return reports.identification_report(
+    return identification_report(
         identification,
         modes,
         title=f"Beam {NASTY}",
@@ -189,7 +194,7 @@ def test_report_without_anything_to_remark(tmp_path):
 
 
 def test_headline_numbers_are_those_of_the_curves(identification, modes, data):
-    rows = dict(reports.identification_summary(identification, modes))
+    rows = dict(identification_summary(identification, modes))
     # The backbone is exact to 0.05 %; the smallest amplitude is 0.1 mm, the largest 1 mm.
     first, last = rows["natural frequency (± 95 %)"].split(", ")
     expected = frequency_at(np.array([1e-4, 1e-3])) / HERTZ
@@ -225,7 +230,7 @@ def test_points_left_out_are_counted_with_the_reason(identification, modes):
         .set(int(sj.PointStatus.NEGATIVE_DAMPING))
     )
     doubted = identification._replace(points=eqx.tree_at(lambda p: p.status, points, status))
-    rows = dict(reports.identification_summary(doubted, modes))
+    rows = dict(identification_summary(doubted, modes))
     assert rows["points used"].startswith("29 of 32")
     assert rows["left out"] == (
         "2 (negative damping: phase beyond 90° of resonance), "
@@ -240,7 +245,7 @@ def test_unstated_noise_and_scatter_of_levels(identification, modes):
         level_frequency_std=0.2 * HERTZ,
         level_damping_std=0.001,
     )
-    rows = dict(reports.identification_summary(identification._replace(fit=fit), modes))
+    rows = dict(identification_summary(identification._replace(fit=fit), modes))
     assert rows["noise"] == (
         "not stated; from the scatter 1.2 % (frequency) and 3.4 % (damping) of the measured phasor"
     )
@@ -260,7 +265,7 @@ def test_resonances_beside_the_nearest_of_harmonic_balance(identification):
         simulated(2e-3, [0.2], [82.0], ["fold"]),
         simulated(3e-3, [0.3], [82.0], ["phase_resonance"]),
     ]
-    table = reports.resonance_table(backbone, found, curves, [1e-3, 3e-3])
+    table = resonance_table(backbone, found, curves, [1e-3, 3e-3])
     assert table.header[0] == "force (mN)"
     assert [row[0] for row in table.rows] == ["1", "2", "3"]
     first, second, third = table.rows
@@ -273,7 +278,7 @@ def test_resonances_beside_the_nearest_of_harmonic_balance(identification):
 
 
 def test_resonances_alone(identification):
-    table = reports.resonance_table(identification.fit.backbone, [resonance(2.0, 0.02, 81.0)])
+    table = resonance_table(identification.fit.backbone, [resonance(2.0, 0.02, 81.0)])
     assert table.header == [
         "force (N)",
         "velocity (mm/s)",
@@ -299,7 +304,7 @@ def test_curves_that_start_at_zero_are_told_from_there(identification, modes):
         ],
     )
     anchored = identification._replace(fit=fit._replace(backbone=anchored))
-    rows = dict(reports.identification_summary(anchored, modes))
+    rows = dict(identification_summary(anchored, modes))
     assert re.match(r"80\.0\d* ± \S+ Hz at 0 m/s", rows["natural frequency (± 95 %)"])
     assert re.match(r"2\.0\d* ± \S+ % at 0 m/s", rows["damping ratio (± 95 %)"])
 

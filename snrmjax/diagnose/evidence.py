@@ -334,8 +334,8 @@ class Bench:
             rows[lost], slopes[lost] = together(every[lost])
             cost[lost] = [self._cost(row) for row in rows[lost]]
         active = np.isfinite(cost)
-        for step in range(_STEPS):
-            if step == _SCREENED:  # the most promising go on
+        for turn in range(_STEPS):
+            if turn == _SCREENED:  # the most promising go on
                 active &= cost <= np.sort(cost)[min(_KEPT, trials) - 1]
             at = np.flatnonzero(active)
             if not at.size:
@@ -343,9 +343,19 @@ class Bench:
             moved = point.copy()
             for t in at:
                 left = self.weighing.decorrelated(rows[t])
-                arms = self.weighing.decorrelated((law.slopes(every[t], slopes[t]) * unit).T).T
-                aim = point[t] + _damped(arms, left, damping[t])
-                moved[t] = np.clip(aim, lower / unit, upper / unit)
+                by = law.slopes(every[t], slopes[t]) * unit
+                arms = self.weighing.decorrelated(by.T).T
+                step = _damped(arms, left, damping[t])
+                moved[t] = np.clip(point[t] + step, lower / unit, upper / unit)
+                promised = float(left @ left - np.sum((left + arms @ step) ** 2))
+                if promised < _SETTLED and np.array_equal(moved[t], point[t] + step):
+                    # So short a step is straight: what it does need not be looked at.
+                    rows[t] = rows[t] + by @ step
+                    point[t], cost[t], active[t] = moved[t], self._cost(rows[t]), False
+                    every[t] = law.outward(moved[t] * unit)
+            at = at[active[at]]
+            if not at.size:
+                break
             values = law.outward(moved[at] * unit)
             new_rows, new_slopes = together(values)
             for place, t in enumerate(at):

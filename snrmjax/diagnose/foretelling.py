@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose.predictions import without_strength
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.forced_response import forced_response
+from snrmjax.simulate.forced_response import forced_response_batch
 from snrmjax.simulate.response_curve import ResponseCurve
 
 ORDER = 5  # harmonics of the responses
@@ -57,14 +58,50 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
 
 
 def responses(
-    model: Structure, data: SteadyStates, forces: Sequence[float]
+    models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
 ) -> list[list[ResponseCurve]]:
-    """Simulated responses around the measured frequencies, force by force."""
+    """Simulated responses around the measured frequencies, force by force (N).
+
+    `models` is one for all forces or one for each, with the same kinds of effects.
+    """
     frequency = np.asarray(data.frequency)
     reach = _REACH * (frequency.max() - frequency.min())
     ends = (float(frequency.min() - reach), float(frequency.max() + reach))
-    curves = forced_response(model, list(forces), *ends, harmonic_order=ORDER, stability=False)
-    return [[c for c in curves if np.isclose(c.force, force, rtol=1e-9)] for force in forces]
+    batch = forced_response_batch(models, forces, *ends, harmonic_order=ORDER, stability=False)
+    return [list(curves) for curves in batch.curves]
+
+
+class Simulated(NamedTuple):
+    """Responses of every level: of both models, and of those that have not seen a level."""
+
+    before: list[list[ResponseCurve]]
+    after: list[list[ResponseCurve]]
+    blind: dict[int, list[ResponseCurve]]
+
+
+def level_simulations(
+    model: Structure,
+    completed: Structure,
+    blind: Mapping[int, Structure],
+    data: SteadyStates,
+    sensor: int,
+) -> Simulated:
+    """Responses under the levels' forces, before and after.
+
+    `blind` has models that have not seen a level. One program follows all responses: what was
+    added counts for nothing in the model before.
+    """
+    forces = level_forces(data, sensor)
+    every, seen = list(forces.values()), [level for level in forces if level in blind]
+    after = [completed] * len(every) + [blind[level] for level in seen]
+    loads = [*every, *(forces[level] for level in seen)]
+    same = without_strength(model, completed)
+    if same is None:
+        old, new = responses(model, data, every), responses(after, data, loads)
+    else:
+        found = responses([*[same] * len(every), *after], data, [*every, *loads])
+        old, new = found[: len(every)], found[len(every) :]
+    return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
@@ -116,23 +153,16 @@ def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonan
     return Resonance(float(curve.frequency[k]) / (2 * np.pi), size, fold)
 
 
-def level_responses(
-    before: Sequence[Sequence[ResponseCurve]],
-    after: Sequence[Sequence[ResponseCurve]],
-    data: SteadyStates,
-    sensor: int,
-    blind: Mapping[int, Structure],
-) -> list[LevelResponse]:
+def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:
     """Measured and foretold resonances of every level.
 
-    `before` and `after` are responses under the levels' forces; `blind` has models that have not
-    seen a level, which speak for it in place of `after`.
+    Models that have not seen a level speak for it in place of the completed one.
     """
     rows = []
     for (level, force), old, new in zip(
-        level_forces(data, sensor).items(), before, after, strict=True
+        level_forces(data, sensor).items(), simulated.before, simulated.after, strict=True
     ):
-        own = responses(blind[level], data, [force])[0] if level in blind else new
+        own = simulated.blind.get(level, new)
         rows.append(
             LevelResponse(
                 level,
@@ -140,7 +170,7 @@ def level_responses(
                 measured_resonance(data, level, sensor),
                 simulated_resonance(old, sensor),
                 simulated_resonance(own, sensor),
-                level in blind,
+                level in simulated.blind,
             )
         )
     return rows

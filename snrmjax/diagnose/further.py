@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
+from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.predictions import Predicted, Predictions
@@ -167,6 +168,14 @@ class Rows(NamedTuple):
     slopes: Float[np.ndarray, "row parameter"]
 
 
+class Compared(NamedTuple):
+    """A model by its measured rows, the χ² that they leave it, and its rows of further states."""
+
+    measured: Rows
+    least: float
+    further: Rows
+
+
 def rows_of(bench: Bench, found: Predicted) -> Rows:
     """Predictions of one trial in units of a bench's noise."""
     slopes = bench.weighing.noise_units(np.moveaxis(found.slopes[0], 2, 0))
@@ -195,10 +204,16 @@ def together(
 
 def refitted(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
-    lower = np.linalg.cholesky(np.eye(len(rows.left)) + shared @ shared.T)
+    return _least(rows, np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T))
+
+
+def _least(rows: Rows, lower: Float[np.ndarray, "row row"]) -> float:
+    """The same from the covariance's Cholesky factor."""
     size = np.linalg.norm(rows.slopes, axis=0)
-    arms = np.linalg.solve(lower, rows.slopes / np.where(size > 0, size, 1.0))
-    left = np.linalg.solve(lower, rows.left)
+    arms = rows.slopes / np.where(size > 0, size, 1.0)
+    arms, left = (
+        solve_triangular(lower, part, lower=True, check_finite=False) for part in (arms, rows.left)
+    )
     along, values, _ = np.linalg.svd(arms, full_matrices=False)
     along = along[:, values > _RESOLUTION * max(values.max(initial=0.0), 1.0)]
     return float(np.sum((left - along @ (along.T @ left)) ** 2))
@@ -207,20 +222,21 @@ def refitted(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
 def separation(
     old: Bench,
     new: Bench,
-    truth: tuple[Rows, Rows],
-    rival: tuple[Rows, Rows],
+    truth: Compared,
+    rival: Compared,
     kept: Bool[np.ndarray, " row"],
 ) -> float:
     """How much more χ² of a rival grows by some rows of further states than that of the truth.
 
-    Arguments: of both models the rows of the measured and of the further states. Each is refitted
-    to all of them, with what they share. Rows for which one of the two has no motion do not count.
+    Each is refitted to the measured and the further rows, with what they share. Rows for which one
+    of the two has no motion do not count.
     """
-    for _, rows in (truth, rival):
+    for _, _, rows in (truth, rival):
         kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)
     shared = together(old, new, kept)
+    lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
     gains = []
-    for before, after in (truth, rival):
+    for before, least, after in (truth, rival):
         both = Rows(*(np.concatenate([a, b[kept]]) for a, b in zip(before, after, strict=True)))
-        gains.append(refitted(both, shared) - refitted(before, old.weighing.shared))
+        gains.append(_least(both, lower) - least)
     return gains[1] - gains[0]

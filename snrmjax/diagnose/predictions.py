@@ -7,6 +7,7 @@ a candidate is a vector of parameters.
 import copy
 import dataclasses
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -157,11 +158,11 @@ class Predictions:
         return kind not in _LIBRARY
 
     def _prepared(self, kinds: list[str]) -> Group:
-        present, modes = [effect.kind for effect in self.model.effects], self.model.modes
-        j = modes.mode_of_interest
-        own = (np.asarray(a)[j] for a in (modes.natural_frequency, modes.damping_ratio))
-        frequency, ratio = (float(number) for number in own)
-        added = tuple(_without_strength(k, frequency, ratio) for k in kinds if k not in present)
+        present = [effect.kind for effect in self.model.effects]
+        frequency, ratio = _of_interest(self.model)
+        added = tuple(
+            _without_strength(EFFECTS[k], frequency, ratio) for k in kinds if k not in present
+        )
         model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
         numbers, stds = parameter_values(model), stated_stds(model)
         names, values = tuple(numbers), np.array(list(numbers.values()))
@@ -336,7 +337,27 @@ _LIBRARY = frozenset(EFFECTS)
 _SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
 
 
-def _without_strength(kind: str, frequency: float, ratio: float) -> AbstractEffect:
+def without_strength(model: Structure, completed: Structure) -> Structure | None:
+    """The first model with the kinds of effects that the second has beside it, without strength.
+
+    The same physics. None where a kind is a user's own, of
+    which nobody knows what takes its strength.
+    """
+    kinds = [effect.kind for effect in completed.effects[len(model.effects) :]]
+    if not _LIBRARY.issuperset(kinds):
+        return None
+    added = tuple(_without_strength(EFFECTS[kind], *_of_interest(model)) for kind in kinds)
+    return dataclasses.replace(model, effects=(*model.effects, *added))
+
+
+def _of_interest(model: Structure) -> tuple[float, float]:
+    """Natural frequency (rad/s) and damping ratio of the mode of interest."""
+    modes, j = model.modes, model.modes.mode_of_interest
+    return float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+
+
+@lru_cache(maxsize=256)
+def _without_strength(one: type[AbstractEffect], frequency: float, ratio: float) -> AbstractEffect:
     """An effect that does nothing, with shapes that no rule forbids.
 
     Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
@@ -355,5 +376,5 @@ def _without_strength(kind: str, frequency: float, ratio: float) -> AbstractEffe
             "damping_ratio": ratio,
         },
     }
-    zero = dict.fromkeys(effect_parameters(kind), 0.0)
-    return make_effect(kind, zero | shapes.get(kind, {}))
+    zero = dict.fromkeys(effect_parameters(one.kind), 0.0)
+    return make_effect(one.kind, zero | shapes.get(one.kind, {}))

@@ -11,6 +11,7 @@ from snrmjax.diagnose.candidates import only_by_calibration
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.further import (
     HARMONICS,
+    Compared,
     Foretold,
     Further,
     Rows,
@@ -215,6 +216,12 @@ class _Hypothesis:
         predictions = self._foretold[self.floor].bench.predictions
         return [predicted(predictions, fit) for fit in (self.truth, *self.rivals)]
 
+    @cached_property
+    def _measured(self) -> list[tuple[Rows, float]]:
+        """Rows of the measured states, refitted, and the χ² that they leave: as `_predicted`."""
+        rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
+        return [(one, refitted(one, self.bench.weighing.shared)) for one in rows]
+
     def request(self, option: _Option) -> Request | None:
         """What an option is expected to gain over the rival that it tells least well."""
         floor = self.floor if option.floor is None else option.floor
@@ -225,12 +232,12 @@ class _Hypothesis:
         exact, *others = self._predicted
         if exact is None or not kept.any():
             return None
-        own = Rows(self.truth.rows, self.truth.slopes), rows_of(foretold.bench, exact)
+        own = Compared(*self._measured[0], rows_of(foretold.bench, exact))
         found = []
-        for fit, columns in zip(self.rivals, others, strict=True):
+        for fit, before, columns in zip(self.rivals, self._measured[1:], others, strict=True):
             if columns is None:
                 continue
-            its = Rows(fit.rows, fit.slopes), rows_of(foretold.bench, columns)
+            its = Compared(*before, rows_of(foretold.bench, columns))
             gain = separation(self.bench, foretold.bench, own, its, kept)
             n = self.bench.n_rows
             needed = _needed(fit.criterion(n) - self.truth.criterion(n))

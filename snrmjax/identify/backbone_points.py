@@ -1,6 +1,6 @@
 """From measured steady states to points of the backbone and of the damping, with errors."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from snrmjax.identify.points import PointStatus, SnrmPoints, invert_one, invert_
 from snrmjax.identify.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.measure.steady_states import SteadyStates, check_phases
+from snrmjax.measure.steady_states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 AmplitudeArgument = Literal["displacement", "velocity"]
@@ -175,23 +175,6 @@ def _ratios_std(
     slope = jnp.stack([-damping / (2 * natural**2), 1 / (2 * natural)], axis=1)
     variance = jnp.einsum("so,sop,sp->s", slope, covariance[:, :2, :2], slope)
     return natural_std, jnp.sqrt(variance)
-
-
-def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
-    """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
-
-    A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
-    """
-    xp: Any = data.velocity.__array_namespace__()
-    amplitude = xp.abs(data.velocity)
-    force = data.force_std / xp.where(data.force > 0, data.force, xp.nan)
-    force = xp.broadcast_to(force[:, None], amplitude.shape)
-    velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
-    # A velocity error without a phase error is taken as a circle in the complex plane.
-    phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
-    stated = xp.stack([force, velocity, phase], axis=2)
-    something = xp.any(xp.isfinite(stated), axis=2, keepdims=True)
-    return xp.where(xp.isfinite(stated), stated, xp.where(something, 0.0, xp.nan))
 
 
 def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:

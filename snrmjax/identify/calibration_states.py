@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.identify.backbone_points import relative_errors
 from snrmjax.identify.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.steady_states import SteadyStates, relative_errors
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import taken
 from snrmjax.simulate.compiled import compiled
@@ -114,17 +113,18 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
     order = told.order
     levels, level = np.unique(told.level, return_inverse=True)
-    parts = CalibrationStates(
-        level=jnp.asarray(level),
-        frequency=jnp.asarray(told.frequency),
-        force=jnp.asarray(told.force),
-        order=jnp.asarray(np.where(np.isfinite(order), order, np.asarray(model.test_order))),
-        velocity=jnp.asarray(velocity),
-        harmonics=jnp.asarray(np.where(there, harmonics, 0.0)),
-        error=jnp.asarray(np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1)),
-        own_std=jnp.asarray(np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1)),
-        known=jnp.asarray(known),
-    )
+    columns: list[Any] = [
+        level,
+        told.frequency,
+        told.force,
+        np.where(np.isfinite(order), order, np.asarray(model.test_order)),
+        velocity,
+        np.where(there, harmonics, 0.0),
+        np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1),
+        np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1),
+        known,
+    ]
+    parts = jax.device_put(CalibrationStates(*columns), may_alias=False)
     orders = tuple(told.harmonic_order[k] for k in places)
     own_places = (tuple(sensors), orders, unknown)
     return Selection(parts, rows, len(levels), *own_places, stated, tuple(notes))

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.identify.backbone_points import mistrust, modal_filter, relative_errors
+from snrmjax.identify.backbone_points import mistrust, modal_filter
 from snrmjax.identify.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates, check_phases
+from snrmjax.measure.steady_states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.simulate.blocks import mapped
 from snrmjax.simulate.compiled import compiled

@@ -1,6 +1,8 @@
 """Reading and writing whole files, and the words that messages about them share."""
 
 import difflib
+import json
+import math
 import os
 import uuid
 from collections.abc import Iterable
@@ -56,6 +58,11 @@ def write_atomically(path: FilePath, content: str | bytes) -> None:
             temporary.unlink()
 
 
+def write_summary(path: Path, summary: dict) -> None:
+    """Write a summary as JSON; numbers that are not finite become null."""
+    write_atomically(path, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+
+
 def file_name(path: FilePath) -> str:
     """The last part of a path, as messages name the file.
 
@@ -100,3 +107,13 @@ def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
     """
     near = near_miss(name, known, cutoff)
     return "" if near is None else f" (did you mean `{near}`?)"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

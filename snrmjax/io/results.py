@@ -1,6 +1,5 @@
 """Results as tables and as one summary: what the commands write."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from snrmjax.identify.identification import Identification
 from snrmjax.identify.points import PointStatus
 from snrmjax.identify.prediction import PredictedResponse, Resonance
 from snrmjax.identify.snrm import reference_sensor
-from snrmjax.io.files import write_atomically
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
@@ -122,11 +120,6 @@ def write_prediction(path: Path, responses: Sequence[PredictedResponse]) -> None
     )
 
 
-def write_summary(path: Path, summary: dict) -> None:
-    """Write a summary as JSON; numbers that are not finite become null."""
-    write_atomically(path, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
-
-
 def summarise(
     identification: Identification, predictions: Sequence[tuple[float, Sequence[Resonance]]]
 ) -> dict:
@@ -202,13 +195,3 @@ def _peaks(velocity: np.ndarray) -> np.ndarray:
     """Peak of the time signal of every point, from its harmonics without the mean (which is 0)."""
     orders = tuple(range(1, velocity.shape[1]))
     return np.asarray(jax.jit(peak_amplitude, static_argnums=1)(velocity[:, 1:], orders))
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

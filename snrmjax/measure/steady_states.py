@@ -1,5 +1,7 @@
 """A table of measured steady states: the input of every identification."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -89,34 +91,34 @@ def steady_states(
         raise ValueError(f"`frequency` must be a vector, but has shape {omega.shape}.")
     n_states, n_sensors = omega.size, len(sensors)
 
-    def per_state(name: str, value: object, dtype: type = np.float64) -> Array:
+    def per_state(name: str, value: object, dtype: type = np.float64) -> Any:
         array = np.full(n_states, np.nan) if value is None else np.asarray(value, dtype=dtype)
         if array.shape != (n_states,):
             raise ValueError(f"`{name}` must have shape ({n_states},), but has {array.shape}.")
-        return jnp.asarray(array)
+        return array
 
-    def per_sensor(name: str, value: object, dtype: type = np.float64) -> Array:
+    def per_sensor(name: str, value: object, dtype: type = np.float64) -> Any:
         shape = (n_states, n_sensors)
         array = np.full(shape, np.nan) if value is None else np.asarray(value, dtype=dtype)
         if array.ndim == 1 and n_sensors == 1:
             array = array[:, None]
         if array.shape != shape:
             raise ValueError(f"`{name}` must have shape {shape}, but has {array.shape}.")
-        return jnp.asarray(array)
+        return array
 
     if harmonics is None:
         harmonics = np.zeros((n_states, n_sensors, 0), dtype=np.complex128)
         if harmonic_order:
             raise ValueError("`harmonic_order` is given without `harmonics`.")
-    harmonics = np.asarray(harmonics, dtype=np.complex128)
-    if harmonics.shape != (n_states, n_sensors, len(harmonic_order)):
+    told: Any = np.asarray(harmonics, dtype=np.complex128)
+    if told.shape != (n_states, n_sensors, len(harmonic_order)):
         raise ValueError(
             f"`harmonics` must have shape {(n_states, n_sensors, len(harmonic_order))}, "
-            f"but has {harmonics.shape}."
+            f"but has {told.shape}."
         )
-    return SteadyStates(
+    states = SteadyStates(
         level=per_state("level", level, np.int64),
-        frequency=jnp.asarray(omega),
+        frequency=per_state("frequency", omega),
         force=per_state("force", force),
         velocity=per_sensor("velocity", velocity, np.complex128),
         measured=per_sensor(
@@ -127,11 +129,13 @@ def steady_states(
         force_std=per_state("force_std", force_std),
         drive=per_state("drive", drive),
         order=per_state("order", order),
-        harmonics=jnp.asarray(harmonics),
+        harmonics=told,
         harmonic_std=per_sensor("harmonic_std", harmonic_std),
         harmonic_order=tuple(harmonic_order),
         sensors=tuple(sensors),
     )
+    # All at once: one by one they compile, a copy of every shape.
+    return jax.device_put(states, may_alias=False)
 
 
 def check_phases(data: SteadyStates, purpose: str) -> None:
@@ -166,3 +170,20 @@ def join_steady_states(*parts: SteadyStates) -> SteadyStates:
                 f"{list(parts[0].sensors)} and {list(parts[0].harmonic_order)}."
             )
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+
+
+def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
+    """Stated 1σ of log force, log velocity and phase; what is not stated is 0 if others are.
+
+    A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
+    """
+    xp: Any = data.velocity.__array_namespace__()
+    amplitude = xp.abs(data.velocity)
+    force = data.force_std / xp.where(data.force > 0, data.force, xp.nan)
+    force = xp.broadcast_to(force[:, None], amplitude.shape)
+    velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
+    # A velocity error without a phase error is taken as a circle in the complex plane.
+    phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
+    stated = xp.stack([force, velocity, phase], axis=2)
+    something = xp.any(xp.isfinite(stated), axis=2, keepdims=True)
+    return xp.where(xp.isfinite(stated), stated, xp.where(something, 0.0, xp.nan))

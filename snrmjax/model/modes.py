@@ -1,6 +1,9 @@
 """Linear modes of a structure and their response to a harmonic force."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
@@ -95,27 +98,20 @@ def linear_modes(
         [] if rigid_body_participation is None else rigid_body_participation,
         rigid_shape.shape[1],
     )
-    zeros = np.zeros(n_modes)
-    return LinearModes(
-        natural_frequency=jnp.asarray(frequency),
-        damping_ratio=jnp.asarray(damping),
-        mode_shape=jnp.asarray(shape),
-        participation=jnp.asarray(_vector("participation", participation, n_modes)),
-        rigid_body_shape=jnp.asarray(rigid_shape),
-        rigid_body_participation=jnp.asarray(rigid_participation),
-        natural_frequency_std=jnp.asarray(
-            zeros
-            if natural_frequency_std is None
-            else _vector("natural_frequency_std", natural_frequency_std, n_modes)
-        ),
-        damping_ratio_std=jnp.asarray(
-            zeros
-            if damping_ratio_std is None
-            else _vector("damping_ratio_std", damping_ratio_std, n_modes)
-        ),
-        sensors=tuple(names),
-        mode_of_interest=mode_of_interest,
-    )
+    numbers: dict[str, Any] = {
+        "natural_frequency": frequency,
+        "damping_ratio": damping,
+        "mode_shape": shape,
+        "participation": _vector("participation", participation, n_modes),
+        "rigid_body_shape": rigid_shape,
+        "rigid_body_participation": rigid_participation,
+    }
+    stds = {"natural_frequency_std": natural_frequency_std, "damping_ratio_std": damping_ratio_std}
+    for name, std in stds.items():
+        numbers[name] = np.zeros(n_modes) if std is None else _vector(name, std, n_modes)
+    modes = LinearModes(**numbers, sensors=tuple(names), mode_of_interest=mode_of_interest)
+    # All at once: one by one they compile, a copy of every shape.
+    return jax.device_put(modes, may_alias=False)
 
 
 def _vector(name: str, value: object, size: int | None = None) -> np.ndarray:

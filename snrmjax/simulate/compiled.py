@@ -66,16 +66,15 @@ def _options(hurried: bool) -> dict[str, str | bool | int]:
     """
     if jax.default_backend() != "cpu":
         return {}
-    return {
-        name: value
-        for name, value in _OPTIONS.items()
-        if not (hurried and name == _LEVEL) and _known(name, value)
-    }
+    wanted = {k: v for k, v in _OPTIONS.items() if not (hurried and k == _LEVEL)}
+    if _known(wanted):
+        return wanted
+    return {name: value for name, value in wanted.items() if _known({name: value})}
 
 
-def _known(name: str, value: str | bool | int) -> bool:
+def _known(options: dict[str, str | bool | int]) -> bool:
     try:
-        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True

@@ -62,7 +62,8 @@ def follow_from_rest(
     From the linear response at an end of the range (rad/s), or with `ramp` from the response to a
     force that rises from zero at the lower end.
     """
-    size = 1 if len(index) == 1 else _BLOCK
+    # A single one of many takes the program of all.
+    size = 1 if np.size(balances.force) == 1 else _BLOCK
     jobs = [index[b : b + size] for b in range(0, len(index), size)]
 
     def follow(job: np.ndarray) -> list[FollowedCurve]:

@@ -173,6 +173,30 @@ def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(mo
     np.testing.assert_allclose(bench.change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max())
 
 
+def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
+    predictions = Predictions(linear_model(), balanced(quadratic))
+    one, bench = candidate("quadratic_damping", scales_of(predictions)), Bench(predictions)
+    best = bench.fitted(one)
+    std = 1 / np.linalg.norm(bench.weighing.decorrelated(best.slopes[:, 0]))
+    looked = []
+    whole = Bench._evaluated
+
+    def counted(self, group, labels, values):
+        looked.append(len(values))
+        return whole(self, group, labels, values)
+
+    monkeypatch.setattr(Bench, "_evaluated", counted)
+    # 0.1σ off, χ² is 0.01 above its least: less than what ends a fit.
+    again = bench.fitted(one._replace(starts=((best.values[0] + 0.1 * std,),)))
+    assert looked == [1]
+    # Of the step Marquardt's damping leaves a hundredth: 1e-3σ, and 1e-4 of what χ² was above.
+    assert again.values[0] == pytest.approx(best.values[0], abs=5e-3 * std)
+    assert again.chi_square == pytest.approx(best.chi_square, abs=1e-4)
+    # 1σ off it is looked at.
+    bench.fitted(one._replace(starts=((best.values[0] + std,),)))
+    assert len(looked) > 2
+
+
 def test_damping_of_one_direction_shows_in_harmonic_2():
     model, data = files("blind_15")
     scales = scales_of(Predictions(model, data))

@@ -9,13 +9,18 @@ import pytest
 import snrmjax as sj
 from snrmjax.diagnose.foretelling import (
     level_forces,
+    level_responses,
+    level_simulations,
     measured_resonance,
     responses,
     simulated_resonance,
 )
+from snrmjax.diagnose.predictions import without_strength
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
 FORCES = (1.0, 4.0)
+FEW = ("one_sided_stop", "quadratic_damping", "force_gain_error", "residual_mode")
 
 
 def linear():
@@ -47,6 +52,45 @@ def test_resonances_of_a_linear_mode_are_its_own():
             # Ω is not quite straight against tan φ: ζ² tan φ₁ tan φ₂/2 is 5e-6 here.
             assert found.frequency == pytest.approx(50.0, rel=1e-5)
             assert found.velocity == pytest.approx(exact, rel=1e-6)
+
+
+def with_kinds(model, kinds):
+    """The model with effects of these kinds."""
+    effects = [
+        make_effect(k, {n: 1.5 if n == "exponent" else 0.1 for n in effect_parameters(k)})
+        for k in kinds
+    ]
+    return dataclasses.replace(model, effects=tuple(effects))
+
+
+@pytest.mark.parametrize("kinds", [FEW, pytest.param(tuple(EFFECTS), marks=pytest.mark.long)])
+def test_without_strength_no_kind_counts(kinds):
+    model, data = linear(), states(linear())
+    same = without_strength(model, with_kinds(model, kinds))
+    assert [effect.kind for effect in same.effects] == list(kinds)
+    for force, curves in zip(FORCES, responses(same, data, FORCES), strict=True):
+        found = simulated_resonance(curves, 0)
+        assert found.frequency == pytest.approx(50.0, rel=1e-9)
+        assert found.velocity == pytest.approx(SHAPE**2 * force / (2 * ZETA * OMEGA), rel=1e-9)
+
+
+def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
+    model, data = linear(), states(linear())
+    # ζ + Δ: at resonance the velocity is ζ/(ζ + Δ) of what it was.
+    doubled, tripled = (
+        dataclasses.replace(
+            model, effects=(make_effect("linear_damping_change", {"damping_ratio_change": more}),)
+        )
+        for more in (ZETA, 2 * ZETA)
+    )
+    found = level_simulations(model, doubled, {1: tripled}, data, 0)
+    assert [len(part) for part in found] == [2, 2, 1]
+    rows = level_responses(found, data, 0)
+    assert [row.held_out for row in rows] == [False, True]
+    for row, factor in zip(rows, (2.0, 3.0), strict=True):
+        tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
+        assert row.before.velocity == pytest.approx(tip, rel=1e-9)
+        assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
 
 
 def test_a_level_on_one_side_of_resonance_has_no_measured_one():
