@@ -121,9 +121,7 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     return Named(bench, pair, nothing, tuple(classes), tuple(table))
 
 
-def _as_pair(
-    bench: Bench, every: dict[str, Candidate], pair: Fit
-) -> tuple[Bench, Fit, list[Fit]]:
+def _as_pair(bench: Bench, every: dict[str, Candidate], pair: Fit) -> tuple[Bench, Fit, list[Fit]]:
     """The weighing of a pair; in it nothing, and each of the two by itself."""
     bench = bench.reweighed(pair)
     return bench, bench.nothing(), [_alone(bench, every, kind, pair) for kind in pair.kinds]
