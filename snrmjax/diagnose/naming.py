@@ -72,7 +72,9 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
         if as_simple is best:
             return of_one
         pair = as_simple
-    bench, nothing, alone = _as_pair(bench, every, pair)
+    bench = bench.reweighed(pair)
+    nothing = bench.nothing()
+    alone = [_alone(bench, every, kind, pair) for kind in pair.kinds]
     simple = min(alone, key=lambda fit: fit.criterion(bench.n_rows))
     if _gain(bench, simple, bench.fitted(*_rest(every, simple, pair))) <= DETECTED:
         # What two seemed to be is one that no start had come near to.
@@ -80,15 +82,7 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
         fits = bench.all_fitted([(_from(every, f), nothing) for f in others])
         one = _simplest(bench, [simple, *fits])
         answers = (_class(bench, [simple, *fits], one.kinds[0]),)
-        of_one = Named(bench, one, nothing, answers, tuple(table))
-        if not _is_below(bench, one, _REFUTED):
-            return of_one
-        # Weighed by what it does, it is refuted, and shows what is beside it.
-        pairs = bench.all_fitted([(c, one) for c in _promising(bench, every, one)])
-        pair = min(pairs, key=lambda fit: fit.criterion(bench.n_rows), default=one)
-        if _gain(bench, one, pair) <= DETECTED:
-            return of_one
-        bench, nothing, alone = _as_pair(bench, every, pair)
+        return Named(bench, one, nothing, answers, tuple(table))
     # Each is chosen anew beside the other: the first one beside the second, then the reverse.
     classes: list[tuple[str, ...]] = []
     kind, other = pair.kinds[0], alone[1]
@@ -119,12 +113,6 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
             pair = _simplest(bench, thirds)
             classes.append(_class(bench, thirds, pair.kinds[2], at=2))
     return Named(bench, pair, nothing, tuple(classes), tuple(table))
-
-
-def _as_pair(bench: Bench, every: dict[str, Candidate], pair: Fit) -> tuple[Bench, Fit, list[Fit]]:
-    """The weighing of a pair; in it nothing, and each of the two by itself."""
-    bench = bench.reweighed(pair)
-    return bench, bench.nothing(), [_alone(bench, every, kind, pair) for kind in pair.kinds]
 
 
 def _pairs(bench: Bench, every: dict[str, Candidate], most: int | None = None) -> list[Fit]:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 
@@ -77,13 +78,14 @@ def _refitted(
     slopes = fit.slopes
     if not slopes.shape[1]:
         return np.zeros(0), fit.rows, slopes
-    shared = bench.weighing.shared[kept]
-    inverse = np.linalg.inv(np.eye(len(shared)) + shared @ shared.T)
+    lower = bench.weighing.of_rows(kept)
     size = np.linalg.norm(slopes, axis=0)
     size = np.where(size > 0, size, 1.0)
     scaled = slopes / size
-    matrix = scaled[kept].T @ inverse @ scaled[kept]
-    change = -np.linalg.pinv(matrix, rcond=1e-12) @ (scaled[kept].T @ inverse @ fit.rows[kept])
+    arms = solve_triangular(lower, scaled[kept], lower=True)
+    matrix = arms.T @ arms
+    left = solve_triangular(lower, fit.rows[kept], lower=True)
+    change = -np.linalg.pinv(matrix, rcond=1e-12) @ (arms.T @ left)
     values, vectors = np.linalg.eigh(matrix)
     # What the kept rows do not see at all is open: as good as any size.
     root = vectors / np.sqrt(np.maximum(values, 1e-12))
@@ -91,17 +93,17 @@ def _refitted(
 
 
 def _foretold(bench: Bench, fit: Fit, out: Bool[np.ndarray, " row"]) -> tuple[float, float]:
-    """χ² of rows left out, with the fitted parameters taken as known and as uncertain."""
-    shared = bench.weighing.shared
-    covariance = np.eye(len(shared)) + shared @ shared.T
-    kept = ~out
-    inverse = np.linalg.inv(covariance[np.ix_(kept, kept)])
-    _, rows, root = _refitted(bench, fit, kept)
-    across = covariance[np.ix_(out, kept)] @ inverse
-    left = rows[out] - across @ rows[kept]
-    own = covariance[np.ix_(out, out)] - across @ covariance[np.ix_(kept, out)]
-    spread = root[out] - across @ root[kept]
-    known, uncertain = (
-        float(left @ np.linalg.solve(c, left)) for c in (own, own + spread @ spread.T)
+    """χ² of rows left out, with the fitted parameters taken as known and as uncertain.
+
+    By one factor of the covariance with the rows left out last, where nothing large cancels.
+    """
+    _, rows, root = _refitted(bench, fit, ~out)
+    shared, n_out = bench.weighing.shared, int(out.sum())
+    last = np.argsort(out, kind="stable")
+    lower = np.linalg.cholesky(np.eye(len(shared)) + shared[last] @ shared[last].T)
+    left, spread = (
+        solve_triangular(lower, part[last], lower=True)[-n_out:] for part in (rows, root)
     )
+    known = float(left @ left)
+    uncertain = float(left @ np.linalg.solve(np.eye(n_out) + spread @ spread.T, left))
     return known, uncertain

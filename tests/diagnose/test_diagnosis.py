@@ -22,6 +22,7 @@ from snrmjax.diagnose.foretelling import (
 from snrmjax.diagnose.naming import named
 from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.sidedness import acts_both_ways, even_share
+from snrmjax.diagnose.verifying import held_out
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effects import EFFECTS
@@ -355,7 +356,27 @@ def test_an_unknown_force_gain_passes_for_nothing():
     value, std = found.parameters["quadratic_damping.coefficient"]
     known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
     assert abs(value - known[0]) < 3 * std
-    assert not any("gain" in name for name in found.detection_limits)
+    # Gains and the modal mass are the same to a force of unknown size.
+    assert not any("gain" in name or "mass" in name for name in found.detection_limits)
+
+
+def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_states_share():
+    """The shared errors are solved for here, by orthogonal steps, and nowhere eliminated."""
+    data = balanced(quadratic)
+    precise = {name: 1e-3 * getattr(data, name) for name in ("velocity_std", "force_std")}
+    data = dataclasses.replace(data, phase_std=1e-3 * data.phase_std, **precise)
+    bench = Bench(Predictions(linear_model(), data, 1.0))
+    nothing, shared = bench.nothing(), bench.weighing.shared
+    out = np.asarray(data.level)[bench.weighing.state] == 2
+    system = np.vstack([shared[~out], np.eye(shared.shape[1])])
+    told, triangle = np.linalg.qr(system)
+    common = np.linalg.solve(triangle, told[: (~out).sum()].T @ bench.base[~out])
+    left = bench.base[out] - shared[out] @ common
+    spread = np.linalg.solve(triangle.T, shared[out].T).T
+    inner = np.linalg.qr(np.vstack([spread.T, np.eye(len(left))]), mode="r")
+    expected = np.linalg.norm(np.linalg.solve(inner.T, left)) / np.sqrt(len(left))
+    found = held_out(bench, nothing, nothing, 2)
+    assert found.after == found.before == pytest.approx(expected, rel=1e-4)
 
 
 def test_data_of_another_mode_and_of_one_level_are_said():
