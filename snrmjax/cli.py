@@ -230,7 +230,8 @@ def identify(
     free: Annotated[
         list[str] | None,
         typer.Option(
-            help="Let the joint fit find force_gain, force_offset or instrument_phase; repeatable."
+            help="Let the joint fit find force_gain, force_offset or instrument_phase, or several.",
+            metavar="NAME[,NAME]",
         ),
     ] = None,
     advise: Annotated[

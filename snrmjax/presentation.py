@@ -240,7 +240,7 @@ def presentation_report(
 def fit_as_asked(
     data: SteadyStates, structure: Structure, fit: str, free: Sequence[str], *, robust: bool
 ) -> JointFit:
-    """The joint fit that `--fit BACKBONE[,DAMPING]` asks for.
+    """The joint fit that `--fit BACKBONE[,DAMPING]` and `--free NAME[,NAME]` ask for.
 
     Raises `ValueError` for more than two families, and what `fit_jointly` raises.
     """
@@ -252,7 +252,7 @@ def fit_as_asked(
         structure.modes,
         backbone=names[0],
         damping=names[1] if len(names) == 2 else "auto",
-        free=free,
+        free=[name for names in free for name in names.split(",")],
         level_gain_std=float(structure.level_gain_std),
         level_phase_std=float(structure.level_phase_std),
         robust=robust,

@@ -247,6 +247,7 @@ def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
         (("--fit", "cubic"), "cubic"),
         (("--fit", "spline,spline,spline"), "3"),
         (("--free", "phase"), "instrument_phase"),
+        (("--free", "force_gain,phase"), "'phase'"),
     ],
 )
 def test_a_wrong_joint_fit_ends_with_two(files, tmp_path, run_here, option, named):

@@ -1,0 +1,5 @@
+"""`python -m snrmjax`: the commands."""
+
+from snrmjax.cli import main
+
+main()
