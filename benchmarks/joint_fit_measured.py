@@ -1,6 +1,6 @@
 """Joint fits of the two measured beams, judged by levels that they have not seen.
 
-Run: python benchmarks/joint_fit_measured.py --data FOLDER [--out FOLDER]
+Run: python benchmarks/joint_fit_measured.py --data FOLDER
 
 FOLDER holds `brake_reuss_beam` and `suspended_beam` with a CSV and a `model.toml` each.
 

@@ -9,6 +9,7 @@ from snrmjax.diagnose.predictions import without_strength
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.forced_response import forced_response_batch
+from snrmjax.simulate.recording import acting_force, recorded_curves
 from snrmjax.simulate.response_curve import ResponseCurve
 
 ORDER = 5  # harmonics of the responses
@@ -60,15 +61,17 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
 def responses(
     models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
 ) -> list[list[ResponseCurve]]:
-    """Simulated responses around the measured frequencies, force by force (N).
+    """Simulated responses around the measured frequencies, force by force (N), as recorded.
 
     `models` is one for all forces or one for each, with the same kinds of effects.
     """
     frequency = np.asarray(data.frequency)
     reach = _REACH * (frequency.max() - frequency.min())
     ends = (float(frequency.min() - reach), float(frequency.max() + reach))
-    batch = forced_response_batch(models, forces, *ends, harmonic_order=ORDER, stability=False)
-    return [list(curves) for curves in batch.curves]
+    each = [models] * len(forces) if isinstance(models, Structure) else list(models)
+    loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
+    batch = forced_response_batch(models, loads, *ends, harmonic_order=ORDER, stability=False)
+    return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 
 class Simulated(NamedTuple):
@@ -136,21 +139,30 @@ def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
 
 
 def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonance:
-    """The strongest phase resonance of a response."""
-    found = [
-        (float(np.abs(c.velocity[k, 1, sensor])), c, int(k))
-        for c in curves
-        for k in c.at_events("phase_resonance")
-    ]
+    """The strongest phase resonance of a response: of the velocity that a sensor records."""
+    found = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
     if not found:
         return Resonance(np.nan, np.nan)
-    size, curve, k = max(found, key=lambda one: one[0])
+    size, frequency, curve = max(found, key=lambda one: one[0])
     folds = curve.at_events("fold")
     fold = np.nan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
         fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
-    return Resonance(float(curve.frequency[k]) / (2 * np.pi), size, fold)
+    return Resonance(frequency / (2 * np.pi), size, fold)
+
+
+def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
+    """Velocities (m/s) and frequencies (rad/s) where a sensor's velocity has the force's phase."""
+    velocity, frequency = np.asarray(curve.velocity)[:, 1, sensor], np.asarray(curve.frequency)
+    real, imag = velocity.real, velocity.imag
+    turns = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
+    found = []
+    for k in np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0)):
+        share = imag[k] / (imag[k] - imag[k + 1])
+        size = (1 - share) * real[k] + share * real[k + 1]
+        found.append((float(size), float((1 - share) * frequency[k] + share * frequency[k + 1])))
+    return found
 
 
 def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:

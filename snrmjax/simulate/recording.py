@@ -11,8 +11,10 @@ from jaxtyping import Array, Complex, Float, Int
 from snrmjax.measure.steady_states import SteadyStates, steady_states
 from snrmjax.model.structure import Structure, simulated_structure
 from snrmjax.simulate.harmonics import displacement_phasors, velocity_phasors
+from snrmjax.simulate.response_curve import ResponseCurve
 
 _BLOCK = 4096
+_POINTS = 256  # of a curve, that instruments record at a time
 
 
 class MeasurementErrors(NamedTuple):
@@ -71,6 +73,45 @@ def recorded_states(
     """
     force, velocity = _through_the_chain(model, states)
     return _with_errors(states, force, velocity, model.modes.sensors, keep_harmonics, errors, seed)
+
+
+def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[ResponseCurve]:
+    """Simulated responses as the model's instruments record them: another force, other velocities.
+
+    Events stay with the motion's points.
+    """
+    if not model.measurement_effects:
+        return list(curves)
+    return [_recorded(model, curve) for curve in curves]
+
+
+def _recorded(model: Structure, curve: ResponseCurve) -> ResponseCurve:
+    n = len(curve.frequency)
+    fill = np.minimum(np.arange(-(-n // _POINTS) * _POINTS), n - 1)  # one length compiles once
+    coefficients = jnp.asarray(np.asarray(curve.coefficients)[fill])
+    j = model.modes.mode_of_interest
+    displacement = jnp.abs(displacement_phasors(coefficients)[:, 1, j])
+    frequency, velocity = (
+        jnp.asarray(np.asarray(part)[fill]) for part in (curve.frequency, curve.velocity)
+    )
+    force = jnp.full(len(fill), curve.force)
+    for effect in model.measurement_effects:
+        force, velocity = effect.recorded(frequency, force, velocity, displacement)
+    return curve._replace(force=float(force[0]), velocity=np.asarray(velocity)[:n])
+
+
+def acting_force(model: Structure, recorded: float) -> float:
+    """The force (N) that the model's instruments record as `recorded` (N).
+
+    Validity: effects whose recorded force is a straight line of the acting one, the same for every
+    motion, as a gain and an offset are.
+    """
+    force = jnp.array([1.0, 2.0]) * recorded
+    rest, still = jnp.ones(2), jnp.zeros((2, 2, len(model.modes.sensors)), dtype=complex)
+    for effect in model.measurement_effects:
+        force, still = effect.recorded(rest, force, still, jnp.zeros(2))
+    at_one, at_two = (float(value) for value in force)
+    return recorded * (1 + (recorded - at_one) / (at_two - at_one))
 
 
 def _through_the_chain(

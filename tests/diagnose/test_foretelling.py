@@ -93,6 +93,28 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
 
 
+def test_responses_are_those_that_instruments_record():
+    """A force and a velocity of the mode become others; in phase they are elsewhere."""
+    chain = (
+        make_effect("force_gain_error", {"gain": 0.2}),
+        make_effect("force_offset_error", {"offset": 0.3}),
+        make_effect("sensor_gain_error", {"gain": 0.1}),
+        make_effect("sensor_phase_error", {"phase_deg": 5.0}),
+        make_effect("mode_shape_change", {"coefficient": 1e4}),
+    )
+    model = dataclasses.replace(linear(), effects=chain)
+    for force, curves in zip(FORCES, responses(model, states(linear()), FORCES), strict=True):
+        seen = simulated_resonance(curves, 0)
+        acting = 1.2 * (force + 0.3)  # the gain stands first: it acts first
+        assert curves[0].force == pytest.approx(force, rel=1e-12)
+        at = 2 * np.pi * seen.frequency
+        q = SHAPE * acting / (OMEGA**2 - at**2 + 2j * ZETA * OMEGA * at)
+        own = 1j * at * SHAPE * q
+        assert np.degrees(np.angle(own)) == pytest.approx(-5.0, abs=0.02)
+        size = abs(own) * (1 + 1e4 * abs(q) ** 2) * 1.1
+        assert seen.velocity == pytest.approx(size, rel=1e-3)
+
+
 def test_a_level_on_one_side_of_resonance_has_no_measured_one():
     assert np.isnan(measured_resonance(states(linear(), (10.0, 30.0)), 0, 0).frequency)
 
