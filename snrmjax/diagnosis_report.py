@@ -62,6 +62,8 @@ def write_diagnosis(
         )
         gain_std = 1.0
     found = diagnose_model(model, data, force_gain_std=gain_std)
+    if gain_std and found.effects:
+        notes = (*notes, f"the answer puts that gain at {gain * found.force_gain:.4g} N/V.")
     found = dataclasses.replace(found, notes=(*notes, *found.notes))
     foretold: list[LevelResponse] = []
     figures = diagnosis_figures(found, data)
@@ -81,7 +83,9 @@ def with_responses(
     found: Diagnosis, model: Structure, data: SteadyStates
 ) -> tuple[list[LevelResponse], Figure]:
     """What simulation adds: resonances and responses of all levels."""
-    simulated = level_simulations(model, found.completed, found.blind, data, found.sensor)
+    simulated = level_simulations(
+        model, found.completed, found.blind, data, found.sensor, found.force_gain
+    )
     foretold = level_responses(simulated, data, found.sensor)
     old, new = ([c for one in curves for c in one] for curves in simulated[:2])
     figure = simulated_figure(old, new, data, found.sensor)

@@ -67,6 +67,7 @@ class Diagnosis:
     completed: Structure
     request: Request | None  # the measurement of `decide_by`, where one was weighed
     blind: dict[int, Structure]  # completed without having seen a level
+    force_gain: float  # acting force over recorded one, where a gain was free; else 1
     rows: Int[np.ndarray, " state"]  # of the data, that were used
     sensor: int  # whose velocity was held
     # Force misfit over noise, less what states share; NaN where the size alone is compared.
@@ -198,6 +199,7 @@ def diagnose_model(
         completed=_completed(model, own, fit.kinds, {name: v for name, (v, _) in values.items()}),
         request=request,
         blind=blind,
+        force_gain=_force_gain(bench, fit),
         rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
         sensor=predictions.chosen.sensors[0],
         before=_of_force(bench, found.nothing),
@@ -285,6 +287,12 @@ def _of_force(bench: Bench, fit: Fit) -> Float[np.ndarray, "state part"]:
     left = np.full((len(chosen.rows), 2), np.nan)
     left[weighing.state[mine], weighing.column[mine]] = weighing.without_shared(fit.rows)[mine]
     return left[np.unique(weighing.state[mine])]
+
+
+def _force_gain(bench: Bench, fit: Fit) -> float:
+    """Acting force over recorded one, as the data put it where it is unknown."""
+    std, place = bench.predictions.force_gain_std, len(bench.predictions.stated)
+    return 1 + std * float(bench.weighing.likeliest(fit.rows)[place]) if std > 0 else 1.0
 
 
 def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:

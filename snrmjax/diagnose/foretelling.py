@@ -88,16 +88,18 @@ def level_simulations(
     blind: Mapping[int, Structure],
     data: SteadyStates,
     sensor: int,
+    force_gain: float = 1.0,
 ) -> Simulated:
     """Responses under the levels' forces, before and after.
 
-    `blind` has models that have not seen a level. One program follows all responses: what was
-    added counts for nothing in the model before.
+    `blind` has models that have not seen a level; `force_gain` is acting force over recorded one
+    for the models after. One program follows all responses: what was added counts for nothing in
+    the model before.
     """
     forces = level_forces(data, sensor)
     every, seen = list(forces.values()), [level for level in forces if level in blind]
     after = [completed] * len(every) + [blind[level] for level in seen]
-    loads = [*every, *(forces[level] for level in seen)]
+    loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
     same = without_strength(model, completed)
     if same is None:
         old, new = responses(model, data, every), responses(after, data, loads)

@@ -356,6 +356,7 @@ def test_an_unknown_force_gain_passes_for_nothing():
     value, std = found.parameters["quadratic_damping.coefficient"]
     known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
     assert abs(value - known[0]) < 3 * std
+    assert found.force_gain == pytest.approx(1 / 1.5, rel=0.01)
     # Gains and the modal mass are the same to a force of unknown size.
     assert not any("gain" in name or "mass" in name for name in found.detection_limits)
 

@@ -91,6 +91,11 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
+    louder = level_responses(level_simulations(model, doubled, {}, data, 0, 1.5), data, 0)
+    for row, same in zip(louder, rows, strict=True):
+        assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)
+        tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
+        assert row.after.velocity == pytest.approx(1.5 * tip / 2.0, rel=1e-9)
 
 
 def test_responses_are_those_that_instruments_record():
