@@ -82,7 +82,7 @@ def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[R
     """
     if not model.measurement_effects:
         return list(curves)
-    return [_recorded(model, curve) for curve in curves]
+    return [_recorded(model, curve) if len(curve.frequency) else curve for curve in curves]
 
 
 def _recorded(model: Structure, curve: ResponseCurve) -> ResponseCurve:
@@ -95,8 +95,7 @@ def _recorded(model: Structure, curve: ResponseCurve) -> ResponseCurve:
         jnp.asarray(np.asarray(part)[fill]) for part in (curve.frequency, curve.velocity)
     )
     force = jnp.full(len(fill), curve.force)
-    for effect in model.measurement_effects:
-        force, velocity = effect.recorded(frequency, force, velocity, displacement)
+    force, velocity = _behind_instruments(model, frequency, force, velocity, displacement)
     return curve._replace(force=float(force[0]), velocity=np.asarray(velocity)[:n])
 
 
@@ -106,10 +105,9 @@ def acting_force(model: Structure, recorded: float) -> float:
     Validity: effects whose recorded force is a straight line of the acting one, the same for every
     motion, as a gain and an offset are.
     """
-    force = jnp.array([1.0, 2.0]) * recorded
-    rest, still = jnp.ones(2), jnp.zeros((2, 2, len(model.modes.sensors)), dtype=complex)
-    for effect in model.measurement_effects:
-        force, still = effect.recorded(rest, force, still, jnp.zeros(2))
+    acting = jnp.array([1.0, 2.0]) * recorded
+    still = jnp.zeros((2, 2, len(model.modes.sensors)), dtype=complex)
+    force, _ = _behind_instruments(model, jnp.ones(2), acting, still, jnp.zeros(2))
     at_one, at_two = (float(value) for value in force)
     return recorded * (1 + (recorded - at_one) / (at_two - at_one))
 
@@ -125,9 +123,17 @@ def _through_the_chain(
     velocity = velocity + _rigid_body_velocity(model, frequency, force, velocity.shape[1])
     j = modes.mode_of_interest
     displacement = jnp.abs(displacement_phasors(coefficients)[:, 1, j])
+    force, velocity = _behind_instruments(model, frequency, force, velocity, displacement)
+    return np.asarray(force), np.asarray(velocity)
+
+
+def _behind_instruments(
+    model: Structure, frequency: Array, force: Array, velocity: Array, displacement: Array
+) -> tuple[Array, Array]:
+    """Force and velocities as the model's measurement effects, one after the other, leave them."""
     for effect in model.measurement_effects:
         force, velocity = effect.recorded(frequency, force, velocity, displacement)
-    return np.asarray(force), np.asarray(velocity)
+    return force, velocity
 
 
 def _rigid_body_velocity(
