@@ -212,16 +212,27 @@ def family_table(summary: dict) -> ReportTable:
             str(one["parameters"]),
             minus(f"{one['score']:.1f}") + (f" ± {one['score_std']:.1f}" if one["score"] else ""),
             f"{one['prediction_error']:.3f}",
+            f"{100 * one['weight']:.0f}",
             "taken" if one["chosen"] else "",
         )
         for one in tried
     ]
-    header = ("curve", "family", "parameters", "score", "error of prediction", "choice")
+    header = (
+        "curve",
+        "family",
+        "parameters",
+        "score",
+        "error of prediction",
+        "weight (%)",
+        "choice",
+    )
     caption = (
         "How well levels are predicted that were left out. Score: log predictive density relative "
         "to the best, ± 1σ of the difference; a family within 2 of the best is as good. Error of "
-        "prediction: left-out residuals over what was foretold, 1 if the bands are right. The "
-        "curve taken may have one term more than the best score asks for, so that its band does "
-        "not rest on the shape of too small a family."
+        "prediction: left-out residuals over what was foretold, 1 if the bands are right. Weight: "
+        "how far a family is to be believed by its score; where another one says something else "
+        "than the one taken, the bands are wider by that. The curve taken may have one term more "
+        "than the best score asks for, so that its band does not rest on the shape of too small a "
+        "family."
     )
     return ReportTable(header, rows, caption)

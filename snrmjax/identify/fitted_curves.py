@@ -30,6 +30,8 @@ def fitted_values(
 ) -> BackboneValues:
     """ω̃ and ζ̃ at amplitudes on the backbone, with 1σ at that amplitude.
 
+    The bands include what the choice among families leaves open (`open_choice`).
+
     Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With `of_a_new_level`
     the bands are those of the next test: they include by how much one level differs from another.
     Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
@@ -40,9 +42,13 @@ def fitted_values(
     if velocity is not None:
         at = np.asarray(velocity, dtype=np.float64)
         values, slopes = values_with_slopes(fit, at)
+        shifts = open_choice(fit, velocity=at)
     else:
-        values, slopes, at = values_at_displacement(fit, np.asarray(displacement, np.float64))
+        given = np.asarray(displacement, np.float64)
+        values, slopes, at = values_at_displacement(fit, given)
+        shifts = open_choice(fit, displacement=given)
     covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
+    covariance += np.einsum("koc,kod->ocd", shifts, shifts)
     squared, damping = values.T
     if of_a_new_level:
         covariance[:, 0, 0] += (squared * fit.level_std[2]) ** 2
@@ -60,6 +66,58 @@ def fitted_values(
         modal_damping=jnp.asarray(damping),
         modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
     )
+
+
+def open_choice(
+    fit: JointFit,
+    *,
+    velocity: Float[np.ndarray, " point"] | None = None,
+    displacement: Float[np.ndarray, " point"] | None = None,
+) -> Float[np.ndarray, "rival point curve"]:
+    """How far ω̃² and 2ζ̃ω̃ may be off because another family could be the right one.
+
+    One shift for each of the fit's rivals, to be taken as an error of 1σ (`beyond_estimation`). A
+    rival that does not have the velocities, or each once, counts for nothing.
+    """
+
+    def described(one: JointFit) -> tuple[np.ndarray, np.ndarray]:
+        if velocity is not None:
+            values, slopes = values_with_slopes(one, velocity)
+        else:
+            values, slopes, _ = values_at_displacement(one, np.asarray(displacement))
+        return values, np.einsum("ocp,pq,ocq->oc", slopes, one.covariance, slopes)
+
+    rivals = fit.rivals
+    if velocity is not None:
+        rivals = tuple(one for one in rivals if not _unanswered(one.fit, float(np.max(velocity))))
+    at = velocity if velocity is not None else np.asarray(displacement)
+    if not rivals:
+        return np.zeros((0, len(at), 2))
+    own = described(fit)
+    return np.stack([beyond_estimation(one.weight, *own, *described(one.fit)) for one in rivals])
+
+
+def beyond_estimation(
+    weight: float,
+    value: Float[np.ndarray, "*batch"],
+    variance: Float[np.ndarray, "*batch"],
+    other: Float[np.ndarray, "*batch"],
+    other_variance: Float[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch"]:
+    """What of the difference of two families' answers is no error of estimation, as 1σ.
+
+    If both were right, the variance of their difference would be that of their variances: only
+    what the squared difference has beyond this speaks of the choice, and counts with the rival's
+    weight. Zero where either has no finite answer.
+    References: for the variance of the difference, Hausman, Econometrica 46 (1978) 1251,
+    doi:10.2307/1913827; for the choice as a part of the variance, Buckland, Burnham & Augustin,
+    Biometrics 53 (1997) 603, doi:10.2307/2533961.
+    """
+    with np.errstate(invalid="ignore"):
+        apart, expected = other - value, np.abs(other_variance - variance)
+        excess = np.sqrt(weight * np.maximum(apart**2 - expected, 0.0))
+    known = np.isfinite(apart) & np.isfinite(excess)
+    return np.where(known, np.sign(apart) * excess, 0.0)
 
 
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
@@ -144,15 +202,24 @@ def displacement_near(
 
     Raises `ValueError` where there are several, or none.
     """
+    missing = _unanswered(fit, float(np.max(velocity)))
+    if missing:
+        raise ValueError(missing)
     found = _near(fit, float(np.max(velocity)))
+    return np.interp(velocity, found.speed, found.displacement)
+
+
+def _unanswered(fit: JointFit, velocity: float) -> str:
+    """Why a backbone has not every velocity up to this one exactly once; nothing if it has."""
+    found = _near(fit, velocity)
     if found.turns_back_at is not None:
-        raise ValueError(
+        return (
             f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
             "several displacements; ask for values at displacements."
         )
-    if np.max(velocity) > found.speed[-1]:
-        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
-    return np.interp(velocity, found.speed, found.displacement)
+    if velocity > found.speed[-1]:
+        return f"the backbone does not reach {velocity:.4g} m/s."
+    return ""
 
 
 class _Reached(NamedTuple):

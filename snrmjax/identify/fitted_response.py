@@ -9,7 +9,11 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.backbone import Backbone
 from snrmjax.identify.curves import ShapePreservingSpline
-from snrmjax.identify.fitted_curves import values_at_displacement
+from snrmjax.identify.fitted_curves import (
+    beyond_estimation,
+    open_choice,
+    values_at_displacement,
+)
 from snrmjax.identify.force_balance import BalanceData, Spread, Unknowns, with_deviations
 from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import JointFit
@@ -18,6 +22,7 @@ from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.simulate.compiled import compiled
 
 _KNOTS = 120
+_ONTO_THE_CURVE = 4  # steps
 _ITERATIONS = 12
 
 
@@ -59,7 +64,11 @@ def as_backbone(fit: JointFit) -> Backbone:
         displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
         sampled = values_at_displacement(fit, displacement)
     values, slopes = (jnp.asarray(part) for part in sampled[:2])
-    covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
+    shifts = jnp.asarray(open_choice(fit, displacement=displacement))
+    covariance = [
+        slopes[:, k] @ fit.covariance @ slopes[:, k].T + shifts[:, :, k].T @ shifts[:, :, k]
+        for k in range(2)
+    ]
     measured = np.asarray(fit.motion().displacement)
     j, r = fit.modes.mode_of_interest, fit.data.sensor
     # Dry friction has no finite damping at rest: there the next knot's value stands.
@@ -91,7 +100,8 @@ def fitted_response(
 
     Bands come from the implicit function theorem on the curve's own equation
     |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude for the frequency, at fixed frequency for the
-    velocity, along both equations of a resonance and of a fold.
+    velocity, along both equations of a resonance and of a fold. They include what the choice among
+    families leaves open: what rivals say of the same points.
 
     Arguments: `force` in N, frequencies in rad/s. Returns the connected curves, the main one
     first; resonances and folds with the first curve that has them.
@@ -168,18 +178,44 @@ def _velocity_at(
     return own + residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))[..., r]
 
 
+class _Banded(NamedTuple):
+    amplitude: np.ndarray
+    frequency: np.ndarray
+    frequency_std: np.ndarray
+    velocity: np.ndarray
+    velocity_std: np.ndarray
+    excess: np.ndarray  # of the curve's equation
+    by_amplitude: np.ndarray  # its slopes
+    by_frequency: np.ndarray
+    through: np.ndarray  # slope of the speed by the amplitude
+
+
 def _banded(
     fit: JointFit, force: float, load: float, amplitude: np.ndarray, frequency: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    program = fit.programmed()
-    covariance = program.spread_out(fit.covariance)
-    found = _bands(
-        *(program.vector, program.restore, fit.modes, fit.spread, fit.data),
-        *(jnp.asarray(covariance), jnp.asarray(force), jnp.asarray(load)),
-        *(jnp.asarray(amplitude), jnp.asarray(frequency)),
-    )
-    omega, omega_std, velocity, velocity_std = (np.asarray(part) for part in found)
-    return omega, omega_std, velocity, velocity_std
+    """Frequency and complex velocity of a curve's points, each with 1σ."""
+
+    def banded(one: JointFit, x: Array, omega: Array, steps: int) -> _Banded:
+        program = one.programmed()
+        settings = (program.vector, program.restore, one.modes, one.spread, one.data)
+        covariance = jnp.asarray(program.spread_out(one.covariance))
+        given = (covariance, jnp.asarray(force), jnp.asarray(load))
+        return _Banded(*map(np.asarray, _bands(*settings, *given, x, omega, np.array(steps))))
+
+    # The points come from curves drawn anew through knots: steps put them on the fit's own.
+    own = banded(fit, jnp.asarray(amplitude), jnp.asarray(frequency), _ONTO_THE_CURVE)
+    variance, speed = [own.frequency_std**2, own.velocity_std**2], np.abs(own.velocity)
+    for rival in fit.rivals:
+        other = banded(rival.fit, jnp.asarray(own.amplitude), jnp.asarray(own.frequency), 0)
+        # Where the rival's curve would be, to first order, by the slopes of the fit's own.
+        frequency = own.frequency - other.excess / own.by_frequency
+        there = np.abs(other.velocity) - own.through / own.by_amplitude * other.excess
+        answers = ((frequency, other.frequency_std), (there, other.velocity_std))
+        for k, (answer, std) in enumerate(answers):
+            value = (own.frequency, speed)[k]
+            shift = beyond_estimation(rival.weight, value, variance[k], answer, std**2)
+            variance[k] = variance[k] + shift**2
+    return own.frequency, np.sqrt(variance[0]), own.velocity, np.sqrt(variance[1])
 
 
 @compiled
@@ -194,7 +230,9 @@ def _bands(
     load: Array,
     x: Array,
     omega: Array,
-) -> tuple[Array, Array, Array, Array]:
+    steps: Array,
+) -> tuple[Array, ...]:
+    """The fields of `_Banded`, after so many steps onto the curve."""
     ones = jnp.ones_like(x)
 
     def excess(vector: Array, x: Array, omega: Array) -> Array:
@@ -211,8 +249,7 @@ def _bands(
         share = excess(vector, x, omega) / (first**2 + second**2)
         return x - share * first * x, omega - share * second * omega
 
-    # The points come from curves drawn anew through knots: these steps put them on the fit's own.
-    x, omega = jax.lax.fori_loop(0, 4, step, (x, omega))
+    x, omega = jax.lax.fori_loop(0, steps, step, (x, omega))
     by_x, by_omega = by(1, x, omega), by(2, x, omega)
     by_vector = jax.jacfwd(excess)(vector, x, omega)
 
@@ -225,7 +262,8 @@ def _bands(
     frequency_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", by_vector, covariance, by_vector))
     velocity_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", moved, covariance, moved))
     velocity = _velocity_at(restore(vector), modes, spread, data, force, x, omega)
-    return omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std
+    known = (x, omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std)
+    return *known, excess(vector, x, omega), by_x, by_omega, through
 
 
 def _located(
@@ -241,8 +279,18 @@ def _located(
     found = _values_and_slopes(fit, force, load, kind, amplitude, frequency)
     if found is None:
         return None
-    (omega, speed, x), slopes = found
-    std = np.sqrt(np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes))
+    values, slopes = found
+    variance = np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes)
+    widened = variance
+    for rival in fit.rivals:
+        there = float(values[2]), float(values[0])
+        answer = _values_and_slopes(rival.fit, force, load, kind, *there)
+        if answer is None:
+            continue  # a fold that the rival does not have moves no band
+        own = np.einsum("op,pq,oq->o", answer[1], rival.fit.covariance, answer[1])
+        shift = beyond_estimation(rival.weight, values, variance, answer[0], own)
+        widened = widened + shift**2
+    (omega, speed, x), std = values, np.sqrt(widened)
     return FittedPoint(
         *(force, float(omega), float(std[0]), float(speed), float(std[1])), bool(x > largest)
     )

@@ -31,6 +31,7 @@ from snrmjax.identify.free_unknowns import (
     with_room,
 )
 from snrmjax.identify.joint_notes import notes_on_neighbours, notes_on_noise, notes_on_reach
+from snrmjax.identify.least_squares import degrees_spent, root_of_inverse
 from snrmjax.identify.level_scatter import Scatter
 from snrmjax.identify.level_slopes import LevelPattern, on_levels
 from snrmjax.identify.neighbours import (
@@ -66,11 +67,21 @@ _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last r
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
+class Rival(NamedTuple):
+    """The same data fitted with another family of one of the curves, that they could mean too."""
+
+    curve: str  # "backbone" or "damping": the one of another family
+    weight: float  # among all families tried, by how they predict what is left out
+    fit: "JointFit"
+
+
 class JointFit(eqx.Module):
     """Two curves, what else was unknown, and how well all of it is known.
 
     `covariance` belongs to the free unknowns in the order of `names`, and includes what the
     residuals of neighbouring states have in common; `level_std` to `LEVEL_ERRORS`, stated or found.
+    `rivals` are fits with other families that predict left-out levels about as well: bands of
+    curves and responses include what is left open by the choice, the covariance does not.
     """
 
     unknowns: Unknowns
@@ -87,6 +98,7 @@ class JointFit(eqx.Module):
     noise_stated: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
     candidates: tuple[Candidate, ...] = eqx.field(static=True)
+    rivals: tuple[Rival, ...]
     notes: tuple[str, ...] = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
 
@@ -194,9 +206,7 @@ def fit_jointly(
     # What the rough pilot misses would pass for levels that differ: a fit without that comes first.
     rough = pilot_start(measured, modes, spread, released)
     begun = fitted(select(rough, measured, scatter_too=False), rough, measured, _ROUGHLY)
-    raw = begun.unknowns.level * begun.spread.level
-    pilot = eqx.tree_at(lambda u: u.level, begun.unknowns, raw)
-    corrected = eqx.tree_at(lambda d: d.correction, measured, begun.data.correction)
+    pilot, corrected = _as_pilot(begun, measured)
     chosen = select(pilot, corrected, scatter_too=True)
     best = fitted(chosen, pilot, corrected, _ROUNDS)
     if not best.converged or (stated and best.scatter.contradicts_upward):
@@ -205,32 +215,45 @@ def fit_jointly(
         again = fitted(other, rough, measured, _ROUNDS)
         if again.scatter.noise < _CLEARLY_LESS * best.scatter.noise:
             chosen, best = other, again
-    notes: tuple[str, ...] = ()
-    if not best.converged:
-        notes = ("the fit did not converge: try a simpler family.",)
-    told = (best.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
-    notes += notes_on_noise(*told, stated=stated, alike=bool(best.neighbours.any()))
-    notes += notes_on_neighbours(best.neighbours)
-    motion = recorded_motion(in_one_form(best.unknowns), best.data, modes, best.spread)
-    notes += notes_on_reach(motion, np.asarray(best.data.level))
-    return JointFit(
-        unknowns=best.unknowns,
-        covariance=best.covariance,
-        spread=best.spread,
-        data=best.data,
-        modes=modes,
-        noise_scale=best.scatter.noise,
-        noise_scale_std=best.scatter.noise_std,
-        level_std=np.asarray(best.spread.level),
-        residuals=best.residuals,
-        neighbour_correlation=best.neighbours,
-        drive_known_only=driven,
-        noise_stated=stated,
-        free=released,
-        candidates=chosen.table,
-        notes=notes,
-        converged=best.converged,
-    )
+
+    def told(found: _Fitted, rivals: tuple[Rival, ...]) -> JointFit:
+        notes: tuple[str, ...] = ()
+        if not found.converged:
+            notes = ("the fit did not converge: try a simpler family.",)
+        noise = (found.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
+        notes += notes_on_noise(*noise, stated=stated, alike=bool(found.neighbours.any()))
+        notes += notes_on_neighbours(found.neighbours)
+        motion = recorded_motion(in_one_form(found.unknowns), found.data, modes, found.spread)
+        notes += notes_on_reach(motion, np.asarray(found.data.level))
+        return JointFit(
+            unknowns=found.unknowns,
+            covariance=found.covariance,
+            spread=found.spread,
+            data=found.data,
+            modes=modes,
+            noise_scale=found.scatter.noise,
+            noise_scale_std=found.scatter.noise_std,
+            level_std=np.asarray(found.spread.level),
+            residuals=found.residuals,
+            neighbour_correlation=found.neighbours,
+            drive_known_only=driven,
+            noise_stated=stated,
+            free=released,
+            candidates=chosen.table,
+            rivals=rivals,
+            notes=notes,
+            converged=found.converged,
+        )
+
+    rivals, (pilot, corrected) = [], _as_pilot(best, measured)
+    for one in chosen.contenders:
+        pair = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
+        pair[one.curve == "damping"] = one.family
+        other = chosen._replace(squared_frequency=pair[0], modal_damping=pair[1])
+        found = fitted(other, pilot, corrected, _ROUGHLY)
+        if found.converged:
+            rivals.append(Rival(one.curve, one.weight, told(found, ())))
+    return told(best, tuple(rivals))
 
 
 class _Fitted(NamedTuple):
@@ -293,7 +316,7 @@ def _fitted(
         settled = float(linear.cost) - float(answer.cost) < _SETTLED
         if turn == most - 1 or (settled and turn >= fewest - 1):
             break
-        dof = max(residuals.size - _spent(jacobian, residuals.size), 1.0)
+        dof = max(residuals.size - degrees_spent(jacobian, residuals.size), 1.0)
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
         scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
     levels = along_resonance(np.asarray(data.level), np.asarray(data.frequency))
@@ -313,6 +336,13 @@ def _fitted(
     )
 
 
+def _as_pilot(found: _Fitted, measured: BalanceData) -> tuple[Unknowns, BalanceData]:
+    """A fit as another one starts from it: levels in their own units, its states' errors."""
+    raw = found.unknowns.level * found.spread.level
+    pilot = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
+    return pilot, eqx.tree_at(lambda d: d.correction, measured, found.data.correction)
+
+
 def _started(pilot: Unknowns, chosen: Selection, spread: Spread) -> Unknowns:
     """The chosen curves, and the pilot's deviations of levels in units of their new 1σ."""
     unit = jnp.where(spread.level > 0, spread.level, 1.0)
@@ -325,27 +355,6 @@ def _started(pilot: Unknowns, chosen: Selection, spread: Spread) -> Unknowns:
 
 def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
     return Spread(jnp.array(scatter.level), spread.linear)
-
-
-def inverse_of(jacobian: np.ndarray) -> np.ndarray:
-    """(JᵀJ)⁻¹, by singular values of the scaled columns."""
-    root = root_of_inverse(jacobian)
-    return root @ root.T
-
-
-def root_of_inverse(jacobian: np.ndarray) -> np.ndarray:
-    """K with (JᵀJ)⁻¹ = KKᵀ."""
-    size = np.linalg.norm(jacobian, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    _, values, rows = np.linalg.svd(jacobian / size, full_matrices=False)
-    return (rows.T / values) / size[:, None]
-
-
-def _spent(jacobian: np.ndarray, n_rows: int) -> float:
-    """Degrees of freedom that the unknowns take from the first rows."""
-    size = np.linalg.norm(jacobian, axis=0)
-    basis = np.linalg.qr(jacobian / np.where(size > 0, size, 1.0))[0]
-    return float(np.sum(basis[:n_rows] ** 2))
 
 
 class _Linear(NamedTuple):

@@ -30,6 +30,7 @@ from snrmjax.identify.level_scatter import (
     level_columns,
     likeliest_std,
 )
+from snrmjax.identify.linear_problem import effective_parameters, left_out_scores, solved
 from snrmjax.identify.pilot import levels_apart, most_parameters
 from snrmjax.identify.roughness import sizes_along
 from snrmjax.identify.smoothing import curve_columns, moved, places_of_bends, with_sizes
@@ -40,6 +41,8 @@ _UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
 _DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating what levels scatter
+_NEGLIGIBLE = 0.03  # weight of a curve that could not widen a band
+_CONTENDERS = 4  # of a curve, at most
 _SMOOTH = "smoothing_spline"
 _STRAIGHT = 1e-7  # of the largest value, a bend that is none
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
@@ -57,6 +60,15 @@ class Candidate(NamedTuple):
     score_std: float  # of the difference to the best, from level to level
     prediction_error: float  # root mean square of left-out residuals over what was foretold
     chosen: bool
+    weight: float = 0.0  # among all tried of this curve, by their scores; they sum to one
+
+
+class Contender(NamedTuple):
+    """A curve that was not taken, though the data could mean it."""
+
+    curve: str  # "backbone" or "damping"
+    weight: float
+    family: AbstractFamily
 
 
 class Choice(NamedTuple):
@@ -92,6 +104,7 @@ class Selection(NamedTuple):
     scatter: Scatter
     jitter: float  # 1σ of relative stiffness from state to state that no stated noise explains
     table: tuple[Candidate, ...]
+    contenders: tuple[Contender, ...]
 
 
 def select_families(
@@ -148,7 +161,8 @@ def select_families(
         if np.array_equal(work.level_std > 0, before.level_std > 0):
             break
     pair = (pilot.squared_frequency, pilot.modal_damping)
-    return Selection(*pair, scatter, jitter, (*tried.table, *other.table))
+    contenders = (*tried.contenders, *other.contenders)
+    return Selection(*pair, scatter, jitter, (*tried.table, *other.table), contenders)
 
 
 _Pair = tuple[AbstractFamily, AbstractFamily]
@@ -174,6 +188,17 @@ def _with_bends(pair: _Pair, sizes: Sequence[float | np.ndarray]) -> list[Abstra
 class _Compared(NamedTuple):
     best: AbstractFamily
     table: list[Candidate]
+    contenders: list[Contender]
+
+
+def _weights(score: Float[np.ndarray, " family"]) -> Float[np.ndarray, " family"]:
+    """How much each family is to be believed, by the log predictive density of what was left out.
+
+    Reference: pseudo-Bayesian averaging, Yao et al., Bayesian Anal. 13 (2018) 917,
+    doi:10.1214/17-BA1091.
+    """
+    share = np.exp(np.nan_to_num(score - np.max(score), nan=-np.inf))
+    return share / np.sum(share)
 
 
 class _Workbench:
@@ -244,7 +269,7 @@ class _Workbench:
         that wanders moves it most where the mode is driven hardest.
         """
         problem = self.problem(pilot.squared_frequency, pilot.modal_damping)
-        left = (problem.residuals + problem.slopes @ _solved(problem)).reshape(-1, 2)
+        left = (problem.residuals + problem.slopes @ solved(problem)).reshape(-1, 2)
         arm = self.known.by_squared * self.known.squared[:, None] / self.noise
         length = np.sum(arm**2, axis=1)
         along = np.sum(arm * left, axis=1) ** 2
@@ -271,7 +296,7 @@ class _Workbench:
         """Gauss–Newton on the linearised balance; exact at once for linear families."""
         for _ in range(steps):
             problem = self.problem(squared, damping)
-            change = _solved(problem)
+            change = solved(problem)
             k = squared.parameters.shape[0]
             m = k + damping.parameters.shape[0]
             squared = moved(squared, change[:k])
@@ -366,6 +391,7 @@ class _Workbench:
             if (rows[k][0], rows[k][2]) == (mine[0], mine[2]) and sizes[k] > sizes[chosen]
         ]
         chosen = int(min(larger, key=lambda k: sizes[k], default=chosen))
+        weight = _weights(total)
         table = [
             Candidate(
                 curve=name,
@@ -377,10 +403,13 @@ class _Workbench:
                 score_std=float(spread[k]),
                 prediction_error=float(row[5]),
                 chosen=k == chosen,
+                weight=float(weight[k]),
             )
             for k, row in enumerate(rows)
         ]
-        return _Compared(rows[chosen][3], table)
+        ordered = [k for k in np.argsort(-weight) if k != chosen and weight[k] > _NEGLIGIBLE]
+        contenders = [Contender(name, float(weight[k]), rows[k][3]) for k in ordered[:_CONTENDERS]]
+        return _Compared(rows[chosen][3], table, contenders)
 
     def _tried(
         self, name: str, starts: list[AbstractFamily], other: AbstractFamily
@@ -398,53 +427,8 @@ class _Workbench:
         _, best, problem = min(found, key=lambda row: row[0])
         first = 0 if name == "backbone" else other.parameters.shape[0]
         own = first + np.arange(best.parameters.shape[0])
-        return best, *_left_out(problem, self.folds), int(np.ceil(_effective(problem, own)))
-
-
-def _effective(problem: Linearised, own: np.ndarray) -> float:
-    """Parameters that the data, and not their priors, tell, of some of the unknowns."""
-    keep, matrix, size = _normal(problem)
-    at = np.flatnonzero(np.isin(np.flatnonzero(keep), own))
-    variance = np.diagonal(np.linalg.inv(matrix))[at] / size[at] ** 2
-    return float(np.sum(1.0 - variance / problem.prior_std[keep][at] ** 2))
-
-
-def _normal(problem: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unknowns that may move, JᵀJ with priors, and their units."""
-    keep = problem.prior_std > 0
-    x = problem.slopes[:, keep]
-    prior = 1.0 / problem.prior_std[keep]
-    size = np.hypot(np.linalg.norm(x, axis=0), prior)
-    size = np.where(size > 0, size, 1.0)
-    matrix = (x / size).T @ (x / size) + np.diag((prior / size) ** 2)
-    return keep, matrix + 1e-12 * np.eye(len(matrix)), size
-
-
-def _solved(problem: Linearised) -> Float[np.ndarray, " unknown"]:
-    """The change of the unknowns that least squares with the priors asks for."""
-    keep, matrix, size = _normal(problem)
-    right = (problem.slopes[:, keep] / size).T @ problem.residuals
-    change = np.zeros(len(keep))
-    change[keep] = -np.linalg.solve(matrix, right) / size
-    return change
-
-
-def _left_out(problem: Linearised, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Log predictive density of every left-out part, and the error over what was foretold."""
-    keep, matrix, size = _normal(problem)
-    x = problem.slopes[:, keep] / size
-    change = -np.linalg.solve(matrix, x.T @ problem.residuals)
-    left = problem.residuals + x @ change
-    scores, squares, count = [], 0.0, 0
-    for rows in folds:
-        own = x[rows]
-        without = matrix - own.T @ own + 1e-10 * np.eye(len(matrix))
-        arms = np.linalg.solve(without, own.T)
-        error = left[rows] + own @ (arms @ left[rows])
-        covariance = np.eye(rows.sum()) + own @ arms
-        covariance = 0.5 * (covariance + covariance.T)
-        sign, logarithm = np.linalg.slogdet(covariance)
-        square = float(error @ np.linalg.solve(covariance, error))
-        scores.append(-0.5 * (square + logarithm) if sign > 0 else -np.inf)
-        squares, count = squares + square, count + len(error)
-    return np.array(scores), float(np.sqrt(squares / count))
+        return (
+            best,
+            *left_out_scores(problem, self.folds),
+            int(np.ceil(effective_parameters(problem, own))),
+        )

@@ -13,6 +13,7 @@ from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.fitted_curves import (
     curve_values,
     displacement_near,
+    open_choice,
     values_at_displacement,
     values_with_slopes,
 )
@@ -29,8 +30,8 @@ from snrmjax.identify.free_unknowns import Restore
 from snrmjax.identify.joint_fit import (
     SOLVER,
     JointFit,
-    inverse_of,
 )
+from snrmjax.identify.least_squares import inverse_of
 from snrmjax.identify.level_slopes import on_levels
 from snrmjax.identify.residuals import (
     all_residuals,
@@ -166,8 +167,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error; and what the residuals of
-    neighbours have in common adds to it.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error; what the residuals of
+    neighbours have in common adds to it, and what the choice among families leaves open.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
@@ -209,7 +210,12 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
         added = (fit.covariance - inverse) / np.outer(unit, unit)
         values, directions = np.linalg.eigh(added)
         rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
-    parts = np.stack([np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows])
+    summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
+    if fit.rivals:
+        name = "choice of the families"
+        rows.append((name, name, np.ones((p, 1))))
+        summed.append(np.sum(open_choice(fit, displacement=at) ** 2, axis=0))
+    parts = np.stack(summed)
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [
         Contribution(source, share[0], share[1], kind)

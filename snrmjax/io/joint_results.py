@@ -13,7 +13,7 @@ from snrmjax.identify.family_base import AbstractFamily
 from snrmjax.identify.fitted_curves import values_to_the_largest
 from snrmjax.identify.fitted_response import FittedPoint, FittedResponse
 from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
-from snrmjax.identify.joint_fit import JointFit
+from snrmjax.identify.joint_fit import JointFit, Rival
 from snrmjax.identify.next_measurement import NextMeasurement
 from snrmjax.identify.selection import Candidate
 from snrmjax.identify.splines import Spline
@@ -81,11 +81,24 @@ def summarise_fit(
             "damping_std_relative": level["damping"],
         },
         "tried": [candidate._asdict() for candidate in fit.candidates],
+        "rivals": [
+            {
+                "curve": one.curve,
+                "family": described(_curve(one.fit, one.curve)),
+                "weight": one.weight,
+            }
+            for one in fit.rivals
+        ],
         "contributions": [one._asdict() for one in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
         "notes": list(fit.notes),
     }
+
+
+def _curve(fit: JointFit, name: str) -> AbstractFamily:
+    pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    return pair[0] if name == "backbone" else pair[1]
 
 
 def described(family: AbstractFamily) -> str:
@@ -110,8 +123,12 @@ def _point(point: FittedPoint) -> dict:
 
 def write_joint_fit(path: FilePath, fit: JointFit) -> None:
     """Write a joint fit, its data and covariance included, as JSON that `read_joint_fit` reads."""
+    write_atomically(Path(path), json.dumps(_encoded(_content(fit)), allow_nan=True) + "\n")
+
+
+def _content(fit: JointFit) -> dict:
     unknowns = fit.unknowns
-    content = {
+    return {
         "format": _FORMAT,
         "names": list(fit.names()),
         "units": list(fit.units()),
@@ -129,9 +146,9 @@ def write_joint_fit(path: FilePath, fit: JointFit) -> None:
         "level_std": fit.level_std,
         "neighbour_correlation": fit.neighbour_correlation,
         "candidates": [candidate._asdict() for candidate in fit.candidates],
+        "rivals": [[one.curve, one.weight, _content(one.fit)] for one in fit.rivals],
         **{name: getattr(fit, name) for name in _PLAIN},
     }
-    write_atomically(Path(path), json.dumps(_encoded(content), allow_nan=True) + "\n")
 
 
 _PLAIN = (
@@ -151,6 +168,10 @@ def read_joint_fit(path: FilePath) -> JointFit:
         raise ValueError(f"{path} is no joint fit: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise ValueError(f"{path} is no joint fit of format {_FORMAT}.")
+    return _rebuilt(content)
+
+
+def _rebuilt(content: dict[str, Any]) -> JointFit:
     data, modes = content["data"], dict(content["modes"])
     modes["sensors"] = tuple(modes["sensors"])
     keys = ("natural_frequency", "damping_ratio", "mode_shape", "participation")
@@ -173,6 +194,7 @@ def read_joint_fit(path: FilePath) -> JointFit:
         residuals=np.asarray(content["residuals"]),
         neighbour_correlation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
         candidates=tuple(Candidate(**row) for row in content["candidates"]),
+        rivals=tuple(Rival(c, w, _rebuilt(rival)) for c, w, rival in content.get("rivals", [])),
         **plain,
     )
 
