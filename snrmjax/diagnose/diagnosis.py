@@ -24,6 +24,7 @@ from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.sidedness import acts_both_ways
+from snrmjax.diagnose.unstated import says_of_levels, with_levels_as_found
 from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
 from snrmjax.identify.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
@@ -87,6 +88,8 @@ def diagnose_model(
     levels' errors inside theirs; Schwarz's criterion decides.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
+    Where neither noise nor errors of levels are stated, both are found: the noise is what the
+    answer leaves, and levels differ by what no smooth curves of amplitude explain.
 
     Returns a `Diagnosis`. Raises `ValueError` for too few states, an unknown force or sensors
     other than the model's.
@@ -101,13 +104,21 @@ def diagnose_model(
             f"a diagnosis needs at least {_LEAST_STATES} usable steady states, or "
             f"{2 * _LEAST_STATES} where phases are unknown, not {n_states}."
         )
+    notes: list[str] = []
+    given = model
+    # Beside a gain that nobody knows no joint fit tells what levels scatter.
+    known = force_gain_std == 0 and not unknown.any() and predictions.chosen.n_levels > 2
+    if known and not predictions.chosen.noise_stated and not says_of_levels(model):
+        model, note = with_levels_as_found(model, data)
+        if note:
+            notes.append(note)
+            predictions = Predictions(model, data, force_gain_std)
     bench = Bench(predictions)
     if not np.isfinite(bench.base).all():
         raise ValueError(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
-    notes: list[str] = []
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
@@ -183,6 +194,7 @@ def diagnose_model(
     # Without phases the first thing to measure is these.
     request = _request(found) if verdict == "ambiguous" and not unknown.any() else None
     force = bench.weighing.column < 2
+    best = {name: value for name, (value, _) in values.items()}
     return Diagnosis(
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
@@ -196,7 +208,7 @@ def diagnose_model(
         noise_scale=float(np.sqrt(noise)),
         notes=tuple(notes),
         table=found.table,
-        completed=_completed(model, own, fit.kinds, {name: v for name, (v, _) in values.items()}),
+        completed=_completed(model if fit.kinds else given, own, fit.kinds, best),
         request=request,
         blind=blind,
         force_gain=_force_gain(bench, fit),
