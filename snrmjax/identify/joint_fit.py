@@ -318,7 +318,7 @@ def _fitted(
             break
         dof = max(residuals.size - degrees_spent(jacobian, residuals.size), 1.0)
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
-        scatter = Scatter(noise, noise / float(np.sqrt(2 * dof)), scatter.level)
+        scatter = scatter._replace(noise=noise, noise_std=noise / float(np.sqrt(2 * dof)))
     levels = along_resonance(np.asarray(data.level), np.asarray(data.frequency))
     alike, root = neighbour_correlation(residuals, levels), root_of_inverse(jacobian)
     rows = jacobian[: 2 * len(room.level)].reshape(-1, 2, len(root))[:n]

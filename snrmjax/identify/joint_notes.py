@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.force_balance import Motion
+from snrmjax.identify.force_balance import LEVEL_ERRORS, Motion
 from snrmjax.identify.level_scatter import Scatter
 
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
@@ -54,6 +54,12 @@ def notes_on_noise(
         notes.append(
             f"levels differ from one another by {', '.join(shared)} (1σ), which no stated error "
             "explains; the bands include it."
+        )
+    if scatter.unbounded:
+        names = " and ".join(LEVEL_ERRORS[kind] for kind in scatter.unbounded)
+        notes.append(
+            f"how far levels differ in {names} cannot be told from these data, where something "
+            "else can do the same; the bands do not include it: state it if you know."
         )
     if n_levels < 3:
         notes.append(

@@ -10,6 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
+_AT_THE_END = 0.99  # of that
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 _CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
 _PHASE = 1  # of the kinds of error
@@ -23,6 +24,7 @@ class Scatter(NamedTuple):
     noise_std: float
     level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
     bends: tuple[float, ...] = ()  # of the curves whose bends were asked for
+    unbounded: tuple[int, ...] = ()  # kinds of error whose search knew no end, and are left out
 
     @property
     def contradicts_upward(self) -> bool:
@@ -72,7 +74,9 @@ def estimated_scatter(
 
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
     `prior_std` is zero were not stated and are estimated. They enter one after the other, while
-    the likelihood asks for them; with fewer than three levels, or without `look`, none does.
+    the likelihood asks for them; with fewer than three levels, or without `look`, none does. One
+    that is likeliest without end, as a gain of levels may be beside a force gain that nobody knows,
+    is none.
     `bends` of curves are estimated along with them: rough curves and levels that differ explain
     the same residuals.
     Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
@@ -86,8 +90,9 @@ def estimated_scatter(
     open_kinds = [k for k in range(n_errors) if stated[k] == 0] if look else []
     price = np.where(np.arange(n_errors) == _PHASE, _CLEAR if bends else _WORTH, _WORTH)
 
-    def forward(stated: np.ndarray, chosen: np.ndarray) -> tuple[_Best, np.ndarray]:
+    def forward(stated: np.ndarray, chosen: np.ndarray) -> tuple[_Best, np.ndarray, list[int]]:
         found, left = likelihood.best(stated, chosen, ends), list(open_kinds)
+        unbounded: list[int] = []
         while left:
             trials = []
             for kind in left:
@@ -97,25 +102,29 @@ def estimated_scatter(
             better, kind = min(trials, key=lambda trial: trial[0].value)
             if better.value > found.value - price[kind]:
                 break
-            found, chosen = better, chosen | (np.arange(len(stated)) == kind)
             left.remove(kind)
-        return found, chosen
+            if np.max(better.std[open_kinds]) > _AT_THE_END * _LARGEST:
+                unbounded.append(kind)
+                continue
+            found, chosen = better, chosen | (np.arange(len(stated)) == kind)
+        return found, chosen, unbounded
 
     is_bend = np.arange(len(stated)) >= n_errors
-    found, chosen = forward(stated, is_bend)
+    found, chosen, unbounded = forward(stated, is_bend)
     if bends and look:
         # Levels that differ look like bends to whom bends come first: here they come last.
         straight = np.where(is_bend, _STIFF * np.array([e[0] for e in ends]), stated)
-        _, kinds = forward(straight, np.zeros(len(stated), dtype=bool))
+        _, kinds, others = forward(straight, np.zeros(len(stated), dtype=bool))
         other = likelihood.best(straight, kinds | is_bend, ends)
         cost, other_cost = (float(price[mask[:n_errors]].sum()) for mask in (chosen, kinds))
         if other.value + other_cost < found.value + cost:
-            found = other
+            found, unbounded = other, others
     return Scatter(
         noise=found.noise,
         noise_std=found.noise / np.sqrt(2 * likelihood.dof),
         level=tuple(found.std[:n_errors].tolist()),
         bends=tuple(found.std[n_errors:].tolist()),
+        unbounded=tuple(sorted(unbounded)),
     )
 
 

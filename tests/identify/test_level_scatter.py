@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snrmjax.identify.joint_notes import notes_on_noise
 from snrmjax.identify.level_scatter import (
     Linearised,
     _Likelihood,
@@ -58,6 +59,19 @@ def test_stated_scatter_is_kept_and_two_levels_say_nothing():
     assert estimated_scatter(problem, index).level[0] == 0.05
     problem, index = sample(3, shared=0.02)
     assert estimated_scatter(problem, index[:2]).level == (0.0, 0.0)
+
+
+def test_a_scatter_without_end_is_none_and_is_said():
+    # Levels of one structure do not differ by their whole size: something else is moving them.
+    found = estimated_scatter(*sample(2, shared=2.0))
+    assert found.level == (0.0, 0.0)
+    assert found.unbounded == (0,)
+    (note,) = notes_on_noise(found, 0.0, np.zeros(2), N_LEVELS, stated=False, alike=False)
+    assert "differ in gain cannot be told" in note
+    # Just inside it is believed, and nothing is said of an end.
+    found = estimated_scatter(*sample(2, shared=0.15))
+    assert found.level[0] == pytest.approx(0.15, rel=0.6)
+    assert found.unbounded == ()
 
 
 def test_slopes_of_the_likelihood_are_those_of_differences():
