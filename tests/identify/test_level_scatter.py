@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snrmjax.identify.force_balance import LEVEL_ERRORS
 from snrmjax.identify.joint_notes import notes_on_noise
 from snrmjax.identify.level_scatter import (
     Linearised,
@@ -66,7 +67,9 @@ def test_a_scatter_without_end_is_none_and_is_said():
     found = estimated_scatter(*sample(2, shared=2.0))
     assert found.level == (0.0, 0.0)
     assert found.unbounded == (0,)
-    (note,) = notes_on_noise(found, 0.0, np.zeros(2), N_LEVELS, stated=False, alike=False)
+    of_a_fit = found._replace(level=(0.0,) * len(LEVEL_ERRORS))
+    given = (0.0, np.zeros(len(LEVEL_ERRORS)), N_LEVELS)
+    (note,) = notes_on_noise(of_a_fit, *given, stated=False, alike=False)
     assert "differ in gain cannot be told" in note
     # Just inside it is believed, and nothing is said of an end.
     found = estimated_scatter(*sample(2, shared=0.15))
