@@ -107,7 +107,8 @@ def diagnose_model(
     notes: list[str] = []
     given = model
     # Beside a gain that nobody knows no joint fit tells what levels scatter.
-    known = force_gain_std == 0 and not unknown.any() and predictions.chosen.n_levels > 2
+    known = not np.any(np.asarray(data.phase_unknown)) and predictions.chosen.n_levels > 2
+    known = known and force_gain_std == 0
     if known and not predictions.chosen.noise_stated and not says_of_levels(model):
         model, note = with_levels_as_found(model, data)
         if note:

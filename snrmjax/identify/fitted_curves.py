@@ -17,6 +17,7 @@ from snrmjax.simulate.blocks import by_blocks
 from snrmjax.simulate.compiled import compiled
 
 _BLOCK = 256  # amplitudes that one program works on
+_LEAST = 0.01  # of the largest amplitude, below which rivals are not asked
 _ITERATIONS = 12
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
@@ -76,25 +77,31 @@ def open_choice(
 ) -> Float[np.ndarray, "rival point curve"]:
     """How far ω̃² and 2ζ̃ω̃ may be off because another family could be the right one.
 
-    One shift for each of the fit's rivals, to be taken as an error of 1σ (`beyond_estimation`). A
-    rival that does not have the velocities, or each once, counts for nothing.
+    One shift for each of the fit's rivals, to be taken as an error of 1σ (`beyond_estimation`).
+    Zero where a rival does not have a velocity, or has it twice. Below a hundredth of the largest
+    amplitude the shifts are those there: dry friction has no finite damping at rest.
     """
+    largest = fit.largest[0 if velocity is None else 1]
+    at = np.asarray(displacement if velocity is None else velocity, dtype=np.float64)
+    at = np.maximum(at, _LEAST * largest)
 
-    def described(one: JointFit) -> tuple[np.ndarray, np.ndarray]:
-        if velocity is not None:
-            values, slopes = values_with_slopes(one, velocity)
+    def described(one: JointFit, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if velocity is None:
+            values, slopes, _ = values_at_displacement(one, at)
         else:
-            values, slopes, _ = values_at_displacement(one, np.asarray(displacement))
+            values, slopes = values_with_slopes(one, at)
         return values, np.einsum("ocp,pq,ocq->oc", slopes, one.covariance, slopes)
 
-    rivals = fit.rivals
-    if velocity is not None:
-        rivals = tuple(one for one in rivals if not _unanswered(one.fit, float(np.max(velocity))))
-    at = velocity if velocity is not None else np.asarray(displacement)
-    if not rivals:
-        return np.zeros((0, len(at), 2))
-    own = described(fit)
-    return np.stack([beyond_estimation(one.weight, *own, *described(one.fit)) for one in rivals])
+    shifts = np.zeros((len(fit.rivals), len(at), 2))
+    own = described(fit, at) if fit.rivals else (at, at)
+    for shift, rival in zip(shifts, fit.rivals, strict=True):
+        has = np.ones(len(at), dtype=bool)
+        if velocity is not None:
+            has = at < _near(rival.fit, float(np.max(at))).once
+        if has.any():
+            theirs = described(rival.fit, at[has])
+            shift[has] = beyond_estimation(rival.weight, own[0][has], own[1][has], *theirs)
+    return shifts
 
 
 def beyond_estimation(
@@ -202,30 +209,28 @@ def displacement_near(
 
     Raises `ValueError` where there are several, or none.
     """
-    missing = _unanswered(fit, float(np.max(velocity)))
-    if missing:
-        raise ValueError(missing)
     found = _near(fit, float(np.max(velocity)))
-    return np.interp(velocity, found.speed, found.displacement)
-
-
-def _unanswered(fit: JointFit, velocity: float) -> str:
-    """Why a backbone has not every velocity up to this one exactly once; nothing if it has."""
-    found = _near(fit, velocity)
     if found.turns_back_at is not None:
-        return (
+        raise ValueError(
             f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
             "several displacements; ask for values at displacements."
         )
-    if velocity > found.speed[-1]:
-        return f"the backbone does not reach {velocity:.4g} m/s."
-    return ""
+    if np.max(velocity) > found.speed[-1]:
+        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
+    return np.interp(velocity, found.speed, found.displacement)
 
 
 class _Reached(NamedTuple):
     displacement: np.ndarray
     speed: np.ndarray
     turns_back_at: float | None  # m/s, below the velocity that was asked for
+
+    @property
+    def once(self) -> float:
+        """The velocity, below which the backbone has each exactly once."""
+        if self.turns_back_at is None:
+            return float(self.speed[-1])
+        return float(np.min(self.speed[np.argmax(self.speed == self.turns_back_at) :]))
 
 
 def _near(fit: JointFit, velocity: float) -> _Reached:

@@ -204,7 +204,9 @@ def _banded(
 
     # The points come from curves drawn anew through knots: steps put them on the fit's own.
     own = banded(fit, jnp.asarray(amplitude), jnp.asarray(frequency), _ONTO_THE_CURVE)
-    variance, speed = [own.frequency_std**2, own.velocity_std**2], np.abs(own.velocity)
+    values = own.frequency, np.abs(own.velocity)
+    variances = own.frequency_std**2, own.velocity_std**2
+    added = [np.zeros_like(one) for one in variances]
     for rival in fit.rivals:
         other = banded(rival.fit, jnp.asarray(own.amplitude), jnp.asarray(own.frequency), 0)
         # Where the rival's curve would be, to first order, by the slopes of the fit's own.
@@ -212,10 +214,10 @@ def _banded(
         there = np.abs(other.velocity) - own.through / own.by_amplitude * other.excess
         answers = ((frequency, other.frequency_std), (there, other.velocity_std))
         for k, (answer, std) in enumerate(answers):
-            value = (own.frequency, speed)[k]
-            shift = beyond_estimation(rival.weight, value, variance[k], answer, std**2)
-            variance[k] = variance[k] + shift**2
-    return own.frequency, np.sqrt(variance[0]), own.velocity, np.sqrt(variance[1])
+            given = (values[k], variances[k], answer, std**2)
+            added[k] += beyond_estimation(rival.weight, *given) ** 2
+    wide = [np.sqrt(one + more) for one, more in zip(variances, added, strict=True)]
+    return own.frequency, wide[0], own.velocity, wide[1]
 
 
 @compiled
@@ -283,8 +285,7 @@ def _located(
     variance = np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes)
     widened = variance
     for rival in fit.rivals:
-        there = float(values[2]), float(values[0])
-        answer = _values_and_slopes(rival.fit, force, load, kind, *there)
+        answer = _of_a_rival(rival.fit, force, load, kind, float(values[2]), float(values[0]))
         if answer is None:
             continue  # a fold that the rival does not have moves no band
         own = np.einsum("op,pq,oq->o", answer[1], rival.fit.covariance, answer[1])
@@ -294,6 +295,26 @@ def _located(
     return FittedPoint(
         *(force, float(omega), float(std[0]), float(speed), float(std[1])), bool(x > largest)
     )
+
+
+def _of_a_rival(
+    rival: JointFit, force: float, load: float, kind: str, amplitude: float, frequency: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """A rival's resonance or fold that corresponds to one of the fit, and its slopes."""
+    near = _values_and_slopes(rival, force, load, kind, amplitude, frequency)
+    if near is not None:
+        return near
+    rough = as_backbone(rival)
+    if kind == "resonance":
+        starts = [(r.amplitude, r.frequency) for r in resonances(rough, rival.modes, force)]
+    else:
+        curves = predict_response(rough, rival.modes, force)
+        starts = [turn for c in curves for turn in _turns(c.frequency, c.amplitude)]
+    for start in sorted(starts, key=lambda one: abs(np.log(one[0] / amplitude))):
+        found = _values_and_slopes(rival, force, load, kind, *start)
+        if found is not None:
+            return found
+    return None
 
 
 def point_slopes(

@@ -67,6 +67,10 @@ _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last r
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
+class NotFinite(ValueError):
+    """A fit whose residuals are no numbers."""
+
+
 class Rival(NamedTuple):
     """The same data fitted with another family of one of the curves, that they could mean too."""
 
@@ -250,7 +254,10 @@ def fit_jointly(
         pair = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
         pair[one.curve == "damping"] = one.family
         other = chosen._replace(squared_frequency=pair[0], modal_damping=pair[1])
-        found = fitted(other, pilot, corrected, _ROUGHLY)
+        try:
+            found = fitted(other, pilot, corrected, _ROUGHLY)
+        except NotFinite:
+            continue  # a family that cannot be fitted is no rival
         if found.converged:
             rivals.append(Rival(one.curve, one.weight, told(found, ())))
     return told(best, tuple(rivals))
@@ -307,7 +314,7 @@ def _fitted(
         data = eqx.tree_at(lambda d: d.correction, data, answer.correction[:n])
         residuals = np.asarray(answer.residuals)[:n]
         if not np.isfinite(float(answer.cost)):
-            raise ValueError("the fit ran into numbers that are not finite: try other families.")
+            raise NotFinite("the fit ran into numbers that are not finite: try other families.")
         jacobian = np.asarray(answer.jacobian)[:, program.own]
         if robust:
             weight = np.sqrt(np.asarray(data.weight))

@@ -58,8 +58,8 @@ def notes_on_noise(
     if scatter.unbounded:
         names = " and ".join(LEVEL_ERRORS[kind] for kind in scatter.unbounded)
         notes.append(
-            f"how far levels differ in {names} cannot be told from these data, where something "
-            "else can do the same; the bands do not include it: state it if you know."
+            f"how far levels differ in {names} cannot be told from these data: it would be by more "
+            "than levels of one test can; the bands do not include it: state it if you know."
         )
     if n_levels < 3:
         notes.append(

@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _SMALL = 0.01  # 1σ of a deviation with which its search begins
 _LARGEST = 0.3  # 1σ of a deviation; levels that differ by more are not one structure's
-_AT_THE_END = 0.99  # of that
+_AT_THE_END, _BEYOND = 0.99, 2.0  # of that: where a search has stopped short, and by too far
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 _CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
 _PHASE = 1  # of the kinds of error
@@ -24,7 +24,7 @@ class Scatter(NamedTuple):
     noise_std: float
     level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
     bends: tuple[float, ...] = ()  # of the curves whose bends were asked for
-    unbounded: tuple[int, ...] = ()  # kinds of error whose search knew no end, and are left out
+    unbounded: tuple[int, ...] = ()  # kinds of error left out: likeliest at sizes no test has
 
     @property
     def contradicts_upward(self) -> bool:
@@ -75,8 +75,8 @@ def estimated_scatter(
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
     `prior_std` is zero were not stated and are estimated. They enter one after the other, while
     the likelihood asks for them; with fewer than three levels, or without `look`, none does. One
-    that is likeliest without end, as a gain of levels may be beside a force gain that nobody knows,
-    is none.
+    that is likeliest at sizes no test has, as a gain of levels may be beside a force gain that
+    nobody knows, is none.
     `bends` of curves are estimated along with them: rough curves and levels that differ explain
     the same residuals.
     Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
@@ -90,23 +90,28 @@ def estimated_scatter(
     open_kinds = [k for k in range(n_errors) if stated[k] == 0] if look else []
     price = np.where(np.arange(n_errors) == _PHASE, _CLEAR if bends else _WORTH, _WORTH)
 
+    wide = (*[(_NOTHING, 10 * _LARGEST)] * n_errors, *(some.ends for some in bends))
+
+    def more_of(chosen: np.ndarray, kind: int) -> np.ndarray:
+        return chosen | (np.arange(len(chosen)) == kind)
+
     def forward(stated: np.ndarray, chosen: np.ndarray) -> tuple[_Best, np.ndarray, list[int]]:
         found, left = likelihood.best(stated, chosen, ends), list(open_kinds)
         unbounded: list[int] = []
         while left:
             trials = []
             for kind in left:
-                more = chosen.copy()
-                more[kind] = True
-                trials.append((likelihood.best(stated, more, ends), kind))
+                trials.append((likelihood.best(stated, more_of(chosen, kind), ends), kind))
             better, kind = min(trials, key=lambda trial: trial[0].value)
             if better.value > found.value - price[kind]:
                 break
             left.remove(kind)
             if np.max(better.std[open_kinds]) > _AT_THE_END * _LARGEST:
-                unbounded.append(kind)
-                continue
-            found, chosen = better, chosen | (np.arange(len(stated)) == kind)
+                freely = likelihood.best(stated, more_of(chosen, kind), wide)
+                if np.max(freely.std[open_kinds]) > _BEYOND * _LARGEST:
+                    unbounded.append(kind)
+                    continue
+            found, chosen = better, more_of(chosen, kind)
         return found, chosen, unbounded
 
     is_bend = np.arange(len(stated)) >= n_errors

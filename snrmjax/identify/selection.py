@@ -200,8 +200,10 @@ def _weights(score: Float[np.ndarray, " family"]) -> Float[np.ndarray, " family"
     Reference: pseudo-Bayesian averaging, Yao et al., Bayesian Anal. 13 (2018) 917,
     doi:10.1214/17-BA1091.
     """
-    share = np.exp(np.nan_to_num(score - np.max(score), nan=-np.inf))
-    return share / np.sum(share)
+    known = np.isfinite(score)
+    share = np.zeros(len(score))
+    share[known] = np.exp(score[known] - np.max(score[known], initial=-np.inf))
+    return share / max(np.sum(share), 1.0)
 
 
 class _Workbench:

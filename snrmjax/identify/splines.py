@@ -95,8 +95,8 @@ class SmoothingSpline(Spline):
 
     Its bends, what a value differs from the straight line between its neighbours' by, are expected
     to be of a size that the restricted likelihood finds: one for all while families are compared,
-    then one that changes along the curve (`sizes_along`), with neighbours that are somewhat alike
-    (`likeness`). A band then holds what the curve may do
+    then half more than one that changes along the curve (`sizes_along`), with neighbours that are
+    somewhat alike (`likeness`). A band then holds what the curve may do
     between levels; with few free knots it holds nothing of what they cannot follow. Levels lie
     denser where a curve is rougher, so that bends from level to level are more alike than
     curvature is.

@@ -146,9 +146,16 @@ def _content(fit: JointFit) -> dict:
         "level_std": fit.level_std,
         "neighbour_correlation": fit.neighbour_correlation,
         "candidates": [candidate._asdict() for candidate in fit.candidates],
-        "rivals": [[one.curve, one.weight, _content(one.fit)] for one in fit.rivals],
+        "rivals": [[one.curve, one.weight, _of_a_rival(one.fit)] for one in fit.rivals],
         **{name: getattr(fit, name) for name in _PLAIN},
     }
+
+
+_SHARED = ("modes", "candidates")  # by a fit and its rivals
+
+
+def _of_a_rival(fit: JointFit) -> dict:
+    return {key: value for key, value in _content(fit).items() if key not in _SHARED}
 
 
 _PLAIN = (
@@ -182,6 +189,7 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         _family(content["modal_damping"]),
     )
     arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
+    shared = {key: content[key] for key in _SHARED}
     plain = {name: content[name] for name in _PLAIN}
     plain |= {"free": tuple(plain["free"]), "notes": tuple(plain["notes"])}
     return JointFit(
@@ -194,7 +202,10 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         residuals=np.asarray(content["residuals"]),
         neighbour_correlation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
         candidates=tuple(Candidate(**row) for row in content["candidates"]),
-        rivals=tuple(Rival(c, w, _rebuilt(rival)) for c, w, rival in content.get("rivals", [])),
+        rivals=tuple(
+            Rival(curve, weight, _rebuilt(rival | shared))
+            for curve, weight, rival in content.get("rivals", [])
+        ),
         **plain,
     )
 

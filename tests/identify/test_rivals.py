@@ -1,13 +1,17 @@
 """What the choice among families leaves open, against the rivals' own answers."""
 
+import dataclasses
+
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import snrmjax as sj
 from snrmjax.identify.fitted_curves import beyond_estimation, open_choice
 from snrmjax.identify.fitted_response import as_backbone
-from snrmjax.identify.selection import ARGUMENTS
+from snrmjax.identify.joint_fit import Rival
+from snrmjax.identify.selection import ARGUMENTS, _weights
 from snrmjax.identify.uncertainty import contributions
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
 
@@ -124,6 +128,76 @@ def test_bands_along_a_response_hold_what_rivals_say(fit):
         std = np.interp(omega, at, theirs.velocity_std[rising])
         pairs.append((np.interp(omega, at, size), std))
     widened(ours.velocity_std[place], pairs, [one.weight for one in fit.rivals])
+
+
+def against(fit, *factors, weight=0.25):
+    """The fit beside rivals whose damping is so many times its own, as well known."""
+    alone = by_estimation_alone(fit)
+
+    def louder(factor):
+        parameters = factor * alone.unknowns.modal_damping.parameters
+        return eqx.tree_at(lambda f: f.unknowns.modal_damping.parameters, alone, parameters)
+
+    rivals = tuple(Rival("damping", weight, louder(factor)) for factor in factors)
+    return dataclasses.replace(alone, rivals=rivals)
+
+
+def test_rivals_add_up_in_any_order(fit):
+    """Along a response, on whose upper flank all of them differ."""
+
+    def added(*factors):
+        wide = sj.fitted_response(against(fit, *factors), FORCE)[0].velocity_std
+        return wide**2 - sj.fitted_response(by_estimation_alone(fit), FORCE)[0].velocity_std ** 2
+
+    one, other, both, turned = added(1.1), added(1.3), added(1.1, 1.3), added(1.3, 1.1)
+    tip = np.argmax(one)
+    assert one[tip] > 0
+    np.testing.assert_allclose(both[tip - 20 : tip], (one + other)[tip - 20 : tip], rtol=1e-9)
+    np.testing.assert_allclose(turned, both, rtol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1.05, 1.3, 1.6])
+def test_a_resonance_is_as_uncertain_as_its_rival_is_far(fit, factor):
+    mine = sj.fitted_response(by_estimation_alone(fit), FORCE)[0].resonances[0]
+    wide = sj.fitted_response(against(fit, factor), FORCE)[0].resonances[0]
+    rival = against(fit, factor).rivals[0].fit
+    theirs = sj.fitted_response(rival, FORCE)[0].resonances[0]
+    apart = (theirs.velocity - mine.velocity) ** 2
+    excess = apart - abs(theirs.velocity_std**2 - mine.velocity_std**2)
+    expected = np.sqrt(mine.velocity_std**2 + 0.25 * excess)
+    assert wide.velocity_std == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_band_at_one_velocity_does_not_hang_on_what_else_is_asked(fit):
+    # ω̃² = a(1 − 0.4 u) turns back at u = 1.25: 1.25 times the largest velocity is beyond that.
+    alone = by_estimation_alone(fit)
+    vector = np.array(alone.vector()[0])
+    vector[1] = -0.4 * vector[0]
+    falling = eqx.tree_at(lambda f: f.unknowns, alone, alone.vector()[1](jnp.asarray(vector)))
+    either = dataclasses.replace(alone, rivals=(Rival("backbone", 0.5, falling),))
+    at = np.array([0.2, 0.5, 1.25]) * fit.largest[1]
+    few, all_three = (open_choice(either, velocity=at[:n])[0] for n in (2, 3))
+    np.testing.assert_allclose(all_three[:2], few, rtol=1e-6)
+    assert np.all(np.abs(few[:, 0]) > 0)
+    assert not all_three[2].any()  # a velocity that the rival does not have
+
+
+def test_at_rest_dry_friction_leaves_damping_as_open_as_just_beside(fit):
+    given = {"backbone": "polynomial:1@displacement", "damping": "viscous_coulomb@displacement"}
+    dry = sj.fit_jointly(noisy(4, gain=0.01), modes(), level_gain_std=0.01, **given)
+    assert np.isinf(np.asarray(sj.fitted_values(dry, displacement=np.zeros(1)).modal_damping))
+    parameters = dry.unknowns.modal_damping.parameters.at[1].set(2.0)
+    dry = eqx.tree_at(lambda f: f.unknowns.modal_damping.parameters, dry, parameters)
+    either = dataclasses.replace(by_estimation_alone(fit), rivals=(Rival("damping", 0.5, dry),))
+    at = np.array([0.0, 0.005, 0.01]) * fit.largest[0]
+    shift = open_choice(either, displacement=at)[0, :, 1]
+    assert shift[2] > 0
+    np.testing.assert_array_equal(shift, shift[2])
+
+
+def test_families_without_a_score_weigh_nothing():
+    np.testing.assert_array_equal(_weights(np.array([-np.inf, 0.0, np.nan])), [0, 1, 0])
+    np.testing.assert_array_equal(_weights(np.array([-np.inf, -np.inf])), [0, 0])
 
 
 def test_the_choice_is_a_contribution(fit):
