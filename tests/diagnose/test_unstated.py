@@ -9,7 +9,7 @@ import snrmjax as sj
 from snrmjax.diagnose import diagnosis
 from snrmjax.diagnose.unstated import with_levels_as_found
 
-from .test_diagnosis import OMEGA, balanced, linear_model, quadratic
+from .test_diagnosis import OMEGA, PARTICIPATION, SHAPE, ZETA, balanced, linear_model, quadratic
 
 LEVELS, SHIFT, SEED = 6, 4e-3, 3
 
@@ -90,3 +90,24 @@ def test_errors_of_levels_are_looked_for_where_nothing_is_said(
     with pytest.raises(Reached):
         sj.diagnose_model(model, given, force_gain_std=gain_std)
     assert bool(looked) == looks
+
+
+def test_errors_of_levels_need_the_phases_of_every_sensor(monkeypatch, data):
+    """A joint fit would refuse the data for a sensor that the diagnosis does not look at."""
+
+    def stop(predictions):
+        raise Reached
+
+    monkeypatch.setattr(diagnosis, "Bench", stop)
+    velocity = np.asarray(data.velocity)
+    modes = sj.linear_modes(
+        *([OMEGA], [ZETA], [[SHAPE], [0.5 * SHAPE]], [PARTICIPATION]), sensors=("one", "other")
+    )
+    two = sj.steady_states(
+        *(np.asarray(data.level), np.asarray(data.frequency), np.asarray(data.force)),
+        np.concatenate([velocity, 0.5 * velocity], axis=1),
+        phase_std=np.tile([np.nan, np.pi], (data.n_states, 1)),
+        sensors=("one", "other"),
+    )
+    with pytest.raises(Reached):
+        sj.diagnose_model(sj.structure(modes), two)
