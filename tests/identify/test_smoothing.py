@@ -88,7 +88,8 @@ def test_a_rough_curve_does_not_pass_for_levels_that_differ():
         # A curve without a prior of its own size leaves its bends to the levels.
         stiff = problem._replace(prior_std=np.where(problem.prior_std == 1.0, 1e-3, np.inf))
         stiff.prior_std[index] = 0.0
-        assert estimated_scatter(stiff, index).level[0] > 0.05
+        found = estimated_scatter(stiff, index)
+        assert found.level[0] > 0.05 or found.unbounded == (0,)
 
 
 def test_levels_that_differ_are_found_beside_a_smooth_curve():
