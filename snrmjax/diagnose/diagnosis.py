@@ -107,9 +107,9 @@ def diagnose_model(
     notes: list[str] = []
     given = model
     # Beside a gain that nobody knows no joint fit tells what levels scatter.
-    known = not np.any(np.asarray(data.phase_unknown)) and predictions.chosen.n_levels > 2
-    known = known and force_gain_std == 0
-    if known and not predictions.chosen.noise_stated and not says_of_levels(model):
+    tells = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
+    silent = not predictions.chosen.noise_stated and not says_of_levels(model)
+    if silent and tells and predictions.chosen.n_levels > 2:
         model, note = with_levels_as_found(model, data)
         if note:
             notes.append(note)

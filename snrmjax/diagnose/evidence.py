@@ -179,9 +179,7 @@ class Bench:
     ) -> None:
         self._passed_on = (by_error, phasors)
         measured = self.predictions.weighed(by_error, phasors)
-        model = self.model
-        levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
-        std = np.array([float(value) for value in (*levels, model.level_damping_std)])
+        std = np.array(self.model.level_stds)
         own, by_linear = self._slopes[:, :, :-2], self._slopes[:, :, -2:]
         gain = self.predictions.force_gain_std * by_error[:, :, :1]
         shared = np.concatenate([own, gain], axis=2) if np.any(gain) else own

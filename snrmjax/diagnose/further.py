@@ -186,9 +186,7 @@ def together(
     old: Bench, new: Bench, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
     """What measured states and some rows of further ones share: the baseline, not their levels."""
-    model = old.model
-    levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
-    stated = sum(float(std) > 0 for std in (*levels, model.level_damping_std))
+    stated = sum(std > 0 for std in old.model.level_stds)
     parts = old.weighing.shared, new.weighing.shared[kept]
     own = [stated * bench.predictions.chosen.n_levels for bench in (old, new)]
     common = [part[:, : part.shape[1] - n] for part, n in zip(parts, own, strict=True)]

@@ -5,7 +5,6 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.force_balance import LEVEL_ERRORS
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.structure import Structure
 
@@ -14,8 +13,7 @@ _MOST = 0.2  # 1σ of a deviation, beyond which smooth curves were not those of 
 
 def says_of_levels(model: Structure) -> bool:
     """Whether a model states any error that the states of a level share."""
-    levels = (model.level_gain_std, model.level_phase_std, model.level_frequency_std)
-    return any(float(std) > 0 for std in (*levels, model.level_damping_std))
+    return any(std > 0 for std in model.level_stds)
 
 
 def with_levels_as_found(model: Structure, data: SteadyStates) -> tuple[Structure, str]:
@@ -29,29 +27,24 @@ def with_levels_as_found(model: Structure, data: SteadyStates) -> tuple[Structur
     # Few diagnoses need it, and it takes long to import.
     from snrmjax.identify.fitted_curves import values_at_displacement
     from snrmjax.identify.joint_fit import fit_jointly
+    from snrmjax.identify.joint_notes import in_words
 
     fit = fit_jointly(data, model.modes)
-    std = dict(zip(LEVEL_ERRORS, np.asarray(fit.level_std).tolist(), strict=True))
-    if not fit.converged or not 0 < max(std.values()) < _MOST:
+    gain, phase, stiffness, damping = np.asarray(fit.level_std)
+    if not fit.converged or not 0 < np.max(fit.level_std) < _MOST:
         return model, ""
     values = values_at_displacement(fit, np.asarray(fit.motion().displacement))[0]
-    squared, damping = np.median(values, axis=0)
+    squared, modal_damping = np.median(values, axis=0)
+    omega = np.sqrt(squared)
     widened = dataclasses.replace(
         model,
-        level_gain_std=jnp.asarray(std["gain"]),
-        level_phase_std=jnp.asarray(std["phase"]),
-        level_frequency_std=jnp.asarray(0.5 * std["stiffness"] * np.sqrt(squared)),
-        level_damping_std=jnp.asarray(std["damping"] * damping / (2 * np.sqrt(squared))),
+        level_gain_std=jnp.asarray(gain),
+        level_phase_std=jnp.asarray(phase),
+        level_frequency_std=jnp.asarray(0.5 * stiffness * omega),
+        level_damping_std=jnp.asarray(damping * modal_damping / (2 * omega)),
     )
-    units = {
-        "gain": (100, " % in gain"),
-        "phase": (180 / np.pi, "° in phase"),
-        "stiffness": (50, " % in natural frequency"),
-        "damping": (100, " % in damping"),
-    }
-    said = [f"{units[k][0] * one:.2g}{units[k][1]}" for k, one in std.items() if one > 0]
-    listed = ", ".join(said)
     return widened, (
-        f"no error of levels is stated: smooth curves leave them different by {listed} (1σ), which "
-        "is taken for errors that the states of a level share."
+        f"no error of levels is stated: smooth curves leave them different by "
+        f"{in_words(fit.level_std)} (1σ), which is taken for errors that the states of a level "
+        "share."
     )

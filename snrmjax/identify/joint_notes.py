@@ -37,7 +37,6 @@ def notes_on_noise(
             f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
             f"noise: it is overstated{more}."
         )
-    units = ((100, "% in gain"), (180 / np.pi, "° in phase"), (50, "% in natural frequency"))
     found_only = np.where(given > 0, 0.0, scatter.level)
     if jitter > 0:
         jitter = 0.5 * jitter * (1.0 if stated else scatter.noise)
@@ -45,14 +44,10 @@ def notes_on_noise(
             f"natural frequency wanders by {100 * jitter:.2g} % from state to state (1σ), which "
             "no stated noise explains."
         )
-    shared = [
-        f"{factor * value:.2g} {name}"
-        for (factor, name), value in zip((*units, (100, "% in damping")), found_only, strict=True)
-        if value > 0
-    ]
+    shared = in_words(found_only)
     if shared:
         notes.append(
-            f"levels differ from one another by {', '.join(shared)} (1σ), which no stated error "
+            f"levels differ from one another by {shared} (1σ), which no stated error "
             "explains; the bands include it."
         )
     if scatter.unbounded:
@@ -67,6 +62,18 @@ def notes_on_noise(
             "levels differ from one another, and the bands do not include it."
         )
     return tuple(notes)
+
+
+def in_words(level_std: Float[np.ndarray, " error"]) -> str:
+    """By how much levels differ in what; nothing where they do not."""
+    units = {
+        "gain": (100, " % in gain"),
+        "phase": (180 / np.pi, "° in phase"),
+        "stiffness": (50, " % in natural frequency"),
+        "damping": (100, " % in damping"),
+    }
+    pairs = [(units[k], one) for k, one in zip(LEVEL_ERRORS, level_std, strict=True) if one > 0]
+    return ", ".join(f"{factor * one:.2g}{name}" for (factor, name), one in pairs)
 
 
 def notes_on_neighbours(correlation: Float[np.ndarray, " part"]) -> tuple[str, ...]:

@@ -53,6 +53,14 @@ class Structure(eqx.Module):
     name: str = eqx.field(static=True, default="structure")
 
     @property
+    def level_stds(self) -> tuple[float, float, float, float]:
+        """1σ that the states of a level share: of gain, phase, natural frequency and damping."""
+        return (
+            *(float(self.level_gain_std), float(self.level_phase_std)),
+            *(float(self.level_frequency_std), float(self.level_damping_std)),
+        )
+
+    @property
     def n_modes(self) -> int:
         """Number of flexible modes."""
         return self.modes.n_modes
