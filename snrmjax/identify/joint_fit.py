@@ -32,7 +32,7 @@ from snrmjax.identify.free_unknowns import (
 )
 from snrmjax.identify.joint_notes import notes_on_neighbours, notes_on_noise, notes_on_reach
 from snrmjax.identify.least_squares import degrees_spent, root_of_inverse
-from snrmjax.identify.level_scatter import Scatter
+from snrmjax.identify.level_scatter import Scatter, few_levels_factor
 from snrmjax.identify.level_slopes import LevelPattern, on_levels
 from snrmjax.identify.neighbours import (
     added_covariance,
@@ -83,7 +83,8 @@ class JointFit(eqx.Module):
     """Two curves, what else was unknown, and how well all of it is known.
 
     `covariance` belongs to the free unknowns in the order of `names`, and includes what the
-    residuals of neighbouring states have in common; `level_std` to `LEVEL_ERRORS`, stated or found.
+    residuals of neighbouring states have in common; `level_std` to `LEVEL_ERRORS`, stated or found:
+    what was found from few levels counts for more in `spread`, as Student's t does.
     `rivals` are fits with other families that predict left-out levels about as well: bands of
     curves and responses include what is left open by the choice, the covariance does not.
     """
@@ -202,7 +203,7 @@ def fit_jointly(
         chosen: Selection, pilot: Unknowns, data: BalanceData, rounds: tuple[int, int]
     ) -> _Fitted:
         noisy = eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(chosen.jitter))
-        level = _with_scatter(spread, chosen.scatter)
+        level = _with_scatter(spread, chosen.scatter, data.n_levels)
         start = _started(pilot, chosen, level)
         settings = (modes, level, released, chosen.scatter)
         return _fitted(start, noisy, *settings, stated=stated, robust=robust, rounds=rounds)
@@ -237,7 +238,7 @@ def fit_jointly(
             modes=modes,
             noise_scale=found.scatter.noise,
             noise_scale_std=found.scatter.noise_std,
-            level_std=np.asarray(found.spread.level),
+            level_std=np.asarray(found.scatter.level),
             residuals=found.residuals,
             neighbour_correlation=found.neighbours,
             drive_known_only=driven,
@@ -360,8 +361,10 @@ def _started(pilot: Unknowns, chosen: Selection, spread: Spread) -> Unknowns:
     )
 
 
-def _with_scatter(spread: Spread, scatter: Scatter) -> Spread:
-    return Spread(jnp.array(scatter.level), spread.linear)
+def _with_scatter(spread: Spread, scatter: Scatter, n_levels: int) -> Spread:
+    """Levels' errors as stated, or as found and as much wider as few levels leave open."""
+    found = few_levels_factor(n_levels) * jnp.array(scatter.level)
+    return Spread(jnp.where(spread.level > 0, spread.level, found), spread.linear)
 
 
 class _Linear(NamedTuple):

@@ -56,10 +56,15 @@ def notes_on_noise(
             f"how far levels differ in {names} cannot be told from these data: it would be by more "
             "than levels of one test can; the bands do not include it: state it if you know."
         )
-    if n_levels < 3:
+    if n_levels == 1:
         notes.append(
-            f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing says how far "
-            "levels differ from one another, and the bands do not include it."
+            "1 level only: nothing says how far levels differ from one another, and the bands do "
+            "not include it."
+        )
+    if n_levels == 2:
+        notes.append(
+            "2 levels only: how far levels differ from one another is known from a single "
+            "difference, and the bands may be too narrow."
         )
     return tuple(notes)
 

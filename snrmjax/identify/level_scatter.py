@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize, minimize_scalar
+from scipy.special import ndtri, stdtrit
 
 _NOTHING = 1e-9  # 1σ that stands for none at all
 _SMALL = 0.01  # 1σ of a deviation with which its search begins
@@ -14,6 +15,7 @@ _AT_THE_END, _BEYOND = 0.99, 2.0  # of that: where a search has stopped short, a
 _WORTH = 5.41  # of −2 log likelihood: 1 %, one-sided, since four kinds of error are tried
 _CLEAR = 20.0  # the same of the phase beside a rough curve, whose bends it imitates
 _PHASE = 1  # of the kinds of error
+_UPPER = 0.975  # share below the upper end of a 95 % band
 _STIFF = 10.0  # times the smallest bends, of a curve that is straight at first
 
 
@@ -74,9 +76,9 @@ def estimated_scatter(
 
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
     `prior_std` is zero were not stated and are estimated. They enter one after the other, while
-    the likelihood asks for them; with fewer than three levels, or without `look`, none does. One
-    that is likeliest at sizes no test has, as a gain of levels may be beside a force gain that
-    nobody knows, is none.
+    the likelihood asks for them; with a single level, or without `look`, none does. One that is
+    likeliest at sizes no test has, as a gain of levels may be beside a force gain that nobody
+    knows, is none.
     `bends` of curves are estimated along with them: rough curves and levels that differ explain
     the same residuals.
     Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
@@ -86,7 +88,7 @@ def estimated_scatter(
     ends = (*[(_NOTHING, _LARGEST)] * n_errors, *(some.ends for some in bends))
     present = [float(problem.prior_std[some.places[0]]) for some in bends]
     stated = np.array([*problem.prior_std[index[0]], *present])
-    look = look and len(index) > 2
+    look = look and len(index) > 1
     open_kinds = [k for k in range(n_errors) if stated[k] == 0] if look else []
     price = np.where(np.arange(n_errors) == _PHASE, _CLEAR if bends else _WORTH, _WORTH)
 
@@ -131,6 +133,15 @@ def estimated_scatter(
         bends=tuple(found.std[n_errors:].tolist()),
         unbounded=tuple(sorted(unbounded)),
     )
+
+
+def few_levels_factor(n_levels: int) -> float:
+    """By how much a 95 % band is wider whose 1σ had to be found from so few levels.
+
+    Student's t over the normal. Two levels count as three: one difference tells no more than an
+    order of size, and with t of one degree no band would be of use.
+    """
+    return float(stdtrit(max(n_levels - 1, 2), _UPPER) / ndtri(_UPPER))
 
 
 def likeliest_std(problem: Linearised, bends: Bends) -> float:

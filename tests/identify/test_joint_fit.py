@@ -240,6 +240,34 @@ def test_levels_that_scatter_are_found_and_enter_the_bands():
     assert np.all(np.asarray(wide) > np.asarray(narrow))
 
 
+def test_two_levels_whose_gains_differ_are_found_to():
+    level, omega, force, velocity = exact()
+    two = level >= LEVELS - 2
+    level, omega, force, velocity = (a[two] for a in (level, omega, force, velocity))
+    rng = np.random.default_rng(3)
+    gain = np.where(level == LEVELS - 1, 0.05, -0.05)
+    own = 0.1 * (0.01 * rng.normal(size=len(level)) + 0.012j * rng.normal(size=len(level)))
+
+    def fitted(shared):
+        data = stated(level, omega, force, velocity * np.exp(shared + own))
+        return fit_jointly(data, modes(), **TRUE)
+
+    def largest_error(fit):
+        values = sj.fitted_values(fit, SPEEDS[3:])
+        off = np.asarray(values.natural_frequency**2 - truth_at(SPEEDS[3:])[0])
+        return np.max(np.abs(off / (2 * values.natural_frequency * values.natural_frequency_std)))
+
+    found = fitted(gain)
+    # Two gains 10 % apart are draws of one population of 10 %/√2, if of any.
+    assert found.level_std[0] == pytest.approx(0.1 / np.sqrt(2), rel=0.3)
+    assert any("a single difference" in note for note in found.notes)
+    # Student's t of two degrees of freedom: 4.303 where a normal has 1.960.
+    wider = 4.303 / 1.960 * found.level_std[0]
+    assert float(found.spread.level[0]) == pytest.approx(wider, rel=1e-3)
+    assert largest_error(found) < 2
+    np.testing.assert_array_equal(fitted(0.0).level_std, 0.0)
+
+
 def test_auto_finds_the_families_that_made_the_data():
     found = fit_jointly(noisy(3, gain=0.002, per_level=15), modes(), level_gain_std=0.002)
     chosen = {c.curve: c for c in found.candidates if c.chosen}

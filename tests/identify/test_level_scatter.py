@@ -9,6 +9,7 @@ from snrmjax.identify.level_scatter import (
     Linearised,
     _Likelihood,
     estimated_scatter,
+    few_levels_factor,
     level_columns,
 )
 from snrmjax.identify.pilot import levels_apart
@@ -54,12 +55,37 @@ def test_scatter_that_is_there_is_found_without_bias():
     assert np.mean([f.noise for f in found]) == pytest.approx(1.0, abs=0.03)
 
 
-def test_stated_scatter_is_kept_and_two_levels_say_nothing():
+def test_stated_scatter_is_kept_and_one_level_says_nothing():
     problem, index = sample(3, shared=0.02)
     problem.prior_std[index[:, 0]] = 0.05
     assert estimated_scatter(problem, index).level[0] == 0.05
     problem, index = sample(3, shared=0.02)
-    assert estimated_scatter(problem, index[:2]).level == (0.0, 0.0)
+    assert estimated_scatter(problem, index[:1]).level == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("n_levels", [2, 3, 4, 8])
+def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
+    level = np.repeat(np.arange(n_levels), PER_LEVEL)
+    n = len(level)
+    levels = level_columns(np.full((n, 1, 1), 50.0), level, n_levels)
+    slopes = np.column_stack([np.ones(n), levels])
+    std = np.concatenate([[np.inf], np.zeros(n_levels)])
+    index = 1 + np.arange(n_levels)[:, None]
+    inside, sizes = [], []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        residuals = rng.normal(size=n) + 50.0 * 0.1 * rng.normal(size=n_levels)[level]
+        problem = Linearised(residuals, slopes, std, np.zeros(len(std)))
+        found = estimated_scatter(problem, index)
+        # The mean of balanced levels, whose noise is small beside what they differ by.
+        band = np.hypot(few_levels_factor(n_levels) * 50.0 * found.level[0], found.noise / 4.5)
+        inside.append(abs(residuals.mean()) < 1.96 * band / np.sqrt(n_levels))
+        sizes.append(found.level[0])
+    # The size of one difference is that of one draw: squares are right in the mean.
+    assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(0.1, rel=0.2)
+    # With two degrees of freedom a band ends at t = 4.303; with one it holds what Cauchy says.
+    wanted = 2 / np.pi * np.arctan(4.303) if n_levels == 2 else 0.95
+    assert np.mean(inside) == pytest.approx(wanted, abs=3 * np.sqrt(0.05 / 300))
 
 
 def test_a_scatter_that_no_test_has_is_none_and_is_said():
