@@ -52,8 +52,9 @@ def fitted_values(
     covariance += np.einsum("koc,kod->ocd", shifts, shifts)
     squared, damping = values.T
     if of_a_new_level:
-        covariance[:, 0, 0] += (squared * fit.level_std[2]) ** 2
-        covariance[:, 1, 1] += (damping * fit.level_std[3]) ** 2
+        stiffness, dissipation = np.asarray(fit.spread.level)[2:]
+        covariance[:, 0, 0] += (squared * stiffness) ** 2
+        covariance[:, 1, 1] += (damping * dissipation) ** 2
     omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
     # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
     slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)

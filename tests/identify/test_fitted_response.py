@@ -142,7 +142,8 @@ def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
 
 
 def test_a_new_level_has_a_wider_band(fit):
-    scattering = dataclasses.replace(fit, level_std=np.array([0.01, 0.0, 0.004, 0.05]))
+    spread = dataclasses.replace(fit.spread, level=np.array([0.01, 0.0, 0.004, 0.05]))
+    scattering = dataclasses.replace(fit, spread=spread)
     speeds = np.array([0.3, 0.8])
     plain = sj.fitted_values(scattering, speeds)
     wide = sj.fitted_values(scattering, speeds, of_a_new_level=True)
