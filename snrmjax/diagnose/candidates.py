@@ -10,6 +10,7 @@ from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
+_WIDE = 0.15  # relative distance of a close mode, beyond which it is one far away
 _CHANGE = 0.05  # of the dynamic stiffness near resonance, that a start makes
 
 
@@ -66,6 +67,17 @@ def _resonance(s: Scales, order: int) -> list[tuple[float, ...]]:
     ]
 
 
+def _close(s: Scales) -> list[tuple[float, ...]]:
+    """Modes some half-power bandwidths away, as strong as a plain change at the resonance."""
+    starts: list[tuple[float, ...]] = []
+    for away in (-8.0, -3.0, 3.0, 8.0):
+        share = 1 + float(np.clip(away * s.damping_ratio, -_WIDE, _WIDE))
+        distance = abs(share**2 - 1 + 2j * s.damping_ratio * share) * s.frequency**2
+        hz = share * s.frequency / (2 * np.pi)
+        starts.append((_CHANGE * s.receptance * distance, hz, s.damping_ratio))
+    return starts
+
+
 _STARTS: Mapping[str, _Start] = {
     "linear_frequency_shift": _one(lambda s: 0.5 * s.change / s.frequency**2),
     "linear_damping_change": _one(lambda s: 0.5 * s.change / s.frequency**2),
@@ -94,6 +106,7 @@ _STARTS: Mapping[str, _Start] = {
     "internal_resonance_1_3": lambda s: _resonance(s, 3),
     "internal_resonance_1_2": lambda s: _resonance(s, 2),
     "residual_mode": _one(lambda s: _CHANGE * s.receptance),
+    "close_mode": _close,
     "mode_shape_change": _one(lambda s: _CHANGE / s.amplitude**2),
     "force_harmonics": lambda s: [(0.02, 0.02)],
     "static_preload": lambda s: [
@@ -127,9 +140,14 @@ def candidate(kind: str, scales: Scales) -> Candidate:
         order = 3 if kind.endswith("3") else 2
         hz = order * scales.frequency / (2 * np.pi)
         lower[1:], upper[1:] = [0.8 * hz, 1e-5], [1.2 * hz, 0.2]
+    if kind == "close_mode":
+        hz = scales.frequency / (2 * np.pi)
+        lower[1:], upper[1:] = [(1 - 2 * _WIDE) * hz, 1e-5], [(1 + 2 * _WIDE) * hz, 0.2]
     unit = tuple(abs(v) if v else 1.0 for v in starts[0])
     if kind.startswith("internal_resonance"):
         unit = (unit[0], 0.01 * unit[1], 0.5 * unit[2])
+    if kind == "close_mode":
+        unit = (unit[0], scales.damping_ratio * unit[1], 0.5 * unit[2])
     return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
 
 
@@ -200,6 +218,13 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
     (
         frozenset({"residual_mode", "sensor_phase_error"}),
         "measure 60° and more off resonance on both sides, or with a second sensor",
+    ),
+    *(
+        (
+            frozenset({"close_mode", other}),
+            "measure with a second sensor, where a further mode has another shape, or sweep wider",
+        )
+        for other in ("residual_mode", "sensor_phase_error")
     ),
     (
         frozenset({"internal_resonance_1_3", "internal_resonance_1_2"}),

@@ -93,6 +93,16 @@ def doubts(
                 twin=True,
             )
         )
+    if "close_mode" in effects:
+        found.append(
+            Doubt(
+                "a mode close by has three numbers of its own: to one sensor a clearance beside a "
+                "cubic stiffness, or several small errors, can look like it.",
+                "measure with a second sensor, where a further mode has another shape, or sweep "
+                "through the frequency at which it is said to be",
+                twin=True,
+            )
+        )
     if len(effects) > 2:
         found.append(Doubt("three effects together can follow most laws.", _WIDER))
     alike = [pair for pair in combinations(effects, 2) if any(g >= set(pair) for g in _SAME_PART)]

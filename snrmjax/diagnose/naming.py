@@ -1,5 +1,6 @@
 """Which effects the data ask for, and which others they cannot tell from them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,14 @@ _ONE = 2  # parameters of one effect; one with more is weighed against two effec
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
+_CLOSE = "close_mode"
+_LIKE_A_MODE = frozenset(
+    {
+        *("residual_mode", "sensor_phase_error", "sensor_gain_error", "force_gain_error"),
+        *("linear_frequency_shift", "linear_damping_change", "added_mass", "frequency_drift"),
+    }
+)
+"""Kinds that change what a linear structure shows, as a further mode does."""
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 
 
@@ -48,8 +57,66 @@ class Named(NamedTuple):
 
 
 def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
-    """Add effects one after the other while the criterion asks for them, three at most."""
+    """Add effects one after the other while the criterion asks for them, three at most.
+
+    A linear mode close by has three numbers of its own and would follow a part of most laws: it
+    is no candidate, but what is found has to be better than it.
+    """
     every = {kind: candidate(kind, scales) for kind in kinds}
+    close = every.pop(_CLOSE, None)
+    found = _searched(bench, every)
+    return found if close is None else _questioned(found, close, every)
+
+
+def _questioned(found: Named, close: Candidate, every: dict[str, Candidate]) -> Named:
+    """The answer, unless a close mode is a better one; where it is as good, it is another reading.
+
+    It is asked in place of all that was found, and in place of what acts like it.
+    """
+    bench, fit = found.bench, found.fit
+    alike = [kind for kind in fit.kinds if kind in _LIKE_A_MODE]
+    others = [kind for kind in fit.kinds if kind not in _LIKE_A_MODE]
+    simple = len(fit.kinds) == 1 and not alike and not _is_below(bench, fit, _REFUTED)
+    if not fit.kinds or simple or bench.predictions.sizes.alone.any():
+        return found
+    jobs = [(close, found.nothing)]
+    if alike and others:
+        jobs.append((close, _only(bench, every, fit, others)))
+    fits = bench.all_fitted(jobs)
+    if not np.isfinite([one.chi_square for one in fits]).any():
+        return found
+    best = _simplest(bench, fits)
+    gain, rows = _gain(bench, fit, best), _table(bench, found.nothing, [best])
+    table = (*found.table, rows)
+    if gain > AS_GOOD:
+        classes = tuple(_kept(found, kind) for kind in best.kinds)
+        again = bench.reweighed(best)
+        beside = _only(again, every, best, best.kinds[:-1])
+        mine = again.fitted(close._replace(starts=(best.of_kind(close.kind),)), beside)
+        return Named(again, mine, again.nothing(), classes, table)
+    if gain < -AS_GOOD:
+        return found
+    place = fit.kinds.index(alike[0]) if alike else 0
+    wider = (*found.classes[place], close.kind)
+    classes = tuple(wider if k == place else own for k, own in enumerate(found.classes))
+    return found._replace(classes=classes, table=table)
+
+
+def _only(bench: Bench, every: dict[str, Candidate], fit: Fit, kinds: Sequence[str]) -> Fit:
+    """Some of the effects of a fit by themselves."""
+    found = bench.nothing()
+    for kind in kinds:
+        found = bench.fitted(_where(every, fit, kind), found)
+    return found
+
+
+def _kept(found: Named, kind: str) -> tuple[str, ...]:
+    """The class of an effect that stays, or a new one."""
+    here = kind in found.fit.kinds
+    return found.classes[found.fit.kinds.index(kind)] if here else (kind,)
+
+
+def _searched(bench: Bench, every: dict[str, Candidate]) -> Named:
     before = bench.nothing()
     bench, singles, rows = _tried(bench, every, before)
     nothing = bench.nothing()

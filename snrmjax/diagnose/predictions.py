@@ -375,6 +375,7 @@ def _without_strength(one: type[AbstractEffect], frequency: float, ratio: float)
             "frequency_hz": 2.2 * frequency / (2 * np.pi),
             "damping_ratio": ratio,
         },
+        "close_mode": {"frequency_hz": 1.1 * frequency / (2 * np.pi), "damping_ratio": ratio},
     }
     zero = dict.fromkeys(effect_parameters(one.kind), 0.0)
     return make_effect(one.kind, zero | shapes.get(one.kind, {}))

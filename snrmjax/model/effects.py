@@ -31,6 +31,7 @@ from snrmjax.model.linear_changes import (
     LinearFrequencyShift,
 )
 from snrmjax.model.measurement_chain import (
+    CloseMode,
     ForceGainError,
     ForceHarmonics,
     ForceOffsetError,
@@ -183,6 +184,7 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
         InternalResonanceOneToThree,
         InternalResonanceOneToTwo,
         ResidualMode,
+        CloseMode,
         ModeShapeChange,
         ForceHarmonics,
         StaticPreload,

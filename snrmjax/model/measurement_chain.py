@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
-from snrmjax.model.rules import ABOVE_MINUS_ONE, Rule
+from snrmjax.model.rules import ABOVE_MINUS_ONE, BELOW_ONE, IN_RANGE_HZ, POSITIVE, Rule
 
 Amplitude = Float[Array, " state"]
 Velocity = Complex[Array, "state harmonic sensor"]
@@ -98,9 +98,35 @@ class ResidualMode(AbstractMeasurementEffect):
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
     ) -> tuple[Amplitude, Velocity]:
         """See `AbstractMeasurementEffect.recorded`."""
-        added = 1j * frequency * self.receptance * force
-        fundamental = np.eye(velocity.shape[-2])[1][:, None]
-        return force, velocity + added[..., None, None] * fundamental
+        return force, _moved_by(velocity, 1j * frequency * self.receptance * force)
+
+
+class CloseMode(AbstractMeasurementEffect):
+    """X_recorded = X + A F/(ω² − Ω² + 2iζωΩ): a linear mode close by, which all sensors see alike.
+
+    `modal_constant` is A in 1/kg, the product of the mode's shapes at sensor and force;
+    `frequency_hz` and `damping_ratio` are the mode's own. The velocity's fundamental gains the
+    mode's; it is orthogonal to the mode of interest and does not act on it.
+    Reference: for the modal constant, D. J. Ewins, Modal Testing, 2nd ed. (2000).
+    """
+
+    kind: ClassVar[str] = "close_mode"
+    stage: ClassVar[int] = 1
+    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {
+        "frequency_hz": (POSITIVE, IN_RANGE_HZ),
+        "damping_ratio": (BELOW_ONE,),
+    }
+    modal_constant: Scalar
+    frequency_hz: Scalar
+    damping_ratio: Scalar
+
+    def recorded(
+        self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
+    ) -> tuple[Amplitude, Velocity]:
+        """See `AbstractMeasurementEffect.recorded`."""
+        own = 2 * jnp.pi * self.frequency_hz
+        stiffness = own**2 - frequency**2 + 2j * self.damping_ratio * own * frequency
+        return force, _moved_by(velocity, 1j * frequency * self.modal_constant * force / stiffness)
 
 
 class ModeShapeChange(AbstractMeasurementEffect):
@@ -115,3 +141,9 @@ class ModeShapeChange(AbstractMeasurementEffect):
     ) -> tuple[Amplitude, Velocity]:
         """See `AbstractMeasurementEffect.recorded`."""
         return force, velocity * (1 + self.coefficient * displacement**2)[..., None, None]
+
+
+def _moved_by(velocity: Velocity, added: Complex[Array, " state"]) -> Velocity:
+    """Velocities whose fundamental has gained something, at every sensor."""
+    fundamental = np.eye(velocity.shape[-2])[1][:, None]
+    return velocity + added[..., None, None] * fundamental

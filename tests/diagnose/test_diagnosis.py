@@ -256,6 +256,73 @@ def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
     return sj.structure(modes, **settings)
 
 
+def beside(frequency, damping, constant, stiffening=0.0, seed=0):
+    """States of the mode, perhaps with a cubic stiffness, beside a linear one that is seen too.
+
+    The motion's force is known, and with it what the other mode does: nothing is solved.
+    """
+    rng = np.random.default_rng(seed)
+    rows = []
+    for level, tip in enumerate(np.geomspace(1e-4, 1e-3, 5)):
+        for phase in np.radians(np.linspace(-60, 60, 11)):
+            x = tip * np.cos(phase)
+            squared = OMEGA**2 * (1 + stiffening * (x / 1e-3) ** 2)
+            omega = np.sqrt(squared) * (1 - ZETA * np.tan(phase))
+            force = (squared - omega**2 + 2j * ZETA * OMEGA * omega) * x / (SHAPE * PARTICIPATION)
+            other = constant * force / (frequency**2 - omega**2 + 2j * damping * frequency * omega)
+            rows.append((level, omega, force, 1j * omega * (x + other)))
+    level, omega, force, velocity = (np.array(column) for column in zip(*rows, strict=True))
+    velocity = velocity * np.exp(-1j * np.angle(force))
+    n = len(level)
+    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
+    return sj.steady_states(
+        level.real.astype(int),
+        omega.real,
+        np.abs(force) * np.exp(NOISE["force"] * rng.normal(size=n)),
+        velocity * np.exp(own),
+        velocity_std=NOISE["velocity"] * np.abs(velocity),
+        phase_std=np.full((n, 1), NOISE["phase"]),
+        force_std=NOISE["force"] * np.abs(force),
+    )
+
+
+CLOSE = {"modal_constant": 0.3, "frequency_hz": 1.03 * OMEGA / (2 * np.pi), "damping_ratio": 0.01}
+
+
+def test_a_mode_close_by_is_found_and_doubted():
+    found = sj.diagnose_model(linear_model(), beside(1.03 * OMEGA, 0.01, 0.3))
+    assert (found.verdict, found.effects) == ("ambiguous", ("close_mode",))
+    for name, truth in CLOSE.items():
+        value, std = found.parameters[f"close_mode.{name}"]
+        assert abs(value - truth) < 3 * std
+        assert std < 0.3 * truth  # known, not just allowed
+    assert "second sensor" in found.decide_by
+    assert found.gap.after == pytest.approx(1.0, abs=0.15)
+    assert found.completed.effects[-1].kind == "close_mode"
+    # The table has what it was better than.
+    assert found.table[-1][0].kind == "close_mode"
+    assert found.table[0][0].kind in ("residual_mode", "sensor_phase_error")
+
+
+def test_a_mode_close_by_is_found_beside_a_nonlinearity():
+    data = beside(1.03 * OMEGA, 0.01, 0.3, stiffening=0.03, seed=1)
+    found = sj.diagnose_model(linear_model(), data)
+    assert set(found.effects) == {"cubic_stiffness", "close_mode"}
+    assert found.verdict == "ambiguous"
+    # ¾ a Q² = 0.03 ω₀² where q is x over the mode's shape.
+    wanted = 0.03 * OMEGA**2 / 0.75 * (SHAPE / 1e-3) ** 2
+    value, std = found.parameters["cubic_stiffness.coefficient"]
+    assert abs(value - wanted) < 3 * std
+
+
+def test_a_phase_error_is_not_taken_for_a_mode_close_by():
+    data = balanced(lambda v: 0.0 * v, seed=2)
+    turned = dataclasses.replace(data, velocity=data.velocity * np.exp(-0.045j))
+    found = sj.diagnose_model(linear_model(), turned)
+    assert (found.verdict, found.effects) == ("named", ("sensor_phase_error",))
+    assert found.candidates == (("sensor_phase_error",),)
+
+
 def test_what_is_located_is_what_was_changed():
     found = sj.diagnose_model(linear_model(), balanced(lambda v: 8.0 * v))
     assert [part.part for part in found.located] == ["damping"]

@@ -459,7 +459,7 @@ def test_the_effects_are_those_of_the_format():
         jenkins_slider iwan_microslip quadratic_damping cubic_damping van_der_pol_damping
         frequency_drift added_mass force_gain_error force_offset_error sensor_gain_error
         sensor_phase_error internal_resonance_1_3 internal_resonance_1_2 residual_mode
-        mode_shape_change force_harmonics static_preload
+        mode_shape_change force_harmonics static_preload close_mode
     """
     assert sorted(EFFECTS) == sorted(kinds.split())
 

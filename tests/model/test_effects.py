@@ -44,7 +44,7 @@ DISSIPATIVE = {"quadratic_damping", "cubic_damping", "van_der_pol_damping"}
 STATES = [(q, v) for q in (-1.5, -0.41, -0.1, 0.0, 0.39, 0.7) for v in (-2.0, -0.3, 0.0, 1.1)]
 
 
-# The other kinds of CONTRACT.md with their parameters in order.
+# The other kinds with their parameters in order: CONTRACT.md's, and `close_mode`.
 OTHER_KINDS = {
     "linear_frequency_shift": ("relative_shift",),
     "linear_damping_change": ("damping_ratio_change",),
@@ -60,6 +60,7 @@ OTHER_KINDS = {
     "internal_resonance_1_3": ("coefficient", "frequency_hz", "damping_ratio"),
     "internal_resonance_1_2": ("coefficient", "frequency_hz", "damping_ratio"),
     "residual_mode": ("receptance",),
+    "close_mode": ("modal_constant", "frequency_hz", "damping_ratio"),
     "mode_shape_change": ("coefficient",),
     "force_harmonics": ("second", "third"),
 }
@@ -68,7 +69,7 @@ MODULES = (effect_base, effects, friction, linear_changes, measurement_chain, mo
 
 def test_the_family_is_complete():
     assert set(EFFECTS) == set(FAMILY) | set(OTHER_KINDS)
-    assert len(EFFECTS) == len(FAMILY) + len(OTHER_KINDS) == 26
+    assert len(EFFECTS) == len(FAMILY) + len(OTHER_KINDS) == 27
     classes = {
         value
         for module in MODULES

@@ -69,6 +69,30 @@ def test_the_structure_shows_the_sensors_something_else():
         np.testing.assert_allclose(velocity[k], VELOCITY[k] * (1 + 5 * q**2), rtol=1e-15)
 
 
+def test_a_close_mode_is_what_two_masses_have_beside_the_first_mode():
+    """Two masses solved at once, against one of their modes and the other as `close_mode`."""
+    stiffness = np.array([[260000.0, -9000.0], [-9000.0, 250000.0]])
+    squares, shapes = np.linalg.eigh(stiffness)
+    ratios, omega = np.array([0.01, 0.02]), np.sqrt(squares)
+    damping = shapes @ np.diag(2 * ratios * omega) @ shapes.T
+    own = np.array([480.0, 505.0, 530.0])
+    both = [
+        1j * w * np.linalg.solve(stiffness - w**2 * np.eye(2) + 1j * w * damping, [0.0, f])[0]
+        for w, f in zip(own, FORCE, strict=True)
+    ]
+    constant = shapes[0] * shapes[1]
+    first = squares[0] - own**2 + 2j * ratios[0] * omega[0] * own
+    seen = np.zeros((3, 4, 1), dtype=complex)
+    seen[:, 1, 0] = 1j * own * constant[0] * FORCE / first
+    hz = omega[1] / (2 * np.pi)
+    parameters = {"modal_constant": constant[1], "frequency_hz": hz, "damping_ratio": ratios[1]}
+    effect = make_effect("close_mode", parameters)
+    force, velocity = effect.recorded(*map(jnp.asarray, (own, FORCE, seen, DISPLACEMENT)))
+    np.testing.assert_array_equal(force, FORCE)
+    np.testing.assert_allclose(velocity[:, 1, 0], both, rtol=1e-12)
+    np.testing.assert_array_equal(velocity[:, [0, 2, 3]], 0)
+
+
 def single(*effects):
     modes = linear_modes([500.0], [0.01], [[1.0]], [1.0])
     return structure(modes, effects=effects)
@@ -119,17 +143,19 @@ def test_force_harmonics():
         ("sensor_gain_error", "gain"),
         ("sensor_phase_error", "phase_deg"),
         ("residual_mode", "receptance"),
+        ("close_mode", "modal_constant"),
         ("mode_shape_change", "coefficient"),
     ],
 )
 def test_zero_is_no_error_and_slopes_are_exact(kind, name):
-    force, velocity = written(kind, **{name: 0.0})
+    others = {"frequency_hz": 80.0, "damping_ratio": 0.01} if kind == "close_mode" else {}
+    force, velocity = written(kind, **{name: 0.0}, **others)
     np.testing.assert_array_equal(force, FORCE)
     np.testing.assert_array_equal(velocity, VELOCITY)
 
     @jax.jit
     def both(value):
-        force, velocity = make_effect(kind, {name: value}).recorded(*TRUE)
+        force, velocity = make_effect(kind, {name: value, **others}).recorded(*TRUE)
         flat = velocity.reshape(-1)
         return jnp.concatenate([force, flat.real, flat.imag])
 

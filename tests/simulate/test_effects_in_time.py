@@ -367,5 +367,5 @@ def test_the_packages_integration_settles_there_too(kind):
 
 def test_no_effect_with_a_force_is_left_out():
     silent = {"force_gain_error", "force_offset_error", "sensor_gain_error", "sensor_phase_error"}
-    silent |= {"residual_mode", "mode_shape_change"}
+    silent |= {"residual_mode", "mode_shape_change", "close_mode"}
     assert {kind for _, kind in ALL} == set(EFFECTS) - silent
