@@ -122,8 +122,10 @@ def diagnose_model(
         )
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
-    if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
-        present |= {"force_gain_error", "sensor_gain_error", "added_mass"}
+    # Of a gain that is not known none can be missing, nor of the mass; and beside a force that may
+    # be anything a further mode can be all that is seen.
+    if force_gain_std > 0:
+        present |= {"force_gain_error", "sensor_gain_error", "added_mass", "close_mode"}
     if unknown.all():
         present |= set(UNSEEN)
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
