@@ -92,7 +92,7 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
                 (
                     *(level, level in inside, best.velocity / velocity - 1),
                     (best.frequency - frequency) / HERTZ,
-                    np.hypot(best.velocity_std / velocity, fit.level_std[0]),
+                    np.hypot(best.velocity_std / velocity, float(fit.spread.level[0])),
                     best.frequency_std / HERTZ,
                 )
             )
@@ -110,7 +110,7 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
             frequency_error_median_hz=np.nanmedian(np.abs(part[:, 3])),
             frequency_error_largest_hz=np.nanmax(np.abs(part[:, 3])),
             within_0_15_hz=np.mean(np.abs(part[:, 3]) < 0.15),
-            # A held-out level has a gain of its own, as large as the fit says that levels have.
+            # A held-out level has a gain of its own, as large as the fit leaves it open.
             velocity_inside_95=np.mean(np.abs(part[:, 2]) < 1.96 * part[:, 4]),
             velocity_std_median=np.nanmedian(part[:, 4]),
             not_found=int(np.isnan(part[:, 2]).sum()),

@@ -120,7 +120,7 @@ SHAPES: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str,
     "force_harmonics": (_harmonics, ("second", "third")),
     "static_preload": (_one("constant_force", True), ("constant_force",)),
 }
-"""The 26 kinds of the library: shape at unit size, and the parameters that carry the size."""
+"""26 kinds of the library: shape at unit size, and the parameters that carry the size."""
 
 OUTSIDE: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str, ...]]] = {
     "lugre": (_with("stiffness", 0.1, 0.3, "slip_displacement"), ("stiffness",)),
@@ -136,7 +136,7 @@ OUTSIDE: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str
     "warming": (_with("softening", 0.15, 0.4, "rate"), ("softening",)),
     "close_mode": (_close_mode, ("constant",)),
 }
-"""Kinds that the library does not have."""
+"""Kinds that the library does not look for; `close_mode` is compared with some answers."""
 
 IN_HARMONICS_ONLY = ("bilinear_stiffness", "force_harmonics")
 IN_TEST_ORDER = ("frequency_drift", "frequency_jump", "warming")

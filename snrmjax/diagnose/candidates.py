@@ -10,6 +10,7 @@ from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
+_LIGHT = 1e-3  # damping ratio of a mode close by, where the model itself has none
 _WIDE = 0.15  # relative distance of a close mode, beyond which it is one far away
 _CHANGE = 0.05  # of the dynamic stiffness near resonance, that a start makes
 
@@ -70,11 +71,12 @@ def _resonance(s: Scales, order: int) -> list[tuple[float, ...]]:
 def _close(s: Scales) -> list[tuple[float, ...]]:
     """Modes some half-power bandwidths away, as strong as a plain change at the resonance."""
     starts: list[tuple[float, ...]] = []
+    ratio = max(s.damping_ratio, _LIGHT)
     for away in (-8.0, -3.0, 3.0, 8.0):
-        share = 1 + float(np.clip(away * s.damping_ratio, -_WIDE, _WIDE))
-        distance = abs(share**2 - 1 + 2j * s.damping_ratio * share) * s.frequency**2
+        share = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
+        distance = abs(share**2 - 1 + 2j * ratio * share) * s.frequency**2
         hz = share * s.frequency / (2 * np.pi)
-        starts.append((_CHANGE * s.receptance * distance, hz, s.damping_ratio))
+        starts.append((_CHANGE * s.receptance * distance, hz, ratio))
     return starts
 
 
@@ -147,7 +149,7 @@ def candidate(kind: str, scales: Scales) -> Candidate:
     if kind.startswith("internal_resonance"):
         unit = (unit[0], 0.01 * unit[1], 0.5 * unit[2])
     if kind == "close_mode":
-        unit = (unit[0], scales.damping_ratio * unit[1], 0.5 * unit[2])
+        unit = (unit[0], unit[2] * unit[1], 0.5 * unit[2])
     return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
 
 
@@ -178,6 +180,14 @@ SECOND_ORDER = frozenset(
     }
 )
 """Kinds that change the fundamental by the square of their strength."""
+
+LIKE_A_MODE = frozenset(
+    {
+        *("residual_mode", "sensor_phase_error", "sensor_gain_error", "force_gain_error"),
+        *("linear_frequency_shift", "linear_damping_change", "added_mass", "frequency_drift"),
+    }
+)
+"""Kinds that change what a linear structure shows, as a further mode close by does."""
 
 # What would settle which of two effects it is.
 _HARMONICS = "the second and third harmonics of the velocity (with their noise floor)"
@@ -224,7 +234,7 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
             frozenset({"close_mode", other}),
             "measure with a second sensor, where a further mode has another shape, or sweep wider",
         )
-        for other in ("residual_mode", "sensor_phase_error")
+        for other in sorted(LIKE_A_MODE)
     ),
     (
         frozenset({"internal_resonance_1_3", "internal_resonance_1_2"}),

@@ -20,7 +20,7 @@ from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
-from snrmjax.diagnose.naming import DETECTED, Named, Row, named
+from snrmjax.diagnose.naming import CLOSE, DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.sidedness import acts_both_ways
@@ -33,6 +33,7 @@ from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structure import Structure
 from snrmjax.simulate.blocks import on_one_core
 
+_LOOSE = 0.1  # relative 1σ of a force's gain
 _LEAST_STATES = 6
 _ANOTHER = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _TURNS, _NEAR = 4, 0.85  # of noise that nobody stated: at most, and when it is found
@@ -83,9 +84,10 @@ def diagnose_model(
     """Find the physics that a model lacks to explain measured steady states.
 
     Works in the force balance: the measured fundamental is held, harmonic balance settles the
-    other harmonics, and the force needed is compared with the measured one. Every effect of the
-    library is fitted with the baseline's parameters free inside their stated errors and the
-    levels' errors inside theirs; Schwarz's criterion decides.
+    other harmonics, and the force needed is compared with the measured one. The library's effects
+    are fitted with the baseline's parameters free inside their stated errors and the levels'
+    errors inside theirs; Schwarz's criterion decides. Answers that a linear mode close by could
+    have caused are compared with one.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
     Where neither noise nor errors of levels are stated, both are found: the noise is what the
@@ -122,10 +124,10 @@ def diagnose_model(
         )
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
-    # Of a gain that is not known none can be missing, nor of the mass; and beside a force that may
-    # be anything a further mode can be all that is seen.
-    if force_gain_std > 0:
-        present |= {"force_gain_error", "sensor_gain_error", "added_mass", "close_mode"}
+    if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
+        present |= {"force_gain_error", "sensor_gain_error", "added_mass"}
+    if force_gain_std > _LOOSE:  # beside a force that may be nothing a mode could be all one sees
+        present.add(CLOSE)
     if unknown.all():
         present |= set(UNSEEN)
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
@@ -328,7 +330,7 @@ def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[s
     """The size of every effect that would have been seen beside what was found."""
     limits = {}
     for kind in EFFECTS:
-        if kind in present or kind in fit.kinds:
+        if kind in present or kind in fit.kinds or kind == CLOSE:
             continue
         tried = candidate(kind, scales)
         change = bench.change(tried)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.candidates import Candidate, Scales, candidate
+from snrmjax.diagnose.candidates import LIKE_A_MODE, Candidate, Scales, candidate
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.screening import foretold, foretold_pairs
 from snrmjax.simulate.blocks import over_cores
@@ -20,14 +20,9 @@ _ONE = 2  # parameters of one effect; one with more is weighed against two effec
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
-_CLOSE = "close_mode"
-_LIKE_A_MODE = frozenset(
-    {
-        *("residual_mode", "sensor_phase_error", "sensor_gain_error", "force_gain_error"),
-        *("linear_frequency_shift", "linear_damping_change", "added_mass", "frequency_drift"),
-    }
-)
-"""Kinds that change what a linear structure shows, as a further mode does."""
+_MOST = 3  # effects of an answer
+CLOSE = "close_mode"
+"""The kind that is no candidate but a question."""
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 
 
@@ -60,10 +55,10 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
     """Add effects one after the other while the criterion asks for them, three at most.
 
     A linear mode close by has three numbers of its own and would follow a part of most laws: it
-    is no candidate, but what is found has to be better than it.
+    is no candidate, but what it may have caused is compared with it.
     """
     every = {kind: candidate(kind, scales) for kind in kinds}
-    close = every.pop(_CLOSE, None)
+    close = every.pop(CLOSE, None)
     found = _searched(bench, every)
     return found if close is None else _questioned(found, close, every)
 
@@ -71,35 +66,59 @@ def named(bench: Bench, scales: Scales, kinds: tuple[str, ...]) -> Named:
 def _questioned(found: Named, close: Candidate, every: dict[str, Candidate]) -> Named:
     """The answer, unless a close mode is a better one; where it is as good, it is another reading.
 
-    It is asked in place of all that was found, and in place of what acts like it.
+    It is asked in place of all that was found, in place of what acts like it, and beside what does
+    not fit. Nothing is asked where nothing was found, nor of a single nonlinearity that fits: a
+    linear mode does the same at every level.
     """
     bench, fit = found.bench, found.fit
-    alike = [kind for kind in fit.kinds if kind in _LIKE_A_MODE]
-    others = [kind for kind in fit.kinds if kind not in _LIKE_A_MODE]
-    simple = len(fit.kinds) == 1 and not alike and not _is_below(bench, fit, _REFUTED)
-    if not fit.kinds or simple or bench.predictions.sizes.alone.any():
+    alike = [kind for kind in fit.kinds if kind in LIKE_A_MODE]
+    others = [kind for kind in fit.kinds if kind not in LIKE_A_MODE]
+    refuted = _is_below(bench, fit, _REFUTED)
+    fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
+    if not fit.kinds or fits_by_itself or bench.predictions.sizes.alone.any():
         return found
     jobs = [(close, found.nothing)]
     if alike and others:
         jobs.append((close, _only(bench, every, fit, others)))
-    fits = bench.all_fitted(jobs)
-    if not np.isfinite([one.chi_square for one in fits]).any():
+    if refuted and len(fit.kinds) < _MOST:
+        jobs.append((close, fit))
+    fits = [one for one in bench.all_fitted(jobs) if np.isfinite(one.chi_square)]
+    if not fits:
         return found
     best = _simplest(bench, fits)
-    gain, rows = _gain(bench, fit, best), _table(bench, found.nothing, [best])
-    table = (*found.table, rows)
+    gain, table = _gain(bench, fit, best), (*found.table, _table(bench, found.nothing, [best]))
     if gain > AS_GOOD:
-        classes = tuple(_kept(found, kind) for kind in best.kinds)
-        again = bench.reweighed(best)
-        beside = _only(again, every, best, best.kinds[:-1])
-        mine = again.fitted(close._replace(starts=(best.of_kind(close.kind),)), beside)
-        return Named(again, mine, again.nothing(), classes, table)
-    if gain < -AS_GOOD:
+        return _replaced(found._replace(table=table), close, every, best)
+    found = found._replace(table=table)
+    if gain < -AS_GOOD or set(fit.kinds) <= set(best.kinds):
         return found
     place = fit.kinds.index(alike[0]) if alike else 0
     wider = (*found.classes[place], close.kind)
     classes = tuple(wider if k == place else own for k, own in enumerate(found.classes))
-    return found._replace(classes=classes, table=table)
+    return found._replace(classes=classes)
+
+
+def _replaced(found: Named, close: Candidate, every: dict[str, Candidate], best: Fit) -> Named:
+    """The answer with a close mode, weighed with it; each class of what stays is tried beside it.
+
+    The one before where the new one's own way of passing on errors refutes it.
+    """
+    bench, pool = found.bench.reweighed(best), every | {close.kind: close}
+    beside = _only(bench, pool, best, best.kinds[:-1])
+    mine = bench.fitted(_where(pool, best, close.kind), beside)
+    if _is_below(bench, mine, _REFUTED) and found.p_value > _REFUTED:
+        return found
+    classes, table = [], list(found.table)
+    for kind in best.kinds[:-1]:
+        rivals = found.classes[found.fit.kinds.index(kind)][1:]
+        rest = _only(bench, pool, mine, [other for other in mine.kinds if other != kind])
+        jobs = [(_where(pool, mine, kind), rest)]
+        jobs += [(every[name], rest) for name in rivals if name not in rest.kinds]
+        fits = bench.all_fitted(jobs) if rivals else []
+        classes.append(_class(bench, fits, kind, at=-1) if rivals else (kind,))
+        if rivals:
+            table.append(_table(bench, rest, fits))
+    return Named(bench, mine, bench.nothing(), (*classes, (close.kind,)), tuple(table))
 
 
 def _only(bench: Bench, every: dict[str, Candidate], fit: Fit, kinds: Sequence[str]) -> Fit:
@@ -108,12 +127,6 @@ def _only(bench: Bench, every: dict[str, Candidate], fit: Fit, kinds: Sequence[s
     for kind in kinds:
         found = bench.fitted(_where(every, fit, kind), found)
     return found
-
-
-def _kept(found: Named, kind: str) -> tuple[str, ...]:
-    """The class of an effect that stays, or a new one."""
-    here = kind in found.fit.kinds
-    return found.classes[found.fit.kinds.index(kind)] if here else (kind,)
 
 
 def _searched(bench: Bench, every: dict[str, Candidate]) -> Named:

@@ -63,8 +63,8 @@ def notes_on_noise(
         )
     if n_levels == 2:
         notes.append(
-            "2 levels only: how far levels differ from one another is known from a single "
-            "difference, and the bands may be too narrow."
+            "2 levels only: a single difference says how far levels differ from one another, if "
+            "they share amplitudes, and the bands may be too narrow."
         )
     return tuple(notes)
 

@@ -105,8 +105,9 @@ def test_where_nothing_is_hidden_nothing_is_found():
     assert found.verdict == "none"
     assert found.effects == ()
     assert found.gap.after == found.gap.before == pytest.approx(1.0, abs=0.2)
-    # Every effect is given a size that would have been seen.
-    assert len(found.detection_limits) == len(EFFECTS)
+    # Every effect that is looked for is given a size that would have been seen.
+    assert len(found.detection_limits) == len(EFFECTS) - 1
+    assert not any("close_mode" in name for name in found.detection_limits)
     assert all(0 < limit < np.inf for limit in found.detection_limits.values())
 
 
@@ -144,7 +145,7 @@ def test_what_an_effect_turns_of_an_uncertain_baseline_is_no_second_effect():
 def test_a_mode_close_by_is_not_taken_for_noise():
     found, key = blind("blind_14")
     assert key["outside"] == "close_mode"
-    assert found.verdict == "unknown"
+    assert (found.verdict, found.effects) == ("ambiguous", ("close_mode",))
 
 
 @pytest.mark.long
@@ -313,6 +314,30 @@ def test_a_mode_close_by_is_found_beside_a_nonlinearity():
     wanted = 0.03 * OMEGA**2 / 0.75 * (SHAPE / 1e-3) ** 2
     value, std = found.parameters["cubic_stiffness.coefficient"]
     assert abs(value - wanted) < 3 * std
+
+
+def test_what_is_kept_beside_a_mode_close_by_is_chosen_anew():
+    data = beside(0.96 * OMEGA, 0.01, 0.3, stiffening=-0.01, seed=5)
+    found = sj.diagnose_model(linear_model(), data)
+    assert found.effects[-1] == "close_mode"
+    # From the fundamental, softening is the one or the other.
+    softening = found.candidates[0]
+    assert {"cubic_stiffness", "quadratic_stiffness"} <= set(softening)
+    rows = {row.kind: row for row in found.table[-1]}
+    assert set(softening) <= set(rows)
+    for kind in softening:
+        names = {label.partition(".")[0] for label in rows[kind].parameters}
+        assert names == {kind, "close_mode"}
+        assert rows[kind].chi_square == pytest.approx(rows[softening[0]].chi_square, abs=6)
+
+
+def test_a_model_without_damping_may_have_a_mode_close_by():
+    scales = scales_of(Predictions(linear_model(damping=0.0), balanced(quadratic)))
+    one = candidate("close_mode", scales)
+    values = np.array(one.starts)
+    assert np.all(np.isfinite(values))
+    assert np.all((values >= one.lower) & (values <= one.upper))
+    assert min(one.unit) > 0
 
 
 def test_a_phase_error_is_not_taken_for_a_mode_close_by():
