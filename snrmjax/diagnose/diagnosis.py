@@ -16,7 +16,7 @@ from snrmjax.diagnose.candidates import (
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, part_of
+from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, never_seen, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
@@ -150,7 +150,9 @@ def diagnose_model(
         power = own_power(bench, found.nothing, fit, part) if part else None
         feeding = frozenset(k for k in fit.kinds if k in GROWING and fit.of_kind(k)[0] < 0)
         orders = predictions.chosen.orders
-        open_ends = doubts(fit.kinds, free.parts, orders, both_ways, power, feeding)
+        stepped = np.asarray(predictions.chosen.states.frequency)
+        wide = frozenset(k for k in fit.kinds if never_seen(k, fit.of_kind(k)[1:], stepped))
+        open_ends = doubts(fit.kinds, free.parts, orders, both_ways, power, feeding, wide)
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]

@@ -4,6 +4,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from snrmjax.diagnose.locating import Located
 
@@ -62,13 +63,15 @@ def doubts(
     both_ways: frozenset[str] = frozenset(),
     own_power: float | None = None,
     feeding: frozenset[str] = frozenset(),
+    wide: frozenset[str] = frozenset(),
 ) -> list[Doubt]:
     """Reasons to doubt the effects that were found, from what was located before any name.
 
     `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
     shows to act in both directions; `own_power` is the power of amplitude that one effect, as
     fitted, has at the states, which is that of its law to lowest order only; `feeding` are kinds
-    of damping that were found to put energy in.
+    of damping that were found to put energy in; `wide` are internal resonances as `never_seen`
+    has them.
     """
     found = _of_harmonics(effects, orders, both_ways)
     # Nothing passive does so; what does has a source, and the law of a loop need not be this one.
@@ -93,6 +96,15 @@ def doubts(
                 twin=True,
             )
         )
+    found += [
+        Doubt(
+            f"{kind} is wider than all frequencies measured: nothing was seen of it as a "
+            "resonance, and many laws of amplitude look like one side of it.",
+            f"step through a wider range at the largest level, and {_WIDER}",
+        )
+        for kind in effects
+        if kind in wide
+    ]
     if "close_mode" in effects:
         found.append(
             Doubt(
@@ -123,6 +135,18 @@ def doubts(
             )
         )
     return found
+
+
+def never_seen(kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray, " state"]) -> bool:
+    """Whether an internal resonance is wider than the range of frequencies measured.
+
+    Arguments: the further mode's frequency in Hz and damping ratio; frequencies of states in rad/s.
+    """
+    if kind not in _RESONANCES:
+        return False
+    hz, ratio = shape
+    width = 2 * ratio * hz / (3 if kind.endswith("3") else 2)  # half-power, as the force steps
+    return width > float(np.ptp(frequency)) / (2 * np.pi)
 
 
 def _of_harmonics(

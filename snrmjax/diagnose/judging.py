@@ -16,6 +16,7 @@ from snrmjax.diagnose.verifying import HeldOut
 
 _MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
 _MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
+_AS_NOISE = 1.3  # times the noise, by which an imitation may miss it at most
 _FAR = 2.0  # times the noise, that the top level is missed by
 _TOLERATED = 1.7  # variance over the stated one that neighbours show
 _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
@@ -131,7 +132,7 @@ def not_foretold(
             f"level {inner.level}, left out, is foretold worse than without the effects: "
             f"{inner.after:.2g} times the noise, {inner.before:.2g} before."
         )
-    if doubted and inner.p_value < _MISSED:
+    if doubted and (inner.p_value < _MISSED or inner.after > _AS_NOISE):
         return (
             f"the answer may be an imitation, and level {inner.level}, left out, is missed by "
             f"{inner.after:.2g} times the noise."

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.candidates import decide_by
-from snrmjax.diagnose.doubts import doubts
+from snrmjax.diagnose.doubts import doubts, never_seen
 from snrmjax.diagnose.locating import Located
 
 
@@ -49,6 +49,26 @@ def test_imitations_are_marked_with_what_would_decide(effects):
     assert found
     assert not any(doubt.refutes for doubt in found)
     assert all(doubt.decide_by for doubt in found)
+
+
+def test_a_mode_close_by_is_a_twin_of_much():
+    (doubt,) = doubts(("close_mode",), ())
+    assert doubt.twin
+    assert "second sensor" in doubt.decide_by
+
+
+def test_an_internal_resonance_wider_than_the_frequencies_measured_was_never_seen():
+    kind, stepped = "internal_resonance_1_3", 2 * np.pi * np.array([49.0, 50.0, 51.0])
+    # Half-power points of a mode of 150 Hz and 1 %: 3 Hz apart, passed by the force within 1 Hz.
+    assert not never_seen(kind, (150.0, 0.01), stepped)
+    assert never_seen(kind, (150.0, 0.021), stepped)
+    assert never_seen("internal_resonance_1_2", (150.0, 0.015), stepped)
+    assert not never_seen("gap_stiffness", (0.1,), stepped)
+    assert doubts((kind,), ()) == []
+    (doubt,) = doubts((kind,), (), wide=frozenset({kind}))
+    assert not doubt.twin
+    assert not doubt.refutes
+    assert "wider range" in doubt.decide_by
 
 
 @pytest.mark.parametrize("orders", [(), (2, 3)])

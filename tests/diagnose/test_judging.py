@@ -155,6 +155,9 @@ FINE = HeldOut(3, 5.0, 1.0, 0.5, 0.5)
         (FINE, FINE._replace(level=5, uncertain_p_value=1e-6), False, "level 5"),
         (FINE._replace(after=1.5, p_value=0.01), FINE, False, None),
         (FINE._replace(after=1.5, p_value=0.01), FINE, True, "imitation"),
+        # Few states: chance may have it, but foretold it is not.
+        (FINE._replace(after=1.35, p_value=0.1), FINE, True, "imitation"),
+        (FINE._replace(after=1.35, p_value=0.1), FINE, False, None),
         (FINE._replace(after=6.0, p_value=0.0), FINE, False, "worse"),
         (FINE._replace(before=0.9, after=1.1, p_value=0.2), FINE, False, None),
     ],
