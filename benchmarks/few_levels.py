@@ -12,7 +12,7 @@ import json
 from typing import NamedTuple
 
 import numpy as np
-from joint_fit_coverage import CASES, ERRORS, Case, Truth, truth_of
+from joint_fit_coverage import CASES, ERRORS, Case, Truth, recorded, truth_of
 
 import snrmjax as sj
 
@@ -38,17 +38,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, differ: bool) -> Found:
     own = QUIET["amplitude"] * rng.normal(size=n) + 1j * QUIET["phase"] * rng.normal(size=n)
     velocity = truth.velocity * np.exp(own + (shared if differ else 0.0))
     force = truth.force * np.exp(QUIET["force"] * rng.normal(size=n))
-    data = sj.steady_states(
-        truth.level,
-        truth.frequency,
-        force,
-        velocity,
-        sensors=case.model.modes.sensors,
-        velocity_std=QUIET["amplitude"] * np.abs(velocity),
-        phase_std=np.full((n, 1), QUIET["phase"]),
-        force_std=QUIET["force"] * force,
-    )
-    fit = sj.fit_jointly(data, case.model.modes)
+    fit = sj.fit_jointly(recorded(case, truth, force, velocity, QUIET), case.model.modes)
     values = sj.fitted_values(fit, displacement=truth.at)
     return Found(
         np.asarray(values.natural_frequency - truth.natural_frequency)

@@ -130,6 +130,22 @@ def truth_of(case: Case) -> Truth:
     )
 
 
+def recorded(
+    case: Case, truth: Truth, force: np.ndarray, velocity: np.ndarray, errors: dict[str, float]
+) -> sj.SteadyStates:
+    """States with their errors, whose random part is stated."""
+    return sj.steady_states(
+        truth.level,
+        truth.frequency,
+        force,
+        velocity,
+        sensors=case.model.modes.sensors,
+        velocity_std=errors["amplitude"] * np.abs(velocity),
+        phase_std=np.full((len(force), 1), errors["phase"]),
+        force_std=errors["force"] * force,
+    )
+
+
 def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
     """Errors in units of the stated 1σ."""
     rng = np.random.default_rng(seed)
@@ -138,18 +154,8 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
     own = ERRORS["amplitude"] * rng.normal(size=n) + 1j * ERRORS["phase"] * rng.normal(size=n)
     velocity = truth.velocity * np.exp(gain + own)
     force = truth.force * np.exp(ERRORS["force"] * rng.normal(size=n))
-    data = sj.steady_states(
-        truth.level,
-        truth.frequency,
-        force,
-        velocity,
-        sensors=case.model.modes.sensors,
-        velocity_std=ERRORS["amplitude"] * np.abs(velocity),
-        phase_std=np.full((n, 1), ERRORS["phase"]),
-        force_std=ERRORS["force"] * force,
-    )
     fit = fit_jointly(
-        data,
+        recorded(case, truth, force, velocity, ERRORS),
         case.model.modes,
         level_gain_std=ERRORS["gain"] if level_known else 1e-9,
         **FAMILY,

@@ -100,7 +100,7 @@ def doubts(
         Doubt(
             f"{kind} is wider than all frequencies measured: nothing was seen of it as a "
             "resonance, and many laws of amplitude look like one side of it.",
-            f"step through a wider range at the largest level, and {_WIDER}",
+            "step through a wider range of frequencies at the largest level",
         )
         for kind in effects
         if kind in wide
