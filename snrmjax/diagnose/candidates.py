@@ -10,6 +10,12 @@ from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
+CLOSE = "close_mode"
+"""The kind that is no candidate of a search but a question to what it found."""
+
+RESONANCE_ORDER = {"internal_resonance_1_2": 2, "internal_resonance_1_3": 3}
+"""Cycles of the further mode to one of the mode of interest."""
+
 _LIGHT = 1e-3  # damping ratio of a mode close by, where the model itself has none
 _WIDE = 0.15  # relative distance of a close mode, beyond which it is one far away
 _CHANGE = 0.05  # of the dynamic stiffness near resonance, that a start makes
@@ -108,7 +114,7 @@ _STARTS: Mapping[str, _Start] = {
     "internal_resonance_1_3": lambda s: _resonance(s, 3),
     "internal_resonance_1_2": lambda s: _resonance(s, 2),
     "residual_mode": _one(lambda s: _CHANGE * s.receptance),
-    "close_mode": _close,
+    CLOSE: _close,
     "mode_shape_change": _one(lambda s: _CHANGE / s.amplitude**2),
     "force_harmonics": lambda s: [(0.02, 0.02)],
     "static_preload": lambda s: [
@@ -138,17 +144,16 @@ def candidate(kind: str, scales: Scales) -> Candidate:
         lower[1], upper[1] = 1e-3 * scales.largest, 1.2 * scales.largest
     if kind == "iwan_microslip":
         lower[1], upper[1] = 1.02, 2.98
-    if kind.startswith("internal_resonance"):
-        order = 3 if kind.endswith("3") else 2
-        hz = order * scales.frequency / (2 * np.pi)
+    if kind in RESONANCE_ORDER:
+        hz = RESONANCE_ORDER[kind] * scales.frequency / (2 * np.pi)
         lower[1:], upper[1:] = [0.8 * hz, 1e-5], [1.2 * hz, 0.2]
-    if kind == "close_mode":
+    if kind == CLOSE:
         hz = scales.frequency / (2 * np.pi)
         lower[1:], upper[1:] = [(1 - 2 * _WIDE) * hz, 1e-5], [(1 + 2 * _WIDE) * hz, 0.2]
     unit = tuple(abs(v) if v else 1.0 for v in starts[0])
-    if kind.startswith("internal_resonance"):
+    if kind in RESONANCE_ORDER:
         unit = (unit[0], 0.01 * unit[1], 0.5 * unit[2])
-    if kind == "close_mode":
+    if kind == CLOSE:
         unit = (unit[0], unit[2] * unit[1], 0.5 * unit[2])
     return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
 
@@ -174,10 +179,7 @@ def parameter_labels(kind: str) -> tuple[str, ...]:
 
 
 SECOND_ORDER = frozenset(
-    {
-        *("quadratic_stiffness", "static_preload", "bilinear_stiffness"),
-        *("internal_resonance_1_2", "internal_resonance_1_3"),
-    }
+    {"quadratic_stiffness", "static_preload", "bilinear_stiffness", *RESONANCE_ORDER}
 )
 """Kinds that change the fundamental by the square of their strength."""
 
@@ -229,15 +231,12 @@ _DECIDES: tuple[tuple[frozenset[str], str], ...] = (
         frozenset({"residual_mode", "sensor_phase_error"}),
         "measure 60° and more off resonance on both sides, or with a second sensor",
     ),
-    *(
-        (
-            frozenset({"close_mode", other}),
-            "measure with a second sensor, where a further mode has another shape, or sweep wider",
-        )
-        for other in sorted(LIKE_A_MODE)
+    (
+        frozenset({CLOSE}),
+        "measure with a second sensor, where a further mode has another shape, or sweep wider",
     ),
     (
-        frozenset({"internal_resonance_1_3", "internal_resonance_1_2"}),
+        frozenset(RESONANCE_ORDER),
         f"step through the frequency of the disturbance and record {_HARMONICS}",
     ),
 )

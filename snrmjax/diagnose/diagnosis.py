@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from snrmjax.diagnose.amplitudes import UNSEEN, what_is_lost
 from snrmjax.diagnose.candidates import (
+    CLOSE,
     SECOND_ORDER,
     Candidate,
     Scales,
@@ -20,7 +21,7 @@ from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, never_seen, part_of
 from snrmjax.diagnose.evidence import Bench, Fit
 from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
 from snrmjax.diagnose.locating import Located, located, own_power
-from snrmjax.diagnose.naming import CLOSE, DETECTED, Named, Row, named
+from snrmjax.diagnose.naming import DETECTED, Named, Row, named
 from snrmjax.diagnose.predictions import Predictions, scales_of
 from snrmjax.diagnose.requesting import Request, requested
 from snrmjax.diagnose.sidedness import acts_both_ways

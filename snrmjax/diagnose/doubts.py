@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose.candidates import CLOSE, RESONANCE_ORDER
 from snrmjax.diagnose.locating import Located
 
 _CONTRADICTED = 4.0  # 1σ between an exponent and the law that was named
@@ -52,7 +53,6 @@ DIRECTED = ("quadratic_damping", "cubic_damping")
 """Damping as of a fluid, which a valve may let pass in one direction only."""
 GROWING = (*DIRECTED, "van_der_pol_damping")
 """Damping that grows with the amplitude and takes energy out where its coefficient is positive."""
-_RESONANCES = frozenset({"internal_resonance_1_2", "internal_resonance_1_3"})
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
 
@@ -105,7 +105,7 @@ def doubts(
         for kind in effects
         if kind in wide
     ]
-    if "close_mode" in effects:
+    if CLOSE in effects:
         found.append(
             Doubt(
                 "a mode close by has three numbers of its own: to one sensor a clearance beside a "
@@ -126,7 +126,7 @@ def doubts(
                 _WIDER,
             )
         )
-    elif len(effects) > 1 and _RESONANCES & set(effects):
+    elif len(effects) > 1 and RESONANCE_ORDER.keys() & set(effects):
         found.append(
             Doubt(
                 "a further mode beside another effect can imitate a law that the library does not "
@@ -142,10 +142,10 @@ def never_seen(kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray,
 
     Arguments: the further mode's frequency in Hz and damping ratio; frequencies of states in rad/s.
     """
-    if kind not in _RESONANCES:
+    if kind not in RESONANCE_ORDER:
         return False
     hz, ratio = shape
-    width = 2 * ratio * hz / (3 if kind.endswith("3") else 2)  # half-power, as the force steps
+    width = 2 * ratio * hz / RESONANCE_ORDER[kind]  # half-power, as the force steps
     return width > float(np.ptp(frequency)) / (2 * np.pi)
 
 

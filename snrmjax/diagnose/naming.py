@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.candidates import LIKE_A_MODE, Candidate, Scales, candidate
+from snrmjax.diagnose.candidates import CLOSE, LIKE_A_MODE, Candidate, Scales, candidate
 from snrmjax.diagnose.evidence import Bench, Fit, unlikely
 from snrmjax.diagnose.screening import foretold, foretold_pairs
 from snrmjax.simulate.blocks import over_cores
@@ -21,8 +21,6 @@ _ONE = 2  # parameters of one effect; one with more is weighed against two effec
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
 _MOST = 3  # effects of an answer
-CLOSE = "close_mode"
-"""The kind that is no candidate but a question."""
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 
 

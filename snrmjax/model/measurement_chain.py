@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
-from snrmjax.model.rules import ABOVE_MINUS_ONE, BELOW_ONE, IN_RANGE_HZ, POSITIVE, Rule
+from snrmjax.model.rules import ABOVE_MINUS_ONE, OF_A_MODE, Rule
 
 Amplitude = Float[Array, " state"]
 Velocity = Complex[Array, "state harmonic sensor"]
@@ -112,10 +112,7 @@ class CloseMode(AbstractMeasurementEffect):
 
     kind: ClassVar[str] = "close_mode"
     stage: ClassVar[int] = 1
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {
-        "frequency_hz": (POSITIVE, IN_RANGE_HZ),
-        "damping_ratio": (BELOW_ONE,),
-    }
+    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = OF_A_MODE
     modal_constant: Scalar
     frequency_hz: Scalar
     damping_ratio: Scalar

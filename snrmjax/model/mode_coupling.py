@@ -11,7 +11,7 @@ from jaxtyping import Array
 from snrmjax.model.effect_base import AbstractAddedMode, Scalar
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
-from snrmjax.model.rules import BELOW_ONE, IN_RANGE_HZ, POSITIVE, Rule
+from snrmjax.model.rules import OF_A_MODE, Rule
 
 
 class AbstractInternalResonance(AbstractAddedMode):
@@ -22,10 +22,7 @@ class AbstractInternalResonance(AbstractAddedMode):
     """
 
     order: ClassVar[int]
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {
-        "frequency_hz": (POSITIVE, IN_RANGE_HZ),
-        "damping_ratio": (BELOW_ONE,),
-    }
+    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = OF_A_MODE
     coefficient: Scalar
     frequency_hz: Scalar
     damping_ratio: Scalar
