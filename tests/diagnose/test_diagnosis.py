@@ -449,10 +449,24 @@ def test_an_unknown_force_gain_passes_for_nothing():
     known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
     assert abs(value - known[0]) < 3 * std
     assert found.force_gain == pytest.approx(1 / 1.5, rel=0.01)
-    # Gains and the modal mass are the same to a force of unknown size, and beside one that may be
-    # nothing a further mode can be all that is seen.
-    never = ("gain", "mass", "close")
-    assert not any(word in name for name in found.detection_limits for word in never)
+    # Gains and the modal mass are the same to a force of unknown size.
+    assert not any("gain" in name or "mass" in name for name in found.detection_limits)
+
+
+@pytest.mark.parametrize(("gain_std", "asked"), [(0.0, True), (0.05, True), (1.0, False)])
+def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, asked, monkeypatch):
+    """It could be all that is seen: the measured suspended beam then had a gain of 5e-6 N/V."""
+    kinds = []
+
+    def noted(bench, scales, some):
+        kinds.extend(some)
+        raise InterruptedError
+
+    monkeypatch.setattr("snrmjax.diagnose.diagnosis.named", noted)
+    with pytest.raises(InterruptedError):
+        sj.diagnose_model(linear_model(), balanced(quadratic), force_gain_std=gain_std)
+    assert ("close_mode" in kinds) == asked
+    assert "cubic_stiffness" in kinds
 
 
 def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_states_share():
