@@ -33,7 +33,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import snrmjax as sj
-from snrmjax.identify.calibration import calibrate_model
+from snrmjax.identify.calibrate.calibration import calibrate_model
 from snrmjax.model.beams import FLAT_BEAM_FORCES
 from snrmjax.model.parameters import parameter_value, with_parameters
 

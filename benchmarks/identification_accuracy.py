@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax import plot
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
+from snrmjax.report import figures as plot
 
 HERTZ = 2 * np.pi
 TONGUE_HZ = (87.3, 90.4)  # where the flat beam's mode exchanges energy with its second one

@@ -23,9 +23,9 @@ from typing import NamedTuple
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.identify.fitted_curves import fitted_values
-from snrmjax.identify.fitted_response import fitted_response
-from snrmjax.identify.joint_fit import fit_jointly
+from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.inference.fitted_response import fitted_response
+from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.model.modes import residual_velocity
 
 HERTZ = 2 * np.pi

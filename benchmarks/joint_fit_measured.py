@@ -25,14 +25,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import snrmjax as sj
-from snrmjax.identify.fitted_curves import values_with_slopes
-from snrmjax.identify.force_balance import weighing_at
-from snrmjax.identify.joint_fit import JointFit, _solve
-from snrmjax.identify.residuals import all_residuals
-from snrmjax.identify.uncertainty import sensitivity
+from snrmjax.identify.inference.fitted_curves import values_with_slopes
+from snrmjax.identify.inference.uncertainty import sensitivity
+from snrmjax.identify.joint.force_balance import weighing_at
+from snrmjax.identify.joint.joint_fit import JointFit, _solve
+from snrmjax.identify.joint.residuals import all_residuals
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
-from snrmjax.simulate.compiled import compiled
+from snrmjax.numerics.compiled import compiled
 
 HERTZ = 2 * np.pi
 

@@ -73,8 +73,8 @@ def lu_seconds(size: int, count: int) -> float:
 
 def one_size(harmonics: int, n_modes: int) -> dict:
     """Cost of the curve of one size."""
-    from snrmjax.simulate.continuation import StepControl, traced
-    from snrmjax.simulate.following import follow_from_rest, response_balances
+    from snrmjax.simulate.continuation.continuation import StepControl, traced
+    from snrmjax.simulate.continuation.curve_tracing import follow_from_rest, response_balances
 
     model, force, before = chain(n_modes), 1.0, peak_memory()
     balances = response_balances([model], np.array([force]), harmonics, None)

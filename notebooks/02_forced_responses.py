@@ -38,8 +38,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax import drawing, plot
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
+from snrmjax.report import figures as plot
+from snrmjax.report import style as drawing
 
 HERTZ = 2 * np.pi
 BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]

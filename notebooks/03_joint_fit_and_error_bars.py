@@ -37,11 +37,13 @@ import jax
 import numpy as np
 
 import snrmjax as sj
-from snrmjax import drawing, joint_plot, plot
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
-from snrmjax.plot_data import contributions_by_kind
-from snrmjax.presentation import corrected
+from snrmjax.report import figures as plot
+from snrmjax.report import joint_figures as joint_plot
+from snrmjax.report import style as drawing
+from snrmjax.report.sampling import contributions_by_kind
+from snrmjax.report.workflow import corrected
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None

@@ -31,10 +31,11 @@ from pathlib import Path
 import numpy as np
 
 import snrmjax as sj
-from snrmjax import diagnosis_report, plot
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effects import make_effect
+from snrmjax.report import diagnosis_report
+from snrmjax.report import figures as plot
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None

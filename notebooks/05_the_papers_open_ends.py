@@ -32,10 +32,12 @@ import numpy as np
 from scipy.stats import t as student
 
 import snrmjax as sj
-from snrmjax import diagnosis_report, drawing, plot
 from snrmjax.measure.force_calibration import calibrate_force
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.model.beams import FLAT_BEAM_FORCES
+from snrmjax.report import diagnosis_report
+from snrmjax.report import figures as plot
+from snrmjax.report import style as drawing
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None

@@ -1,30 +1,11 @@
 # The public names and where they live; `__init__.py` imports each on first use.
 from .diagnose.diagnosis import Diagnosis, diagnose_model
-from .identify.backbone import Backbone, BackboneFit, fit_backbone
-from .identify.backbone_points import BackbonePoints, identify_points
-from .identify.calibration import CalibratedModel, calibrate_model
-from .identify.families import FAMILIES
-from .identify.fitted_curves import fitted_values
-from .identify.fitted_response import FittedPoint, FittedResponse, fitted_response
-from .identify.identification import Identification, identify_backbone
-from .identify.joint_fit import JointFit, fit_jointly
-from .identify.next_measurement import NextMeasurement, next_measurements
-from .identify.points import (
-    PointStatus,
-    SnrmPoints,
-    closed_form,
-    invert_amplitude_phase,
-    invert_phasor,
-)
-from .identify.prediction import (
-    PredictedResponse,
-    Resonance,
-    predict_response,
-    resonance_by_fixed_point,
-    resonances,
-)
-from .identify.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
-from .identify.uncertainty import (
+from .identify.calibrate.calibration import CalibratedModel, calibrate_model
+from .identify.curves.families import FAMILIES
+from .identify.inference.fitted_curves import fitted_values
+from .identify.inference.fitted_response import FittedPoint, FittedResponse, fitted_response
+from .identify.inference.optimal_design import NextMeasurement, next_measurements
+from .identify.inference.uncertainty import (
     bootstrap,
     compare_bands,
     contributions,
@@ -32,6 +13,25 @@ from .identify.uncertainty import (
     sample_posterior,
     sensitivity,
 )
+from .identify.joint.joint_fit import JointFit, fit_jointly
+from .identify.pointwise.backbone import Backbone, BackboneFit, fit_backbone
+from .identify.pointwise.backbone_points import BackbonePoints, identify_points
+from .identify.pointwise.identification import Identification, identify_backbone
+from .identify.pointwise.inversion import (
+    PointStatus,
+    SnrmPoints,
+    closed_form,
+    invert_amplitude_phase,
+    invert_phasor,
+)
+from .identify.pointwise.prediction import (
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonance_by_fixed_point,
+    resonances,
+)
+from .identify.pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from .measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .measure.steady_states import SteadyStates, join_steady_states, steady_states
 from .model.averaging import averaged_effect, averaged_force, averaged_response
@@ -45,39 +45,43 @@ from .model.potential import (
     potential_from_force_table,
 )
 from .model.structure import Structure, equilibria, structure
-from .simulate.branches import isolated_responses
-from .simulate.continuation import CurveStatus, StepControl
-from .simulate.controlled import (
+from .simulate.balance.harmonics import velocity_phasors
+from .simulate.continuation.continuation import CurveStatus, StepControl
+from .simulate.continuation.response_curve import ResponseCurve
+from .simulate.continuation.stability import StabilityLoss, floquet_multipliers
+from .simulate.solutions.controlled import (
     ControlledCurve,
     DampedModeBranch,
     damped_normal_mode,
     phase_controlled,
     response_controlled,
 )
-from .simulate.controlled_test import phase_controlled_test, response_controlled_test
-from .simulate.forced_response import (
+from .simulate.solutions.forced_response import (
     ResponseBatch,
     forced_response,
     forced_response_batch,
     solve_at_frequency,
 )
-from .simulate.harmonics import velocity_phasors
-from .simulate.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
-from .simulate.periodic_motion import (
+from .simulate.solutions.isolated_responses import isolated_responses
+from .simulate.solutions.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
+from .simulate.solutions.periodic_motion import (
     PeriodicMotion,
     motions_at_velocities,
     periodic_motion,
     response_at_velocities,
 )
-from .simulate.response_curve import ResponseCurve
-from .simulate.stability import StabilityLoss, floquet_multipliers
-from .simulate.time_integration import (
+from .simulate.solutions.time_integration import (
     IntegratedMotion,
     MotionStatus,
     settled_motion,
     stepped_sine,
 )
-from .simulate.virtual_test import MeasurementErrors, VirtualTest, phase_resonance_test
+from .simulate.virtual_test.controlled_test import phase_controlled_test, response_controlled_test
+from .simulate.virtual_test.phase_resonance_test import (
+    MeasurementErrors,
+    VirtualTest,
+    phase_resonance_test,
+)
 
 __all__ = [
     "FAMILIES",

@@ -24,7 +24,7 @@ from snrmjax.io.models import read_model, write_model
 from snrmjax.io.tables import read_steady_states, write_steady_states
 from snrmjax.io.units import HERTZ
 from snrmjax.model.beams import FLAT_BEAM_FORCES
-from snrmjax.simulate.continuation import STATUS_MESSAGE
+from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE
 
 app = typer.Typer(
     name="snrmjax",
@@ -78,8 +78,8 @@ def demo(out: Out) -> None:
     what `identify` makes of it, figures and report.html.
     """
     from snrmjax.io import results
-    from snrmjax.plot import save_figure, simulated_response_figure
-    from snrmjax.presentation import present_identification, write_identification
+    from snrmjax.report.figures import save_figure, simulated_response_figure
+    from snrmjax.report.workflow import present_identification, write_identification
 
     with _staged(out) as folder:
         model = sj.flat_beam()
@@ -128,7 +128,7 @@ def simulate(
     Writes response.csv and response.png.
     """
     from snrmjax.io import results
-    from snrmjax.plot import save_figure, simulated_response_figure
+    from snrmjax.report.figures import save_figure, simulated_response_figure
 
     with _staged(out) as folder:
         structure = read_model(model)
@@ -172,7 +172,7 @@ def nnm(
     Writes nnm.csv and nnm.png.
     """
     from snrmjax.io import results
-    from snrmjax.plot import normal_mode_figure, save_figure
+    from snrmjax.report.figures import normal_mode_figure, save_figure
 
     with _staged(out) as folder:
         structure = read_model(model)
@@ -249,7 +249,7 @@ def identify(
     and fit.json, and with --next also next.csv.
     """
     from snrmjax.io import joint_results
-    from snrmjax.presentation import (
+    from snrmjax.report.workflow import (
         corrected,
         fit_as_asked,
         present_identification,
@@ -329,7 +329,7 @@ def diagnose(
     Without phases: velocity_m_s, the amplitude of the fundamental, in place of velocity_re_m_s and
     velocity_im_m_s; or a phase_std_deg of 60 or more. The notes say what is lost.
     """
-    from snrmjax.diagnosis_report import write_diagnosis
+    from snrmjax.report.diagnosis_report import write_diagnosis
 
     several = len(data) > 1
     if len({path.stem for path in data}) < len(data):
@@ -391,7 +391,7 @@ def _report_truncation(curves: list[sj.ResponseCurve], harmonics: int) -> None:
 
 
 def _report_equilibria(structure: sj.Structure) -> None:
-    from snrmjax.presentation import equilibria_notes
+    from snrmjax.report.workflow import equilibria_notes
 
     for note in equilibria_notes(structure):
         _warn(note)

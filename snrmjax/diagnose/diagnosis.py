@@ -7,8 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from snrmjax.diagnose.amplitudes import UNSEEN, what_is_lost
-from snrmjax.diagnose.candidates import (
+from snrmjax.diagnose.checks.cross_validation import HeldOut, gap, held_out, without_level
+from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
+from snrmjax.diagnose.checks.doubts import GROWING, Doubt, doubts, never_seen, part_of
+from snrmjax.diagnose.checks.level_variance import says_of_levels, with_levels_as_found
+from snrmjax.diagnose.checks.verdict import (
+    judged,
+    neighbour_noise,
+    not_foretold,
+    tolerated,
+    unproved,
+)
+from snrmjax.diagnose.design.discriminating_test import Request, requested
+from snrmjax.diagnose.misfit.amplitudes import UNSEEN, what_is_lost
+from snrmjax.diagnose.misfit.candidates import (
     CLOSE,
     SECOND_ORDER,
     Candidate,
@@ -17,22 +29,16 @@ from snrmjax.diagnose.candidates import (
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.doubts import GROWING, Doubt, doubts, never_seen, part_of
-from snrmjax.diagnose.evidence import Bench, Fit
-from snrmjax.diagnose.judging import judged, neighbour_noise, not_foretold, tolerated, unproved
-from snrmjax.diagnose.locating import Located, located, own_power
-from snrmjax.diagnose.naming import DETECTED, Named, Row, named
-from snrmjax.diagnose.predictions import Predictions, scales_of
-from snrmjax.diagnose.requesting import Request, requested
-from snrmjax.diagnose.sidedness import acts_both_ways
-from snrmjax.diagnose.unstated import says_of_levels, with_levels_as_found
-from snrmjax.diagnose.verifying import HeldOut, gap, held_out, without_level
-from snrmjax.identify.calibration_states import ASSUMED_ERROR
+from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.search.locating import Located, located, own_power
+from snrmjax.diagnose.search.model_search import DETECTED, Named, Row, named
+from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.steady_states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.blocks import on_one_core
+from snrmjax.numerics.blocks import on_one_core
 
 _LOOSE = 0.1  # relative 1σ of a force's gain
 _LEAST_STATES = 6

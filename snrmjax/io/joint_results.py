@@ -8,16 +8,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.families import FAMILIES
-from snrmjax.identify.family_base import AbstractFamily
-from snrmjax.identify.fitted_curves import values_to_the_largest
-from snrmjax.identify.fitted_response import FittedPoint, FittedResponse
-from snrmjax.identify.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
-from snrmjax.identify.joint_fit import JointFit, Rival
-from snrmjax.identify.next_measurement import NextMeasurement
-from snrmjax.identify.selection import Candidate
-from snrmjax.identify.splines import Spline
-from snrmjax.identify.uncertainty import Contribution
+from snrmjax.identify.curves.families import FAMILIES
+from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.splines import Spline
+from snrmjax.identify.inference.fitted_curves import values_to_the_largest
+from snrmjax.identify.inference.fitted_response import FittedPoint, FittedResponse
+from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
+from snrmjax.identify.joint.joint_fit import JointFit, Rival
+from snrmjax.identify.joint.selection import Candidate
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table

@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.backbone import Backbone, BackboneValues
-from snrmjax.identify.identification import Identification
-from snrmjax.identify.points import PointStatus
-from snrmjax.identify.prediction import PredictedResponse, Resonance
-from snrmjax.identify.snrm import reference_sensor
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.pointwise.inversion import PointStatus
+from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.model.structure import Structure
-from snrmjax.simulate.forced_response import ResponseCurve
-from snrmjax.simulate.normal_modes import NormalModeBranch
+from snrmjax.simulate.solutions.forced_response import ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 BACKBONE_POINTS = 200
 

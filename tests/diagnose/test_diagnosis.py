@@ -2,42 +2,38 @@
 
 import dataclasses
 import functools
-import json
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
 from jaxtyping import Array
+from truth.balanced_sets import (
+    KEYS,
+    NOISE,
+    OMEGA,
+    SHAPE,
+    ZETA,
+    balanced,
+    beside,
+    files,
+    linear_model,
+    quadratic,
+)
 
 import snrmjax as sj
-from snrmjax.diagnose.candidates import candidate
-from snrmjax.diagnose.evidence import Bench
-from snrmjax.diagnose.foretelling import (
+from snrmjax.diagnose.checks.cross_validation import held_out
+from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways, even_share
+from snrmjax.diagnose.misfit.candidates import candidate
+from snrmjax.diagnose.misfit.effect_fit import Bench
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.response_prediction import (
     level_forces,
     measured_resonance,
     responses,
     simulated_resonance,
 )
-from snrmjax.diagnose.naming import named
-from snrmjax.diagnose.predictions import Predictions, scales_of
-from snrmjax.diagnose.sidedness import acts_both_ways, even_share
-from snrmjax.diagnose.verifying import held_out
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
+from snrmjax.diagnose.search.model_search import named
 from snrmjax.model.effects import EFFECTS
-
-HERE = Path(__file__).parent
-KEYS = json.loads((HERE / "keys.json").read_text())
-SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 300.0, 0.01
-NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003}
-
-
-def files(name, folder="blind"):
-    """Model and data of a set."""
-    model = read_model(HERE / folder / f"{name}.toml")
-    data = read_steady_states(HERE / folder / f"{name}.csv", sensors=model.modes.sensors)
-    return model, data.steady_states
 
 
 @functools.cache
@@ -211,82 +207,6 @@ def test_damping_of_one_direction_shows_in_harmonic_2():
     assert not acts_both_ways(found.bench, found.fit, "quadratic_damping")
 
 
-def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
-    """States of a linear mode whose damping changes with velocity, and their noise.
-
-    `shift` is the relative 1σ by which the natural frequency differs from level to level.
-
-    For a displacement and a frequency the force that holds them is known: nothing is solved.
-    """
-    rng = np.random.default_rng(seed)
-    rows = []
-    shifts = shift * np.random.default_rng([seed, 1]).normal(size=levels)
-    for level, tip in enumerate(np.geomspace(1e-4, 1e-3, levels)):
-        for phase in np.radians(np.linspace(-55, 55, per_level)):
-            x = tip * np.cos(phase)
-            omega = OMEGA * (1 - ZETA * np.tan(phase))
-            damping = 2 * ZETA * OMEGA + change_of_damping(omega * x)
-            needed = (OMEGA * (1 + shifts[level])) ** 2 - omega**2 + 1j * omega * damping
-            rows.append((level, omega, abs(needed) * x / (SHAPE * PARTICIPATION), needed, x))
-    level, omega, force, needed, x = (np.array(column) for column in zip(*rows, strict=True))
-    velocity = 1j * omega * x * np.exp(-1j * np.angle(needed))
-    n = len(level)
-    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
-    velocity = velocity * np.exp(own)
-    force = force * np.exp(NOISE["force"] * rng.normal(size=n))
-    return sj.steady_states(
-        level,
-        omega.real,
-        force.real,
-        velocity,
-        velocity_std=NOISE["velocity"] * np.abs(velocity),
-        phase_std=np.full((n, 1), NOISE["phase"]),
-        force_std=NOISE["force"] * force.real,
-    )
-
-
-def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
-    modes = sj.linear_modes(
-        [frequency],
-        [damping],
-        [[SHAPE]],
-        [PARTICIPATION],
-        natural_frequency_std=[1e-4 * OMEGA],
-        damping_ratio_std=[damping_std * ZETA],
-    )
-    return sj.structure(modes, **settings)
-
-
-def beside(frequency, damping, constant, stiffening=0.0, seed=0):
-    """States of the mode, perhaps with a cubic stiffness, beside a linear one that is seen too.
-
-    The motion's force is known, and with it what the other mode does: nothing is solved.
-    """
-    rng = np.random.default_rng(seed)
-    rows = []
-    for level, tip in enumerate(np.geomspace(1e-4, 1e-3, 5)):
-        for phase in np.radians(np.linspace(-60, 60, 11)):
-            x = tip * np.cos(phase)
-            squared = OMEGA**2 * (1 + stiffening * (x / 1e-3) ** 2)
-            omega = np.sqrt(squared) * (1 - ZETA * np.tan(phase))
-            force = (squared - omega**2 + 2j * ZETA * OMEGA * omega) * x / (SHAPE * PARTICIPATION)
-            other = constant * force / (frequency**2 - omega**2 + 2j * damping * frequency * omega)
-            rows.append((level, omega, force, 1j * omega * (x + other)))
-    level, omega, force, velocity = (np.array(column) for column in zip(*rows, strict=True))
-    velocity = velocity * np.exp(-1j * np.angle(force))
-    n = len(level)
-    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
-    return sj.steady_states(
-        level.real.astype(int),
-        omega.real,
-        np.abs(force) * np.exp(NOISE["force"] * rng.normal(size=n)),
-        velocity * np.exp(own),
-        velocity_std=NOISE["velocity"] * np.abs(velocity),
-        phase_std=np.full((n, 1), NOISE["phase"]),
-        force_std=NOISE["force"] * np.abs(force),
-    )
-
-
 CLOSE = {"modal_constant": 0.3, "frequency_hz": 1.03 * OMEGA / (2 * np.pi), "damping_ratio": 0.01}
 
 
@@ -389,11 +309,6 @@ def test_too_few_states_and_a_model_of_something_else_are_said():
     data = balanced(lambda v: 0.0 * v, levels=1, per_level=4)
     with pytest.raises(ValueError, match="at least 6"):
         sj.diagnose_model(linear_model(), data)
-
-
-def quadratic(velocity):
-    """The change of damping that quadratic damping makes, 18 kg^-1/2 at these shapes."""
-    return 8.0 * velocity
 
 
 def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, linear_sum_assignment
 
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
-from snrmjax.simulate.forced_response import forced_response
+from snrmjax.simulate.solutions.forced_response import forced_response
 
 
 class TimeDomain:

@@ -1,0 +1,166 @@
+"""What is left of a fit, if it has an order: noise has none, of whatever size it is."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import fdtrc, ndtr
+
+from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+
+UNLIKELY = 1e-3
+_OF_AMPLITUDE, _OF_TEST = 6, 8  # knots of free curves
+_RESOLUTION = 1e-6  # of singular values: curves that an answer has already
+
+
+def pattern(bench: Bench, fit: Fit) -> str | None:
+    """Why what is left cannot be noise of any one size; None where it can."""
+    left = bench.weighing.without_shared(fit.rows)
+    for reason in (_by_level(bench, left), _by_direction(bench, left), _of_neighbours(bench, left)):
+        if reason is not None:
+            return reason
+    return left_curve(bench, fit)
+
+
+def left_curve(bench: Bench, fit: Fit) -> str | None:
+    """Which free curve still explains something beside an answer; None where chance does as much.
+
+    Stiffness and damping may change with the amplitude as they like, and the stiffness with the
+    order of the test: a law that is nearly right, or a drift that is no straight line, leaves
+    little of χ² and all of it in such a curve. The answer's own parameters stay free, and Fisher's
+    ratio asks for no noise of the stated size.
+    """
+    chosen, weighing = bench.predictions.chosen, bench.weighing
+    if chosen.phase_unknown.any():
+        return None  # sizes are not linear in a curve
+    speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
+    amplitude = _hats(np.log(speed), _OF_AMPLITUDE)
+    order = np.argsort(np.argsort(chosen.rows)).astype(float)
+    of_test = _hats(order, _OF_TEST)
+    curves = (
+        ("the stiffness as a free function of the amplitude", 0, amplitude),
+        ("the damping as a free function of the amplitude", 1, amplitude),
+        ("a natural frequency that moves freely in the order of the test", 0, of_test),
+    )
+    left = weighing.decorrelated(fit.rows)
+    own = _basis(weighing.decorrelated(fit.slopes.T).T)
+    found = []
+    for name, part, hats in curves:
+        arms = weighing.decorrelated((bench.by_linear[:, [part]] * hats[weighing.state]).T).T
+        basis = _basis(np.concatenate([own, arms], axis=1))
+        n_free = bench.n_rows - basis.shape[1]
+        n_own = basis.shape[1] - own.shape[1]
+        rest = float(left @ left - np.sum((left @ basis) ** 2))
+        gain = float(np.sum((left @ basis) ** 2) - np.sum((left @ own) ** 2))
+        if n_own > 0 and n_free > 0:
+            ratio = max(gain, 0.0) / n_own / (rest / n_free)
+            found.append((float(fdtrc(n_own, n_free, ratio)), name))
+    chance, name = min(found, default=(1.0, ""))
+    if chance * len(curves) >= UNLIKELY:
+        return None
+    return (
+        f"{name} still explains a part of what is left (by chance with a probability of "
+        f"{chance:.0e}): the law is another one."
+    )
+
+
+def _by_level(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+    """Misfits of one level, of the force or the harmonics, that are larger than elsewhere."""
+    level = np.asarray(bench.predictions.chosen.states.level)[bench.weighing.state]
+    of_force = bench.weighing.column < 2
+    groups = [
+        (level == k) & (of_force == force) for k in np.unique(level) for force in (True, False)
+    ]
+    groups = [mine for mine in groups if mine.any() and not mine.all()]
+    for mine in groups:
+        ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
+        if fdtrc(mine.sum(), (~mine).sum(), ratio) < UNLIKELY / len(groups):
+            name = bench.level_numbers[int(level[mine][0])]
+            what = "the force" if of_force[mine][0] else "the harmonics"
+            return (
+                f"what is left of {what} at level {name} is {np.sqrt(ratio):.2g} times as large as "
+                "elsewhere: noise of one size it is not."
+            )
+    return None
+
+
+def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+    """Misfits of the force along what a natural frequency would do, larger than those across.
+
+    Noise of one size is the same in every direction of whitened parts; a structure whose natural
+    frequency is another one for every state, by its temperature for example, has one direction.
+    """
+    weighing = bench.weighing
+    force = np.full((len(weighing.known), 2), np.nan)
+    unit = np.full_like(force, np.nan)
+    mine = weighing.column < 2
+    force[weighing.state[mine], weighing.column[mine]] = left[mine]
+    unit[weighing.state[mine], weighing.column[mine]] = bench.by_linear[mine, 0]
+    whole = np.isfinite(force).all(axis=1)
+    if not whole.any() or bench.predictions.chosen.phase_unknown.any():
+        return None
+    force, unit = force[whole], unit[whole]
+    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    with_it = np.sum(force * unit, axis=1)
+    across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
+    ratio = float(np.sum(with_it**2) / np.sum(across**2))
+    if not fdtrc(len(with_it), len(with_it), ratio) < UNLIKELY:
+        return None
+    return (
+        f"what is left is {np.sqrt(ratio):.2g} times as large along a change of the natural "
+        "frequency as across it: noise of one size it is not. Were the states of a level measured "
+        "at different temperatures?"
+    )
+
+
+def _of_neighbours(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+    """Misfits that neighbours along a level share."""
+    for of_test in (True, False):
+        parts = list(along(bench, left, of_test=of_test))
+        number = sum(max(len(some) - 1, 0) for some in parts)
+        if not number:
+            continue
+        square = np.mean(np.concatenate(parts) ** 2)
+        common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
+        if ndtr(-common * np.sqrt(number)) < UNLIKELY / 2:
+            order = "in the order of the test" if of_test else "along the resonance"
+            return (
+                f"neighbours {order} are left with like misfits (correlation {common:.2f}): noise "
+                "has none."
+            )
+    return None
+
+
+def along(
+    bench: Bench, rows: Float[np.ndarray, " row"], *, of_test: bool = False
+) -> Iterator[Float[np.ndarray, " state"]]:
+    """Rows of the force, level by level, along the resonance or in the order of the test.
+
+    Along a resonance that bends over the phase of the velocity is what never turns back.
+    """
+    weighing, chosen = bench.weighing, bench.predictions.chosen
+    level = np.asarray(chosen.states.level)
+    phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
+    for column in range(2):
+        mine = weighing.column == column
+        values, states = rows[mine], weighing.state[mine]
+        for number in range(chosen.n_levels):
+            some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
+            keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]
+            yield values[some[np.argsort(keys, kind="stable")]]
+
+
+def _hats(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndarray, "state knot"]:
+    """Curves of straight pieces with as many states between any two knots."""
+    at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
+    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
+
+
+def _basis(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row any"]:
+    """Orthonormal columns that span the same."""
+    size = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(size > 0, size, 1.0)
+    if not columns.shape[1]:
+        return scaled
+    left, values, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(left[:, values > _RESOLUTION * values[0]])

@@ -1,0 +1,364 @@
+"""Which measurement would settle what is open: what rivals are expected to lose by it."""
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from snrmjax.diagnose.design.further_states import (
+    HARMONICS,
+    Compared,
+    Foretold,
+    Further,
+    Rows,
+    foretold_states,
+    predicted,
+    refitted,
+    rows_of,
+    separation,
+)
+from snrmjax.diagnose.misfit.candidates import only_by_calibration
+from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.predictions import Predicted
+from snrmjax.diagnose.search.model_search import AS_GOOD, Named
+
+STATES = 12
+"""Of a level, or off resonance, that a request is for."""
+
+_RIVALS = 4  # of a class, that are weighed
+_WITHIN = np.radians(55.0)  # phases of a further level
+_OFF = np.radians(np.linspace(30.0, 60.0, STATES // 2))
+_HIGHER, _LOWER = (1.5, 2.0), 0.5  # times the velocities of the largest and the smallest level
+_CERTAIN = 1.64  # 1σ of what noise makes of an expected gain: 95 % of tests do better
+_ORDINARY = 3e-3  # of the largest velocity: noise of harmonics that nobody took care of
+_RESOLVED = {"velocity": 0.01, "frequency": 2e-4}  # relative, by a careful test
+_SEEN = 0.1  # of the larger of two harmonics, above which the smaller one has a phase
+_CLOSER, _FINEST = 3.0, 1e-4  # the steps in which less noise is asked for, and the end of it
+
+
+class Request(NamedTuple):
+    """A measurement that is expected to settle what a diagnosis left open.
+
+    What does not apply is None: a calibration has no level, and only harmonics have a noise that
+    is asked for.
+    """
+
+    kind: str  # "harmonics", "off_resonance", "lower_level", "higher_level", "calibration"
+    sentence: str
+    quantity: str | None = None  # in which rivals differ most: "harmonic 2", "velocity", …
+    level: int | None = None  # that is measured again, or whose velocities are scaled
+    force: float | None = None  # N, at resonance
+    frequency: float | None = None  # Hz, at resonance
+    states: int | None = None
+    phase: tuple[float, float] | None = None  # degrees off resonance, on both sides
+    harmonics: tuple[int, ...] = ()
+    harmonic_std: float | None = None  # m/s
+    expected_gain: float | None = None  # of χ², over the rival that is told least well
+    needed_gain: float | None = None
+    calibration_too: bool = False  # whether two that only it separates stay open
+
+    @property
+    def settles(self) -> bool:
+        """Whether what is expected is enough."""
+        if self.expected_gain is None or self.needed_gain is None:
+            return self.kind == "calibration"
+        return self.expected_gain >= self.needed_gain
+
+
+class _Option(NamedTuple):
+    """Some rows of what was foretold."""
+
+    kind: str
+    place: int  # of the `Further`
+    orders: tuple[int, ...]  # of harmonics that count
+    of_force: bool
+    floor: float | None  # m/s, that is asked for
+
+
+def requested(found: Named, places: tuple[int, ...]) -> Request | None:
+    """The cheapest measurement that is expected to leave only what is true of some classes.
+
+    Every member of a class at one of the `places` is taken for true in turn, further states are
+    foretold by it, and its rivals are refitted to the measured and the further states together, to
+    first order: they lose what their own freedom cannot follow. Enough is what leaves them behind
+    with 95 % probability. Where nothing is enough, what comes nearest; None where no rival can be
+    compared.
+    """
+    bench = found.bench
+    speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
+    floor = _floor(bench)
+    ordinary = floor if floor is not None else _ORDINARY * float(speed.max())
+    groups = [list(_rivals(found, place)) for place in places]
+    every = [rival for group in groups for rival in group]
+    tried = [(found.fit, every)]
+    tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
+    hypotheses = [
+        _Hypothesis(bench, truth, [fit for fit in rivals if _can_be_told(truth, fit)], ordinary)
+        for truth, rivals in tried
+    ]
+    best: Request | None = None
+    for option in _options(ordinary, float(speed.max()), measured=floor is not None):
+        worst: Request | None = None
+        for hypothesis in hypotheses if every else []:
+            request = hypothesis.request(option)
+            if request is not None and (worst is None or _share(request) < _share(worst)):
+                worst = request
+            if worst is None or not worst.settles:
+                break
+        if worst is not None and worst.settles:
+            return worst
+        if worst is not None and (best is None or _share(worst) > _share(best)):
+            best = worst
+    return best
+
+
+def _can_be_told(one: Fit, other: Fit) -> bool:
+    """Whether two answers are different ones that no calibration is needed for."""
+    differ = set(one.kinds) ^ set(other.kinds)
+    return bool(differ) and not only_by_calibration(differ)
+
+
+def _share(request: Request) -> float:
+    return (request.expected_gain or 0.0) / (request.needed_gain or 1.0)
+
+
+def _floor(bench: Bench) -> float | None:
+    """Noise of harmonics, m/s; None where none were measured."""
+    chosen = bench.predictions.chosen
+    first = 2 * len(chosen.sensors)
+    own = np.asarray(chosen.states.own_std)[:, first:] * np.sqrt(2)
+    own = own * np.abs(np.asarray(chosen.states.velocity)[:, :1])
+    return float(np.median(own[own > 0])) if np.any(own > 0) else None
+
+
+def _further(bench: Bench) -> tuple[Further, ...]:
+    """The largest level as it is, both ends off resonance, a smaller level and larger ones."""
+    states = bench.predictions.chosen.states
+    level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
+    peaks = [np.abs(velocity[level == k]).max() for k in range(level.max() + 1)]
+    low, top = int(np.argmin(peaks)), int(np.argmax(peaks))
+    again = np.sort(np.angle(velocity[level == top]))
+    off, spread = np.concatenate([-_OFF[::-1], _OFF]), np.linspace(-_WITHIN, _WITHIN, STATES)
+    higher = [Further(top, scale, spread) for scale in _HIGHER]
+    return (
+        Further(top, 1.0, again[:: -(-len(again) // (2 * STATES))]),
+        Further(low, 1.0, off),
+        Further(top, 1.0, off),
+        Further(low, _LOWER, spread),
+        *higher,
+    )
+
+
+def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Option]:
+    """Measurements, the cheapest first."""
+    known = HARMONICS if measured else ()
+    each = [(h,) for h in HARMONICS] + [HARMONICS]
+    if not measured:
+        yield from (_Option("harmonics", 0, orders, False, ordinary) for orders in each)
+    yield from (_Option("off_resonance", place, known, True, None) for place in (1, 2))
+    yield _Option("lower_level", 3, known, True, None)
+    yield from (_Option("higher_level", place, known, True, None) for place in (4, 5))
+    floor = ordinary
+    if not measured:
+        yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
+    while floor > _FINEST * largest:
+        floor = max(floor / _CLOSER, _FINEST * largest)
+        yield from (_Option("harmonics", 0, orders, False, floor) for orders in each)
+        yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
+
+
+def _rivals(found: Named, place: int) -> Iterator[Fit]:
+    """What the class at a place has beside the answer, as the table says that it fits."""
+    bench = found.bench
+    for name in found.classes[place][1 : 1 + _RIVALS]:
+        kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
+        # One effect with more parameters may stand for two.
+        fit = _from_table(found, kinds) or _from_table(found, {name})
+        columns = fit and predicted(bench.predictions, fit)
+        if fit is None or columns is None:
+            continue
+        rows = rows_of(bench, columns)
+        if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
+            least = refitted(rows, bench.weighing.shared)
+            yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
+
+
+def _from_table(found: Named, kinds: set[str]) -> Fit | None:
+    """The last fit of some kinds that a table has, without its rows."""
+    for row in (row for step in found.table[::-1] for row in step):
+        if {label.partition(".")[0] for label in row.parameters} == kinds:
+            values = np.array(list(row.parameters.values()))
+            rows, slopes = np.zeros(0), np.zeros((0, len(values)))
+            labels = tuple(row.parameters)
+            return Fit(tuple(kinds), labels, values, row.chi_square, rows, slopes, values, values)
+    return None
+
+
+class _Hypothesis:
+    """One model that may be true, what it foretells of further states, and its rivals."""
+
+    def __init__(self, bench: Bench, truth: Fit, rivals: list[Fit], floor: float):
+        self.bench, self.truth, self.rivals = bench, truth, rivals
+        self.floor = floor  # m/s, of harmonics where none is asked for
+        self.further = _further(bench)
+
+    @cached_property
+    def _foretold(self) -> dict[float, Foretold]:
+        """By the noise of harmonics."""
+        first = foretold_states(self.bench, self.truth, self.further, self.floor)
+        return {self.floor: first}
+
+    @cached_property
+    def _predicted(self) -> list[Predicted | None]:
+        """Of the truth, then of the rivals."""
+        predictions = self._foretold[self.floor].bench.predictions
+        return [predicted(predictions, fit) for fit in (self.truth, *self.rivals)]
+
+    @cached_property
+    def _measured(self) -> list[tuple[Rows, float]]:
+        """Rows of the measured states, refitted, and the χ² that they leave: as `_predicted`."""
+        rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
+        return [(one, refitted(one, self.bench.weighing.shared)) for one in rows]
+
+    def request(self, option: _Option) -> Request | None:
+        """What an option is expected to gain over the rival that it tells least well."""
+        floor = self.floor if option.floor is None else option.floor
+        if floor not in self._foretold:
+            self._foretold[floor] = self._foretold[self.floor].with_floor(floor)
+        foretold = self._foretold[floor]
+        kept = _rows(foretold, option)
+        exact, *others = self._predicted
+        if exact is None or not kept.any():
+            return None
+        own = Compared(*self._measured[0], rows_of(foretold.bench, exact))
+        found = []
+        for fit, before, columns in zip(self.rivals, self._measured[1:], others, strict=True):
+            if columns is None:
+                continue
+            its = Compared(*before, rows_of(foretold.bench, columns))
+            gain = separation(self.bench, foretold.bench, own, its, kept)
+            n = self.bench.n_rows
+            needed = _needed(fit.criterion(n) - self.truth.criterion(n))
+            said = _difference(foretold, (self.truth, exact), (fit, columns), option)
+            found.append((gain, needed, *said))
+        if not found:
+            return None
+        gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
+        one = self.further[option.place]
+        size = np.degrees(np.abs(one.phase))
+        request = Request(
+            kind=option.kind,
+            sentence="",
+            quantity=quantity,
+            level=int(self.bench.level_numbers[one.level]),
+            force=foretold.force[option.place],
+            frequency=foretold.frequency[option.place] / (2 * np.pi),
+            states=len(one.phase),
+            phase=(float(size.min()), float(size.max())),
+            harmonics=option.orders if option.floor is not None else (),
+            harmonic_std=option.floor,
+            expected_gain=float(gain),
+            needed_gain=needed,
+        )
+        return request._replace(
+            sentence=f"{_place(request, one.scale, foretold, option)}: {words}."
+        )
+
+
+def _place(request: Request, scale: float, foretold: Foretold, option: _Option) -> str:
+    """Where and what to measure, in words."""
+    at = f"near {request.frequency:.4g} Hz"
+    level = f"level {request.level} ({request.force:.3g} N)"
+    closely = ""
+    if option.floor is not None:
+        velocity = np.asarray(foretold.bench.predictions.chosen.states.velocity)[:, 0]
+        largest = np.abs(velocity[foretold.rows_of[option.place]]).max()
+        names = " and ".join(str(h) for h in option.orders)
+        plural = "s" if len(option.orders) > 1 else ""
+        closely = (
+            f"harmonic{plural} {names} to better than {100 * option.floor / largest:.2g} % of the "
+            f"fundamental ({option.floor:.2g} m/s)"
+        )
+    if option.kind == "harmonics":
+        return f"Measure {closely} at {level} {at}"
+    if option.kind == "off_resonance":
+        return f"Measure {STATES} states 30° to 60° off resonance, on both sides, at {level} {at}"
+    beside = f", with {closely}" if closely else ""
+    return (
+        f"Add a level of {request.force:.3g} N, {scale:g} times the velocities of level "
+        f"{request.level}, with {STATES} states within 55° of resonance {at}{beside}"
+    )
+
+
+def _needed(ahead: float) -> float:
+    """Expected gain over a rival that leaves it out of the class, if the truth is now `ahead`.
+
+    A gain G of χ² scatters by 2√G.
+    """
+    least = max(AS_GOOD - ahead, 0.0)
+    return float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
+
+
+def _rows(foretold: Foretold, option: _Option) -> Bool[np.ndarray, " row"]:
+    weighing = foretold.bench.weighing
+    mine = foretold.rows_of[option.place][weighing.state]
+    first = 2 * len(foretold.bench.predictions.chosen.sensors)
+    wanted = [weighing.column < 2] if option.of_force else []
+    for order in option.orders:
+        at = first + 2 * HARMONICS.index(order)
+        wanted.append((weighing.column == at) | (weighing.column == at + 1))
+    return mine & np.logical_or.reduce(wanted)
+
+
+def _difference(
+    foretold: Foretold,
+    truth: tuple[Fit, Predicted],
+    rival: tuple[Fit, Predicted],
+    option: _Option,
+) -> tuple[str, str]:
+    """In what two models differ most under an option, and by how much, in words."""
+    states = foretold.bench.predictions.chosen.states
+    velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
+    columns = rival[1].columns[0] - truth[1].columns[0]
+    apart = columns[:, 0::2] + 1j * columns[:, 1::2]
+    mine = np.flatnonzero(foretold.rows_of[option.place])
+    mine = mine[np.isfinite(apart[mine]).all(axis=1)]
+    kinds = truth[0].kinds, rival[0].kinds
+    one, other = (
+        " and ".join(kind for kind in own if kind not in its) for own, its in (kinds, kinds[::-1])
+    )
+    if not mine.size:
+        return "velocity", f"{one} against {other}, which has no such motion"
+    at = mine[np.argmin(np.abs(np.angle(velocity[mine])))]
+    if option.floor is not None:
+        places = [HARMONICS.index(h) for h in option.orders]
+        own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
+        its = own + apart[at, [len(foretold.bench.predictions.chosen.sensors) + k for k in places]]
+        most = int(np.argmax(np.abs(own - its)))
+        name = f"harmonic {option.orders[most]}"
+        sizes = [f"{round(100 * abs(h[most]), 6):.2g} %" for h in (own, its)]
+        both = np.abs([own[most], its[most]])
+        turned = abs(np.degrees(np.angle(its[most] / own[most]))) if both.min() > 0 else 0.0
+        seen = both.min() > _SEEN * both.max() and turned > 1.0
+        turn = f", turned by {turned:.0f}°" if seen else ""
+        words = f"{sizes[0]} of the fundamental with {one}, {sizes[1]}{turn} with {other}"
+        return name, f"{name} is {words}"
+    if option.kind == "off_resonance":
+        share = 100 * float(np.abs(apart[mine, 0]).max())
+        return "velocity", f"with {one} and {other} velocities differ by up to {share:.2g} %"
+    # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
+    modes, j = foretold.bench.model.modes, foretold.bench.model.modes.mode_of_interest
+    slower = float(apart[at, 0].real)
+    shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
+    if abs(slower) / _RESOLVED["velocity"] > abs(shift) / _RESOLVED["frequency"]:
+        speed = float(np.abs(velocity[at]))
+        values, unit, name = (speed, speed / max(1 + slower, 0.1)), "m/s", "velocity"
+    else:
+        hertz = float(omega[at]) / (2 * np.pi)
+        values, unit, name = (hertz, hertz * (1 + shift)), "Hz", "frequency"
+    return (
+        name,
+        f"{name} at resonance {values[0]:.4g} {unit} with {one}, {values[1]:.4g} with {other}",
+    )

@@ -1,0 +1,240 @@
+"""States that a test could add, as an answer foretells them, and what they would tell of rivals."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.linalg import solve_triangular
+
+from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
+from snrmjax.diagnose.misfit.programs import COMPARED
+from snrmjax.measure.steady_states import SteadyStates, steady_states
+
+HARMONICS = COMPARED
+"""That are foretold of further states."""
+
+_RESOLUTION = 1e-12  # of singular values: what further states do not see at all stays open
+
+
+class Further(NamedTuple):
+    """States that could be added: motions of a measured level, scaled."""
+
+    level: int  # counted from zero
+    scale: float  # of its velocities
+    phase: Float[np.ndarray, " state"]  # rad
+
+
+class Foretold(NamedTuple):
+    """Further states as an answer foretells them, without noise."""
+
+    bench: Bench
+    rows_of: tuple[Bool[np.ndarray, " state"], ...]  # the states of every `Further`
+    force: tuple[float, ...]  # N at resonance, of every `Further`
+    frequency: tuple[float, ...]  # rad/s at resonance
+    floor: float  # m/s, noise of harmonics
+
+    def with_floor(self, floor: float) -> "Foretold":
+        """The same with another noise of harmonics."""
+        chosen = self.bench.predictions.chosen
+        own = chosen.states.own_std * (floor / self.floor)
+        states = chosen.states._replace(own_std=own)
+        bench = self.bench.with_errors(chosen._replace(states=states))
+        return self._replace(bench=bench, floor=floor)
+
+
+def foretold_states(bench: Bench, fit: Fit, further: tuple[Further, ...], floor: float) -> Foretold:
+    """Further states of the structure that a fit describes.
+
+    A motion is held, as everywhere in a diagnosis, and its force follows: velocities of a level
+    are scaled, and frequencies are moved to where the phase is the one wanted. Noise is that of the
+    states measured, in the median; `floor` is that of harmonics, m/s.
+    """
+    states = bench.predictions.chosen.states
+    level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
+    speed, omega, member = [], [], []
+    for number, one in enumerate(further):
+        mine = level == one.level
+        phase = np.angle(velocity[mine])
+        order = np.argsort(phase)
+        tip = np.abs(velocity[mine]) / np.maximum(np.cos(phase), 0.1)
+        speed.append(one.scale * np.interp(one.phase, phase[order], tip[order]) * np.cos(one.phase))
+        omega.append(np.interp(one.phase, phase[order], np.asarray(states.frequency)[mine][order]))
+        member.append(np.full(len(one.phase), number))
+    aim = np.concatenate([one.phase for one in further])
+    size, at, whose = (np.concatenate(parts) for parts in (speed, omega, member))
+    modes, j = bench.model.modes, bench.model.modes.mode_of_interest
+    sensor = bench.predictions.chosen.sensors[0]
+    unit = float(modes.mode_shape[sensor, j] * modes.participation[j])
+    data = _states(bench, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    force, _ = _needed(bench, fit, data)
+    # The modal stiffness ω̃² − Ω² + iΩδ of the held motion, and Ω where tan φ is the one wanted.
+    stiffness = unit * force / (np.exp(1j * aim) * size / (1j * at))
+    half = 0.5 * stiffness.imag / at * np.tan(aim)
+    square = stiffness.real + at**2 + half**2
+    moved = np.sqrt(np.maximum(square, 0.0)) - half
+    at = np.where(np.isfinite(moved) & (np.abs(moved / at - 1) < 0.5), moved, at)
+    data = _states(bench, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    force, harmonics = _needed(bench, fit, data)
+    good = np.isfinite(np.abs(force)) & np.all(np.isfinite(harmonics), axis=1)
+    turn = np.exp(-1j * np.angle(force))
+    seen = harmonics * turn[:, None] ** np.array(HARMONICS)
+    own = np.exp(1j * aim) * size * turn
+    found = _states(bench, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor)
+    predictions = Predictions(bench.model, found, bench.predictions.force_gain_std)
+    rows = tuple(whose[good] == number for number in range(len(further)))
+    ends = [_at_resonance(data=found, mine=mine, sensor=sensor) for mine in rows]
+    force_at, frequency_at = zip(*ends, strict=True)
+    return Foretold(Bench(predictions).reweighed(fit), rows, force_at, frequency_at, floor)
+
+
+def _at_resonance(
+    data: SteadyStates, mine: Bool[np.ndarray, " state"], sensor: int
+) -> tuple[float, float]:
+    """Force and frequency where the phase is zero; NaN without states."""
+    if not mine.any():
+        return np.nan, np.nan
+    phase = np.angle(np.asarray(data.velocity)[mine, sensor])
+    order = np.argsort(phase)
+    force, omega = (np.asarray(part)[mine][order] for part in (data.force, data.frequency))
+    at = [float(np.interp(0.0, phase[order], part)) for part in (force, omega)]
+    return at[0], at[1]
+
+
+def _states(
+    bench: Bench,
+    whose: Int[np.ndarray, " state"],
+    omega: Float[np.ndarray, " state"],
+    velocity: Complex[np.ndarray, " state"],
+    force: Float[np.ndarray, " state"],
+    harmonics: Complex[np.ndarray, "state harmonic"] | None,
+    floor: float,
+) -> SteadyStates:
+    """States of the reference sensor with the noise of the measured ones."""
+    chosen, sensors = bench.predictions.chosen, bench.model.modes.sensors
+    n, sensor = len(omega), chosen.sensors[0]
+    error = np.median(np.asarray(chosen.states.error), axis=0)
+    alone = np.zeros((n, len(sensors)))
+    alone[:, sensor] = 1.0
+    seen = np.zeros((n, len(HARMONICS))) if harmonics is None else harmonics
+    return steady_states(
+        whose,
+        omega,
+        force,
+        alone * velocity[:, None],
+        sensors=sensors,
+        measured=alone > 0,
+        velocity_std=error[1] * np.abs(velocity)[:, None] * alone,
+        phase_std=error[1 + len(sensors)] * alone,
+        force_std=error[0] * force,
+        order=np.ones(n),  # after the test
+        harmonics=alone[:, :, None] * seen[:, None, :],
+        harmonic_std=np.full((n, len(sensors)), floor),
+        harmonic_order=HARMONICS,
+    )
+
+
+def _needed(
+    bench: Bench, fit: Fit, data: SteadyStates
+) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
+    """The force that motions need under a fit, for one newton recorded, and their harmonics."""
+    predictions = Predictions(bench.model, data)
+    group = predictions.group(max(fit.kinds, key=predictions.is_apart))
+    values, own = group.values.copy(), bench.baseline(fit)
+    for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
+        values[group.place(name)] = value
+    columns = predictions.of(group, values[None]).columns[0]
+    parts = columns[:, 0::2] + 1j * columns[:, 1::2]
+    first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
+    higher = parts[:, first : first + len(HARMONICS)]
+    velocity = np.asarray(predictions.chosen.states.velocity)[:, 0]
+    return 1.0 + parts[:, 0], higher * np.abs(velocity)[:, None]
+
+
+def predicted(predictions: Predictions, fit: Fit) -> Predicted | None:
+    """Columns of all states under a fit's parameters; None where no program has all its kinds."""
+    group = predictions.group(max(fit.kinds, key=predictions.is_apart))
+    if not set(fit.labels) <= set(group.names):
+        return None
+    values = group.values.copy()
+    values[[group.place(label) for label in fit.labels]] = fit.values
+    return predictions.of(group, values[None], fit.labels)
+
+
+class Rows(NamedTuple):
+    """Misfits in units of noise, and their slopes by the parameters of a fit."""
+
+    left: Float[np.ndarray, " row"]
+    slopes: Float[np.ndarray, "row parameter"]
+
+
+class Compared(NamedTuple):
+    """A model by its measured rows, the χ² that they leave it, and its rows of further states."""
+
+    measured: Rows
+    least: float
+    further: Rows
+
+
+def rows_of(bench: Bench, found: Predicted) -> Rows:
+    """Predictions of one trial in units of a bench's noise."""
+    slopes = bench.weighing.noise_units(np.moveaxis(found.slopes[0], 2, 0))
+    return Rows(bench.weighing.noise_units(found.columns)[0], slopes.T)
+
+
+def together(
+    old: Bench, new: Bench, kept: Bool[np.ndarray, " row"]
+) -> Float[np.ndarray, "row shared"]:
+    """What measured states and some rows of further ones share: the baseline, not their levels."""
+    stated = sum(std > 0 for std in old.model.level_stds)
+    parts = old.weighing.shared, new.weighing.shared[kept]
+    own = [stated * bench.predictions.chosen.n_levels for bench in (old, new)]
+    common = [part[:, : part.shape[1] - n] for part, n in zip(parts, own, strict=True)]
+    apart = [part[:, part.shape[1] - n :] for part, n in zip(parts, own, strict=True)]
+    blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
+    return np.concatenate(
+        [
+            np.concatenate([common[0], apart[0], blank[0]], axis=1),
+            np.concatenate([common[1], blank[1], apart[1]], axis=1),
+        ]
+    )
+
+
+def refitted(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
+    """χ² when a fit's parameters have moved to where all rows put them, to first order."""
+    return _least(rows, np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T))
+
+
+def _least(rows: Rows, lower: Float[np.ndarray, "row row"]) -> float:
+    """The same from the covariance's Cholesky factor."""
+    size = np.linalg.norm(rows.slopes, axis=0)
+    arms = rows.slopes / np.where(size > 0, size, 1.0)
+    arms, left = (
+        solve_triangular(lower, part, lower=True, check_finite=False) for part in (arms, rows.left)
+    )
+    along, values, _ = np.linalg.svd(arms, full_matrices=False)
+    along = along[:, values > _RESOLUTION * max(values.max(initial=0.0), 1.0)]
+    return float(np.sum((left - along @ (along.T @ left)) ** 2))
+
+
+def separation(
+    old: Bench,
+    new: Bench,
+    truth: Compared,
+    rival: Compared,
+    kept: Bool[np.ndarray, " row"],
+) -> float:
+    """How much more χ² of a rival grows by some rows of further states than that of the truth.
+
+    Each is refitted to the measured and the further rows, with what they share. Rows for which one
+    of the two has no motion do not count.
+    """
+    for _, _, rows in (truth, rival):
+        kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)
+    shared = together(old, new, kept)
+    lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
+    gains = []
+    for before, least, after in (truth, rival):
+        both = Rows(*(np.concatenate([a, b[kept]]) for a, b in zip(before, after, strict=True)))
+        gains.append(_least(both, lower) - least)
+    return gains[1] - gains[0]

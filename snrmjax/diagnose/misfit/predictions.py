@@ -1,0 +1,381 @@
+"""What a model with an effect says of measured states: the force and the harmonics they need.
+
+Effects stand in a structure without strength, so that one program answers for many candidates:
+a candidate is a vector of parameters.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from snrmjax.diagnose.misfit import programs
+from snrmjax.diagnose.misfit.amplitudes import sizes_of
+from snrmjax.diagnose.misfit.candidates import Scales, candidate, parameter_labels
+from snrmjax.identify.calibrate.calibration_states import (
+    CalibrationStates,
+    Selection,
+    calibration_states,
+    state_whitener,
+)
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.parameters import parameter_values, stated_stds
+from snrmjax.model.structure import Structure
+from snrmjax.numerics.blocks import by_blocks, over_cores, padded
+
+_BLOCK = 64  # rows of a program: a state under one vector of parameters each
+_GROWN = 16  # of those that are grown, one after the other
+_DIRECTIONS = 8  # derivatives that a call gives, at most
+_LEAST = 1e-6  # of its unit, that a shape counts for at least
+_ERROR = 0.1  # of which a slope takes a thousandth: of a logarithm, or rad
+_TRIALS = _BLOCK  # that may meet in a block, at most
+
+
+class Group(NamedTuple):
+    """A structure with several effects without strength."""
+
+    model: Structure
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " parameter"]
+    unit: Float[np.ndarray, " parameter"]  # a change that is plainly seen, or smaller
+    is_strength: Bool[np.ndarray, " parameter"]  # the first of an added effect
+    is_shape: Bool[np.ndarray, " parameter"]  # another one of it
+    force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
+
+    def place(self, name: str) -> int:
+        """Where a parameter is."""
+        return self.names.index(name)
+
+
+class _Steps(NamedTuple):
+    """Directions of slopes: a parameter each, or errors of the states where there is none (−1)."""
+
+    place: Int[np.ndarray, " direction"]
+    length: Float[np.ndarray, "trial direction"]
+    by_error: Float[np.ndarray, "input direction"]
+
+
+class Predicted(NamedTuple):
+    """Columns of all states for several trials, and their derivatives along given directions.
+
+    NaN where no motion was found. A column is what is missed of the force, relative to the
+    measured one, or of a harmonic, relative to the measured velocity: real and imaginary parts, or
+    the size and nothing where the phase is unknown. The phasors are what the model has, and are
+    relative to a velocity of unknown phase.
+    """
+
+    columns: Float[np.ndarray, "trial state column"]
+    slopes: Float[np.ndarray, "trial state column direction"]
+    phasors: Complex[np.ndarray, "trial state part"]
+    force_slopes: Complex[np.ndarray, "trial state direction"]
+
+
+class Measured(NamedTuple):
+    """The states, their whitening and what of them was measured."""
+
+    chosen: Selection
+    by_error: Float[np.ndarray, "state column input"]
+    whiten: Float[np.ndarray, "state column column"]
+    known: Bool[np.ndarray, "state column"]
+
+    @property
+    def states(self) -> CalibrationStates:
+        """The states themselves."""
+        return self.chosen.states
+
+
+class Predictions:
+    """Answers for one model and one set of data."""
+
+    def __init__(self, model: Structure, data: SteadyStates, force_gain_std: float = 0.0):
+        # Its name would be a part of the programs.
+        self.model = dataclasses.replace(model, name="")
+        self.chosen = calibration_states(model, data, programs.HARMONICS)
+        self.sizes = sizes_of(self.chosen)
+        self.states, orders, self._own_columns = _widened(self.chosen)
+        self.held = (self.chosen.sensors, orders, programs.HARMONICS)
+        self.level_numbers = np.asarray(data.level)[self.chosen.rows]
+        self.force_gain_std = force_gain_std
+        numbers = parameter_values(self.model)
+        # What is stated of the baseline: numbers and their 1σ.
+        self.stated = {k: (numbers[k], std) for k, std in stated_stds(self.model).items()}
+        self._groups: dict[str, Group] = {}
+        found = by_blocks(self._baseline_motions, _GROWN, *self.states)
+        # Room for a power of two of states: few sizes compile.
+        room = [padded(rows) for rows in (*self.states, *found)]
+        arrays = jax.device_put(room)
+        self._stored = programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:])
+
+    def _baseline_motions(self, *rows: Array) -> tuple[Array, Array]:
+        return programs.grown(self.model, CalibrationStates(*rows), self.held)
+
+    def group(self, kind: str) -> Group:
+        """The structure that has this kind of effect.
+
+        The library shares one; effects of a user have structures of their own, which have the
+        library's too.
+        """
+        key = kind if kind not in _LIBRARY else ""
+        if key not in self._groups:
+            self._groups[key] = self._prepared([k for k in EFFECTS if k in _LIBRARY or k == kind])
+        return self._groups[key]
+
+    def scale_errors(self, factor: float) -> None:
+        """Take all errors of force, velocities and phases so many times larger."""
+        states = self.chosen.states
+        self.chosen = self.chosen._replace(states=states._replace(error=factor * states.error))
+
+    def turned(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
+        """The same with velocities of unknown phase at these phases, rad."""
+        states, unknown = self.chosen.states, self.chosen.phase_unknown[:, :1]
+        turn = np.where(unknown, np.exp(1j * phase)[:, None], 1.0)
+        other = copy.copy(self)
+        other.chosen = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
+        return other
+
+    def weighed(
+        self,
+        by_error: Float[np.ndarray, "state column input"],
+        phasors: Complex[np.ndarray, "state part"],
+    ) -> Measured:
+        """The states with the whitening of a model that passes errors on so and has the phasors."""
+        chosen = self.chosen
+        if self.sizes.alone.any():
+            own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
+            chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
+        return whitened_states(chosen, by_error)
+
+    def is_apart(self, kind: str) -> bool:
+        """Whether a kind has a program of its own."""
+        return kind not in _LIBRARY
+
+    def _prepared(self, kinds: list[str]) -> Group:
+        present = [effect.kind for effect in self.model.effects]
+        frequency, ratio = _of_interest(self.model)
+        added = tuple(
+            _without_strength(EFFECTS[k], frequency, ratio) for k in kinds if k not in present
+        )
+        model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
+        numbers, stds = parameter_values(model), stated_stds(model)
+        names, values = tuple(numbers), np.array(list(numbers.values()))
+        kinds = [added[k].kind for k in programs.forces_of(added)]
+        owner = [name.split(".")[0] for name in names]
+        force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
+        std = np.array([stds.get(name, 0.0) for name in names])
+        unit = np.maximum(0.01 * np.abs(values), std)
+        unit[unit == 0] = 1.0
+        scales, where = scales_of(self), {name: k for k, name in enumerate(names)}
+        is_strength, is_shape = np.zeros((2, len(names)), dtype=bool)
+        for effect in added:
+            places = [where[label] for label in parameter_labels(effect.kind)]
+            unit[places] = candidate(effect.kind, scales).unit
+            is_strength[places[0]], is_shape[places[1:]] = True, True
+        return Group(model, names, values, unit, is_strength, is_shape, force)
+
+    def of(
+        self,
+        group: Group,
+        values: Float[np.ndarray, "trial parameter"],
+        along: Sequence[str] = (),
+    ) -> Predicted:
+        """What the states miss under every trial's parameters, and slopes along some of these."""
+        places = np.array([group.place(name) for name in along], dtype=int)
+        # Slopes are differences, over a small share of what is plainly seen. The unit of a shape
+        # may be a guess: its own size counts, unless that is nothing.
+        size = np.abs(values)
+        length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
+        own = np.clip(size, _LEAST * group.unit, group.unit)
+        length = np.where(group.is_shape & (size > 0), own, length)[:, places]
+        steps = _Steps(places, length, np.zeros((self.states[6].shape[1], len(places))))
+        columns, slopes = self._in_turn(group, values, steps)
+        slopes = slopes / length[:, None, None]
+        force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
+        compared = self.sizes.compared(columns, slopes)
+        return Predicted(*compared, self.sizes.phasors(columns), force_slopes)
+
+    def by_error(
+        self, group: Group, values: Float[np.ndarray, " parameter"]
+    ) -> tuple[Float[np.ndarray, "state column input"], Complex[np.ndarray, "state part"]]:
+        """Derivatives by the states' errors, as a model with these parameters passes them on.
+
+        Returns the model's phasors too.
+        """
+        inputs = self.states[6].shape[1]
+        none = (np.full(inputs, -1), np.zeros((1, inputs)))
+        steps = _Steps(*none, _ERROR * np.eye(inputs))
+        columns, slopes = self._in_turn(group, values[None], steps)
+        found = self.sizes.compared(columns, slopes / _ERROR, of_errors=True)[1]
+        return found[0], self.sizes.phasors(columns)[0]
+
+    def _in_turn(
+        self, group: Group, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns, and slopes along some directions after the other."""
+        wanted, parts = len(steps.place), []
+        for begin in range(0, max(wanted, 1), _DIRECTIONS):
+            some = slice(begin, begin + _DIRECTIONS)
+            own = _Steps(*(_filled(a[..., some]) for a in steps))
+            parts.append(self._answers(group, values, own, min(wanted - begin, _DIRECTIONS)))
+        return parts[0][0], np.concatenate([slope for _, slope in parts], axis=3)[..., :wanted]
+
+    def _answers(
+        self,
+        group: Group,
+        values: Float[np.ndarray, "trial parameter"],
+        steps: "_Steps",
+        wanted: int,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and slopes: friction by its formulas, and marching where they fail."""
+        used = np.any(values != group.values, axis=0)
+        used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
+        active = np.zeros(group.force.max() + 1, dtype=bool)
+        active[group.force[used & (group.force >= 0)]] = True
+        fixed = (group.model, group.names, self.held, len(self.model.effects))
+        n, trials = len(self.chosen.rows), len(values)
+        state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
+
+        def answered(swings: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+            def block(some: np.ndarray) -> list[np.ndarray]:
+                at = padded(some, _BLOCK)
+                first = int(trial[some[0]])
+                near = slice(first, first + _TRIALS)
+                ours = [padded(a[near], _TRIALS) for a in (values, steps.length)]
+                parts: list[Any] = [*ours, steps.place, steps.by_error]
+                table = programs.Trials(*parts)
+                which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
+                found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
+                return [np.asarray(a)[: len(some), self._own_columns] for a in found]
+
+            blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
+            parts = over_cores(block, blocks)
+            return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+        found = answered(True, np.arange(n * trials))
+        good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in found]
+        left = np.flatnonzero(~(good[0] & good[1]))
+        slides = any(group.names[k].split(".")[0] in _SLIDING for k in np.flatnonzero(used))
+        if left.size and slides:
+            for part, own in zip(found, answered(False, left), strict=True):
+                part[left] = own
+        columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in found)
+        return columns, slopes
+
+
+def _widened(chosen: Selection) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
+    """The states as the programs take them, their harmonics, and which columns are the states' own.
+
+    Harmonics that the states lack have room: further states that are asked for have them, and one
+    program answers for both.
+    """
+    n, n_sensors = chosen.states.velocity.shape
+    orders = tuple(sorted({*programs.COMPARED, *chosen.orders}))
+    places = np.array([orders.index(h) for h in chosen.orders], dtype=int)
+    harmonics = np.zeros((n, n_sensors, len(orders)), dtype=complex)
+    harmonics[:, :, places] = chosen.states.harmonics
+    first = n_sensors + len(orders) * np.arange(n_sensors)[:, None]
+    parts = np.append(np.arange(n_sensors), first + places)
+    columns = (2 * parts[:, None] + np.arange(2)).reshape(-1)
+    wide = np.zeros((2, n, 2 * n_sensors * (1 + len(orders))))
+    # Of a phasor whose size alone counts the programs give both parts.
+    known = np.asarray(chosen.states.known)[:, ::2]
+    wide[:, :, columns] = chosen.states.own_std, np.repeat(known, 2, axis=1)
+    own = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
+    states = (chosen.states._asdict() | own).values()
+    return [np.asarray(part) for part in states], orders, columns
+
+
+def _filled(directions: np.ndarray) -> np.ndarray:
+    room = np.zeros((*directions.shape[:-1], _DIRECTIONS), dtype=directions.dtype)
+    room[..., : directions.shape[-1]] = directions
+    return room
+
+
+def whitened_states(
+    chosen: Selection, by_error: Float[np.ndarray, "state column input"]
+) -> Measured:
+    """The states with the whitening that follows from their errors."""
+    parts = [padded(np.asarray(part)) for part in (*chosen.states, by_error)]
+    arrays = jax.device_put(parts)
+    states = CalibrationStates(*arrays[:-1])
+    whiten = np.asarray(state_whitener(states, arrays[-1], jnp.zeros(())))[: len(by_error)]
+    used = np.any(whiten != 0, axis=(1, 2))
+    return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
+
+
+def scales_of(predictions: Predictions) -> Scales:
+    """What is typical of the measured motions."""
+    modes, j = predictions.model.modes, predictions.model.modes.mode_of_interest
+    states = predictions.chosen.states
+    speed, omega, force = (
+        np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
+    )
+    shape = abs(float(modes.mode_shape[predictions.chosen.sensors[0], j]))
+    amplitude = speed / omega / shape
+    return Scales(
+        amplitude=float(np.median(amplitude)),
+        largest=float(np.max(amplitude)),
+        frequency=float(modes.natural_frequency[j]),
+        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        receptance=float(np.median(speed / omega / force)),
+        smallest_force=float(np.min(force)),
+        damping_ratio=float(modes.damping_ratio[j]),
+    )
+
+
+PLAIN = "cubic_stiffness"
+"""A kind of the library, whose program also answers for the baseline by itself."""
+
+_LIBRARY = frozenset(EFFECTS)
+_SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
+
+
+def without_strength(model: Structure, completed: Structure) -> Structure | None:
+    """The first model with the kinds of effects that the second has beside it, without strength.
+
+    The same physics. None where a kind is a user's own, of
+    which nobody knows what takes its strength.
+    """
+    kinds = [effect.kind for effect in completed.effects[len(model.effects) :]]
+    if not _LIBRARY.issuperset(kinds):
+        return None
+    added = tuple(_without_strength(EFFECTS[kind], *_of_interest(model)) for kind in kinds)
+    return dataclasses.replace(model, effects=(*model.effects, *added))
+
+
+def _of_interest(model: Structure) -> tuple[float, float]:
+    """Natural frequency (rad/s) and damping ratio of the mode of interest."""
+    modes, j = model.modes, model.modes.mode_of_interest
+    return float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+
+
+@lru_cache(maxsize=256)
+def _without_strength(one: type[AbstractEffect], frequency: float, ratio: float) -> AbstractEffect:
+    """An effect that does nothing, with shapes that no rule forbids.
+
+    Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
+    """
+    shapes = {
+        "gap_stiffness": {"gap": 1.0},
+        "one_sided_stop": {"gap": 1.0},
+        "jenkins_slider": {"slip_displacement": 1.0},
+        "iwan_microslip": {"exponent": 1.5},
+        "internal_resonance_1_3": {
+            "frequency_hz": 3.3 * frequency / (2 * np.pi),
+            "damping_ratio": ratio,
+        },
+        "internal_resonance_1_2": {
+            "frequency_hz": 2.2 * frequency / (2 * np.pi),
+            "damping_ratio": ratio,
+        },
+        "close_mode": {"frequency_hz": 1.1 * frequency / (2 * np.pi), "damping_ratio": ratio},
+    }
+    zero = dict.fromkeys(effect_parameters(one.kind), 0.0)
+    return make_effect(one.kind, zero | shapes.get(one.kind, {}))

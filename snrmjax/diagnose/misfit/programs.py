@@ -1,0 +1,279 @@
+"""The compiled programs behind predictions: rows of states, each under parameters of its own.
+
+A motion under a trial's parameters is reached from the baseline's by steps with the baseline's
+Jacobian, for many rows at once. One program answers for many effects: those that a call does not
+ask for are passed over.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import partial
+from typing import ClassVar, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from snrmjax.identify.calibrate.calibration_states import CalibrationStates
+from snrmjax.identify.calibrate.inverse_force import Erring, held_state, missed_columns
+from snrmjax.model.effect_base import (
+    AbstractEffect,
+    AbstractForce,
+    AbstractKinked,
+    AbstractMemoryless,
+)
+from snrmjax.model.friction import IwanMicroslip, JenkinsSlider
+from snrmjax.model.mode_coupling import AbstractInternalResonance
+from snrmjax.model.parameters import with_parameters
+from snrmjax.model.structure import Structure
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.balance.harmonics import displacement_phasors, harmonic_basis
+from snrmjax.simulate.balance.prescribed_motion import Secants, nothing_of, start_of
+
+HARMONICS = 5
+"""Of the motions: one sees three of them, and two more bend those."""
+
+COMPARED = (2, 3)
+"""Harmonics that have room in the programs, measured or not."""
+
+_STEP = 2.5e-4  # of a direction, between the two ends of a slope
+_SHARE = 1e-2  # of a slope's first step, below which the last one is
+_NOTHING = 1e-9  # relative difference of columns that solutions may have by chance
+_CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
+
+Held = tuple[tuple[int, ...], tuple[int, ...], int]
+"""The sensors (the reference first), the harmonics compared and the harmonics of a motion."""
+
+
+@compiled
+def grown(
+    model: Structure, states: CalibrationStates, held: Held
+) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
+    """Motions grown from small amplitudes, NaN where none was found, and inverse Jacobians."""
+
+    def one(*row: Array) -> tuple[Array, Array]:
+        state = CalibrationStates(*row)
+        motion = held_state(model, state, state.velocity[0], held[0][0], held[2])
+        point, jacobian = motion.grown_with_jacobian()
+        return point, jnp.linalg.inv(jacobian)
+
+    return mapped(one, *states)
+
+
+class Stored(NamedTuple):
+    """States, baseline motions and inverse Jacobians there; a row for every state, and spare."""
+
+    states: CalibrationStates
+    near: Float[Array, "state entry"]
+    inverse: Float[Array, "state entry entry"]
+
+
+class Trials(NamedTuple):
+    """Parameters of some trials, and the steps of slopes: of one parameter, or of errors."""
+
+    values: Float[Array, "trial parameter"]
+    length: Float[Array, "trial direction"]
+    place: Int[Array, " direction"]
+    by_error: Float[Array, "input direction"]
+
+
+@compiled
+def missed(
+    model: Structure,
+    names: tuple[str, ...],
+    held: Held,
+    own: int,
+    swings: bool,
+    active: Bool[Array, " force"],
+    wanted: Int[Array, ""],
+    stored: Stored,
+    trials: Trials,
+    state: Int[Array, " row"],
+    trial: Int[Array, " row"],
+) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
+    """What every row misses, and its slopes along the directions `wanted`, else zero.
+
+    NaN where no motion was found. Slopes are differences between motions a small step apart: the
+    second is a step or two from the first, and the equations are compiled but once.
+    Arguments: the first `own` effects are the baseline's; with `swings` friction is taken by
+    formulas for cycles that turn only twice, and others give NaN; of the added `forces_of` only
+    the `active` count; a row is a state and a trial by their numbers.
+    """
+    n_directions = len(trials.place)
+    close = jnp.where(wanted > 0, _CLOSER, _CLOSE)
+
+    def one(state: Array, trial: Array) -> tuple[Array, Array]:
+        measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
+        values, length = trials.values[trial], trials.length[trial]
+
+        def found(
+            number: Array, start: Secants, columns: Float[Array, "column direction"]
+        ) -> tuple[Secants, Float[Array, "column direction"]]:
+            along = jnp.where(jnp.arange(n_directions) == number - 1, _STEP, 0.0)
+            mine = trials.place[number - 1] == jnp.arange(len(names))
+            changed = with_parameters(model, names, values + (length @ along) * mine)
+            added = changed.effects[own:]
+            forces = [_quick(added[k], swings=swings) for k in forces_of(added)]
+            rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
+            changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
+            erring = Erring(measured, 1.0, trials.by_error @ along)
+            motion = erring.motion(changed, held[0][0], held[2])
+            parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
+            balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
+            motion = dataclasses.replace(motion, balance=balance)
+            share = jnp.where(number > 0, _SHARE, 0.0)
+            end = motion.solved_by_secants(inverse, start, close, share)
+            # Where the second motion is not found, the first step towards it is its slope.
+            lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
+            point = jnp.where(lost, start.point + end.moves[0], end.point)
+            own_columns = missed_columns(erring, motion, point, *held[:2])
+            start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
+            place = jnp.arange(n_directions + 1) == number
+            return start, jnp.where(place, own_columns[:, None], columns)
+
+        none = nothing_of(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
+        columns = jax.lax.fori_loop(
+            0, wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
+        )[1]
+        change = columns[:, 1:] - columns[:, :1]
+        seen = (jnp.arange(n_directions) < wanted) & ~(jnp.abs(change) < _NOTHING)
+        return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
+
+    return jax.vmap(one)(state, trial)
+
+
+def forces_of(effects: Sequence[AbstractEffect]) -> list[int]:
+    """Which effects are taken as forces on the mode of interest."""
+    kinds = (AbstractForce, AbstractInternalResonance)
+    return [k for k, effect in enumerate(effects) if isinstance(effect, kinds)]
+
+
+class _ForcedBalance(HarmonicBalance):
+    """A balance with further forces, each sampled as it needs; few of them count."""
+
+    forces: tuple[AbstractForce, ...] = ()
+    active: Bool[Array, " force"] = eqx.field(default_factory=lambda: jnp.zeros(0, dtype=bool))
+
+    def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
+        """See `HarmonicBalance.residual`."""
+        j = self.model.modes.mode_of_interest
+        x, omega = self.coefficients(point)[:, j], point[-1] * self.frequency_scale
+        added = jnp.zeros_like(x)
+        for n_samples in sorted({_samples(force) for force in self.forces}):
+            mine = [k for k, force in enumerate(self.forces) if _samples(force) == n_samples]
+            some = jnp.any(self.active[jnp.array(mine)])
+            added = added + _where(some, partial(self._harmonics, mine, n_samples), x, omega)
+        unit = self.frequency_scale**2 * self.displacement_scale
+        own = jnp.asarray(self.model.own_mode)
+        return super().residual(point) + jnp.outer(added / unit, own).reshape(-1)
+
+    def _harmonics(
+        self, mine: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
+    ) -> Float[Array, " coefficient"]:
+        """Coefficients of some of the forces over the cycle of a mode's coefficients."""
+        basis = harmonic_basis(HARMONICS, n_samples)
+        q = jnp.asarray(basis.synthesis) @ x
+        v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
+        force = jnp.zeros_like(q)
+        for k in mine:
+            force = force + _where(self.active[k], self.forces[k].cycle_force, q, v)
+        return jnp.asarray(basis.analysis) @ force
+
+
+def _where(
+    counts: Bool[Array, ""], function: Callable[[Array, Array], Array], first: Array, second: Array
+) -> Array:
+    """A function of two arrays of the first one's shape where it counts, else nothing."""
+    # A method of a module with arrays has no hash.
+    taken = jax.lax.cond(
+        counts, lambda a, b: function(a, b), lambda a, _: jnp.zeros_like(a), first, second
+    )
+    return taken
+
+
+def _samples(force: AbstractForce) -> int:
+    if isinstance(force, AbstractKinked):
+        return 512
+    return 128 if isinstance(force, AbstractMemoryless) else 256
+
+
+def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:
+    if isinstance(effect, AbstractInternalResonance):
+        return _Resonance(effect)
+    if swings and isinstance(effect, JenkinsSlider):
+        return _SwingingSlider(effect.stiffness, effect.slip_displacement)
+    if swings and isinstance(effect, IwanMicroslip):
+        return _SwingingIwan(effect.coefficient, effect.exponent)
+    return cast(AbstractForce, effect)  # one of `forces_of`
+
+
+class _Resonance(AbstractForce):
+    """What a coupled mode in steady motion does to the mode of interest."""
+
+    kind: ClassVar[str] = "resonance"
+    effect: AbstractInternalResonance
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        mode, q, n = self.effect, displacement, self.effect.order
+        basis = harmonic_basis(HARMONICS, q.shape[0])
+        slope = jnp.asarray(basis.synthesis @ basis.derivative) @ (jnp.asarray(basis.analysis) @ q)
+        omega = jnp.sqrt(jnp.sum(velocity**2) / jnp.sum(slope**2))
+        load = displacement_phasors((jnp.asarray(basis.analysis) @ q**n)[:, None])[:, 0]
+        own = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
+        rate = jnp.arange(HARMONICS + 1) * omega
+        stiffness = own**2 - rate**2 + 2j * mode.damping_ratio * own * rate
+        answer = -mode.coefficient * load / stiffness
+        parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)[jnp.array(_KEPT)]
+        return n * mode.coefficient * q ** (n - 1) * (jnp.asarray(basis.synthesis) @ parts)
+
+
+_KEPT = (0, *range(2, 2 * HARMONICS + 2))  # the mean has no sine
+
+
+class _SwingingSlider(JenkinsSlider):
+    """A slider over a cycle between two turns; NaN over others."""
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        q, slip = displacement, self.slip_displacement
+        high, low, falling = _swing(q)
+        down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
+        stuck = jnp.clip(0.0, high - slip, low + slip)
+        position = jnp.where(2 * slip < high - low, jnp.where(falling, down, up), stuck)
+        return -self.stiffness * position
+
+
+class _SwingingIwan(IwanMicroslip):
+    """Masing's rule over a cycle between two turns; NaN over others."""
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        high, low, falling = _swing(displacement)
+        backbone = 0.5 * (high - low)
+        gone = jnp.where(falling, high - displacement, displacement - low) / 2
+        branch = self._lost(backbone) - 2 * self._lost(gone)
+        return jnp.where(falling, -branch, branch)
+
+    def _lost(self, stretch: Array) -> Array:
+        """What the virgin curve c|x|^p has lost."""
+        safe = jnp.where(stretch > 0, stretch, 1.0)
+        return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
+
+
+def _swing(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
+    """The largest and the smallest sample, NaN where there are further turns, and what falls."""
+    n = q.shape[0]
+    top, bottom = jnp.argmax(q), jnp.argmin(q)
+    since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
+    ahead = jnp.roll(q, -1) - q
+    swings = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
+    nothing = jnp.where(swings, 0.0, jnp.nan)
+    return q[top] + nothing, q[bottom] + nothing, since <= fall

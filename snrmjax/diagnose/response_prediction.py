@@ -1,0 +1,190 @@
+"""What models foretell of a test: resonances under its forces."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.misfit.predictions import without_strength
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.structure import Structure
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.solutions.forced_response import forced_response_batch
+from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
+
+ORDER = 5  # harmonics of the responses
+_REACH = 0.3  # of the measured range of frequencies, added at both ends
+
+
+class Resonance(NamedTuple):
+    """Where a response is in phase with its force; NaN for what a test or a curve does not have."""
+
+    frequency: float  # Hz
+    velocity: float  # m/s
+    fold: float = np.nan  # Hz, of the branch that ends nearest above
+
+
+class LevelResponse(NamedTuple):
+    """A level's measured resonance and what two models foretell."""
+
+    level: int
+    force: float  # N, at resonance
+    measured: Resonance
+    before: Resonance
+    after: Resonance
+    held_out: bool  # whether `after` is of a model that has not seen the level
+
+
+def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
+    """Force of every level that has a known one, N: at resonance, where its states enclose it.
+
+    A test that holds the response changes the force along a level; elsewhere it is their mean.
+    Without phases it is that of the state with the largest velocity over force.
+    """
+    level, force = np.asarray(data.level), np.asarray(data.force)
+    velocity = np.asarray(data.velocity)[:, sensor]
+    good = np.isfinite(force) & np.isfinite(np.abs(velocity))
+    found = {}
+    for number in np.unique(level[good]):
+        mine = good & (level == number)
+        if np.asarray(data.phase_unknown)[mine, sensor].any():
+            found[int(number)] = float(force[_largest(data, mine, sensor)])
+            continue
+        phase, order = np.angle(velocity[mine]), np.argsort(np.angle(velocity[mine]))
+        inside = phase.min() <= 0 <= phase.max()
+        own = force[mine]
+        at = np.interp(0.0, phase[order], own[order]) if inside else np.mean(own)
+        found[int(number)] = float(at)
+    return found
+
+
+def responses(
+    models: Structure | Sequence[Structure], data: SteadyStates, forces: Sequence[float]
+) -> list[list[ResponseCurve]]:
+    """Simulated responses around the measured frequencies, force by force (N), as recorded.
+
+    `models` is one for all forces or one for each, with the same kinds of effects.
+    """
+    frequency = np.asarray(data.frequency)
+    reach = _REACH * (frequency.max() - frequency.min())
+    ends = (float(frequency.min() - reach), float(frequency.max() + reach))
+    each = [models] * len(forces) if isinstance(models, Structure) else list(models)
+    loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
+    batch = forced_response_batch(models, loads, *ends, harmonic_order=ORDER, stability=False)
+    return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
+
+
+class Simulated(NamedTuple):
+    """Responses of every level: of both models, and of those that have not seen a level."""
+
+    before: list[list[ResponseCurve]]
+    after: list[list[ResponseCurve]]
+    blind: dict[int, list[ResponseCurve]]
+
+
+def level_simulations(
+    model: Structure,
+    completed: Structure,
+    blind: Mapping[int, Structure],
+    data: SteadyStates,
+    sensor: int,
+    force_gain: float = 1.0,
+) -> Simulated:
+    """Responses under the levels' forces, before and after.
+
+    `blind` has models that have not seen a level; `force_gain` is acting force over recorded one
+    for the models after. One program follows all responses: what was added counts for nothing in
+    the model before.
+    """
+    forces = level_forces(data, sensor)
+    every, seen = list(forces.values()), [level for level in forces if level in blind]
+    after = [completed] * len(every) + [blind[level] for level in seen]
+    loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
+    same = without_strength(model, completed)
+    if same is None:
+        old, new = responses(model, data, every), responses(after, data, loads)
+    else:
+        found = responses([*[same] * len(every), *after], data, [*every, *loads])
+        old, new = found[: len(every)], found[len(every) :]
+    return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
+
+
+def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
+    """By interpolation between the states on both sides; NaN where one side is empty.
+
+    Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least. Without
+    phases the state with the largest velocity over force is taken, if others enclose it.
+    """
+    velocity, frequency = np.asarray(data.velocity)[:, sensor], np.asarray(data.frequency)
+    mine = (np.asarray(data.level) == level) & np.isfinite(np.abs(velocity))
+    if np.asarray(data.phase_unknown)[mine, sensor].any():
+        top = _largest(data, mine, sensor)
+        if frequency[top] in (frequency[mine].min(), frequency[mine].max()):
+            return Resonance(np.nan, np.nan)
+        return Resonance(float(frequency[top]) / (2 * np.pi), float(abs(velocity[top])))
+    velocity, frequency = velocity[mine], frequency[mine]
+    phase = np.angle(velocity)
+    order = np.argsort(phase)
+    order = order[np.cos(phase[order]) > 0]
+    phase, velocity, frequency = phase[order], velocity[order], frequency[order]
+    if not order.size or phase[0] > 0 or phase[-1] < 0:
+        return Resonance(np.nan, np.nan)
+    at = np.interp(0.0, np.tan(phase), frequency)
+    tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
+    return Resonance(float(at) / (2 * np.pi), float(tip))
+
+
+def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
+    """Of some states the one with the largest velocity over force."""
+    ratio = np.abs(np.asarray(data.velocity)[:, sensor]) / np.asarray(data.force)
+    return int(np.argmax(np.where(mine & np.isfinite(ratio), ratio, -np.inf)))
+
+
+def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonance:
+    """The strongest phase resonance of a response: of the velocity that a sensor records."""
+    found = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
+    if not found:
+        return Resonance(np.nan, np.nan)
+    size, frequency, curve = max(found, key=lambda one: one[0])
+    folds = curve.at_events("fold")
+    fold = np.nan
+    if folds.size:
+        tips = np.abs(curve.velocity[folds, 1, sensor])
+        fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
+    return Resonance(frequency / (2 * np.pi), size, fold)
+
+
+def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
+    """Velocities (m/s) and frequencies (rad/s) where a sensor's velocity has the force's phase."""
+    velocity, frequency = np.asarray(curve.velocity)[:, 1, sensor], np.asarray(curve.frequency)
+    real, imag = velocity.real, velocity.imag
+    turns = (imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])
+    found = []
+    for k in np.flatnonzero(turns & (real[:-1] > 0) & (real[1:] > 0)):
+        share = imag[k] / (imag[k] - imag[k + 1])
+        size = (1 - share) * real[k] + share * real[k + 1]
+        found.append((float(size), float((1 - share) * frequency[k] + share * frequency[k + 1])))
+    return found
+
+
+def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:
+    """Measured and foretold resonances of every level.
+
+    Models that have not seen a level speak for it in place of the completed one.
+    """
+    rows = []
+    for (level, force), old, new in zip(
+        level_forces(data, sensor).items(), simulated.before, simulated.after, strict=True
+    ):
+        own = simulated.blind.get(level, new)
+        rows.append(
+            LevelResponse(
+                level,
+                force,
+                measured_resonance(data, level, sensor),
+                simulated_resonance(old, sensor),
+                simulated_resonance(own, sensor),
+                level in simulated.blind,
+            )
+        )
+    return rows

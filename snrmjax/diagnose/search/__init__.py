@@ -1,0 +1,1 @@
+"""Where the misfit lies, and which effects explain it."""

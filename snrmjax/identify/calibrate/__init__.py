@@ -1,0 +1,1 @@
+"""Parameters of a model fitted to measured states through its harmonic balance."""

@@ -1,0 +1,412 @@
+"""Parameters of a model fitted to measured steady states, through its harmonic balance.
+
+A state is not simulated at its force and frequency, where near a fold there are several answers or
+none. Its frequency and the fundamental of its velocity are held at what was measured, and the
+balance is solved for the rest of the motion and for the force that it needs. That force has one
+value however the response folds; what it misses of the measured one is the residual.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from snrmjax.identify.calibrate.calibration_states import (
+    CalibrationStates,
+    Selection,
+    calibration_states,
+    state_whitener,
+    whitened,
+)
+from snrmjax.identify.calibrate.inverse_force import Erring, held_state, missed_columns
+from snrmjax.measure.steady_states import SteadyStates, check_phases
+from snrmjax.model.parameters import (
+    checked_names,
+    parameter_value,
+    stated_std,
+    with_parameters,
+    with_stated_std,
+)
+from snrmjax.model.structure import Structure
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
+
+# Rounds of fitting and whitening anew. In the first, what the data say little about stays within
+# about this relative step, and harmonics have this relative error: far from the truth they
+# mislead. The last number is the tolerance, relative and in 1σ.
+_ROUNDS = ((0.1, 1.0, 1e-3), (0.3, 0.1, 1e-3), (np.inf, 0.0, 1e-3), (np.inf, 0.0, 1e-8))
+# Unknowns in units of so many 1σ: the solver's damping, one unit's worth at first, is then light.
+_LIGHT = 30.0
+
+
+class CalibratedModel(eqx.Module):
+    """A model with fitted parameters, and how well they are known.
+
+    `residuals` are whitened: of unit variance if noise and model are right; NaN where nothing was
+    measured or the state has no weight. A state's columns are real and imaginary parts of the
+    force, of the other sensors' fundamentals and of the harmonics. `covariance` and `std` are
+    widened by `noise_scale` where no noise is stated or where the residuals contradict it. What a
+    level shares is by how much its velocities were found to be too large and to lead.
+    """
+
+    model: Structure  # with the fitted values, and their 1σ where it has a place for them
+    values: Float[np.ndarray, " parameter"]
+    std: Float[np.ndarray, " parameter"]
+    covariance: Float[np.ndarray, "parameter parameter"]
+    residuals: Float[np.ndarray, "state column"]
+    state_converged: Bool[np.ndarray, " state"]
+    level_gain: Float[np.ndarray, " level"]  # relative
+    level_phase: Float[np.ndarray, " level"]  # rad
+    reduced_chi_square: float
+    noise_scale: float  # its root: the residuals over the stated noise
+    names: tuple[str, ...] = eqx.field(static=True)
+    noise_stated: bool = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+
+class _Settings(NamedTuple):
+    """What is compiled into a program."""
+
+    names: tuple[str, ...]
+    sensors: tuple[int, ...]  # rows of the mode shapes, the reference sensor first
+    orders: tuple[int, ...]  # harmonics that are compared
+    harmonic_order: int
+    shared: tuple[str, ...]  # errors that a level shares
+    n_levels: int
+
+    @property
+    def held(self) -> tuple[int, int]:
+        """The sensor whose velocity is held, and the harmonic order."""
+        return self.sensors[0], self.harmonic_order
+
+
+class _Aim(NamedTuple):
+    """What unknowns mean, and what holds them near zero, where they all begin.
+
+    An unknown is a parameter's change relative to its start, or its value where that is zero, or
+    what a level shares in units of 1σ.
+    """
+
+    values: Float[Array, " parameter"]
+    weight: Float[Array, " parameter"]  # 1/σ, 0 where there is none
+    level_std: Float[Array, " error"]
+
+    def parameters(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " parameter"]:
+        """The parameters themselves."""
+        own = unknowns[: self.values.shape[0]]
+        return jnp.where(self.values != 0, self.values * (1 + own), own)
+
+    def misses(self, unknowns: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """Residuals of the unknowns themselves."""
+        off = (self.parameters(unknowns) - self.values) * self.weight
+        return jnp.append(off, unknowns[off.shape[0] :])
+
+
+class _Slopes(NamedTuple):
+    """All states at some unknowns, and their derivatives."""
+
+    points: Float[Array, "state entry"]
+    columns: Float[Array, "state column"]
+    by_unknown: Float[Array, "state column unknown"]
+    by_error: Float[Array, "state column input"]
+    points_by_unknown: Float[Array, "state entry unknown"]
+
+
+def calibrate_model(
+    model: Structure,
+    data: SteadyStates,
+    parameters: Sequence[str],
+    *,
+    harmonic_order: int = 9,
+    level_gain_std: float = 0.0,
+    level_phase_std: float = 0.0,
+    priors: bool = False,
+) -> CalibratedModel:
+    """Fit parameters of a model to measured steady states of all levels at once.
+
+    Minimises the whitened sum of squares of (F_needed − F)/F over the states, F_needed being the
+    complex force that the measured frequency and fundamental velocity need (`needed_force`), and
+    of what is missed of other sensors and of harmonics with a stated error. The covariance of a
+    state's residuals follows from the stated errors of force, velocity and phase; it is taken anew
+    where a fit ended. Levenberg–Marquardt, with the balance's exact derivatives.
+
+    Arguments: `model` gives the start and all that is not fitted; `parameters` are out of
+    `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
+    that all velocities of a level share: they become unknowns. With `priors` the standard
+    deviations that the model states for fitted parameters hold them near their start.
+    Returns a `CalibratedModel`. A state for which no balanced motion is found has no weight and is
+    named in the notes. Where errors of velocity are not stated for all states, equal relative ones
+    are taken for all and their size found from the residuals.
+    Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
+    unknown force or phase, for levels' errors below zero and for too few data.
+    Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
+    an internal resonance several motions have one fundamental; the one that grows from small
+    amplitudes is taken.
+    Reference: the formulation is this package's own.
+    """
+    names = checked_names(model, parameters)
+    level_std = {"gain": level_gain_std, "phase": level_phase_std}
+    for name, value in level_std.items():
+        if not 0 <= value < np.inf:
+            raise ValueError(f"`level_{name}_std` must be zero or positive, but is {value}.")
+    check_phases(data, "a calibration")
+    chosen = calibration_states(model, data, harmonic_order)
+    shared = tuple(name for name, value in level_std.items() if value > 0)
+    picked = (chosen.sensors, chosen.orders, harmonic_order, shared, chosen.n_levels)
+    settings = _Settings(names, *picked)
+    prior_std = np.array([stated_std(model, name) if priors else 0.0 for name in names])
+    weight = np.divide(1.0, prior_std, out=np.zeros(len(names)), where=prior_std > 0)
+    n_rows = int(chosen.states.known.sum()) + int(np.sum(weight > 0))
+    if n_rows <= len(names):
+        raise ValueError(
+            f"{len(names)} parameters need more than {len(names)} data, but {len(chosen.rows)} "
+            f"usable states give {n_rows}."
+        )
+    aim = _Aim(
+        values=jnp.stack([parameter_value(model, name) for name in names]),
+        weight=jnp.asarray(weight),
+        level_std=jnp.array([level_std[name] for name in shared]),
+    )
+    return _result(model, data.n_states, chosen, settings, aim)
+
+
+@compiled
+def _grown(
+    model: Structure,
+    states: CalibrationStates,
+    settings: _Settings,
+    parameters: Float[Array, " parameter"],
+) -> Float[Array, "state entry"]:
+    """Solutions for the measured velocities, grown from small amplitudes."""
+    model = with_parameters(model, settings.names, parameters)
+
+    def one(*row: Array) -> Array:
+        state = CalibrationStates(*row)
+        return held_state(model, state, state.velocity[0], *settings.held).grown()
+
+    return mapped(one, *states)
+
+
+def _columns(
+    model: Structure,
+    state: CalibrationStates,
+    settings: _Settings,
+    aim: _Aim,
+    unknowns: Float[Array, " unknown"],
+    error: Float[Array, " input"],
+    near: Float[Array, " entry"],
+) -> tuple[Float[Array, " column"], Float[Array, " entry"]]:
+    """Columns of one state, and the solution behind them.
+
+    `error` adds to the logarithms of force and velocities and to the phases: for derivatives.
+    """
+    p = len(settings.names)
+    model = with_parameters(model, settings.names, aim.parameters(unknowns))
+    level = unknowns[p:].reshape(settings.n_levels, len(settings.shared))[state.level]
+    shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
+    factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
+    erring = Erring(state, factor, error)
+    motion = erring.motion(model, settings.sensors[0], settings.harmonic_order)
+    point = motion.solved(near)
+    return missed_columns(erring, motion, point, settings.sensors, settings.orders), point
+
+
+@compiled
+def _slopes(
+    model: Structure,
+    states: CalibrationStates,
+    settings: _Settings,
+    aim: _Aim,
+    unknowns: Float[Array, " unknown"],
+    near: Float[Array, "state entry"],
+) -> _Slopes:
+    def one(*row: Array) -> _Slopes:
+        state, start = CalibrationStates(*row[:-1]), row[-1]
+
+        def both(unknowns: Array, error: Array) -> tuple:
+            found = _columns(model, state, settings, aim, unknowns, error, start)
+            return found, found
+
+        slopes = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
+        (columns, points), (value, point) = slopes(unknowns, jnp.zeros_like(state.error))
+        return _Slopes(point, value, columns[0], columns[1], points[0])
+
+    return mapped(one, *states, near)
+
+
+@compiled
+def _fit(
+    model: Structure,
+    states: CalibrationStates,
+    settings: _Settings,
+    aim: _Aim,
+    start: Float[Array, " unknown"],
+    slopes: _Slopes,
+    whiten: Float[Array, "state column column"],
+    unit: Float[Array, " unknown"],
+    hold: Float[Array, " unknown"],
+    tolerance: Float[Array, ""],
+) -> tuple[Array, Array, Array]:
+    """The unknowns that fit best, solutions near theirs, and whether the solver converged."""
+
+    def near(change: Array) -> Array:
+        return jax.lax.stop_gradient(slopes.points + slopes.points_by_unknown @ change)
+
+    def residuals(y: Array, _: None = None) -> Array:
+        unknowns = start + y * unit
+
+        def one(*row: Array) -> Array:
+            state, begin = CalibrationStates(*row[:-1]), row[-1]
+            none = jnp.zeros_like(state.error)
+            return _columns(model, state, settings, aim, unknowns, none, begin)[0]
+
+        # A state that is lost on the way is NaN: the solver then takes a smaller step.
+        of_states = whitened(whiten, mapped(one, *states, near(y * unit)))
+        rest = jnp.append(aim.misses(unknowns), hold * y * unit)
+        return jnp.append(of_states.reshape(-1), rest)
+
+    limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance}
+    solver: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+        **limits, linear_solver=lx.QR()
+    )
+    solution: optx.Solution = optx.least_squares(
+        residuals, solver, jnp.zeros_like(start), max_steps=60, throw=False
+    )
+    change = solution.value * unit
+    good = jnp.asarray(solution.result == optx.RESULTS.successful)
+    return start + change, near(change), good
+
+
+class _Fitted(NamedTuple):
+    unknowns: np.ndarray
+    residuals: Float[np.ndarray, "state column"]
+    jacobian: Float[np.ndarray, "row unknown"]
+    usable: Bool[np.ndarray, " state"]
+    good: bool
+
+
+def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, aim: _Aim) -> _Fitted:
+    """Fit, whiten anew where the fit ended, and fit again."""
+    subject = (model, states, settings)
+    unknowns = jnp.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
+    slopes = _slopes(*subject, aim, unknowns, _grown(*subject, aim.values))
+    good, relative = True, np.asarray(aim.values) != 0
+    for turn, (step, doubt, tolerance) in enumerate(_ROUNDS):
+        lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
+        if turn and lost.any():
+            again = jnp.where(
+                lost[:, None], _grown(*subject, aim.parameters(unknowns)), slopes.points
+            )
+            slopes = _slopes(*subject, aim, unknowns, again)
+        whiten = state_whitener(states, slopes.by_error, jnp.asarray(doubt))
+        # Every unknown in its own unit: the solver's damping then treats them alike.
+        size = np.linalg.norm(_jacobian(whiten, slopes, aim, unknowns), axis=0)
+        unit = jnp.asarray(_LIGHT / np.where(size > 0, size, 1.0))
+        hold = jnp.asarray(np.append(relative / step, np.zeros(len(unknowns) - len(relative))))
+        unknowns, near, ended = _fit(
+            *subject, aim, unknowns, slopes, whiten, unit, hold, jnp.asarray(tolerance)
+        )
+        slopes, good = _slopes(*subject, aim, unknowns, near), bool(ended)
+    return _Fitted(
+        unknowns=np.asarray(unknowns),
+        residuals=whitened(*map(np.asarray, (whiten, slopes.columns))),
+        jacobian=_jacobian(whiten, slopes, aim, unknowns),
+        usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
+        good=good,
+    )
+
+
+def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim, unknowns: Array) -> np.ndarray:
+    own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
+    of_states = whitened(own, by_unknown).reshape(-1, unknowns.shape[0])
+    return np.concatenate([of_states, np.asarray(_own_slopes(aim, unknowns))])
+
+
+@compiled
+def _own_slopes(aim: _Aim, unknowns: Array) -> Float[Array, "unknown unknown"]:
+    return jax.jacfwd(aim.misses)(unknowns)
+
+
+def _result(
+    model: Structure, n_states: int, chosen: Selection, settings: _Settings, aim: _Aim
+) -> CalibratedModel:
+    found = _fitted(model, chosen.states, settings, aim)
+    names, p, usable = settings.names, len(settings.names), found.usable
+    known = np.asarray(chosen.states.known) & usable[:, None]
+    freedom = int(known.sum()) + int(np.sum(np.asarray(aim.weight) > 0)) - p
+    square = np.sum(found.residuals**2) + np.sum(
+        np.asarray(aim.misses(jnp.asarray(found.unknowns))) ** 2
+    )
+    reduced = float(square) / freedom if freedom > 0 else np.nan
+    values = np.asarray(aim.parameters(jnp.asarray(found.unknowns)))
+    unit = np.where(np.asarray(aim.values) != 0, np.asarray(aim.values), 1.0)
+    covariance = _inverse_of_square(found.jacobian)[:p, :p] * unit * unit[:, None]
+    doubt = float(np.sqrt(2 / max(freedom, 1)))
+    if not chosen.noise_stated or not reduced <= 1 + 3 * doubt:
+        covariance = covariance * reduced
+    std = np.sqrt(np.diag(covariance))
+    level = found.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
+    shared = dict(zip(settings.shared, level.T, strict=True))
+    nothing = np.zeros(settings.n_levels)
+    residuals = np.full((n_states, known.shape[1]), np.nan)
+    residuals[chosen.rows] = np.where(known, found.residuals, np.nan)
+    converged = np.zeros(n_states, dtype=bool)
+    converged[chosen.rows] = usable
+    fitted = with_parameters(model, names, jnp.asarray(values))
+    return CalibratedModel(
+        model=with_stated_std(fitted, names, jnp.asarray(std)),
+        values=values,
+        std=std,
+        covariance=covariance,
+        residuals=residuals,
+        state_converged=converged,
+        level_gain=shared.get("gain", nothing),
+        level_phase=shared.get("phase", nothing),
+        reduced_chi_square=reduced,
+        noise_scale=float(np.sqrt(reduced)),
+        names=names,
+        noise_stated=chosen.noise_stated,
+        converged=found.good and freedom > 0,
+        notes=(*chosen.notes, *_notes(chosen, names, found, reduced, 3 * doubt)),
+    )
+
+
+def _notes(
+    chosen: Selection, names: tuple[str, ...], found: _Fitted, reduced: float, doubt: float
+) -> list[str]:
+    notes = []
+    if not found.good:
+        notes.append("the fit did not converge: start nearer, or fit fewer parameters.")
+    if not found.usable.all():
+        lost = ", ".join(str(k) for k in chosen.rows[~found.usable])
+        notes.append(f"no balanced motion was found for the states {lost}: they have no weight.")
+    times = f"{np.sqrt(reduced):.2g} times the stated noise"
+    if chosen.noise_stated and not reduced <= 1 + doubt:
+        notes.append(
+            f"residuals are {times}: it is understated or the model lacks something; the standard "
+            "deviations are widened accordingly."
+        )
+    if chosen.noise_stated and reduced < 1 - doubt:
+        notes.append(f"residuals are only {times}: it is overstated.")
+    blind = [name for name, slope in zip(names, found.jacobian.T, strict=False) if not slope.any()]
+    if blind:
+        notes.append(f"the data say nothing about {', '.join(blind)}.")
+    return notes
+
+
+def _inverse_of_square(jacobian: np.ndarray) -> np.ndarray:
+    """(JᵀJ)⁻¹ by singular values of the scaled columns; infinite for what has no influence."""
+    size = np.linalg.norm(jacobian, axis=0)
+    seen = np.flatnonzero(size > 0)
+    _, values, rows = np.linalg.svd(jacobian[:, seen] / size[seen], full_matrices=False)
+    root = (rows.T / values) / size[seen, None]
+    inverse = np.diag(np.where(size > 0, 0.0, np.inf))
+    inverse[np.ix_(seen, seen)] = root @ root.T
+    return inverse

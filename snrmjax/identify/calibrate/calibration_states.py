@@ -1,0 +1,169 @@
+"""Measured states as a calibration compares them with a model."""
+
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.measure.steady_states import SteadyStates, relative_errors
+from snrmjax.model.structure import Structure
+from snrmjax.numerics.blocks import taken
+from snrmjax.numerics.compiled import compiled
+
+OneKind = TypeVar("OneKind", Array, np.ndarray)
+
+ASSUMED_ERROR = 0.01
+"""Relative and rad, of velocities where nobody stated any noise: a fit then finds its size."""
+
+
+class CalibrationStates(NamedTuple):
+    """Measured states; the reference sensor comes first.
+
+    A column is the real or the imaginary part of the force, of another sensor's fundamental or of
+    a harmonic, the latter two over the reference velocity.
+    """
+
+    level: Int[Array, " state"]  # counted from zero
+    frequency: Float[Array, " state"]  # rad/s
+    force: Float[Array, " state"]  # N
+    order: Float[Array, " state"]  # of the test, 0…1
+    velocity: Complex[Array, "state sensor"]  # m/s
+    harmonics: Complex[Array, "state sensor harmonic"]  # m/s
+    error: Float[Array, "state input"]  # 1σ of log force, of log velocities and of phases
+    own_std: Float[Array, "state column"]  # 1σ of what a column alone has: noise of harmonics
+    known: Bool[Array, "state column"]  # what was measured
+
+
+class Selection(NamedTuple):
+    """What of the data is used."""
+
+    states: CalibrationStates
+    rows: Int[np.ndarray, " state"]  # of the data
+    n_levels: int
+    sensors: tuple[int, ...]  # in the order of the states' sensors
+    orders: tuple[int, ...]  # harmonics that are compared
+    phase_unknown: Bool[np.ndarray, "state sensor"]
+    noise_stated: bool
+    notes: tuple[str, ...]
+
+
+def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int) -> Selection:
+    """The states that the reference sensor measured under a known force.
+
+    Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
+    compared where their error is stated. A velocity of unknown phase, and its harmonics, are real
+    and positive, and the imaginary part of what they are compared by is not known; where it is
+    that of the reference sensor, the phases of the whole state count as unknown.
+    Raises `ValueError` for sensors other than the model's, where no force is known and where no
+    state is left.
+    """
+    if data.sensors != model.modes.sensors:
+        raise ValueError(
+            f"`data` has the sensors {list(data.sensors)}, but `model` has "
+            f"{list(model.modes.sensors)}."
+        )
+    if not np.any(np.isfinite(np.asarray(data.force))):
+        raise ValueError(
+            "the force is unknown (only a drive voltage is given): calibrate it first, with "
+            "`calibrate_force` and `apply_calibration`."
+        )
+    notes: list[str] = []
+    # Operations of JAX compile for every number of states.
+    told: Any = jax.tree.map(np.asarray, data)
+    r = reference_sensor(model.modes)
+    sensors = [r, *(s for s in range(len(told.sensors)) if s != r)]
+    velocity = told.velocity[:, sensors]
+    size = np.abs(velocity)
+    measured = told.measured[:, sensors] & np.isfinite(size) & (size > 0)
+    force, frequency = told.force, told.frequency
+    rows = np.flatnonzero(measured[:, 0] & np.isfinite(force) & (force > 0) & (frequency > 0))
+    if not rows.size:
+        raise ValueError(
+            f"no state has a force above zero and a velocity of {data.sensors[r]!r}, the sensor "
+            "that sees the mode of interest best."
+        )
+    velocity, measured = np.where(measured, velocity, 0.0)[rows], measured[rows]
+    told = taken(told, rows)
+    errors = np.asarray(relative_errors(told))[:, sensors]
+    stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
+    if not stated:
+        errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
+        notes.append("some errors are not stated: equal relative errors are taken for all states.")
+    errors = np.where(measured[..., None], errors, 0.0)
+    places = [k for k, h in enumerate(told.harmonic_order) if 1 < h <= harmonic_order]
+    harmonics = told.harmonics[:, sensors][..., places]
+    std = told.harmonic_std[:, sensors] / np.abs(velocity[:, :1])
+    there = np.isfinite(np.abs(harmonics)) & (measured & (std > 0))[..., None]
+    unknown = np.asarray(told.phase_unknown)[:, sensors]
+    unknown = measured & (unknown | unknown[:, :1])
+    velocity = np.where(unknown, np.abs(velocity), velocity)
+    harmonics = np.where(unknown[..., None], np.abs(harmonics), harmonics)
+    errors[..., 2] = np.where(unknown, 0.0, errors[..., 2])
+    if places and not there.any():
+        notes.append("harmonics are left out: no error is stated for them.")
+        harmonics, there, places = harmonics[..., :0], there[..., :0], []
+    n = len(rows)
+    real = np.concatenate([np.ones((n, 1), bool), measured[:, 1:], there.reshape(n, -1)], axis=1)
+    alone = [unknown, np.repeat(unknown, len(places), axis=1)]
+    known = np.stack([real, real & ~np.concatenate(alone, axis=1)], axis=2).reshape(n, -1)
+    # Each part of a complex error has half its square.
+    own = np.where(there, std[..., None] / np.sqrt(2), 0.0).reshape(n, -1)
+    order = told.order
+    levels, level = np.unique(told.level, return_inverse=True)
+    columns: list[Any] = [
+        level,
+        told.frequency,
+        told.force,
+        np.where(np.isfinite(order), order, np.asarray(model.test_order)),
+        velocity,
+        np.where(there, harmonics, 0.0),
+        np.concatenate([errors[:, 0, :1], *np.moveaxis(errors, 2, 0)[1:]], 1),
+        np.repeat(np.pad(own, ((0, 0), (len(sensors), 0))), 2, axis=1),
+        known,
+    ]
+    parts = jax.device_put(CalibrationStates(*columns), may_alias=False)
+    orders = tuple(told.harmonic_order[k] for k in places)
+    own_places = (tuple(sensors), orders, unknown)
+    return Selection(parts, rows, len(levels), *own_places, stated, tuple(notes))
+
+
+@compiled
+def state_whitener(
+    states: CalibrationStates,
+    by_error: Float[Array, "state column input"],
+    doubt: Float[Array, ""],
+) -> Float[Array, "state column column"]:
+    """The matrices that make a state's columns independent and of unit variance.
+
+    Arguments: derivatives of the columns with respect to the errors in `states.error`; `doubt`
+    is a further error of the harmonics, relative to their own size. Zero for
+    states whose derivatives are not finite: they have no weight.
+    """
+    good = jnp.all(jnp.isfinite(by_error), axis=(1, 2))[:, None, None]
+    scaled = jnp.where(good, by_error, 1.0) * states.error[:, None, :]
+    size = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
+    wide = jnp.pad(size, ((0, 0), (states.velocity.shape[1], 0)))
+    own = states.own_std**2 + doubt**2 * jnp.repeat(wide, 2, axis=1) ** 2
+    own = jnp.where(states.known, own, 1.0)
+    covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(own)
+    # Rounding must not make it singular.
+    floor = 1e-14 * jnp.trace(covariance, axis1=1, axis2=2)[:, None, None]
+    eye = jnp.eye(covariance.shape[1])
+    root = jnp.linalg.cholesky(covariance + floor * eye)
+    inverse = jax.vmap(lambda low: jax.scipy.linalg.solve_triangular(low, eye, lower=True))(root)
+    return jnp.where(good, inverse, 0.0)
+
+
+def whitened(
+    whitener: Float[OneKind, "state column column"], columns: Float[OneKind, "state column *entry"]
+) -> Float[OneKind, "state column *entry"]:
+    """Columns of all states, or their derivatives, made independent; zero without weight.
+
+    NumPy's arrays stay so.
+    """
+    xp: Any = columns.__array_namespace__()
+    used = xp.any(whitener != 0, axis=(1, 2)).reshape(-1, *(1,) * (columns.ndim - 1))
+    return xp.einsum("sij,sj...->si...", whitener, xp.where(used, columns, 0.0))

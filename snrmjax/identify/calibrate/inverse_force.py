@@ -1,0 +1,129 @@
+"""The force that a measured motion needs: one value however the response folds."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.identify.calibrate.calibration_states import CalibrationStates, calibration_states
+from snrmjax.measure.steady_states import SteadyStates, check_phases
+from snrmjax.model.structure import Structure
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.prescribed_motion import HeldMotion, held_motion
+
+
+class NeededForce(eqx.Module):
+    """Motions with a given fundamental and the forces they need; NaN where none was found."""
+
+    force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
+    velocity: Complex[Array, "state harmonic sensor"]  # m/s, as recorded, h = 0…H
+    converged: Bool[Array, " state"]
+
+
+def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 9) -> NeededForce:
+    """The complex force that measured frequencies and fundamental velocities need.
+
+    Solves the harmonic balance for all coefficients and the force, with the velocity's fundamental
+    at the reference sensor held at what was measured: one value however the response folds. The
+    motion is grown from small amplitudes by Newton's method. A differentiable function of the
+    model, by the implicit function theorem: in forward and in reverse mode, once.
+
+    Returns a `NeededForce`, NaN where no motion was found and for states that the reference sensor
+    did not measure. It is the measured force where model and measurement are right.
+    Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
+
+    >>> import snrmjax as sj
+    >>> linear = sj.structure(sj.linear_modes([500.0], [0.01], [[2.0]], [3.0]))
+    >>> data = sj.steady_states([1], [500.0], [1.0], [0.9 + 0.0j])
+    >>> needed_force(linear, data).force.round(6)
+    Array([1.5+0.j], dtype=complex128)
+    """
+    check_phases(data, "a needed force")
+    chosen = calibration_states(model, data, harmonic_order)
+    found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
+    n, rows = data.n_states, chosen.rows
+    nothing = jnp.full((n, *found.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
+    return NeededForce(
+        force=nothing[:, 0, 0].at[rows].set(found.force),
+        velocity=nothing.at[rows].set(found.velocity),
+        converged=jnp.zeros(n, dtype=bool).at[rows].set(found.converged),
+    )
+
+
+def held_state(
+    model: Structure,
+    state: CalibrationStates,
+    velocity: Complex[Array, ""],
+    sensor: int,
+    harmonic_order: int,
+) -> HeldMotion:
+    """The equations of one state with a velocity (m/s) of the reference sensor."""
+    return held_motion(
+        eqx.tree_at(lambda m: m.test_order, model, state.order),
+        *(state.frequency, state.force, velocity),
+        sensor=sensor,
+        harmonic_order=harmonic_order,
+        scale=jnp.abs(state.velocity[0]),
+    )
+
+
+class Erring(NamedTuple):
+    """A state whose record is taken to err."""
+
+    state: CalibrationStates
+    factor: Complex[Array, ""] | float  # of all velocities
+    error: Float[Array, " input"]  # of the logarithms of force and velocities, and of the phases
+
+    def velocities(self) -> tuple[Complex[Array, " sensor"], Complex[Array, "sensor harmonic"]]:
+        """Fundamentals and harmonics freed of the errors, in m/s."""
+        state, n = self.state, self.state.velocity.shape[0]
+        own = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        return state.velocity * own, state.harmonics * own[:, None]
+
+    def motion(self, model: Structure, sensor: int, harmonic_order: int) -> HeldMotion:
+        """The equations of its motion."""
+        return held_state(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
+
+
+def missed_columns(
+    erring: Erring,
+    motion: HeldMotion,
+    point: Float[Array, " entry"],
+    sensors: tuple[int, ...],
+    orders: tuple[int, ...],
+) -> Float[Array, " column"]:
+    """What a state's motion misses of the force, other sensors and harmonics.
+
+    Arguments: `motion` is that of `erring`, and `point` its solution; `sensors` has the reference
+    first; `orders` are the harmonics that are compared.
+    Returns real and imaginary parts, of the force over the measured one and of the rest over the
+    measured velocity.
+    """
+    state = erring.state
+    velocity, harmonics = erring.velocities()
+    force, seen = motion.recorded(point)
+    seen = seen[:, np.array(sensors)]
+    higher = seen[np.array(orders, dtype=int)].T - harmonics
+    missed = jnp.append((seen[1] - velocity)[1:], higher.reshape(-1)) / jnp.abs(state.velocity[0])
+    own = (force - state.force * jnp.exp(erring.error[0])) / state.force
+    each = jnp.append(own, missed)
+    parts = jnp.stack([each.real, each.imag], axis=1).reshape(-1)
+    return jnp.where(state.known, parts, 0.0)
+
+
+@compiled
+def _needed(
+    model: Structure, states: CalibrationStates, sensor: int, harmonic_order: int
+) -> NeededForce:
+    def one(*row: Array) -> NeededForce:
+        state = CalibrationStates(*row)
+        held = held_state(model, state, state.velocity[0], sensor, harmonic_order)
+        point = held.solved(held.grown())
+        force, velocity = held.recorded(point)
+        return NeededForce(force, velocity, jnp.isfinite(jax.lax.stop_gradient(point[-1])))
+
+    return mapped(one, *states)

@@ -1,0 +1,1 @@
+"""Families of smooth curves of amplitude with a few parameters."""

@@ -1,0 +1,225 @@
+"""Curves through values at knots: natural cubic splines of the squared amplitude."""
+
+import itertools
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.curves.family_base import AbstractFamily, Argument, Coefficient, linear_start
+
+_NEAREST = 0.01  # distance of two knots, of their amplitude
+_SMALL = 0.05  # amplitude, of the largest, below which distances count as if they were there
+
+
+class Spline(AbstractFamily):
+    """A natural cubic spline in amplitude², through values at knots; the first knot is at zero.
+
+    Drawn by `hats`, and not by intervals: the program is a tenth of what a search for intervals
+    and its derivatives compile to.
+    """
+
+    kind: ClassVar[str] = "spline"
+    orders: ClassVar[tuple[int, ...]] = (3, 4, 5, 6)
+    knots: Float[Array, " knot"]  # of (amplitude/scale)²
+    mix: Float[Array, "term knot"]  # from values at the knots to coefficients of 1, u and `hats`
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractFamily`."""
+        u = (jnp.asarray(amplitude) / self.scale) ** 2
+        return _drawn(u, self.mix @ self.parameters, self.knots)
+
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """See `AbstractFamily`."""
+        n = self.parameters.shape[0]
+        return tuple(Coefficient(f"knot_{k}", 0.0, True) for k in range(n))
+
+    @classmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: np.ndarray,
+        values: np.ndarray,
+        weight: np.ndarray,
+    ) -> list[AbstractFamily]:
+        """See `AbstractFamily`; knots at zero and where the amplitudes divide into equal parts."""
+        scale = float(np.max(amplitude))
+        shares = np.quantile(amplitude / scale, np.linspace(0, 1, order)[1:])
+        # Knots that coincide, of levels at one amplitude, are drawn apart evenly instead.
+        knots = np.concatenate([[0.0], shares**2])
+        if np.min(np.diff(knots)) < 0.02 / order:
+            knots = np.linspace(0.0, 1.0, order) ** 2
+        unit = jnp.asarray(scale, dtype=jnp.float64)
+        blank = cls.through(knots, np.zeros(order), unit, argument)
+        columns = spline_columns(blank, amplitude)
+        start = linear_start(columns, values, weight)
+        return [eqx.tree_at(lambda f: f.parameters, blank, jnp.asarray(start))]
+
+    @classmethod
+    def through(
+        cls,
+        knots: Float[np.ndarray, " knot"],
+        values: Float[np.ndarray, " knot"],
+        scale: Float[Array, ""],
+        argument: Argument,
+    ) -> "Spline":
+        """The spline through values at knots, which are squares of amplitude/scale."""
+        mix = jnp.asarray(np.linalg.inv(_terms(knots, knots)))
+        return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
+
+
+@jax.custom_jvp
+def _drawn(u: Array, coefficients: Array, knots: Array) -> Array:
+    line = jnp.stack([jnp.ones_like(u), u], axis=-1)
+    return jnp.concatenate([line, hats(u, knots)[0]], axis=-1) @ coefficients
+
+
+@_drawn.defjvp
+def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """One set of hats serves all directions, where automatic rules would draw them for each.
+
+    Knots have no derivative: they are chosen, not fitted.
+    """
+    u, coefficients, knots = primals
+    by_u, by_coefficients, _ = tangents
+    slope = coefficients[1] + hats(u, knots)[1] @ coefficients[2:]
+    return _drawn(u, coefficients, knots), slope * by_u + _drawn(u, by_coefficients, knots)
+
+
+class SmoothingSpline(Spline):
+    """A natural cubic spline with a knot at every level that is as smooth as the data ask for.
+
+    Its bends, what a value differs from the straight line between its neighbours' by, are expected
+    to be of a size that the restricted likelihood finds: one for all while families are compared,
+    then half more than one that changes along the curve (`sizes_along`), with neighbours that are
+    somewhat alike (`likeness`). A band then holds what the curve may do
+    between levels; with few free knots it holds nothing of what they cannot follow. Levels lie
+    denser where a curve is rougher, so that bends from level to level are more alike than
+    curvature is.
+    Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.
+    """
+
+    kind: ClassVar[str] = "smoothing_spline"
+    orders: ClassVar[tuple[int, ...]] = (12,)
+    largest_size: ClassVar[int] = 24
+    bends: Float[Array, "bend knot"]  # from values at the knots
+    bend_std: Float[Array, "*bend"]  # 1σ of the bends, one for all or each its own
+
+    def prior_residuals(self) -> Float[Array, " row"]:
+        """See `AbstractCurve`."""
+        return self.bends @ self.parameters / self.bend_std
+
+    @classmethod
+    def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
+        """See `AbstractFamily`: a knot at rest and one at every level, or more if these are few."""
+        return (int(np.clip(n_levels, min(8, n_states // 3), cls.largest_size - 1)) + 1,)
+
+    @classmethod
+    def starts(
+        cls,
+        order: int,
+        argument: Argument,
+        amplitude: np.ndarray,
+        values: np.ndarray,
+        weight: np.ndarray,
+    ) -> list[AbstractFamily]:
+        """See `AbstractFamily`; knots at rest and in the middles of groups of equally many states.
+
+        Knots that would almost coincide are one.
+        """
+        scale = float(np.max(amplitude))
+        groups = np.array_split(np.sort(amplitude / scale), order - 1)
+        apart = [1.0]
+        for knot in [float(np.median(group)) for group in groups][-2::-1]:
+            if knot < apart[-1] - _NEAREST * max(apart[-1], _SMALL):
+                apart.append(knot)
+        knots = np.array([0.0, *apart[::-1]]) ** 2
+        unit = jnp.asarray(scale, dtype=jnp.float64)
+        blank = cls.through(knots, np.zeros(len(knots)), unit, argument)
+        start = linear_start(spline_columns(blank, amplitude), values, weight)
+        size = jnp.asarray(max(float(np.std(values)), 1e-3 * float(np.max(np.abs(values)))))
+        return [
+            eqx.tree_at(lambda f: (f.parameters, f.bend_std), blank, (jnp.asarray(start), size))
+        ]
+
+    @classmethod
+    def through(
+        cls,
+        knots: Float[np.ndarray, " knot"],
+        values: Float[np.ndarray, " knot"],
+        scale: Float[Array, ""],
+        argument: Argument,
+    ) -> "SmoothingSpline":
+        """See `Spline`; bends of all sizes are alike likely until `bend_std` says otherwise."""
+        mix = jnp.asarray(np.linalg.inv(_terms(knots, knots)))
+        bends = jnp.asarray(_bends(knots))
+        fixed = (scale, argument, jnp.asarray(knots), mix, bends, jnp.asarray(np.inf))
+        return cls(jnp.asarray(values), *fixed)
+
+
+class Bent(NamedTuple):
+    """A smoothing spline as a straight line and its bends: values at knots = both · unknowns."""
+
+    both: Float[np.ndarray, "knot unknown"]  # two of the line, then the bends
+    straight: Float[np.ndarray, " knot"]  # values at the knots without the bends
+    prior_std: Float[np.ndarray, " unknown"]
+
+
+def bent(curve: SmoothingSpline) -> Bent:
+    """The line and the bends of a curve."""
+    of_bends = np.asarray(curve.bends)
+    values, knots = np.asarray(curve.parameters), np.asarray(curve.knots)
+    back = np.linalg.pinv(of_bends)
+    both = np.column_stack([np.ones_like(knots), knots, back])
+    prior = np.concatenate([[np.inf, np.inf], np.full(len(of_bends), np.asarray(curve.bend_std))])
+    return Bent(both, values - back @ (of_bends @ values), prior)
+
+
+def spline_columns(
+    curve: Spline, amplitude: Float[np.ndarray, " point"]
+) -> Float[np.ndarray, "point knot"]:
+    """Derivatives of a spline by its values at the knots, on the host."""
+    u = (amplitude / float(curve.scale)) ** 2
+    return _terms(u, np.asarray(curve.knots)) @ np.asarray(curve.mix)
+
+
+def _bends(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
+    """Change of slope at every inner knot, times the mean distance to its neighbours.
+
+    A bend's variance is expected to grow with that distance, counted in logarithms of amplitude:
+    in units of the mean one.
+    """
+    gap, amplitude = np.diff(knots), np.sqrt(knots)
+    matrix = np.zeros((len(gap) - 1, len(knots)))
+    for k, (below, above) in enumerate(itertools.pairwise(gap)):
+        mean = 0.5 * (below + above)
+        matrix[k, k : k + 3] = mean * np.array([1 / below, -1 / below - 1 / above, 1 / above])
+    reach = np.log(amplitude[2:] / np.maximum(amplitude[:-2], 0.5 * amplitude[1:-1]))
+    return matrix / np.sqrt(reach / np.mean(reach))[:, None]
+
+
+def hats(u: Array | np.ndarray, knots: Float[Array | np.ndarray, " knot"]) -> tuple[Array, Array]:
+    """Functions whose second derivative is a hat over three successive knots, and their slopes.
+
+    Straight outside of their hat and made of clipped differences: nothing large cancels, as it
+    does in sums of truncated powers. On the host for arrays of the host.
+    """
+    xp: Any = np if isinstance(u, np.ndarray) else jnp
+    u = u[..., None]
+    left, middle, right = knots[:-2], knots[1:-1], knots[2:]
+    rise, fall = middle - left, right - middle
+    up, down = xp.clip(u - left, 0.0, rise), xp.clip(u - middle, 0.0, fall)
+    past, beyond = xp.maximum(u - middle, 0.0), xp.maximum(u - right, 0.0)
+    value = up**3 / (6 * rise) + 0.5 * (rise * past + down**2 + fall * beyond)
+    value = value - down**3 / (6 * fall)
+    return value, 0.5 * up**2 / rise + down - 0.5 * down**2 / fall
+
+
+def _terms(
+    u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
+) -> Float[np.ndarray, "point term"]:
+    return np.column_stack([np.ones_like(u), u, hats(u, knots)[0]])

@@ -1,0 +1,1 @@
+"""What a joint fit says: curves and responses with bands, and what to measure next."""

@@ -1,0 +1,272 @@
+"""Both curves of a joint fit at amplitudes on the backbone, with bands."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.curves.family_base import AbstractCurve
+from snrmjax.identify.joint.force_balance import Unknowns
+from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone import BackboneValues
+from snrmjax.numerics.blocks import by_blocks
+from snrmjax.numerics.compiled import compiled
+
+_BLOCK = 256  # amplitudes that one program works on
+_LEAST = 0.01  # of the largest amplitude, below which rivals are not asked
+_ITERATIONS = 12
+_DOUBLINGS = 6  # of the displacement, to reach a velocity
+
+
+def fitted_values(
+    fit: JointFit,
+    velocity: Float[np.ndarray, " point"] | None = None,
+    *,
+    displacement: Float[np.ndarray, " point"] | None = None,
+    of_a_new_level: bool = False,
+) -> BackboneValues:
+    """ω̃ and ζ̃ at amplitudes on the backbone, with 1σ at that amplitude.
+
+    The bands include what the choice among families leaves open (`open_choice`).
+
+    Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With `of_a_new_level`
+    the bands are those of the next test: they include by how much one level differs from another.
+    Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
+    have where it softens: give displacements there.
+    """
+    if (velocity is None) == (displacement is None):
+        raise ValueError("give either `velocity` or `displacement`.")
+    if velocity is not None:
+        at = np.asarray(velocity, dtype=np.float64)
+        values, slopes = values_with_slopes(fit, at)
+        shifts = open_choice(fit, velocity=at)
+    else:
+        given = np.asarray(displacement, np.float64)
+        values, slopes, at = values_at_displacement(fit, given)
+        shifts = open_choice(fit, displacement=given)
+    covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
+    covariance += np.einsum("koc,kod->ocd", shifts, shifts)
+    squared, damping = values.T
+    if of_a_new_level:
+        stiffness, dissipation = np.asarray(fit.spread.level)[2:]
+        covariance[:, 0, 0] += (squared * stiffness) ** 2
+        covariance[:, 1, 1] += (damping * dissipation) ** 2
+    omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
+    # ζ̃ = δ/(2√s): dζ̃ = dδ/(2ω̃) − ζ̃ ds/(2s).
+    slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
+    zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
+    return BackboneValues(
+        velocity=jnp.asarray(at),
+        natural_frequency=jnp.asarray(omega),
+        natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
+        damping_ratio=jnp.asarray(zeta),
+        damping_ratio_std=jnp.asarray(zeta_std),
+        modal_damping=jnp.asarray(damping),
+        modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
+    )
+
+
+def open_choice(
+    fit: JointFit,
+    *,
+    velocity: Float[np.ndarray, " point"] | None = None,
+    displacement: Float[np.ndarray, " point"] | None = None,
+) -> Float[np.ndarray, "rival point curve"]:
+    """How far ω̃² and 2ζ̃ω̃ may be off because another family could be the right one.
+
+    One shift for each of the fit's rivals, to be taken as an error of 1σ (`beyond_estimation`).
+    Zero where a rival does not have a velocity, or has it twice. Below a hundredth of the largest
+    amplitude the shifts are those there: dry friction has no finite damping at rest.
+    """
+    largest = fit.largest[0 if velocity is None else 1]
+    at = np.asarray(displacement if velocity is None else velocity, dtype=np.float64)
+    at = np.maximum(at, _LEAST * largest)
+
+    def described(one: JointFit, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if velocity is None:
+            values, slopes, _ = values_at_displacement(one, at)
+        else:
+            values, slopes = values_with_slopes(one, at)
+        return values, np.einsum("ocp,pq,ocq->oc", slopes, one.covariance, slopes)
+
+    shifts = np.zeros((len(fit.rivals), len(at), 2))
+    own = described(fit, at) if fit.rivals else (at, at)
+    for shift, rival in zip(shifts, fit.rivals, strict=True):
+        has = np.ones(len(at), dtype=bool)
+        if velocity is not None:
+            has = at < _near(rival.fit, float(np.max(at))).once
+        if has.any():
+            theirs = described(rival.fit, at[has])
+            shift[has] = beyond_estimation(rival.weight, own[0][has], own[1][has], *theirs)
+    return shifts
+
+
+def beyond_estimation(
+    weight: float,
+    value: Float[np.ndarray, "*batch"],
+    variance: Float[np.ndarray, "*batch"],
+    other: Float[np.ndarray, "*batch"],
+    other_variance: Float[np.ndarray, "*batch"],
+) -> Float[np.ndarray, "*batch"]:
+    """What of the difference of two families' answers is no error of estimation, as 1σ.
+
+    If both were right, the variance of their difference would be that of their variances: only
+    what the squared difference has beyond this speaks of the choice, and counts with the rival's
+    weight. Zero where either has no finite answer.
+    References: for the variance of the difference, Hausman, Econometrica 46 (1978) 1251,
+    doi:10.2307/1913827; for the choice as a part of the variance, Buckland, Burnham & Augustin,
+    Biometrics 53 (1997) 603, doi:10.2307/2533961.
+    """
+    with np.errstate(invalid="ignore"):
+        apart, expected = other - value, np.abs(other_variance - variance)
+        excess = np.sqrt(weight * np.maximum(apart**2 - expected, 0.0))
+    known = np.isfinite(apart) & np.isfinite(excess)
+    return np.where(known, np.sign(apart) * excess, 0.0)
+
+
+def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
+    """`fitted_values` from rest to the largest measured amplitude.
+
+    In equal steps of velocity, or of displacement where the backbone turns back in velocity.
+    """
+    displacement, velocity = fit.largest
+    steps = np.linspace(0.0, 1.0, n_points)
+    if _near(fit, velocity).turns_back_at is None:
+        return fitted_values(fit, velocity * steps)
+    return fitted_values(fit, displacement=displacement * steps)
+
+
+def curve_values(
+    unknowns: Unknowns, velocity: Float[Array, " point"], near: Float[Array, " point"]
+) -> Float[Array, "point 2"]:
+    """ω̃² and 2ζ̃ω̃ at velocities on the backbone, `near` displacements; differentiable."""
+    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+
+    def excess(x: Array) -> Array:
+        return x * jnp.sqrt(squared(squared.amplitude(x, velocity))) - velocity
+
+    x = _solved(excess, near)
+    return jnp.stack(
+        [squared(squared.amplitude(x, velocity)), damping(damping.amplitude(x, velocity))], axis=1
+    )
+
+
+def _speed(squared: AbstractCurve, displacement: Float[Array, " point"]) -> Float[Array, " point"]:
+    """Velocity amplitude of the backbone; its derivative is that of the equation's solution."""
+
+    def excess(v: Array) -> Array:
+        return v - displacement * jnp.sqrt(squared(squared.amplitude(displacement, v)))
+
+    return _solved(excess, displacement * jnp.sqrt(squared(jnp.zeros_like(displacement))))
+
+
+def _solved(excess: Callable[[Array], Array], start: Array) -> Array:
+    """Newton's method for every point by itself; the derivative is the solution's."""
+
+    def step(_: int, x: Array) -> Array:
+        value, slope = jax.jvp(excess, (x,), (jnp.ones_like(x),))
+        return x - value / slope
+
+    fixed = jax.lax.stop_gradient
+    found = fixed(jax.lax.fori_loop(0, _ITERATIONS, step, fixed(start)))
+    slope = fixed(jax.jvp(excess, (found,), (jnp.ones_like(found),))[1])
+    return found - excess(found) / slope
+
+
+def values_with_slopes(
+    fit: JointFit, velocity: Float[np.ndarray, " point"]
+) -> tuple[Float[np.ndarray, "point curve"], Float[np.ndarray, "point curve unknown"]]:
+    """ω̃² and 2ζ̃ω̃ at velocities, and their derivatives by the free unknowns at that velocity.
+
+    Raises `ValueError` where the backbone has a velocity at several displacements.
+    """
+    vector, restore, own = fit.programmed()
+    near = displacement_near(fit, velocity)
+    found = by_blocks(lambda v, x: _at_velocity(vector, restore, v, x), _BLOCK, velocity, near)
+    return found[0], found[1][:, :, own]
+
+
+def values_at_displacement(
+    fit: JointFit, displacement: Float[np.ndarray, " point"]
+) -> tuple[
+    Float[np.ndarray, "point curve"],
+    Float[np.ndarray, "point curve unknown"],
+    Float[np.ndarray, " point"],
+]:
+    """ω̃² and 2ζ̃ω̃, their derivatives by the free unknowns, and the velocity, at displacements."""
+    vector, restore, own = fit.programmed()
+    found = by_blocks(lambda x: _at_displacement(vector, restore, x), _BLOCK, displacement)
+    return found[0], found[1][:, :, own], found[2]
+
+
+def displacement_near(
+    fit: JointFit, velocity: Float[np.ndarray, " point"]
+) -> Float[np.ndarray, " point"]:
+    """Displacement of the backbone at velocities, to one part in a few hundred.
+
+    Raises `ValueError` where there are several, or none.
+    """
+    found = _near(fit, float(np.max(velocity)))
+    if found.turns_back_at is not None:
+        raise ValueError(
+            f"the backbone turns back at {found.turns_back_at:.4g} m/s: there velocities belong to "
+            "several displacements; ask for values at displacements."
+        )
+    if np.max(velocity) > found.speed[-1]:
+        raise ValueError(f"the backbone does not reach {np.max(velocity):.4g} m/s.")
+    return np.interp(velocity, found.speed, found.displacement)
+
+
+class _Reached(NamedTuple):
+    displacement: np.ndarray
+    speed: np.ndarray
+    turns_back_at: float | None  # m/s, below the velocity that was asked for
+
+    @property
+    def once(self) -> float:
+        """The velocity, below which the backbone has each exactly once."""
+        if self.turns_back_at is None:
+            return float(self.speed[-1])
+        return float(np.min(self.speed[np.argmax(self.speed == self.turns_back_at) :]))
+
+
+def _near(fit: JointFit, velocity: float) -> _Reached:
+    """The backbone from rest to beyond the measured displacements and a velocity."""
+    vector, restore, _ = fit.programmed()
+    reach = fit.largest[0]
+    for _ in range(_DOUBLINGS):
+        x = np.linspace(0.0, reach, _BLOCK)
+        speed = np.asarray(_at_displacement(vector, restore, x)[2])
+        turns = np.flatnonzero(~(np.diff(speed) > 0))
+        if turns.size and np.min(speed[turns[0] :]) < velocity:
+            return _Reached(x, speed, float(speed[turns[0]]))
+        if turns.size or speed[-1] >= velocity:
+            break
+        reach *= 2
+    end = turns[0] + 1 if turns.size else len(x)
+    return _Reached(x[:end], speed[:end], None)
+
+
+@compiled
+def _at_velocity(
+    vector: Array, restore: Restore, velocity: Array, near: Array
+) -> tuple[Array, Array]:
+    def of(vector: Array) -> Array:
+        return curve_values(restore(vector), velocity, near)
+
+    return of(vector), jax.jacfwd(of)(vector)
+
+
+@compiled
+def _at_displacement(vector: Array, restore: Restore, x: Array) -> tuple[Array, Array, Array]:
+    def of(vector: Array) -> Array:
+        squared, damping = restore(vector).squared_frequency, restore(vector).modal_damping
+        speed = _speed(squared, x)
+        pair = [curve(curve.amplitude(x, speed)) for curve in (squared, damping)]
+        return jnp.stack(pair, axis=1)
+
+    return of(vector), jax.jacfwd(of)(vector), _speed(restore(vector).squared_frequency, x)

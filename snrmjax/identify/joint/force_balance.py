@@ -1,0 +1,283 @@
+"""The complex force balance of all measured states: what a joint fit makes small.
+
+With V the velocity of the nonlinear mode and X = V/(iΩ), a state balances when
+((ω̃² − Ω²) + iΩ·2ζ̃ω̃) X/A = F. Evaluated at the measured motion this has one value for every
+curve, however the response folds.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
+from snrmjax.identify.pointwise.backbone_points import mistrust, modal_filter
+from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.measure.steady_states import SteadyStates, check_phases, relative_errors
+from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
+
+STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
+"""What every state may err in at random, relative or in rad; stiffness is never stated."""
+
+_STEPS = 4  # towards every state's likeliest errors
+_FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
+_UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
+
+LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
+"""What all states of a level may have in common, relative or in rad."""
+
+
+class BalanceData(eqx.Module):
+    """Measured states as the balance needs them: one velocity each."""
+
+    level: Int[Array, " state"]  # counted from zero
+    frequency: Float[Array, " state"]  # rad/s
+    force: Float[Array, " state"]  # N, or V where only the drive is known
+    velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
+    share: Float[Array, "state sensor"]  # of the sensors in it
+    std: Float[Array, "state input"]  # of `STATE_ERRORS`
+    weight: Float[Array, " state"]  # 1, or less for what a robust loss mistrusts
+    correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
+    n_levels: int = eqx.field(static=True)
+    sensor: int = eqx.field(static=True)  # the one whose motion is meant
+
+
+class Unknowns(eqx.Module):
+    """Everything that a joint fit may change.
+
+    Deviations of levels and linear parameters are in units of their own 1σ.
+    """
+
+    squared_frequency: AbstractFamily  # ω̃², rad²/s²
+    modal_damping: AbstractFamily  # 2ζ̃ω̃, 1/s
+    log_force_gain: Float[Array, ""]
+    force_offset: Float[Array, ""]  # N, relative to the smallest force
+    instrument_phase: Float[Array, ""]  # rad
+    level: Float[Array, "level error"]
+    linear: Float[Array, " deviation"]
+
+
+class Spread(eqx.Module):
+    """1σ of what the unknowns give in their own units."""
+
+    level: Float[Array, " error"]  # of `LEVEL_ERRORS`
+    linear: Float[Array, " deviation"]  # natural frequencies (rad/s), then damping ratios
+
+
+def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
+    """The states with a measured velocity, and whether their noise is stated.
+
+    Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
+    off resonance (`mistrust`); the fit then finds its size. Without an error of the force a state
+    near a fold would be exact in one direction, since amplitude and phase there move the balance
+    in the other: a force of which no error is stated gets a tenth of the velocity's.
+    Raises `ValueError` where phases are unknown.
+    """
+    check_phases(data, "a joint fit")
+    r = reference_sensor(modes)
+    stated = relative_errors(data)
+    combined, share, std, _ = modal_filter(data, modes, r, data.velocity, stated)
+    velocity, errors = np.asarray(combined), np.asarray(std)
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    force = np.asarray(data.drive if driven else data.force)
+    keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
+    known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
+    if not known:
+        far = mistrust(velocity)
+        errors = np.stack([far, far, far], axis=1)
+    of_force = np.where(errors[:, 0] > 0, errors[:, 0], _UNSTATED_FORCE * errors[:, 1])
+    errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
+    levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
+    return (
+        BalanceData(
+            level=jnp.asarray(index),
+            frequency=jnp.asarray(data.frequency)[keep],
+            force=jnp.asarray(force[keep]),
+            velocity=jnp.asarray(velocity[keep]),
+            share=jnp.asarray(share)[keep],
+            std=jnp.asarray(errors[keep]),
+            weight=jnp.ones(int(keep.sum())),
+            correction=no_errors(int(keep.sum())),
+            n_levels=len(levels),
+            sensor=r,
+        ),
+        known,
+    )
+
+
+def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
+    """The modes with the residual ones' frequencies and dampings changed by deviation·1σ."""
+    keep = np.asarray(modes.residual_modes, dtype=int)
+    change = deviation * spread
+    return eqx.tree_at(
+        lambda m: (m.natural_frequency, m.damping_ratio),
+        modes,
+        (
+            modes.natural_frequency.at[keep].add(change[: keep.size]),
+            modes.damping_ratio.at[keep].add(change[keep.size :]),
+        ),
+    )
+
+
+class Motion(eqx.Module):
+    """The nonlinear mode's motion in every state, and the force on it."""
+
+    velocity: Complex[Array, " state"]  # m/s at the reference sensor
+    displacement: Float[Array, " state"]  # m
+    force: Float[Array, " state"]  # N
+
+    def amplitude(self, curve: AbstractCurve) -> Float[Array, " state"]:
+        """The amplitude that a curve is a function of."""
+        return curve.amplitude(self.displacement, jnp.abs(self.velocity))
+
+
+@compiled
+def recorded_motion(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Motion:
+    """`motion_of` the states as they were recorded."""
+    return motion_of(unknowns, data, modes, spread, no_errors(data.level.shape[0]))
+
+
+def motion_of(
+    unknowns: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    error: Float[Array, "state input"],
+) -> Motion:
+    """What the record says of the mode when it is freed of its errors.
+
+    `error` adds to the logarithms of force and velocity and to the phase: for derivatives.
+    """
+    level = (unknowns.level * spread.level)[data.level]
+    gain = jnp.exp(unknowns.log_force_gain + error[:, 0])
+    force = data.force * gain + unknowns.force_offset * jnp.min(data.force)
+    phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
+    velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + 1j * phase)
+    linear = with_deviations(modes, unknowns.linear, spread.linear)
+    residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
+    own = velocity - jnp.sum(data.share * residual, axis=1)
+    return Motion(own, jnp.abs(own) / data.frequency, force)
+
+
+def force_balance(
+    unknowns: Unknowns,
+    data: BalanceData,
+    modes: LinearModes,
+    spread: Spread,
+    error: Float[Array, "state input"],
+) -> Float[Array, "state part"]:
+    """Force needed for the measured motion minus the force, over the force: real and imaginary."""
+    motion = motion_of(unknowns, data, modes, spread, error)
+    level = (unknowns.level * spread.level)[data.level]
+    squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
+    damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
+    squared = squared * (1 + level[:, 2] + error[:, 3])
+    damping = damping * (1 + level[:, 3])
+    r, j = data.sensor, modes.mode_of_interest
+    constant = modes.mode_shape[r, j] * modes.participation[j]
+    omega = data.frequency
+    stiffness = squared - omega**2 + 1j * omega * damping
+    needed = stiffness * motion.velocity / (1j * omega * constant)
+    # Relative to the recorded force, but with no advantage from a larger gain.
+    unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
+    excess = (needed - motion.force) / unit
+    return jnp.stack([excess.real, excess.imag], axis=1)
+
+
+def no_errors(n_states: int) -> Float[Array, "state input"]:
+    """States as they were recorded."""
+    return jnp.zeros((n_states, len(STATE_ERRORS)))
+
+
+def error_slopes(
+    balance: Callable[[Array], Array], at: Float[Array, "state input"]
+) -> Float[Array, "state part input"]:
+    """Derivatives of the balance with respect to `STATE_ERRORS`, `at` some.
+
+    Every state has its own: one push forward for each input gives them all.
+    """
+    n_states, kinds = at.shape
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, n_states, kinds))
+    return jnp.moveaxis(mapped(jax.linearize(balance, at)[1], directions), 0, 2)
+
+
+class Weighing(NamedTuple):
+    """What turns a balance into independent residuals of unit variance, state by state."""
+
+    whiten: Float[Array, "state part part"]
+    offset: Float[Array, "state part"]  # of the balance, from the corrected state to the record
+
+
+def weighing_at(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Weighing:
+    """How much every balance weighs, by its slopes at the corrected states.
+
+    The balance is straight between a record and its corrected state, which lies on the curves:
+    there its slopes do not go up and down with the noise, as they do at the record, where they
+    pull every curve to one side. With `nearest_errors` as corrections the whitened balance is as
+    long as these are in units of their 1σ.
+    Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
+    8 (1987) 1052, doi:10.1137/0908085.
+    """
+    slopes = slopes_by_error(unknowns, data, modes, spread)
+    offset = -jnp.einsum("sie,se->si", slopes, data.correction)
+    return Weighing(whitener(slopes, data.std), offset)
+
+
+def nearest_errors(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Float[Array, "state input"]:
+    """The likeliest errors with which every state balances, from its present correction on.
+
+    Each step solves the balance made straight at the last one's end: what is left of the balance
+    falls by the ratio of a state's error to the curves' length.
+    """
+
+    def step(errors: Array, _: None) -> tuple[Array, None]:
+        erring = eqx.tree_at(lambda d: d.correction, data, errors)
+        slopes = slopes_by_error(unknowns, erring, modes, spread)
+        whiten = whitener(slopes, data.std)
+        balance = force_balance(unknowns, data, modes, spread, errors)
+        straight = balance - jnp.einsum("sie,se->si", slopes, errors)
+        whitened = jnp.einsum("sij,sj->si", whiten, straight)
+        found = -jnp.einsum("sje,sij,si->se", slopes, whiten, whitened) * data.std**2
+        return jnp.clip(found, -_FARTHEST, _FARTHEST), None
+
+    return jax.lax.scan(step, data.correction, length=_STEPS)[0]
+
+
+def slopes_by_error(
+    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+) -> Float[Array, "state part input"]:
+    """Derivatives of the balance by the states' errors, at the corrected states."""
+    return error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), data.correction)
+
+
+def whitener(
+    slopes: Float[Array, "state part input"], std: Float[Array, "state input"]
+) -> Float[Array, "state part part"]:
+    """The matrices that turn a balance into independent residuals of unit variance."""
+    scaled = slopes * std[:, None, :]
+    covariance = scaled @ scaled.transpose(0, 2, 1)
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # The inverse of Cholesky's factor of a 2×2 matrix; rounding must not make it singular.
+    floor = 1e-14 * (a + c)
+    first = jnp.sqrt(a + floor)
+    second = jnp.sqrt(jnp.maximum(c - b**2 / (a + floor), floor))
+    zero = jnp.zeros_like(a)
+    return jnp.stack(
+        [
+            jnp.stack([1 / first, zero], axis=1),
+            jnp.stack([-b / (first**2 * second), 1 / second], axis=1),
+        ],
+        axis=1,
+    )

@@ -1,0 +1,140 @@
+"""The unknowns that a fit may change as one vector, in the order that their names have."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from snrmjax.identify.curves.packed_curve import as_any_family
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Unknowns
+
+_FEWEST_STATES, _LEVELS = 48, 8  # that there is room for; levels come in so many
+
+FREE = ("force_gain", "force_offset", "instrument_phase")
+"""Unknowns of the measurement that a fit may free."""
+
+
+class Restore(eqx.Module):
+    """From a vector of free unknowns to all of them."""
+
+    unknowns: Unknowns
+    free: tuple[str, ...] = eqx.field(static=True)
+
+    def vector(self) -> Float[Array, " unknown"]:
+        """The free unknowns."""
+        return ravel_pytree(eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free)))[0]
+
+    def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
+        """All unknowns, the free ones from the vector."""
+        moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
+        return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
+
+    @property
+    def level_places(self) -> Int[np.ndarray, "level error"]:
+        """Where in the vector the deviations of levels are."""
+        level, end = self.unknowns.level, self.vector().size - self.unknowns.linear.size
+        return end - level.size + np.arange(level.size).reshape(level.shape)
+
+
+class Programmed(NamedTuple):
+    """The free unknowns as compiled programs take them: with curves of one form and size.
+
+    `own` says where in the longer vector the fit's own unknowns are; the others move nothing.
+    """
+
+    vector: Float[Array, " entry"]
+    restore: Restore
+    own: Int[np.ndarray, " unknown"]
+
+    def spread_out(
+        self, covariance: Float[np.ndarray, "unknown unknown"]
+    ) -> Float[np.ndarray, "entry entry"]:
+        """A covariance of the fit's unknowns among all entries of the vector."""
+        full = np.zeros((len(self.vector), len(self.vector)))
+        full[np.ix_(self.own, self.own)] = covariance
+        return full
+
+
+def programmed(
+    unknowns: Unknowns, free: tuple[str, ...], n_levels: int | None = None
+) -> Programmed:
+    """Unknowns for a program that serves every family, and so many levels."""
+    whole, present = in_one_form(unknowns), len(unknowns.level)
+    if n_levels is not None:
+        whole = eqx.tree_at(lambda u: u.level, whole, filled(unknowns.level, n_levels, 0.0))
+    vector = Restore(whole, free).vector()
+    (n, m), (size, other) = (
+        (u.squared_frequency.parameters.shape[0], u.modal_damping.parameters.shape[0])
+        for u in (unknowns, whole)
+    )
+    linear = len(vector) - len(unknowns.linear)
+    spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
+    rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
+    own = [*range(n), *range(size, size + m), *rest]
+    return Programmed(vector, Restore(whole, free), np.array(own))
+
+
+def with_room(data: BalanceData) -> BalanceData:
+    """The data with spare states that weigh nothing and spare levels: few sizes compile."""
+    n, levels = len(data.level), data.n_levels
+    power = 1 << (n - 1).bit_length()
+    size = max(n, _FEWEST_STATES, 3 * power // 4 if n <= 3 * power // 4 else power)
+    roomy = jax.tree.map(lambda a: filled(a, size, None), data)
+    weight = filled(data.weight, size, 0.0)
+    n_levels = _LEVELS * -(-levels // _LEVELS)
+    return dataclasses.replace(roomy, weight=weight, n_levels=n_levels)
+
+
+def filled(rows: Array, size: int, spare: float | None) -> np.ndarray:
+    """Rows and spare ones, of one number or, without it, copies of the last."""
+    known = np.asarray(rows)
+    missing = np.repeat(known[-1:], size - len(known), axis=0)
+    return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
+
+
+def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
+    """Which leaves a fit may change, as a filter of `equinox.partition`."""
+    frozen = jax.tree.map(lambda _: False, unknowns)
+    moving = [
+        *("force_gain" in free, "force_offset" in free, "instrument_phase" in free),
+        *(True, True, True, True),
+    ]
+
+    def where(u: Unknowns) -> tuple:
+        return (
+            *(u.log_force_gain, u.force_offset, u.instrument_phase),
+            *(u.level, u.linear, u.squared_frequency.parameters, u.modal_damping.parameters),
+        )
+
+    return eqx.tree_at(where, frozen, tuple(moving))
+
+
+def named_unknowns(
+    unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]
+) -> tuple[tuple[str, str], ...]:
+    """Names and units of the free unknowns in the order of their vector."""
+    curves = (
+        ("backbone", "rad^2/s^2", unknowns.squared_frequency),
+        ("damping", "1/s", unknowns.modal_damping),
+    )
+    measurement = {"force_gain": "log", "force_offset": "smallest force", "instrument_phase": "rad"}
+    return (
+        *(
+            (f"{name}.{c.name}", unit if c.is_value else "1")
+            for name, unit, family in curves
+            for c in family.coefficients()
+        ),
+        *((name, unit) for name, unit in measurement.items() if name in free),
+        *((f"level_{k}.{e}", "std") for k in range(data.n_levels) for e in LEVEL_ERRORS),
+        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
+    )
+
+
+def in_one_form(unknowns: Unknowns) -> Unknowns:
+    """The same unknowns with both curves as compiled programs take them."""
+    pair = (as_any_family(unknowns.squared_frequency), as_any_family(unknowns.modal_damping))
+    return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, pair)

@@ -1,0 +1,1 @@
+"""One backbone point from each steady state, and curves through the points."""

@@ -1,0 +1,356 @@
+"""Curves of ω̃² and 2ζ̃ω̃ against amplitude, and their fit to scattered points.
+
+A curve is a family (piecewise linear as in the paper, or a shape-preserving cubic spline), knots
+and values at the knots. Families differ only in how they pass through the knots.
+"""
+
+from abc import abstractmethod
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import interpax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy.linalg import lstsq
+
+from snrmjax.numerics.least_squares import ErrorSizes, error_sizes, penalised_least_squares
+
+
+class AbstractCurve(eqx.Module):
+    """A function of amplitude through values at knots; continued linearly beyond them."""
+
+    kind: ClassVar[str]
+    knots: Float[Array, " knot"]  # amplitudes, increasing
+    values: Float[Array, " knot"]
+
+    @staticmethod
+    @abstractmethod
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """The variable in which the curve is drawn through its knots."""
+
+    @abstractmethod
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """The curve between its first and its last knot."""
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """Value at an amplitude; beyond the knots along the end slopes of the abscissa."""
+        x = self.abscissa(jnp.asarray(amplitude))
+        first, last = self.abscissa(self.knots[0]), self.abscissa(self.knots[-1])
+        inside = jnp.clip(x, first, last)
+        flat = inside.reshape(-1)
+        value = self.within(flat).reshape(x.shape)
+        if self.knots.shape[0] < 2:
+            return value
+        slopes = jax.vmap(jax.grad(lambda u: self.within(u[None])[0]))(jnp.stack([first, last]))
+        below = jnp.minimum(x - first, 0.0) * slopes[0]
+        return value + below + jnp.maximum(x - last, 0.0) * slopes[1]
+
+
+class PiecewiseLinear(AbstractCurve):
+    """Straight lines between the knots, in the amplitude itself: the paper's choice."""
+
+    kind: ClassVar[str] = "piecewise_linear"
+
+    @staticmethod
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve.abscissa`."""
+        return amplitude
+
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """See `AbstractCurve.within`."""
+        if self.knots.shape[0] < 2:
+            return jnp.broadcast_to(self.values[0], abscissa.shape)
+        return interpax.interp1d(abscissa, self.knots, self.values, method="linear", extrap=True)
+
+
+class ShapePreservingSpline(AbstractCurve):
+    """A monotonicity-preserving cubic (PCHIP) in the squared amplitude.
+
+    The square makes the curve an even, smooth function of amplitude: ω̃² of a smooth restoring
+    force is linear in it to first order, at zero and when continued beyond the data.
+    """
+
+    kind: ClassVar[str] = "spline"
+
+    @staticmethod
+    def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve.abscissa`."""
+        return amplitude**2
+
+    def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
+        """See `AbstractCurve.within`."""
+        if self.knots.shape[0] < 2:
+            return jnp.broadcast_to(self.values[0], abscissa.shape)
+        knots = self.abscissa(self.knots)
+        method = "monotonic" if self.knots.shape[0] > 2 else "linear"
+        return interpax.interp1d(abscissa, knots, self.values, method=method, extrap=True)
+
+
+CURVES: dict[str, type[AbstractCurve]] = {
+    curve.kind: curve for curve in (PiecewiseLinear, ShapePreservingSpline)
+}
+"""Families of curves by name."""
+
+AS_STATED = ErrorSizes(1.0, 0.0)
+"""Errors of the stated size, none of them shared."""
+
+
+class CurveFit(NamedTuple):
+    """A curve fitted to points, with the uncertainty of its values at the knots."""
+
+    curve: AbstractCurve
+    covariance: Float[Array, "knot knot"]
+
+    def std(self, amplitude: Float[Array, " point"]) -> Float[Array, " point"]:
+        """1σ of the curve at some amplitudes."""
+        slopes = _slopes(self.curve, amplitude)
+        return jnp.sqrt(jnp.einsum("pk,kl,pl->p", slopes, self.covariance, slopes))
+
+
+@eqx.filter_jit
+def _slopes(curve: AbstractCurve, amplitude: Array) -> Float[Array, "point knot"]:
+    """Derivatives of the curve with respect to its values."""
+
+    def at(values: Array) -> Array:
+        return eqx.tree_at(lambda c: c.values, curve, values)(amplitude)
+
+    return jax.jacfwd(at)(curve.values)
+
+
+def place_knots(
+    amplitude: Float[np.ndarray, " point"], level: np.ndarray, n_knots: int
+) -> Float[np.ndarray, " knot"]:
+    """At most `n_knots` amplitudes, spread as the points are, from the smallest to the largest.
+
+    A level that was held at one amplitude (within 15 % from end to end) gets one knot: what
+    varies inside it is not amplitude. Otherwise knots are at least 3 % apart.
+    """
+    candidates: list[float] = []
+    for one in np.unique(level):
+        inside = amplitude[level == one]
+        held = len(inside) > 1 and inside.max() < 1.15 * inside.min()
+        candidates += [float(np.median(inside))] if held else inside.tolist()
+    ordered = np.sort(candidates)
+    apart = [ordered[0]]
+    for value in ordered[1:]:
+        if value >= 1.03 * apart[-1]:
+            apart.append(value)
+    pick = np.linspace(0, len(apart) - 1, min(max(n_knots, 2), len(apart)))
+    knots = np.asarray(apart)[np.unique(np.round(pick).astype(int))]
+    lowest, highest = amplitude.min(), amplitude.max()
+    if len(knots) == 1:
+        return np.array([lowest, highest]) if highest > lowest else knots
+    knots[0], knots[-1] = lowest, highest
+    return knots
+
+
+def fit_curve(
+    kind: str,
+    knots: Float[np.ndarray, " knot"],
+    smoothing: float,
+    amplitude: Float[np.ndarray, " point"],
+    values: Float[np.ndarray, " point"],
+    std: Float[np.ndarray, " point"],
+    level: np.ndarray,
+    *,
+    fixed_first: float | None = None,
+    sizes: ErrorSizes = AS_STATED,
+) -> CurveFit:
+    """Fit a curve to points by penalised least squares over its values at the knots.
+
+    Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `smoothing` weighs the
+    bending of the curve in its abscissa against the points (relative to what a knot knows on
+    average); `std` 1σ of the values, or their relative sizes when the scale is not known;
+    `level` groups points whose errors are partly shared. `fixed_first` pins the value at the
+    first knot. `sizes` scale the two parts of the covariance.
+    Returns `CurveFit`.
+    """
+    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    at_knots, _, slopes = _settle(problem)
+    free, n = problem.free, len(knots)
+    result = penalised_least_squares(
+        slopes[:, free],
+        np.zeros(len(amplitude)),
+        problem.spread,
+        np.asarray(level)[:, None] == np.unique(level),
+        problem.rough[:, free],
+        np.zeros(len(problem.rough)),
+    )
+    covariance = np.zeros((n, n))
+    tau = sizes.level_std / problem.unit
+    covariance[free, free] = (
+        sizes.noise_scale**2 * result.unshared_covariance + tau**2 * result.shared_covariance
+    )
+    return CurveFit(
+        curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * problem.unit)),
+        covariance=jnp.asarray(covariance * problem.unit**2),
+    )
+
+
+class _Problem(NamedTuple):
+    """A fit in values of order one."""
+
+    kind: str
+    knots: np.ndarray
+    amplitude: np.ndarray
+    target: np.ndarray
+    spread: np.ndarray
+    rough: np.ndarray  # rows of the roughness penalty
+    first: float  # where the first knot starts, and stays if it is not free
+    free: slice  # the knots that are fitted
+    unit: float  # of the values
+
+
+def _problem(
+    kind: str,
+    knots: np.ndarray,
+    smoothing: float,
+    amplitude: np.ndarray,
+    values: np.ndarray,
+    std: np.ndarray,
+    fixed_first: float | None,
+) -> _Problem:
+    unit = float(np.max(np.abs(values)))
+    target, spread = np.asarray(values) / unit, np.asarray(std) / unit
+    information = np.sum(1.0 / spread**2) / len(knots)
+    bending = _bending(np.asarray(CURVES[kind].abscissa(jnp.asarray(knots))))
+    return _Problem(
+        kind=kind,
+        knots=knots,
+        amplitude=amplitude,
+        target=target,
+        spread=spread,
+        rough=np.sqrt(smoothing * information) * bending,
+        first=float(np.mean(target)) if fixed_first is None else fixed_first / unit,
+        free=slice(0 if fixed_first is None else 1, len(knots)),
+        unit=unit,
+    )
+
+
+def _settle(problem: _Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values at the knots, the curve at the points and its derivatives there.
+
+    The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
+    """
+    at_knots = np.full(len(problem.knots), float(np.mean(problem.target)))
+    at_knots[0] = problem.first
+    everything = np.ones(len(problem.target), dtype=bool)
+    for _ in range(12):
+        current, slopes = _linearised(problem.kind, problem.knots, at_knots, problem.amplitude)
+        step = _step(problem, at_knots, current, slopes, everything)
+        at_knots = at_knots + step
+        if np.max(np.abs(step)) < 1e-9:
+            break
+    return at_knots, current + slopes @ step, slopes
+
+
+def _step(
+    problem: _Problem,
+    at_knots: np.ndarray,
+    current: np.ndarray,
+    slopes: np.ndarray,
+    used: Bool[np.ndarray, " point"],
+) -> np.ndarray:
+    """Change of the values at the knots that fits some of the points best."""
+    free = problem.free
+    spread = problem.spread[used]
+    design = np.concatenate([slopes[used, free] / spread[:, None], problem.rough[:, free]])
+    right = np.concatenate([(problem.target - current)[used] / spread, -problem.rough @ at_knots])
+    step = np.zeros(len(at_knots))
+    # Not by normal equations: a strong penalty would drown what the points say.
+    step[free] = lstsq(design, right, cond=1e-15, lapack_driver="gelsy", check_finite=False)[0]
+    return step
+
+
+class LeftOut(NamedTuple):
+    """How well levels are predicted by the others."""
+
+    score: float  # error²/std², mean of the better three quarters of the levels; infinity = none
+    sizes: ErrorSizes
+    squares: Float[np.ndarray, " level"]  # error²/std² of every level that was predicted
+
+
+def predict_left_out(
+    kind: str,
+    knots: Float[np.ndarray, " knot"],
+    smoothing: float,
+    amplitude: Float[np.ndarray, " point"],
+    values: Float[np.ndarray, " point"],
+    std: Float[np.ndarray, " point"],
+    level: np.ndarray,
+    fixed_first: float | None = None,
+) -> LeftOut:
+    """Leave out every level in turn and predict it from a curve through the others.
+
+    A level is left out of the problem linearised at the fit to all of them: a shape-preserving
+    spline is nearly linear in its values, and one linear solve a level is fast.
+    Points outside the amplitudes of the other levels are left aside: they would be continued,
+    not interpolated.
+    """
+    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    at_knots, current, slopes = _settle(problem)
+    errors, spreads = [], []
+    for one in np.unique(level):
+        kept, left = level != one, level == one
+        left &= (amplitude >= amplitude[kept].min()) & (amplitude <= amplitude[kept].max())
+        if not left.any():
+            continue
+        step = _step(problem, at_knots, current, slopes, kept)
+        predicted = (current + slopes @ step)[left] * problem.unit
+        errors.append(values[left] - predicted)
+        spreads.append(std[left])
+    if not errors:
+        return LeftOut(np.inf, AS_STATED, np.zeros(0))
+    pairs = zip(errors, spreads, strict=True)
+    squares = np.array([np.mean((error / spread) ** 2) for error, spread in pairs])
+    # A few levels that no curve predicts, at a sharp bend, must not decide for all.
+    score = float(np.mean(np.sort(squares)[: -(-3 * len(squares) // 4)]))
+    return LeftOut(score, error_sizes(errors, spreads), squares)
+
+
+def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
+    """dg/d log a of a curve at amplitudes between its knots, to the accuracy weights need."""
+    knots, values = np.asarray(curve.knots), np.asarray(curve.values)
+    low = np.clip(amplitude * (1 - 1e-4), knots[0], knots[-1])
+    high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
+    change = [_linearised(curve.kind, knots, values, a)[0] for a in (low, high)]
+    return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
+
+
+def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
+    """Rows whose squares add up to about ∫(d²g/du²)² du of values at knots, u from 0 to 1."""
+    u = (abscissa - abscissa[0]) / max(abscissa[-1] - abscissa[0], 1e-300)
+    n = len(u)
+    rows = np.zeros((max(n - 2, 0), n))
+    for k in range(n - 2):
+        left, right = u[k + 1] - u[k], u[k + 2] - u[k + 1]
+        mean = 0.5 * (left + right)
+        rows[k, k : k + 3] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) / np.sqrt(mean)
+    return rows
+
+
+def _linearised(
+    kind: str, knots: np.ndarray, values: np.ndarray, amplitude: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A curve at some amplitudes and its derivatives with respect to its values, in NumPy.
+
+    The fit tries many knots and would compile for each; the curves themselves are JAX.
+    The spline's derivatives are central differences: they steer Gauss-Newton steps whose fixed
+    point does not depend on them.
+    """
+    n = len(knots)
+    if n == 1:
+        return np.full(len(amplitude), values[0]), np.ones((len(amplitude), 1))
+    if kind == PiecewiseLinear.kind or n == 2:
+        x, u = (amplitude, knots) if kind == PiecewiseLinear.kind else (amplitude**2, knots**2)
+        slopes = np.stack([np.interp(x, u, column) for column in np.eye(n)], axis=1)
+        return slopes @ values, slopes
+    # A quarter of the time that importing the package would take, and not needed to simulate.
+    from scipy.interpolate import PchipInterpolator
+
+    step = 1e-7 * max(float(np.max(np.abs(values))), 1e-300)
+    columns = values[:, None] + step * np.concatenate([np.eye(n), -np.eye(n)], axis=1)
+    both = PchipInterpolator(knots**2, np.column_stack([values, columns]))(amplitude**2)
+    return both[:, 0], (both[:, 1 : n + 1] - both[:, n + 1 :]) / (2 * step)

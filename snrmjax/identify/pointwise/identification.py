@@ -1,0 +1,149 @@
+"""The whole inverse method in one call: steady states in, backbone and damping out."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.identify.pointwise.backbone import BackboneFit, CurveFamily, fit_backbone
+from snrmjax.identify.pointwise.backbone_points import (
+    AmplitudeArgument,
+    AmplitudeMeasure,
+    BackbonePoints,
+    identify_points,
+    mistrust,
+)
+from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.modes import LinearModes
+
+
+class Identification(NamedTuple):
+    """Points, curves and everything that a reader of them should know."""
+
+    points: BackbonePoints
+    fit: BackboneFit
+    notes: tuple[str, ...]
+
+
+def identify_backbone(
+    data: SteadyStates,
+    modes: LinearModes,
+    *,
+    amplitude: AmplitudeArgument = "displacement",
+    measure: AmplitudeMeasure = "fundamental",
+    family: CurveFamily = "spline",
+    n_knots: int | None = None,
+    anchor: bool = False,
+) -> Identification:
+    """Backbone and damping of the mode of interest from near-resonant steady states.
+
+    `identify_points`, then `fit_backbone`; their arguments are described there. Where no noise
+    is stated, the standard deviations of the points come from the scatter about the curves.
+    Returns an `Identification` whose `notes` say in words what was left out, what the noise
+    turned out to be and how far an anchor moved the curves.
+    Reference: Kwarta & Allen, section 2.2.
+    """
+    points = identify_points(data, modes, amplitude=amplitude, measure=measure)
+    fit = fit_backbone(points, modes, family=family, n_knots=n_knots, anchor=anchor)
+    if not fit.noise_stated:
+        points = _with_scatter(points, fit)
+    return Identification(points, fit, _notes(points, fit, modes))
+
+
+def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
+    """Points whose standard deviations come from the scatter, shared by level or not."""
+    sensitivity = np.asarray(points.sensitivity)
+    scale = mistrust(np.asarray(points.mode_velocity))[:, None] * np.array(fit.noise_scale)
+    spread = scale[:, :, None] * np.array([0.0, 1.0, 1.0])
+    own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
+    natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
+    frequency_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), fit.level_frequency_std)
+    damping_std = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), fit.level_damping_std)
+    damping_std = np.hypot(damping_std, damping * frequency_std / natural)
+    return eqx.tree_at(
+        lambda p: (p.natural_frequency_std, p.damping_ratio_std),
+        points,
+        (jnp.asarray(frequency_std), jnp.asarray(damping_std)),
+    )
+
+
+def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tuple[str, ...]:
+    notes = []
+    status = np.asarray(points.status)
+    for kind in PointStatus:
+        count = int(np.sum(status == kind))
+        if kind != PointStatus.OK and count:
+            notes.append(
+                f"{count} of {len(status)} points are left out of the curves: "
+                f"{STATUS_MESSAGE[kind]}."
+            )
+    other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
+    if other:
+        notes.append(
+            f"{other} points have a second root that amplitude and phase alone would also allow."
+        )
+    scale = max(fit.noise_scale)
+    if fit.noise_stated and scale > 1.5:
+        notes.append(
+            f"points scatter {scale:.1f} times as much as the stated noise: the bands are too "
+            "narrow, or something other than noise is at work."
+        )
+    if not fit.noise_stated:
+        notes.append(
+            "no noise is stated: it was estimated from the scatter of left-out levels, "
+            f"{100 * fit.noise_scale[0]:.2g} % (frequency) and {100 * fit.noise_scale[1]:.2g} % "
+            "(damping) of the measured phasor at resonance, more off it."
+        )
+    level_hz = fit.level_frequency_std / (2 * np.pi)
+    shared = [f"{level_hz:.2g} Hz"] if level_hz > 0 else []
+    if fit.level_damping_std > 0:
+        shared.append(f"{100 * fit.level_damping_std:.2g} % of critical damping")
+    if shared:
+        notes.append(
+            f"levels differ from one another by {' and '.join(shared)} (1σ); the bands include it."
+        )
+    notes += _phase_trend(points, fit)
+    if fit.anchor is not None:
+        anchor = fit.anchor
+        hz = 1 / (2 * np.pi)
+        notes.append(
+            f"anchored at the linear mode: the free curves miss it at zero amplitude by "
+            f"{anchor.frequency_gap * hz:+.3g} ± {anchor.frequency_gap_std * hz:.2g} Hz and "
+            f"{100 * anchor.damping_gap:+.3g} ± {100 * anchor.damping_gap_std:.2g} % damping; the "
+            f"measured points were moved by up to {anchor.largest_frequency_shift * hz:+.2g} Hz "
+            f"and {100 * anchor.largest_damping_shift:+.2g} %."
+        )
+    if np.asarray(points.filter_residual).max(initial=0.0) > 0.1 and len(modes.sensors) > 1:
+        notes.append(
+            "the sensors do not move as the mode shape says (residual up to "
+            f"{100 * np.nanmax(np.asarray(points.filter_residual)):.0f} %): check the shape, or "
+            "the mode's shape changes with amplitude."
+        )
+    return tuple(notes)
+
+
+def _phase_trend(points: BackbonePoints, fit: BackboneFit) -> list[str]:
+    """A sentence when damping changes with the phase inside the levels, which it should not."""
+    use = np.asarray(points.usable)
+    level = np.asarray(points.level)[use]
+    sine = np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
+    curve = np.asarray(fit.backbone.values(points.amplitude).modal_damping)[use]
+    excess = np.asarray(points.modal_damping)[use] / curve - 1
+    members = level[:, None] == np.unique(level)
+    share = members / members.sum(axis=0)
+    x, y = (values - members @ (share.T @ values) for values in (sine, excess))
+    if not np.any(x != 0) or not np.any(y != 0):
+        return []
+    slope = float(x @ y / (x @ x))
+    explained = slope**2 * float(x @ x) / float(y @ y)
+    across = slope * 2 * np.sin(np.pi / 4)
+    if explained < 0.3 or abs(across) < 0.1:
+        return []
+    course = "rises" if across > 0 else "falls"
+    return [
+        f"inside the levels damping {course} by {100 * abs(across):.0f} % of itself "
+        "from 45° lag to 45° lead, which damping that depends on amplitude alone does "
+        "not: check the phase and the force calibration, and trust states near resonance."
+    ]

@@ -1,0 +1,366 @@
+"""Forced responses that an identified backbone predicts: resonances and whole curves."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument
+from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
+from snrmjax.model.modes import LinearModes, residual_velocity
+
+CONTINUED = 1.5
+"""Curves are continued up to this multiple of the largest measured amplitude."""
+
+_SCAN = 4096
+
+
+class Resonance(NamedTuple):
+    """A phase resonance under a given force: the nonlinear mode moves in phase with it."""
+
+    force: float  # N
+    amplitude: float  # of the backbone's argument, m or m/s
+    frequency: float  # rad/s
+    damping_ratio: float
+    velocity: float  # m/s at the backbone's sensor, residual modes included
+    continued: bool  # beyond the measured amplitudes
+
+
+class PredictedResponse(NamedTuple):
+    """One connected response curve in order: up the low-frequency side, down the other."""
+
+    force: float  # N
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    velocity: Complex[np.ndarray, " point"]  # m/s at the backbone's sensor
+    amplitude: Float[np.ndarray, " point"]  # of the backbone's argument
+    stable: Bool[np.ndarray, " point"]
+    branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
+    continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
+    isolated: bool  # a closed curve, apart from the main one
+
+
+def resonances(backbone: Backbone, modes: LinearModes, force: float) -> list[Resonance]:
+    """All phase resonances under a force, by Newton's method from every sign change.
+
+    At resonance Ω = ω̃ and the velocity amplitude of the mode is v = |A|F/(2ζ̃ω̃), both functions
+    of amplitude; the total adds the residual modes. Damping that falls with amplitude can give
+    several solutions.
+
+    Arguments: `force` in N. Returns the solutions in order of amplitude, up to `CONTINUED` times
+    the largest measured amplitude; an empty list when none lies there.
+    Raises `ValueError` for a force that is not positive.
+    Reference: Kwarta & Allen, Eq. (19).
+    """
+    _require_force(force)
+    amplitude = _scan(backbone)
+    load = abs(float(backbone.modal_constant)) * force
+    excess = _on_backbone(backbone, amplitude).excess(load)
+    at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
+    found = []
+    for k in at:
+        low, high = amplitude[k], amplitude[k + 1]
+        start = low - excess[k] * (high - low) / (excess[k + 1] - excess[k])
+        root, good = _newton_resonance(
+            backbone, *(jnp.asarray(v) for v in (force, start, low, high))
+        )
+        if bool(good):
+            found.append(_resonance(backbone, modes, force, float(root)))
+    return found
+
+
+def resonance_by_fixed_point(
+    backbone: Backbone,
+    modes: LinearModes,
+    force: float,
+    *,
+    start: float | None = None,
+    max_steps: int = 256,
+) -> Resonance | None:
+    """One phase resonance by the paper's fixed-point iteration v ← |A|F/(2ζ̃ω̃)(v).
+
+    Arguments: `force` in N; `start` the first amplitude (of the backbone's argument), by default
+    the largest measured one. Returns None when the iteration does not converge, which happens
+    where damping changes fast with amplitude: use `resonances`.
+    Reference: Kwarta & Allen, Eq. (19).
+    """
+    _require_force(force)
+    first = jnp.asarray(float(backbone.largest) if start is None else start)
+    root, good = _picard(backbone, jnp.asarray(force), first, max_steps)
+    largest = CONTINUED * float(backbone.largest)
+    if not bool(good) or not 0 < float(root) <= largest:
+        return None
+    return _resonance(backbone, modes, force, float(root))
+
+
+def predict_response(
+    backbone: Backbone,
+    modes: LinearModes,
+    force: float,
+    *,
+    from_frequency: float = 0.0,
+    to_frequency: float = np.inf,
+    points_per_side: int = 200,
+    smallest_fraction: float = 0.02,
+) -> list[PredictedResponse]:
+    """The whole response to a force, both sides of resonance and the unstable part included.
+
+    With the amplitude as parameter the frequency has a closed form: for a displacement X
+    Ω² = ω̃² − δ²/2 ± √((|A|F/X)² − δ²ω̃² + δ⁴/4), δ = 2ζ̃ω̃, and likewise for a velocity. A point
+    is unstable where, at fixed frequency, a larger amplitude needs less force, or where the
+    damping of small changes of amplitude is negative: both follow from the averaged equations.
+
+    Arguments: `force` in N, frequencies in rad/s; `points_per_side` on either side of every
+    resonance; the main curve starts at `smallest_fraction` of its largest amplitude.
+    Returns the connected curves, the main one first, isolated ones after it.
+    Reference: Kwarta & Allen, section 2.2 and Eq. (10).
+    """
+    _require_force(force)
+    scan = _scan(backbone)
+    load = abs(float(backbone.modal_constant)) * force
+    inside = _on_backbone(backbone, scan).frequencies(load)[2] >= 0
+    starts = [scan[0]] if inside[0] else []
+    ends: list[float] = []
+    for k in np.flatnonzero(np.diff(inside.astype(int))):
+        edge = _edge(backbone, load, scan[k], scan[k + 1], inside[k])
+        (ends if inside[k] else starts).append(edge)
+    if inside[-1]:
+        ends.append(scan[-1])
+    curves = []
+    for number, (low, high) in enumerate(zip(starts, ends, strict=True)):
+        main = number == 0 and bool(inside[0])
+        curve = _one_curve(
+            backbone,
+            modes,
+            force,
+            max(low, smallest_fraction * high) if main else low,
+            high,
+            points_per_side,
+            closed=not main,
+        )
+        keep = (curve.frequency >= from_frequency) & (curve.frequency <= to_frequency)
+        # A range that cuts the peak off leaves two pieces, which no line may join.
+        runs = np.split(np.arange(len(keep)), np.flatnonzero(np.diff(keep.astype(int))) + 1)
+        curves += [_subset(curve, run) for run in runs if run.size and keep[run[0]]]
+    return curves
+
+
+def _require_force(force: float) -> None:
+    if not force > 0 or not np.isfinite(force):
+        raise ValueError(f"`force` must be positive, but is {force!r} N.")
+
+
+def _scan(backbone: Backbone) -> Float[np.ndarray, " point"]:
+    """Amplitudes from zero to the end of the continued curve."""
+    return CONTINUED * float(backbone.largest) * np.linspace(0.0, 1.0, _SCAN + 1)
+
+
+class _OnBackbone(NamedTuple):
+    """ω̃², 2ζ̃ω̃ and their slopes at some amplitudes; what follows from them is plain NumPy."""
+
+    amplitude: Float[np.ndarray, " point"]
+    squared: Float[np.ndarray, " point"]
+    damping: Float[np.ndarray, " point"]
+    squared_slope: Float[np.ndarray, " point"]
+    damping_slope: Float[np.ndarray, " point"]
+    argument: AmplitudeArgument
+
+    def excess(self, load: float) -> Float[np.ndarray, " point"]:
+        """v·2ζ̃ω̃ − |A|F: zero at a phase resonance."""
+        displacement = self.argument == "displacement"
+        with np.errstate(invalid="ignore"):
+            velocity = self.amplitude * (np.sqrt(self.squared) if displacement else 1.0)
+        return velocity * self.damping - load
+
+    def frequencies(self, load: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ω² below and above resonance, and the margin, negative where there is no Ω."""
+        with np.errstate(divide="ignore"):
+            ratio = (load / self.amplitude) ** 2
+        if self.argument == "displacement":
+            middle = self.squared - 0.5 * self.damping**2
+            margin = ratio - self.damping**2 * self.squared + 0.25 * self.damping**4
+        else:
+            middle = self.squared + 0.5 * (ratio - self.damping**2)
+            margin = middle**2 - self.squared**2
+            # Without real frequencies the product of the roots, ω̃⁴, still lets both be negative.
+            margin = np.where(middle > 0, margin, -np.abs(margin))
+        root = np.sqrt(np.maximum(margin, 0.0))
+        with np.errstate(invalid="ignore"):
+            return middle - root, middle + root, margin
+
+    def stable(self, frequency: Float[np.ndarray, " point"]) -> Bool[np.ndarray, " point"]:
+        """Stability of the averaged equations at (amplitude, Ω), see `predict_response`."""
+        stiffness = self.squared - frequency**2
+        turn = frequency**2 * self.damping * self.damping_slope
+        # d(A²F²)/da at fixed Ω, without a positive factor.
+        rise = stiffness**2 + (self.damping * frequency) ** 2
+        rise += self.amplitude * (stiffness * self.squared_slope + turn)
+        return (rise > 0) & (2 * self.damping + self.amplitude * self.damping_slope > 0)
+
+
+def _on_backbone(backbone: Backbone, amplitude: Float[np.ndarray, " point"]) -> _OnBackbone:
+    value, damping, slope, damping_slope = map(np.asarray, _values_and_slopes(backbone, amplitude))
+    return _OnBackbone(amplitude, value, damping, slope, damping_slope, backbone.argument)
+
+
+@eqx.filter_jit
+def _values_and_slopes(
+    backbone: Backbone, amplitude: Float[np.ndarray, " point"]
+) -> tuple[Array, Array, Array, Array]:
+    at = jnp.asarray(amplitude)
+
+    def curves(a: Array) -> tuple[Array, Array]:
+        return backbone.squared_frequency(a), backbone.modal_damping(a)
+
+    # Both curves hold point by point: one push forward along ones gives every slope.
+    values, slopes = jax.jvp(curves, (at,), (jnp.ones_like(at),))
+    return *values, *slopes
+
+
+def _edge(backbone: Backbone, load: float, low: float, high: float, inside: bool) -> float:
+    """Amplitude between two scanned ones where response begins or ends, kept on its inner side."""
+    for _ in range(5):
+        fine = low + (high - low) * np.linspace(0.0, 1.0, _SCAN + 1)
+        same = (_on_backbone(backbone, fine).frequencies(load)[2] >= 0) == inside
+        k = max(int(np.argmin(same)), 1)
+        low, high = fine[k - 1], fine[k]
+    return low if inside else high
+
+
+@eqx.filter_jit
+def _newton_resonance(
+    backbone: Backbone, force: Array, start: Array, low: Array, high: Array
+) -> tuple[Array, Array]:
+    """The root in a bracket, in units of its upper end."""
+    load = jnp.abs(backbone.modal_constant) * force
+
+    def equation(share: Array, _: None) -> Array:
+        amplitude = share * high
+        return backbone.velocity(amplitude) * backbone.modal_damping(amplitude) / load - 1.0
+
+    solution: optx.Solution = optx.root_find(
+        equation,
+        optx.Newton(rtol=1e-12, atol=1e-12),
+        jnp.asarray(start / high),
+        options={"lower": jnp.asarray(low / high), "upper": jnp.asarray(1.0)},
+        max_steps=64,
+        throw=False,
+    )
+    good = (solution.result == optx.RESULTS.successful) & jnp.isfinite(solution.value)
+    return solution.value * high, good
+
+
+@eqx.filter_jit
+def _picard(backbone: Backbone, force: Array, start: Array, max_steps: int) -> tuple[Array, Array]:
+    load = jnp.abs(backbone.modal_constant) * force
+
+    def update(amplitude: Array, _: None) -> Array:
+        velocity = load / backbone.modal_damping(amplitude)
+        if backbone.argument == "velocity":
+            return velocity
+        return velocity / backbone.natural_frequency(amplitude)
+
+    solution: optx.Solution = optx.fixed_point(
+        update,
+        optx.FixedPointIteration(rtol=1e-10, atol=1e-14),
+        start,
+        max_steps=max_steps,
+        throw=False,
+    )
+    good = (solution.result == optx.RESULTS.successful) & jnp.isfinite(solution.value)
+    return solution.value, good
+
+
+def _resonance(backbone: Backbone, modes: LinearModes, force: float, amplitude: float) -> Resonance:
+    frequency, damping, velocity = _on_resonance(
+        backbone, modes, jnp.asarray(force), jnp.asarray(amplitude)
+    )
+    return Resonance(
+        force=force,
+        amplitude=amplitude,
+        frequency=float(frequency),
+        damping_ratio=float(damping),
+        velocity=float(jnp.abs(velocity)),
+        continued=amplitude > float(backbone.largest) * (1 + 1e-9),
+    )
+
+
+@eqx.filter_jit
+def _on_resonance(
+    backbone: Backbone, modes: LinearModes, force: Array, amplitude: Array
+) -> tuple[Array, Array, Array]:
+    frequency = backbone.natural_frequency(amplitude)
+    damping = backbone.damping_ratio(amplitude)
+    return frequency, damping, _velocity(backbone, modes, force, frequency, frequency, damping)
+
+
+@eqx.filter_jit
+def _velocity(
+    backbone: Backbone,
+    modes: LinearModes,
+    force: Array,
+    frequency: Array,
+    natural_frequency: Array,
+    damping_ratio: Array,
+) -> Complex[Array, "*batch"]:
+    r = modes.sensors.index(backbone.sensor)
+    own = nonlinear_mode_velocity(
+        backbone.modal_constant * force, natural_frequency, damping_ratio, frequency
+    )
+    load = jnp.broadcast_to(force, frequency.shape)
+    return own + residual_velocity(modes, frequency, load)[..., r]
+
+
+def _one_curve(
+    backbone: Backbone,
+    modes: LinearModes,
+    force: float,
+    low: float,
+    high: float,
+    points_per_side: int,
+    *,
+    closed: bool,
+) -> PredictedResponse:
+    load = abs(float(backbone.modal_constant)) * force
+    # Points crowd where both sides meet: there the frequency changes with a square root.
+    angle = np.linspace(0.0, 1.0, points_per_side)
+    share = 0.5 * (1 - np.cos(np.pi * angle)) if closed else np.sin(0.5 * np.pi * angle)
+    amplitude = low + (high - low) * share
+    both = _on_backbone(backbone, np.concatenate([amplitude, amplitude[::-1]]))
+    below, above, _ = both.frequencies(load)
+    squared = np.concatenate([below[:points_per_side], above[points_per_side:]])
+    # Points without a real frequency are dropped at the end: every force has the same shapes,
+    # and the functions below are compiled once.
+    keep = squared > 0
+    frequency = np.sqrt(np.where(keep, squared, 1.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        natural = np.sqrt(both.squared)
+        ratio = both.damping / (2 * natural)
+    arrays = (jnp.asarray(v) for v in (force, frequency, natural, ratio))
+    velocity = np.asarray(_velocity(backbone, modes, *arrays))
+    curve = PredictedResponse(
+        force=force,
+        frequency=frequency,
+        velocity=velocity,
+        amplitude=both.amplitude,
+        stable=both.stable(frequency),
+        branch=tuple(np.where(frequency <= natural, "lead", "lag").tolist()),
+        continued=both.amplitude > float(backbone.largest) * (1 + 1e-9),
+        isolated=closed,
+    )
+    return _subset(curve, keep)
+
+
+def _subset(curve: PredictedResponse, keep: np.ndarray) -> PredictedResponse:
+    return curve._replace(
+        frequency=curve.frequency[keep],
+        velocity=curve.velocity[keep],
+        amplitude=curve.amplitude[keep],
+        stable=curve.stable[keep],
+        branch=tuple(np.asarray(curve.branch)[keep].tolist()),
+        continued=curve.continued[keep],
+    )

@@ -1,0 +1,112 @@
+"""`diagnosis.json`: what a diagnosis says, for other programs."""
+
+import math
+from collections.abc import Sequence
+
+from snrmjax.diagnose.design.discriminating_test import Request
+from snrmjax.diagnose.diagnosis import Diagnosis
+from snrmjax.diagnose.response_prediction import LevelResponse
+from snrmjax.diagnose.search.locating import Located
+
+
+def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] = ()) -> dict:
+    """A diagnosis as plain numbers and texts, in SI units; `foretold` are simulated resonances.
+
+    `request` is the measurement of `decide_by` for programs: its `kind` (`harmonics` of the states
+    of `level`, states `off_resonance` at it, a `lower_level` or `higher_level` whose velocities are
+    those of `level` scaled, or a `calibration`), the force and frequency at resonance, how many
+    `states` and how far off resonance in phase, the `harmonics` wanted with the noise they need,
+    the `quantity` in which rivals differ most, and by how much χ² the rival that is told least well
+    is expected to lose, beside what would settle it; `calibration_too` if effects stay open that
+    only a calibration separates.
+    """
+    gap = diagnosis.gap
+    inner, outer = gap.interpolated, gap.extrapolated
+    return {
+        "verdict": diagnosis.verdict,
+        "effects": list(diagnosis.effects),
+        "candidates": [list(group) for group in diagnosis.candidates],
+        "decide_by": diagnosis.decide_by,
+        "request": _request(diagnosis.request),
+        "located": [_part(part) for part in diagnosis.located],
+        "parameters": {
+            name: {"value": value, "std": std}
+            for name, (value, std) in diagnosis.parameters.items()
+        },
+        "gap": {
+            "before": gap.before,
+            "after": gap.after,
+            "held_out_before": inner.before if inner else None,
+            "held_out_after": inner.after if inner else None,
+            "held_out_level": inner.level if inner else None,
+            "noise_floor": 1.0,
+            "top_level": outer.level if outer else None,
+            "top_level_before": outer.before if outer else None,
+            "top_level_after": outer.after if outer else None,
+        },
+        "detection_limits": diagnosis.detection_limits,
+        "p_value": diagnosis.p_value,
+        "noise_scale": diagnosis.noise_scale,
+        "notes": list(diagnosis.notes),
+        "resonances": [
+            {
+                "level": row.level,
+                "force_n": row.force,
+                "held_out": row.held_out,
+                **{
+                    f"{name}_{quantity}": value if math.isfinite(value) else None
+                    for name in ("measured", "before", "after")
+                    for quantity, value in zip(
+                        ("frequency_hz", "velocity_m_s", "fold_hz"),
+                        getattr(row, name),
+                        strict=True,
+                    )
+                    if (name, quantity) != ("measured", "fold_hz")
+                },
+            }
+            for row in foretold
+        ],
+        "tried": [
+            [
+                {
+                    "effect": row.kind,
+                    "gain": row.gain if math.isfinite(row.gain) else None,
+                    "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
+                    "parameters": row.parameters,
+                }
+                for row in step
+            ]
+            for step in diagnosis.table
+        ],
+    }
+
+
+def _request(request: Request | None) -> dict | None:
+    if request is None:
+        return None
+    return {
+        "kind": request.kind,
+        "level": request.level,
+        "force_n": request.force,
+        "frequency_hz": request.frequency,
+        "quantity": request.quantity,
+        "states": request.states,
+        "phase_deg": list(request.phase) if request.phase else None,
+        "harmonics": list(request.harmonics),
+        "harmonic_std_m_s": request.harmonic_std,
+        "expected_gain": request.expected_gain,
+        "needed_gain": request.needed_gain,
+        "settles": request.settles,
+        "calibration_too": request.calibration_too,
+    }
+
+
+def _part(part: Located) -> dict:
+    entry = {
+        "part": part.part,
+        "velocity_range_m_s": list(part.velocity_range),
+        "p_value": part.p_value,
+    }
+    if part.exponent is not None:
+        entry |= {"exponent": part.exponent, "exponent_std": part.exponent_std}
+    return entry

@@ -1,0 +1,1 @@
+"""Compiled programs, blocks of equal problems over the cores, and least squares."""

@@ -1,0 +1,384 @@
+"""Figures in the manner of the method paper: measured, identified, predicted and simulated.
+
+Blue is measured, vermilion identified or predicted, black simulated; dashed thin lines are
+unstable and pale ones lie beyond the measured amplitudes. Axes are in Hz, degrees and per cent of
+critical damping. Figures need no display and change none of matplotlib's settings.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.identify.pointwise.prediction import CONTINUED, PredictedResponse, Resonance
+from snrmjax.io.files import FilePath, file_name, write_atomically
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.measure.indicators import appropriation_of
+from snrmjax.measure.signals import force_velocity_loop, peak_amplitude
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.model.modes import LinearModes
+from snrmjax.report.sampling import (
+    BAND,
+    measured_near,
+    phase_of,
+    sample_backbone,
+    sensor_index,
+    span_of,
+    usable_damping,
+    velocity_of,
+)
+from snrmjax.report.style import (
+    CROSS,
+    DOT,
+    FILL,
+    HOLLOW,
+    IDENTIFIED,
+    MEASURED,
+    SERIES,
+    SIMULATED,
+    STAR,
+    explain_lines,
+    fit_axis,
+    legend,
+    marks,
+    name_axes,
+    panels,
+    phase_axis,
+    plain,
+    png_bytes,
+    response_line,
+    stars,
+    unit_for,
+    with_unit,
+)
+from snrmjax.simulate.solutions.forced_response import ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+
+class DampingSeries(NamedTuple):
+    """The modal damping of one structure, or by one method: points, a curve, or both."""
+
+    label: str
+    points: BackbonePoints | None = None
+    backbone: Backbone | None = None
+
+
+def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 200.0) -> None:
+    """Write a figure as a PNG, whole or not at all.
+
+    Raises `ValueError` when `path` does not end in .png or cannot be written.
+    """
+    if not file_name(path).lower().endswith(".png"):
+        raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
+    write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
+
+
+def backbone_figure(
+    points: BackbonePoints,
+    backbone: Backbone,
+    *,
+    truth: NormalModeBranch | None = None,
+    modes: LinearModes | None = None,
+) -> Figure:
+    """Measured steady states, the points identified from them, and the curves through these.
+
+    Three panels: velocity amplitude and phase against frequency (0° at resonance), and damping
+    ratio against velocity amplitude. Error bars and bands are 95 %; axes fit the points, so that
+    a wide band may leave them. Steady states that have no place in the curves, as their status
+    says, are grey crosses.
+
+    Arguments: `truth` a nonlinear mode to compare with; `modes` the linear modes, of which the
+    mode of interest is marked at zero amplitude.
+    Returns the figure. Raises `ValueError` when `truth` lacks the backbone's sensor.
+    Reference: Kwarta & Allen, Figs. 7 and 10.
+    """
+    use = np.asarray(points.usable)
+    omega = np.asarray(points.frequency) / HERTZ
+    natural = np.asarray(points.natural_frequency) / HERTZ
+    damping = 100 * np.asarray(points.damping_ratio)
+    measured, own = np.abs(np.asarray(points.velocity)), np.asarray(points.backbone_velocity)
+    unit = unit_for([*measured[use], *own[use]], "m/s")
+    measured, own = measured / unit.size, own / unit.size
+    top = 1.06 * np.max([*measured[use], *own[use]])
+    curve = sample_backbone(backbone)
+    velocity = curve.velocity / unit.size
+
+    figure, ((speeds, phases, dampings),) = panels(13.0, 4.7, 1, 3)
+    for axes, y in ((speeds, measured), (phases, phase_of(points.mode_velocity, backbone))):
+        marks(axes, omega[use], y[use], DOT, "measured")
+        marks(axes, omega[~use], y[~use], CROSS, "measured, left out")
+    marks(dampings, own[~use], damping[~use], CROSS)
+    bars = BAND * np.asarray(points.natural_frequency_std)[use] / HERTZ
+    damping_bars = 100 * BAND * np.asarray(points.damping_ratio_std)[use]
+    stars(speeds, natural[use], own[use], "identified, 95 % bars", xerr=bars)
+    stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
+    stars(dampings, own[use], damping[use], yerr=damping_bars)
+    speeds.plot(curve.frequency, velocity, color=IDENTIFIED, zorder=4, label="identified curve")
+    dampings.plot(velocity, curve.damping, color=IDENTIFIED, zorder=4)
+    sides = curve.frequency - curve.frequency_error, curve.frequency + curve.frequency_error
+    speeds.fill_betweenx(velocity, *sides, color=IDENTIFIED, **FILL, label="95 % band")
+    sides = curve.damping - curve.damping_error, curve.damping + curve.damping_error
+    dampings.fill_between(velocity, *sides, color=IDENTIFIED, **FILL)
+    seen, seen_damping = [*omega, *curve.frequency], [*curve.damping]
+    if truth is not None:
+        true_velocity = np.abs(velocity_of(truth, backbone.sensor)) / unit.size
+        inside = np.where(true_velocity <= top, truth.frequency / HERTZ, np.nan)
+        speeds.plot(inside, true_velocity, "--", color=SIMULATED, zorder=4, label="true mode")
+        seen += [*inside]
+    if modes is not None:
+        j = modes.mode_of_interest
+        linear = float(modes.natural_frequency[j]) / HERTZ, 100 * float(modes.damping_ratio[j])
+        diamond = {**HOLLOW, "marker": "D"}
+        marks(speeds, linear[0], 0.0, diamond, "linear mode")
+        marks(dampings, 0.0, linear[1], diamond)
+        seen, seen_damping = [*seen, linear[0]], [*seen_damping, linear[1]]
+    phases.sharex(speeds)
+    speeds.set_ylim(0.0, top)
+    dampings.set_xlim(0.0, top)
+    fit_axis(speeds, "x", natural[use], seen, bars)
+    fit_axis(dampings, "y", damping[use], seen_damping, damping_bars)
+    phase_axis(phases)
+    at, level = plain(backbone.sensor), f"Velocity amplitude ({unit.name})"
+    name_axes(speeds, f"(a) amplitude at {at}", "Frequency (Hz)", level)
+    name_axes(phases, "(b) phase", "Frequency (Hz)", "Phase of the mode's velocity (°)")
+    name_axes(dampings, "(c) damping", level, "Damping ratio (% of critical)")
+    legend(figure)
+    return figure
+
+
+def response_figure(
+    backbone: Backbone,
+    predicted: Sequence[PredictedResponse],
+    resonances: Sequence[Resonance] = (),
+    *,
+    simulated: Sequence[ResponseCurve] = (),
+    measured: SteadyStates | None = None,
+    frequency_range: tuple[float, float] | None = None,
+    force_tolerance: float = 0.03,
+) -> Figure:
+    """Predicted responses, one row a force, beside harmonic balance and what was measured.
+
+    Two panels a row: velocity amplitude and velocity phase against frequency. Stars are phase
+    resonances, dashed parts unstable, pale ones beyond the measured amplitudes.
+
+    Arguments: `frequency_range` in rad/s, by default where a response exceeds a quarter of its
+    peak; `measured` steady states appear in the row whose force is within the relative
+    `force_tolerance` of theirs.
+    Returns the figure. Raises `ValueError` when there is no response or a sensor is missing.
+    Reference: Kwarta & Allen, Figs. 8 and 11.
+    """
+    sensor = backbone.sensor
+    exact = [c for c in simulated if len(c.frequency)]
+    every: list[PredictedResponse | ResponseCurve] = [*exact, *predicted]
+    forces = sorted({c.force for c in every})
+    if not forces:
+        raise ValueError("there is no response to show: `predicted` and `simulated` are empty.")
+    spans = (
+        [frequency_range] if frequency_range else [span_of(c, sensor) for c in predicted or exact]
+    )
+    low, high = min(s[0] for s in spans) / HERTZ, max(s[1] for s in spans) / HERTZ
+    spine = sample_backbone(backbone, reach=CONTINUED)
+    figure, rows = panels(10.5, 0.8 + 3.1 * len(forces), len(forces), 2)
+    for force, (speeds, phases) in zip(forces, rows, strict=True):
+        omega, states = measured_near(measured, sensor, force, force_tolerance)
+        curves = [c for c in every if c.force == force]
+        velocities = [velocity_of(curve, sensor) for curve in curves]
+        largest = np.nanmax(np.abs(np.concatenate([*velocities, states])))
+        unit = unit_for(largest, "m/s")
+        for part, style in ((~spine.beyond, {"label": "backbone"}), (spine.beyond, {"alpha": 0.4})):
+            x, y = spine.frequency[part], spine.velocity[part] / unit.size
+            speeds.plot(x, y, ":", color=IDENTIFIED, **style)
+        phases.axhline(0.0, color="0.6", linewidth=1.0, zorder=1)
+        for curve, v in zip(curves, velocities, strict=True):
+            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, phase_of(v, backbone))):
+                x = curve.frequency / HERTZ
+                if isinstance(curve, PredictedResponse):
+                    name, colour, width, beyond = "predicted", IDENTIFIED, 1.5, curve.continued
+                else:
+                    name, colour, width, beyond = "harmonic balance", SIMULATED, 3.0, None
+                response_line(axes, x, y, curve.stable, name, colour, width, beyond)
+        for axes, y in ((speeds, np.abs(states) / unit.size), (phases, phase_of(states, backbone))):
+            marks(axes, omega, y, DOT, "measured")
+        found = [(one.frequency / HERTZ, one.velocity) for one in resonances if one.force == force]
+        star = {**STAR, "markersize": 15.0, "zorder": 5}
+        marks(speeds, [f for f, _ in found], [v / unit.size for _, v in found], star, "resonance")
+        marks(phases, [f for f, _ in found], np.zeros(len(found)), star)
+        speeds.set(xlim=(low, high), ylim=(0.0, 1.12 * largest / unit.size))
+        phases.sharex(speeds)
+        phase_axis(phases)
+        bottom = "Frequency (Hz)" if force == forces[-1] else ""
+        title, level = f"force {with_unit(force, 'N')}: ", f"Velocity amplitude ({unit.name})"
+        name_axes(speeds, f"{title}amplitude at {plain(sensor)}", bottom, level)
+        name_axes(phases, f"{title}phase", bottom, "Velocity phase (°)")
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def simulated_response_figure(
+    curves: Sequence[ResponseCurve], *, sensor: str | None = None
+) -> Figure:
+    """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
+
+    Unstable parts are dashed; triangles mark peaks, squares folds, dots phase resonances.
+
+    Arguments: `sensor` by default the first of the curves.
+    Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
+    """
+    drawn = sorted((c for c in curves if len(c.frequency)), key=lambda c: c.force)
+    if not drawn:
+        raise ValueError("there is no response to show: no curve has a point.")
+    name = sensor or drawn[0].sensors[0]
+    forces = sorted({c.force for c in drawn})
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
+    colours = dict(zip(forces, shades, strict=True))
+    unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
+    figure, ((speeds,), (phases,)) = panels(9.0, 7.5, 2, 1)
+    markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
+    for event in (None, *markers):
+        for curve in drawn:
+            v, x = velocity_of(curve, name), curve.frequency / HERTZ
+            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
+                if event is None:
+                    label, colour = with_unit(curve.force, "N"), colours[curve.force]
+                    response_line(axes, x, y, curve.stable, label, colour, 1.8)
+                    continue
+                at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
+                if event == "phase_resonance":
+                    style |= {"color": "black", "markersize": 3.0}
+                marks(axes, x[at], y[at], style, event.replace("_", " "))
+    speeds.set_ylim(bottom=0.0)
+    phases.sharex(speeds)
+    phase_axis(phases)
+    name_axes(speeds, f"(a) amplitude at {plain(name)}", "", f"Velocity amplitude ({unit.name})")
+    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
+    """A nonlinear normal mode: velocity against frequency, and frequency against energy.
+
+    The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
+    part where an internal resonance puts energy into higher harmonics. The energy axis shows the
+    last five decades.
+
+    Arguments: `sensor` by default the branch's first.
+    Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
+    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
+    doi:10.1016/j.ymssp.2008.04.002, for the frequency-energy plot.
+    """
+    if not len(branch.frequency):
+        raise ValueError("there is no normal mode to show: the branch has no point.")
+    name = sensor or branch.sensors[0]
+    fundamental = np.abs(velocity_of(branch, name))
+    signal = branch.velocity[:, 1:, branch.sensors.index(name)]
+    peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
+    unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
+    figure, ((speeds, energies),) = panels(11.0, 4.7, 1, 2)
+    speeds.plot(omega, peak / unit.size, color=SERIES[5], label="peak of the signal")
+    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, label="fundamental")
+    energies.semilogx(branch.energy, omega, color=SIMULATED)
+    energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
+    speeds.set_ylim(bottom=0.0)
+    title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
+    name_axes(speeds, title, "Frequency (Hz)", level)
+    name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
+    legend(figure)
+    return figure
+
+
+def force_velocity_figure(
+    data: SteadyStates, states: Sequence[int], *, sensor: str | None = None
+) -> Figure:
+    """Force-velocity loops of a few steady states: the thinner, the nearer to resonance.
+
+    The dashed line is the part of the fundamental in phase with the force: at phase resonance
+    and without further harmonics nothing else is left.
+
+    Arguments: `states` are row numbers of `data`; `sensor` by default the first. Harmonics that
+    were not measured are left out.
+    Returns the figure. Raises `ValueError` when there is no state, one does not exist or was not
+    measured under a known force, or the sensor is missing.
+    Reference: Kwarta & Allen, Fig. 2.
+    """
+    name = sensor or data.sensors[0]
+    r = sensor_index(data.sensors, name)
+    good = np.flatnonzero(np.asarray(data.measured[:, r]) & np.isfinite(np.asarray(data.force)))
+    wrong = [k for k in states if k not in good]
+    if wrong or not len(states):
+        raise ValueError(
+            f"`states` must be rows measured at {name!r} under a known force, of which there are "
+            f"{len(good)}, but {f'has {wrong[0]}' if wrong else 'is empty'}."
+        )
+    phasors = np.concatenate([data.velocity[:, r, None], data.harmonics[:, r]], axis=1)
+    phasors = np.where(np.isfinite(phasors), phasors, 0.0)[list(states)]
+    forces = np.asarray(data.force)[list(states)]
+    loops = force_velocity_loop(
+        jnp.asarray(forces), jnp.asarray(phasors), (1, *data.harmonic_order)
+    )
+    frequency, indicator = np.asarray(data.frequency) / HERTZ, np.asarray(appropriation_of(data))
+    columns = min(3, len(states))
+    height = -(-len(states) // columns)
+    figure, grid = panels(3.9 * columns, 0.3 + 3.7 * height, height, columns)
+    for number, (axes, k) in enumerate(zip(grid.flat, states, strict=False)):
+        force, velocity = np.asarray(loops.force[number]), np.asarray(loops.velocity[number])
+        force_unit, unit = unit_for(force, "N"), unit_for(velocity, "m/s")
+        ends, phasor = np.array([-1.0, 1.0]), phasors[number, 0]
+        in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
+        axes.plot(*in_phase, "--", color=SIMULATED, linewidth=1.1)
+        axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED)
+        turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
+        title = f"level {int(data.level[k])}, {frequency[k]:.4g} Hz\n"
+        title += f"phase {turn}, indicator {indicator[k]:.2f}"
+        name_axes(axes, title, f"Force ({force_unit.name})", f"Velocity ({unit.name})")
+    for axes in grid.flat[len(states) :]:
+        axes.remove()
+    return figure
+
+
+def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | None = None) -> Figure:
+    """Modal damping 2ζ̃ω̃ against the velocity amplitude on the backbone, with 95 % bands.
+
+    Constant for a structure with linear damping, whatever its stiffness does.
+
+    Arguments: `linear` the value 2ζω of the linear mode in 1/s, drawn as a dotted line.
+    Returns the figure. Raises `ValueError` when there is nothing to show.
+    Reference: Kwarta & Allen, Fig. B.1.
+    """
+    shown = [s for s in series if s.points is not None or s.backbone is not None]
+    if not shown:
+        raise ValueError("there is no damping to show: no series has points or a backbone.")
+    figure, ((axes,),) = panels(7.5, 5.2, 1, 1)
+    curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in shown]
+    largest = [c.velocity for c in curves if c]
+    largest += [usable_damping(s.points)[0] for s in shown if s.points]
+    unit = unit_for(np.concatenate(largest), "m/s")
+    dots: list[float] = []
+    lines: list[float] = [] if linear is None else [linear]
+    for number, (one, curve) in enumerate(zip(shown, curves, strict=True)):
+        colour, name = SERIES[number % len(SERIES)], plain(one.label)
+        if one.points is not None:
+            velocity, damping = usable_damping(one.points)
+            style = {**DOT, "color": colour, "alpha": 0.7}
+            marks(axes, velocity / unit.size, damping, style, None if curve else name)
+            dots += [*damping]
+        if curve is not None:
+            velocity, damping = curve.velocity / unit.size, curve.modal_damping
+            sides = damping - curve.modal_damping_error, damping + curve.modal_damping_error
+            axes.fill_between(velocity, *sides, color=colour, **FILL)
+            axes.plot(velocity, damping, color=colour, label=name)
+            lines += [*damping]
+    if linear is not None:
+        axes.axhline(linear, color=SIMULATED, linestyle=":", label="linear mode")
+    axes.set_xlim(left=0.0)
+    fit_axis(axes, "y", dots, lines)
+    name_axes(axes, "", f"Velocity amplitude ({unit.name})", "Modal damping 2ζω (1/s)")
+    legend(figure)
+    return figure

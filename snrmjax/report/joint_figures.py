@@ -1,0 +1,276 @@
+"""Figures of joint fits: curves with bands, residuals, what bands are made of, and advice."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from snrmjax.identify.inference.fitted_response import FittedResponse
+from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.report.sampling import (
+    BAND,
+    BackboneSamples,
+    contributions_by_kind,
+    fit_residuals,
+    sample_fit,
+    velocity_of,
+)
+from snrmjax.report.style import (
+    DOT,
+    FILL,
+    HOLLOW,
+    IDENTIFIED,
+    MEASURED,
+    SERIES,
+    SIMULATED,
+    Unit,
+    explain_lines,
+    fit_axis,
+    legend,
+    marks,
+    name_axes,
+    panels,
+    phase_axis,
+    plain,
+    response_line,
+    unit_for,
+    with_unit,
+)
+from snrmjax.simulate.solutions.controlled import DampedModeBranch
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+_LEAST_SHARE = 0.005  # of a band's variance: what is smaller stands in one bar together
+
+
+class FitSeries(NamedTuple):
+    """A joint fit to be drawn, and the points that single states give."""
+
+    label: str
+    fit: JointFit
+    points: BackbonePoints | None = None
+
+
+def fitted_curves_figure(
+    series: Sequence[FitSeries], *, truth: NormalModeBranch | DampedModeBranch | None = None
+) -> Figure:
+    """Natural frequency and damping of joint fits against amplitude, with 95 % bands.
+
+    Dots are what single states give on their own. Of a single fit whose levels scatter, the paler
+    band holds the curve of one further level.
+
+    Arguments: `truth` a mode to compare with, of which a damped one shows its damping too.
+    Returns the figure. Raises `ValueError` when there is no fit.
+    """
+    if not series:
+        raise ValueError("there is no fit to show: `series` is empty.")
+    curves = [sample_fit(one.fit) for one in series]
+    unit = unit_for(np.concatenate([curve.velocity for curve in curves]), "m/s")
+    reach = [curve.velocity[-1] for curve in curves]
+    for one in series:
+        if one.points is not None:
+            reach += [*np.asarray(one.points.backbone_velocity)[np.asarray(one.points.usable)]]
+    top = 1.04 * max(reach) / unit.size
+    figure, ((natural, damping),) = panels(11.0, 5.2, 1, 2)
+    seen: tuple[list[float], list[float]] = ([], [])
+    dots: tuple[list[float], list[float]] = ([], [])
+    for number, (one, curve) in enumerate(zip(series, curves, strict=True)):
+        colour, name = SERIES[number % len(SERIES)], plain(one.label)
+        if one.points is not None:
+            use = np.asarray(one.points.usable)
+            own = np.asarray(one.points.backbone_velocity)[use] / unit.size
+            each = (
+                np.asarray(one.points.natural_frequency)[use] / HERTZ,
+                100 * np.asarray(one.points.damping_ratio)[use],
+            )
+            style = {**DOT, "markersize": 4.0, "alpha": 0.55, "color": MEASURED}
+            if len(series) > 1:
+                style["color"] = colour
+            for axes, y, kept in zip((natural, damping), each, dots, strict=True):
+                marks(axes, own, y, style, None if len(series) > 1 else "single states")
+                kept += [*y]
+        if len(series) == 1 and np.any(one.fit.level_std[2:] > 0):
+            wide = sample_fit(one.fit, of_a_new_level=True)
+            _bands(natural, damping, wide, unit, colour, "95 % band of a further level", 0.5)
+        _bands(natural, damping, curve, unit, colour, "95 % band")
+        for axes, y in ((natural, curve.frequency), (damping, curve.damping)):
+            axes.plot(curve.velocity / unit.size, y, color=colour, zorder=4, label=name)
+        for kept, y, error in (
+            (seen[0], curve.frequency, curve.frequency_error),
+            (seen[1], curve.damping, curve.damping_error),
+        ):
+            kept += [*(y - error), *(y + error)]
+    if truth is not None:
+        x = np.abs(velocity_of(truth, series[0].fit.modes.sensors[series[0].fit.data.sensor]))
+        inside = x / unit.size <= top
+        style = {"color": SIMULATED, "linestyle": "--", "linewidth": 1.2, "zorder": 5}
+        natural.plot(x[inside] / unit.size, truth.frequency[inside] / HERTZ, **style, label="true")
+        if isinstance(truth, DampedModeBranch):
+            damping.plot(x[inside] / unit.size, 100 * truth.damping_ratio[inside], **style)
+    for axes, kept, shown in zip((natural, damping), dots, seen, strict=True):
+        axes.set_xlim(0.0, top)
+        fit_axis(axes, "y", kept, shown)
+    level = f"Velocity amplitude ({unit.name})"
+    name_axes(natural, "(a) natural frequency", level, "Natural frequency (Hz)")
+    name_axes(damping, "(b) damping", level, "Damping ratio (% of critical)")
+    legend(figure)
+    return figure
+
+
+def _bands(
+    natural: Axes,
+    damping: Axes,
+    curve: BackboneSamples,
+    unit: Unit,
+    colour: str,
+    name: str,
+    strength: float = 1.0,
+) -> None:
+    fill = {**FILL, "alpha": strength * FILL["alpha"], "color": colour}
+    x = curve.velocity / unit.size
+    for axes, y, error in (
+        (natural, curve.frequency, curve.frequency_error),
+        (damping, curve.damping, curve.damping_error),
+    ):
+        axes.fill_between(x, y - error, y + error, **fill, label=name)
+
+
+def residuals_figure(fit: JointFit) -> Figure:
+    """Whitened residuals of a joint fit against amplitude and phase, and how they are spread.
+
+    Each state leaves two, of unit variance and independent where noise and curves are right. A
+    trend is what the curves do not follow; more outside ±1.96 than one in twenty is noise larger
+    than stated, or outliers.
+    """
+    left = fit_residuals(fit)
+    unit = unit_for(left.velocity, "m/s")
+    figure, ((speeds, phases, spread),) = panels(13.0, 4.7, 1, 3)
+    for part, (colour, name) in enumerate(((MEASURED, "first part"), (IDENTIFIED, "second part"))):
+        style = {**DOT, "color": colour, "markersize": 4.0, "alpha": 0.7}
+        marks(speeds, left.velocity / unit.size, left.parts[:, part], style, name)
+        marks(phases, left.phase, left.parts[:, part], style)
+    reach = max(3.5, 1.08 * float(np.max(np.abs(left.parts))))
+    for axes in (speeds, phases):
+        for y, line in ((0.0, "-"), (-BAND, "--"), (BAND, "--")):
+            axes.axhline(y, color="0.4", linewidth=0.9, linestyle=line, zorder=1)
+        axes.set_ylim(-reach, reach)
+    speeds.set_xlim(left=0.0)
+    edges = np.linspace(-reach, reach, 2 * int(np.clip(np.sqrt(left.parts.size), 8, 20)) + 1)
+    spread.hist(left.parts.reshape(-1), edges, density=True, color="0.75", label="residuals")
+    x = np.linspace(-reach, reach, 201)
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    spread.plot(x, normal, color=SIMULATED, label="normal distribution, variance one")
+    outside = 100 * float(np.mean(np.abs(left.parts) > BAND))
+    ylabel = "Whitened residual (1)"
+    name_axes(speeds, "(a) against amplitude", f"Velocity amplitude ({unit.name})", ylabel)
+    name_axes(phases, "(b) against phase", "Velocity phase (°), 0° at resonance", ylabel)
+    title = f"(c) rms {left.rms:.2f}, {outside:.1f} % outside ±1.96"
+    name_axes(spread, title, ylabel, "Density (1)")
+    legend(figure)
+    return figure
+
+
+def contributions_figure(rows: Sequence[Contribution]) -> Figure:
+    """What the bands of both curves are made of: shares of their variance, as bars.
+
+    Errors of one kind stand together, the levels' among them; kinds that add less than 0.5 % to
+    both bands share one bar. Bars of one colour sum to the whole variance.
+
+    Raises `ValueError` when there is no contribution.
+    """
+    if not rows:
+        raise ValueError("there is nothing to show: `rows` is empty.")
+    kinds = contributions_by_kind(rows)
+    large = [row for row in kinds if max(row.frequency_share, row.damping_share) >= _LEAST_SHARE]
+    small = [row for row in kinds if row not in large]
+    names = [row.source for row in large]
+    shares = [(row.frequency_share, row.damping_share) for row in large]
+    if small:
+        names.append(small[0].source if len(small) == 1 else f"{len(small)} smaller ones together")
+        shares.append((sum(r.frequency_share for r in small), sum(r.damping_share for r in small)))
+    place = np.arange(len(names))
+    figure, ((axes,),) = panels(9.0, 1.6 + 0.62 * len(names), 1, 1)
+    for k, (what, colour) in enumerate((("natural frequency", MEASURED), ("damping", IDENTIFIED))):
+        widths = [100 * share[k] for share in shares]
+        bars = axes.barh(place + (k - 0.5) * 0.38, widths, 0.36, color=colour, label=what)
+        axes.bar_label(bars, [f"{w:.1f} %" for w in widths], padding=3, fontsize=9.5)
+    axes.set_yticks(place, [plain(name) for name in names])
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlim(0.0, 1.12 * 100 * max(max(share) for share in shares))
+    axes.xaxis.set_major_formatter(PercentFormatter(decimals=0))
+    name_axes(axes, "", "Share of the band's variance, mean over the amplitudes", "")
+    legend(figure)
+    return figure
+
+
+def advice_figure(
+    responses: Sequence[FittedResponse], advice: Sequence[NextMeasurement], sensor: str
+) -> Figure:
+    """Where the advised states lie on the fitted responses, numbered by rank.
+
+    Arguments: `responses` of the advised forces, drawn above a quarter of their peaks and as far
+    as an advised state is from them; `sensor` is what the axis names.
+    Returns the figure. Raises `ValueError` when there is no response.
+    """
+    if not responses:
+        raise ValueError("there is no response to show: `responses` is empty.")
+    forces = sorted({one.force for one in responses})
+    figure, ((speeds,), (phases,)) = panels(9.0, 7.5, 2, 1)
+    largest = max(float(np.max(np.abs(one.velocity))) for one in responses)
+    unit = unit_for(largest, "m/s")
+    resonant = np.concatenate(
+        [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
+    )
+    sign = 1.0 if np.sum(resonant.real) >= 0 else -1.0
+    for curve in responses:
+        colour = SERIES[forces.index(curve.force) % len(SERIES)]
+        size = np.abs(curve.velocity)
+        mine = [one.velocity for one in advice if one.force == curve.force]
+        near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
+        x, name = curve.frequency[near] / HERTZ, with_unit(curve.force, "N")
+        turn = np.angle(sign * curve.velocity[near]) / DEGREE
+        for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
+            pieces = (curve.stable[near], name, colour, 1.5, curve.continued[near])
+            response_line(axes, x, y, *pieces)
+    for one in advice:
+        marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
+        turn = np.angle(sign * np.exp(1j * one.phase)) / DEGREE
+        marks(phases, one.frequency / HERTZ, turn, HOLLOW)
+    for ranks, first in _together(advice):
+        at = (first.frequency / HERTZ, first.velocity / unit.size)
+        text = ", ".join(map(str, ranks))
+        offset: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+        box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
+        speeds.annotate(text, at, **offset, fontsize=10.5, zorder=6, bbox=box)
+    if forces[-1] > 8 * forces[0]:
+        speeds.set_yscale("log")
+    else:
+        speeds.set_ylim(0.0, 1.12 * largest / unit.size)
+    phases.sharex(speeds)
+    phase_axis(phases)
+    name_axes(speeds, f"(a) amplitude at {plain(sensor)}", "", f"Velocity amplitude ({unit.name})")
+    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def _together(advice: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
+    """Ranks whose marks would hide one another, with the first of them."""
+    groups: list[tuple[list[int], NextMeasurement]] = []
+    for one in advice:
+        for ranks, first in groups:
+            near = abs(one.frequency / first.frequency - 1) < 0.005
+            if near and abs(one.velocity / first.velocity - 1) < 0.03:
+                ranks.append(one.rank)
+                break
+        else:
+            groups.append(([one.rank], one))
+    return groups

@@ -1,0 +1,238 @@
+"""What a report tells of a joint fit: its parameters, errors and residuals, and its advice."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
+from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.uncertainty import Contribution, contributions
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.io.joint_results import summarise_fit
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
+from snrmjax.report.joint_figures import (
+    FitSeries,
+    advice_figure,
+    contributions_figure,
+    fitted_curves_figure,
+    residuals_figure,
+)
+from snrmjax.report.style import unit_for
+
+_LISTED = 12  # contributions by name; the rest stands in one row
+
+CURVES_CAPTION = (
+    "The joint fit. Lines are the fitted curves, fitted to all states at once; darker bands hold "
+    "the true curve with 95 %. Where levels differ from one another, the paler band holds the "
+    "curve of one further level. Dots are what single states give on their own, shared errors of "
+    "their level included."
+)
+RESIDUALS_CAPTION = (
+    "Whitened residuals: what the fit leaves of every state's force balance, in units of its "
+    "noise and made independent. Two a state. Where curves and noise are right they are a cloud "
+    "without shape, and one in twenty lies outside the dashed lines. A bend says that the curves, "
+    "the phase or the linear modes are not right; a funnel says that the noise is not."
+)
+SHARES_CAPTION = (
+    "Where the width of the bands comes from: shares of the variance, mean over the measured "
+    "amplitudes. Bars of one colour sum to 100 %. Random errors shrink with more states, errors "
+    "of levels only with more levels."
+)
+ADVICE_CAPTION = (
+    "Where the advised states lie on the fitted responses, numbered in the order of the table. "
+    "Dashed parts are unstable."
+)
+
+
+class ToldFit(NamedTuple):
+    """A joint fit with what its report needs."""
+
+    fit: JointFit
+    shares: tuple[Contribution, ...]
+    advice: tuple[NextMeasurement, ...]
+    responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
+
+
+def tell_fit(fit: JointFit, advice: Sequence[NextMeasurement] = ()) -> ToldFit:
+    """What contributes to the bands of a fit, and the responses on which its advice lies."""
+    forces = sorted({one.force for one in advice})
+    responses = [fitted_response(fit, force)[0] for force in forces]
+    return ToldFit(fit, tuple(contributions(fit)), tuple(advice), tuple(responses))
+
+
+def joint_figures(told: ToldFit, points: BackbonePoints) -> dict[str, Figure]:
+    """Figures of a joint fit by the names of their files; `points` of single states."""
+    figures = {
+        "joint_fit": fitted_curves_figure([FitSeries("joint fit", told.fit, points)]),
+        "residuals": residuals_figure(told.fit),
+        "contributions": contributions_figure(told.shares),
+    }
+    if told.advice:
+        sensor = told.fit.modes.sensors[told.fit.data.sensor]
+        figures["next"] = advice_figure(told.responses, told.advice, sensor)
+    return figures
+
+
+def joint_sections(told: ToldFit, figures: dict[str, Figure]) -> list[Section]:
+    """The sections of a report that tell a joint fit, with its figures."""
+    fit = told.fit
+    summary = summarise_fit(fit, ())
+    families = f"{summary['backbone']} for ω² and {summary['damping']} for 2ζω"
+    intro = (
+        f"Both curves were fitted together to {len(fit.data.level)} states of "
+        f"{fit.data.n_levels} levels: {families} (family, size and the amplitude it is a function "
+        "of). Errors that the states of a level share are unknowns of the fit."
+    )
+    shown = [
+        ReportFigure(figures["joint_fit"], CURVES_CAPTION),
+        ReportFigure(figures["residuals"], RESIDUALS_CAPTION),
+    ]
+    sections = [
+        Section("Joint fit", [intro], shown, [parameter_table(summary), error_table(summary)]),
+        Section(
+            "What the bands are made of",
+            (),
+            [ReportFigure(figures["contributions"], SHARES_CAPTION)],
+            [contribution_table(told.shares)],
+        ),
+    ]
+    if told.advice:
+        pictured = [ReportFigure(figures["next"], ADVICE_CAPTION)]
+        table = advice_table(told.advice)
+        sections.append(Section("What to measure next", (), pictured, [table]))
+    if fit.candidates:
+        sections.append(Section("Families tried", (), (), [family_table(summary)]))
+    return sections
+
+
+def parameter_table(summary: dict) -> ReportTable:
+    """Parameters as `summarise_fit` has them, ± 1σ, and what they read as in other units."""
+    rows = [
+        (
+            *(name, minus(with_error(one["value"], one["std"])), _unit(one["unit"])),
+            minus(_reads_as(name, one["value"], one["std"])),
+        )
+        for name, one in summary["parameters"].items()
+    ]
+    caption = (
+        "Parameters ± 1σ. Those of a curve are values of ω² or 2ζω, or what a term adds to them "
+        "at the largest measured amplitude. Knots ascend in amplitude, the first at zero."
+    )
+    return ReportTable(("parameter", "value ± 1σ", "unit", "that is"), rows, caption)
+
+
+def _unit(name: str) -> str:
+    return {"rad^2/s^2": "rad²/s²", "1": "", "log": "", "smallest force": "× smallest force"}.get(
+        name, name
+    )
+
+
+def _reads_as(name: str, value: float, std: float) -> str:
+    """Values of a backbone as frequencies, a gain as a factor, a phase in degrees."""
+    if name.startswith(("backbone.at_zero", "backbone.knot_")) and value > 0:
+        omega = float(np.sqrt(value))
+        return f"{with_error(omega / HERTZ, 0.5 * std / omega / HERTZ)} Hz"
+    if name == "force_gain":
+        return f"gain {with_error(float(np.exp(value)), float(np.exp(value)) * std)}"
+    if name == "instrument_phase":
+        return f"{with_error(value / DEGREE, std / DEGREE)}°"
+    return ""
+
+
+def error_table(summary: dict) -> ReportTable:
+    """The noise, and what levels have in common, as the fit takes them."""
+    noise, levels = summary["noise"], summary["levels"]
+    scale, std = noise["scale"], noise["scale_std"]
+    of_noise = (
+        f"{with_error(scale, std)} × the stated one"
+        if noise["stated"]
+        else f"{with_error(100 * scale, 100 * std)} % of the velocity"
+    )
+    wandering = 100 * noise["wandering_of_natural_frequency"]
+    rows = [
+        ("random noise, from the residuals", of_noise),
+        ("natural frequency, from state to state", f"{wandering:.2g} %"),
+        ("gain of a level", f"{100 * levels['gain_std']:.2g} %"),
+        ("phase of a level", f"{levels['phase_std_deg']:.2g}°"),
+        (
+            "natural frequency, from level to level",
+            f"{100 * levels['natural_frequency_std_relative']:.2g} %",
+        ),
+        ("damping, from level to level", f"{100 * levels['damping_std_relative']:.2g} %"),
+    ]
+    return ReportTable(("error", "1σ"), rows, "Errors as the fit takes them, stated or found.")
+
+
+def contribution_table(shares: Sequence[Contribution]) -> ReportTable:
+    """The largest contributions to the bands by name, and all others in one row."""
+    named, others = shares[:_LISTED], shares[_LISTED:]
+    pairs = [(one.source, one.frequency_share, one.damping_share) for one in named]
+    if others:
+        rest = sum(o.frequency_share for o in others), sum(o.damping_share for o in others)
+        pairs.append((f"{len(others)} further ones together", *rest))
+    rows = [(name, f"{100 * a:.1f}", f"{100 * b:.1f}") for name, a, b in pairs]
+    header = ("source of error", "natural frequency (%)", "damping (%)")
+    return ReportTable(header, rows, "Shares of the variance of both bands, largest first.")
+
+
+def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
+    """Advised states by rank, with the reason of each."""
+    load = unit_for([one.force for one in advice], "N")
+    unit = unit_for([one.velocity for one in advice], "m/s")
+    rows = [
+        (
+            *(f"{one.rank}", f"{one.force / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
+            *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
+            *(f"{100 * one.expected_band_ratio:.1f}", one.reason),
+        )
+        for one in advice
+    ]
+    header = (
+        *("rank", f"force ({load.name})", "frequency (Hz)", f"velocity ({unit.name})"),
+        *("phase (°)", "bands left (%)", "reason"),
+    )
+    caption = (
+        "Each state given the ones before it. Velocity and phase are those to be expected; bands "
+        "left: the mean width of the bands after this measurement, of today's."
+    )
+    return ReportTable(header, rows, caption)
+
+
+def family_table(summary: dict) -> ReportTable:
+    """Families tried, the best of each curve first."""
+    tried = sorted(summary["tried"], key=lambda one: (one["curve"], -one["score"]))
+    rows = [
+        (
+            one["curve"],
+            f"{one['family']}:{one['size']}@{one['argument']}",
+            str(one["parameters"]),
+            minus(f"{one['score']:.1f}") + (f" ± {one['score_std']:.1f}" if one["score"] else ""),
+            f"{one['prediction_error']:.3f}",
+            f"{100 * one['weight']:.0f}",
+            "taken" if one["chosen"] else "",
+        )
+        for one in tried
+    ]
+    header = (
+        "curve",
+        "family",
+        "parameters",
+        "score",
+        "error of prediction",
+        "weight (%)",
+        "choice",
+    )
+    caption = (
+        "How well levels are predicted that were left out. Score: log predictive density relative "
+        "to the best, ± 1σ of the difference; a family within 2 of the best is as good. Error of "
+        "prediction: left-out residuals over what was foretold, 1 if the bands are right. Weight: "
+        "how far a family is to be believed by its score; where another one says something else "
+        "than the one taken, the bands are wider by that. The curve taken may have one term more "
+        "than the best score asks for, so that its band does not rest on the shape of too small a "
+        "family."
+    )
+    return ReportTable(header, rows, caption)

@@ -1,0 +1,163 @@
+"""What figures read off results: sampled curves, phasors and phases, in the figures' units."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+from snrmjax.identify.pointwise.backbone_points import BackbonePoints
+from snrmjax.identify.pointwise.prediction import PredictedResponse
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.simulate.solutions.controlled import DampedModeBranch
+from snrmjax.simulate.solutions.forced_response import ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+BAND = 1.96
+"""Half the width of a 95 % band in standard deviations."""
+
+_CURVE_POINTS = 200  # as many as files have: one compiled function serves both
+
+
+class BackboneSamples(NamedTuple):
+    """A backbone at some amplitudes, in the units of the figures; errors are 95 %."""
+
+    velocity: np.ndarray  # m/s
+    frequency: np.ndarray  # Hz
+    frequency_error: np.ndarray  # Hz
+    damping: np.ndarray  # % of critical
+    damping_error: np.ndarray
+    modal_damping: np.ndarray  # 1/s
+    modal_damping_error: np.ndarray
+    beyond: np.ndarray  # whether the amplitude exceeds the measured ones
+
+
+def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
+    """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
+    start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
+    amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
+    beyond = np.asarray(amplitude) > float(backbone.largest)
+    return _in_units(backbone.values(amplitude), beyond)
+
+
+def sample_fit(
+    fit: JointFit, *, of_a_new_level: bool = False, reach: float = 1.0
+) -> BackboneSamples:
+    """The curves of a joint fit from zero to `reach` times the largest measured velocity."""
+    largest = fit.largest[1]
+    velocity = np.linspace(0.0, reach * largest, _CURVE_POINTS)
+    values = fitted_values(fit, velocity, of_a_new_level=of_a_new_level)
+    return _in_units(values, velocity > largest)
+
+
+def _in_units(values: BackboneValues, beyond: np.ndarray) -> BackboneSamples:
+    omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
+    return BackboneSamples(
+        velocity=np.asarray(values.velocity),
+        frequency=omega / HERTZ,
+        frequency_error=BAND * omega_std / HERTZ,
+        damping=100 * damping,
+        damping_error=100 * BAND * damping_std,
+        modal_damping=modal,
+        modal_damping_error=BAND * modal_std,
+        beyond=beyond,
+    )
+
+
+class FitResiduals(NamedTuple):
+    """What a joint fit leaves of its states, whitened: of unit variance if all is right."""
+
+    level: np.ndarray  # counted from one
+    velocity: np.ndarray  # m/s
+    phase: np.ndarray  # degrees, 0 at resonance
+    parts: np.ndarray  # (state, 2)
+    rms: float
+
+
+def fit_residuals(fit: JointFit) -> FitResiduals:
+    """The residuals of a joint fit, with the place of their states."""
+    modes, velocity = fit.modes, np.asarray(fit.motion().velocity)
+    j, r = modes.mode_of_interest, fit.data.sensor
+    sign = np.sign(float(modes.mode_shape[r, j] * modes.participation[j]))
+    return FitResiduals(
+        level=np.asarray(fit.data.level) + 1,
+        velocity=np.abs(velocity),
+        phase=np.angle(sign * velocity) / DEGREE,
+        parts=fit.residuals,
+        rms=float(np.sqrt(np.mean(fit.residuals**2))),
+    )
+
+
+def contributions_by_kind(rows: Sequence[Contribution]) -> list[Contribution]:
+    """Contributions to a band with those of one kind together, largest first.
+
+    >>> row = Contribution("gain of level 1", 0.2, 0.1, "gain of levels")
+    >>> contributions_by_kind([row, row._replace(source="gain of level 2")])[0][:3]
+    ('gain of levels', 0.4, 0.2)
+    """
+    kinds = list(dict.fromkeys(row.kind for row in rows))
+    together = [
+        Contribution(
+            kind,
+            sum(row.frequency_share for row in rows if row.kind == kind),
+            sum(row.damping_share for row in rows if row.kind == kind),
+            kind,
+        )
+        for kind in kinds
+    ]
+    return sorted(together, key=lambda row: -row.frequency_share - row.damping_share)
+
+
+def velocity_of(
+    curve: PredictedResponse | ResponseCurve | NormalModeBranch | DampedModeBranch, sensor: str
+) -> np.ndarray:
+    """Phasors (m/s) of the velocity fundamental along a curve, at one sensor.
+
+    A `PredictedResponse` has only its backbone's sensor. Raises `ValueError` for an unknown one.
+    """
+    if isinstance(curve, PredictedResponse):
+        return curve.velocity
+    return curve.velocity[:, 1, sensor_index(curve.sensors, sensor)]
+
+
+def usable_damping(points: BackbonePoints) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity on the backbone (m/s) and modal damping (1/s) of the points that curves use."""
+    use = np.asarray(points.usable)
+    return np.asarray(points.backbone_velocity)[use], np.asarray(points.modal_damping)[use]
+
+
+def phase_of(velocity: Any, backbone: Backbone) -> np.ndarray:
+    """Velocity phase in degrees, 0 at resonance whatever the sign of the modal constant."""
+    return np.angle(np.asarray(velocity) * np.sign(float(backbone.modal_constant))) / DEGREE
+
+
+def sensor_index(sensors: tuple[str, ...], name: str) -> int:
+    """Place of a sensor among all, or a `ValueError` that names these."""
+    if name not in sensors:
+        raise ValueError(f"the sensor must be one of {list(sensors)}, but is {name!r}.")
+    return sensors.index(name)
+
+
+def span_of(curve: PredictedResponse | ResponseCurve, sensor: str) -> tuple[float, float]:
+    """Frequencies (rad/s) between which a response exceeds a quarter of its peak, and a margin."""
+    amplitude = np.abs(velocity_of(curve, sensor))
+    inside = curve.frequency[amplitude >= 0.25 * amplitude.max()]
+    margin = 0.1 * np.ptp(inside)
+    return inside.min() - margin, inside.max() + margin
+
+
+def measured_near(
+    measured: SteadyStates | None, sensor: str, force: float, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (Hz) and phasors (m/s) of the steady states under about this force."""
+    if measured is None:
+        return np.zeros(0), np.zeros(0, dtype=np.complex128)
+    r = sensor_index(measured.sensors, sensor)
+    near = np.abs(np.asarray(measured.force) / force - 1) <= tolerance
+    near &= np.asarray(measured.measured[:, r])
+    return np.asarray(measured.frequency)[near] / HERTZ, np.asarray(measured.velocity)[near, r]

@@ -1,0 +1,1 @@
+"""Harmonic balance: Fourier series, residuals with exact Jacobians, prescribed motion."""

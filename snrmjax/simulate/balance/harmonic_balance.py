@@ -1,0 +1,282 @@
+"""Harmonic balance of a structure: residual and analytic Jacobian.
+
+Unknowns are scaled to order one: displacement coefficients by a displacement, the frequency by
+the natural frequency of the mode of interest, and the residual accordingly.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.model.averaging import AveragedForce, averaged_effect
+from snrmjax.model.effect_base import AbstractForce, AbstractKinked
+from snrmjax.model.structure import LinearTerms, Structure
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonics import (
+    alias_free_samples,
+    harmonic_basis,
+    squared_orders,
+    tangent_blocks,
+)
+
+
+class HarmonicBalance(eqx.Module):
+    """The balance R(x, λ) = 0 of one structure under one force, or of its normal modes.
+
+    `x` holds the (coefficient, mode) displacements divided by `displacement_scale`, flattened;
+    λ is the frequency divided by `frequency_scale`. Without a force and with `cosine_only` the
+    solutions are the conservative normal modes (damping and velocities are left out).
+    """
+
+    model: Structure
+    force: Float[Array, ""]  # N, amplitude of a cosine
+    displacement_scale: Float[Array, ""]  # kg^1/2 m
+    frequency_scale: Float[Array, ""]  # rad/s
+    harmonic_order: int = eqx.field(static=True)
+    n_samples: int = eqx.field(static=True)
+    cosine_only: bool = eqx.field(static=True, default=False)
+
+    @property
+    def n_coefficients(self) -> int:
+        """Fourier coefficients of one mode."""
+        return self.harmonic_order + 1 if self.cosine_only else 2 * self.harmonic_order + 1
+
+    @property
+    def size(self) -> int:
+        """Number of equations."""
+        return self.n_coefficients * self.model.n_modes
+
+    def coefficients(self, point: Float[Array, " unknown"]) -> Float[Array, "coefficient mode"]:
+        """Unscaled displacement coefficients of a point (x, λ), in kg^1/2 m."""
+        flat = point[: self.size] * self.displacement_scale
+        return flat.reshape(self.n_coefficients, self.model.n_modes)
+
+    def point(
+        self, coefficients: Float[Array, "coefficient mode"], frequency: Float[Array, ""]
+    ) -> Float[Array, " unknown"]:
+        """The scaled point (x, λ) of unscaled coefficients and a frequency in rad/s."""
+        scaled = coefficients.reshape(-1) / self.displacement_scale
+        return jnp.append(scaled, frequency / self.frequency_scale)
+
+    def load(self) -> Float[Array, " equation"]:
+        """Scaled force of one newton: the right-hand side for `force` = 1."""
+        model = self.model
+        if self.cosine_only:
+            return jnp.zeros(self.size)
+        spectrum = model.load_orders()
+        orders = np.arange(min(len(spectrum), self.harmonic_order + 1))
+        cosines = np.eye(self.n_coefficients)[:, np.maximum(2 * orders - 1, 0)]
+        load = jnp.outer(cosines @ spectrum[: len(orders)], model.modes.participation)
+        return load.reshape(-1) / (self.frequency_scale**2 * self.displacement_scale)
+
+    def residual(self, point: Float[Array, " unknown"]) -> Float[Array, " equation"]:
+        """R(x, λ): force balance of every coefficient over ω²·displacement scale."""
+        return self._balance(point, with_jacobian=False)[0]
+
+    def linearised(
+        self, point: Float[Array, " unknown"]
+    ) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
+        """R(x, λ) and its Jacobian with respect to (x, λ), the last column for λ."""
+        return self._balance(point, with_jacobian=True)
+
+    def _balance(self, point: Array, *, with_jacobian: bool) -> tuple[Array, Array]:
+        model, fs = self.model, self.frequency_scale
+        n, size = model.n_modes, self.n_coefficients
+        basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
+        terms = model.linear_terms()
+        stiffness, damping = terms.stiffness / fs**2, terms.damping / fs
+        h2 = squared_orders(self.harmonic_order, cosine_only=self.cosine_only)[:, None]
+        inertia = h2 * terms.mass
+        x, omega = point[:-1].reshape(size, n), point[-1]
+        slope = jnp.asarray(basis.derivative) @ x
+        samples = jnp.asarray(basis.synthesis) @ (x * self.displacement_scale)
+        by_omega = jnp.asarray(basis.synthesis) @ (slope * (fs * self.displacement_scale))
+        rate = omega * by_omega
+        unit = fs**2 * self.displacement_scale
+        internal = jnp.asarray(basis.analysis) @ (model.nonlinear_force(samples, rate) / unit)
+        balance = (stiffness - omega**2 * inertia) * x + omega * damping * slope + internal
+        residual = balance.reshape(-1) - self.force * self.load()
+        if not with_jacobian:
+            return residual, jnp.zeros((0,))
+        tangent = model.pointwise.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
+        blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
+        blocks = blocks.transpose(0, 2, 1, 3)
+        eye, own = jnp.eye(size)[:, None, :], np.arange(n)
+        linear = (
+            eye * stiffness[:, None]
+            - omega**2 * eye * inertia[:, :, None]
+            + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
+        )
+        blocks = blocks.at[:, own, :, own].add(linear.transpose(1, 0, 2))
+        column = damping * slope - 2 * omega * inertia * x
+        if model.effects:
+            added, by_rate = self._effects(samples, rate, by_omega, omega)
+            j = model.modes.mode_of_interest
+            blocks = blocks.at[:, j, :, j].add(added)
+            column = column.at[:, j].add(by_rate)
+        by_x = blocks.reshape(size * n, size * n)
+        return residual, jnp.concatenate([by_x, column.reshape(-1, 1)], axis=1)
+
+    def _effects(
+        self, samples: Array, rate: Array, by_omega: Array, omega: Array
+    ) -> tuple[Array, Array]:
+        """What velocity and history add on the mode of interest: the block and the λ column."""
+        model, j = self.model, self.model.modes.mode_of_interest
+        basis = harmonic_basis(self.harmonic_order, self.n_samples, cosine_only=self.cosine_only)
+        unit = self.frequency_scale**2 * self.displacement_scale
+        q, v, v_omega = samples[:, j], rate[:, j], by_omega[:, j]
+        viscous = model.pointwise.tangent_damping(samples, rate)
+        viscous_blocks = tangent_blocks(basis, viscous[:, None])[:, :, 0] @ basis.derivative
+        block = viscous_blocks * (omega / self.frequency_scale)
+        change = viscous * v_omega
+        if model.by_cycle:
+
+            def cycle(q: Array, v: Array) -> Array:
+                return sum((e.cycle_force(q, v) for e in model.by_cycle), jnp.zeros_like(q))
+
+            def along(direction: Array, direction_rate: Array) -> Array:
+                return jax.jvp(cycle, (q, v), (direction, direction_rate))[1]
+
+            shapes = jnp.asarray(basis.synthesis.T) * self.displacement_scale
+            rates = jnp.asarray((basis.synthesis @ basis.derivative).T)
+            rates = rates * (omega * self.frequency_scale * self.displacement_scale)
+            block = block + basis.analysis @ jax.vmap(along)(shapes, rates).T / unit
+            change = change + along(jnp.zeros_like(q), v_omega)
+        return block, jnp.asarray(basis.analysis) @ change / unit
+
+
+def harmonic_balance(
+    model: Structure,
+    force: Float[Array, ""] | float,
+    displacement_scale: Float[Array, ""] | float,
+    *,
+    harmonic_order: int,
+    n_samples: int | None = None,
+    cosine_only: bool = False,
+) -> HarmonicBalance:
+    """The balance of `model` under a cosine force of amplitude `force` (N).
+
+    `n_samples` defaults to the alias-free number for a polynomial potential and to at least
+    128 when there are effects with forces, which are not polynomial.
+    Raises `ValueError` when `harmonic_order` is below 1 or the samples are too few to tell the
+    harmonics apart.
+    """
+    n_samples = samples_for(model, harmonic_order, n_samples)
+    modes = model.modes
+    return HarmonicBalance(
+        model=model,
+        force=jnp.asarray(force, dtype=jnp.float64),
+        displacement_scale=jnp.asarray(displacement_scale, dtype=jnp.float64),
+        frequency_scale=modes.natural_frequency[modes.mode_of_interest],
+        harmonic_order=harmonic_order,
+        n_samples=n_samples,
+        cosine_only=cosine_only,
+    )
+
+
+def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) -> int:
+    """Time samples over a period: those asked for, or what the model's forces need.
+
+    Raises `ValueError` as `harmonic_balance` does.
+    """
+    if harmonic_order < 1:
+        raise ValueError(f"`harmonic_order` must be 1 or more, but is {harmonic_order}.")
+    if n_samples is not None and n_samples <= 2 * harmonic_order:
+        raise ValueError(
+            f"`n_samples` must be above {2 * harmonic_order}, twice the harmonic order, "
+            f"but is {n_samples}."
+        )
+    if n_samples is None:
+        n_samples = alias_free_samples(harmonic_order, max(model.potential.degree - 1, 1))
+        if any(isinstance(effect, AbstractForce) for effect in model.effects):
+            n_samples = max(n_samples, 128, 16 * harmonic_order)
+        if model.by_cycle:
+            kinked = any(isinstance(e, AbstractKinked) for e in model.effects)
+            n_samples = max(n_samples, 512 if kinked else 256)
+    return n_samples
+
+
+def truncation_error(
+    balance: HarmonicBalance,
+    coefficients: Float[Array, "coefficient mode"],
+    frequency: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Estimated share of the velocity that the harmonics left out, H + 1 to 2H, would have.
+
+    The forces that the motion exerts at those harmonics, over the linear dynamic stiffness there:
+    the first step of a Newton iteration with twice the harmonics. Root mean square over the
+    period and the modes, relative; frequency in rad/s.
+    """
+    model, order = balance.model, balance.harmonic_order
+    basis = harmonic_basis(2 * order, samples_for(model, 2 * order, None))
+    x = jnp.pad(coefficients, ((0, 2 * order), (0, 0)))
+    samples = jnp.asarray(basis.synthesis) @ x
+    rate = frequency * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
+    force = (jnp.asarray(basis.analysis) @ model.nonlinear_force(samples, rate))[2 * order + 1 :]
+    terms, h = model.linear_terms(), np.arange(order + 1, 2 * order + 1)[:, None]
+    stiffness = terms.stiffness - terms.mass * (h * frequency) ** 2
+    square = (force[0::2] ** 2 + force[1::2] ** 2) / (
+        stiffness**2 + (terms.damping * h * frequency) ** 2
+    )
+    left_out = jnp.sum(h**2 * square)
+    repeated = np.repeat(np.arange(1, order + 1), 2)[:, None]
+    kept = jnp.sum((repeated * coefficients[1:]) ** 2)
+    return jnp.sqrt(left_out / kept)
+
+
+def linear_coefficients(
+    model: Structure, force: Float[Array, ""], frequency: Float[Array, ""], harmonic_order: int
+) -> Float[Array, "coefficient mode"]:
+    """Displacement coefficients of the linear response: where a forced response starts."""
+    terms = model.linear_terms()
+    stiffness = terms.stiffness - terms.mass * frequency**2 + 1j * terms.damping * frequency
+    phasor = force * model.modes.participation / stiffness
+    start = jnp.zeros((2 * harmonic_order + 1, model.n_modes))
+    return start.at[1].set(phasor.real).at[2].set(-phasor.imag)
+
+
+def resonance_displacement(model: Structure, force: float) -> float:
+    """Rough displacement (kg^1/2 m) of the mode of interest at resonance: a scale, no result.
+
+    Solves 2ζ̃ω̃ ω̃ Q = |P| with ω̃² = ω₀² + ¾·4c Q² from the mode's own quartic term, and with the
+    averages of the effects. The damping counts as at least that of ζ = 5e-5, and the scale is
+    at least the static displacement of every mode, so that no motion is small beside it.
+    """
+    modes, j = model.modes, model.modes.mode_of_interest
+    mass, damping, stiffness = (np.asarray(part) for part in _linear_terms(model))
+    participation = np.asarray(modes.participation)
+    omega = np.sqrt(stiffness[j] / mass[j])
+    least_damping = 1e-4 * omega
+    load = abs(force * participation[j])
+    own = dict(zip(model.potential.monomials, np.asarray(model.potential.coefficient), strict=True))
+    quartic = max(3.0 * float(own.get((j,) * 4, 0.0)), 0.0)
+    static = float(np.max(np.abs(force * participation / stiffness)))
+    if load == 0:
+        return static
+    largest = load / (max(damping[j], least_damping) * omega)
+    amplitude = largest * np.logspace(-9, 0, 361)
+    needed_stiffness = stiffness[j] + quartic * amplitude**2
+    viscous = np.full(amplitude.shape, damping[j])
+    forces = tuple(e for e in model.effects if isinstance(e, AbstractForce))
+    if forces:
+        added = _averages(forces, jnp.asarray(amplitude), jnp.asarray(omega))
+        needed_stiffness = needed_stiffness + np.maximum(np.asarray(added.stiffness), 0.0)
+        viscous = viscous + np.asarray(added.damping)
+    needed = np.maximum(viscous, least_damping) * np.sqrt(needed_stiffness) * amplitude
+    return float(np.maximum(static, np.interp(load, np.maximum.accumulate(needed), amplitude)))
+
+
+@compiled
+def _linear_terms(model: Structure) -> LinearTerms:
+    return model.linear_terms()
+
+
+@compiled
+def _averages(effects: tuple[AbstractForce, ...], amplitude: Array, omega: Array) -> AveragedForce:
+    """What all effects together do to a mode, by averaging."""
+    each = [averaged_effect(effect, amplitude, omega, n_samples=128) for effect in effects]
+    return AveragedForce(
+        *(sum(part, jnp.zeros_like(amplitude)) for part in zip(*each, strict=True))
+    )

@@ -1,0 +1,250 @@
+"""Motions whose fundamental is held at one sensor, and the force that they need.
+
+At a given frequency a force may have several motions or, beyond a fold, none; a motion has one
+force. So a measured motion is put into the harmonic balance, and the force is solved for.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
+
+# Growth of a motion, in shares of the velocity that was measured.
+_SMALL, _FIRST, _SHORTEST = 1e-3, 0.15, 2e-3
+_NEAR = 1e-6  # relative size of a Newton step after which one more is exact to rounding
+_SECANTS = 20  # steps with one Jacobian that is brought up to date, at most
+_CLOSE = 1e-5  # relative size of such a step after which the error is far below all noise
+
+
+class Secants(NamedTuple):
+    """A point, and the steps towards it: all that Broyden's method keeps of its updates.
+
+    Reference: C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations (1995), section
+    7.3, doi:10.1137/1.9781611970944.
+    """
+
+    point: Float[Array, " unknown"]
+    moves: Float[Array, "step unknown"]
+    taken: Int[Array, ""]
+
+    def updated(self, move: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """A step by the inverse Jacobian at the start, as one by that after all steps but one."""
+
+        def update(k: Array, move: Array) -> Array:
+            now, further = self.moves[k], self.moves[k + 1]
+            return move + (now @ move) / (now @ now) * further
+
+        return jax.lax.fori_loop(0, self.taken - 1, update, move)
+
+
+def start_of(point: Float[Array, " unknown"]) -> Secants:
+    """A point of whose neighbourhood nothing is known."""
+    none = nothing_of(point)
+    return Secants(point, none + jnp.zeros((_SECANTS, point.shape[0])), none.astype(int))
+
+
+def nothing_of(point: Float[Array, " unknown"]) -> Float[Array, ""]:
+    """Zero, a number of every point.
+
+    A loop of many points whose first state is theirs throughout is traced once; else again and
+    again until it is known what is.
+    """
+    return jnp.where(point[0] == 0, 0.0, 0.0)
+
+
+class HeldMotion(eqx.Module):
+    """The equations of one state: its balance, and the fundamental held at what was measured.
+
+    A point holds the balance's scaled displacements and the cosine and the sine of the force over
+    `force`; phases are relative to the measured force.
+    """
+
+    balance: HarmonicBalance  # without a force
+    model: Structure
+    frequency: Float[Array, ""]  # rad/s
+    force: Float[Array, ""]  # N, measured
+    velocity: Complex[Array, ""]  # m/s, of the reference sensor
+    sensor: int = eqx.field(static=True)
+
+    def equations(self, point: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """What is left of the balance and of the fundamental."""
+        residual = self.balance.residual(self._balance_point(point))
+        return jnp.concatenate([residual - self._load(point[-2:]), self._miss(point)])
+
+    def linearised(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """The equations and their exact Jacobian."""
+        residual, jacobian = self.balance.linearised(self._balance_point(point))
+        left = jnp.concatenate([residual - self._load(point[-2:]), self._miss(point)])
+        wide = jnp.concatenate([jacobian[:, :-1], -jax.jacfwd(self._load)(point[-2:])], axis=1)
+        return left, jnp.concatenate([wide, jax.jacrev(self._miss)(point)])
+
+    def recorded(self, point: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """Complex force (N) and velocity (harmonic, sensor) that the instruments would record."""
+        modes = simulated_structure(self.model).modes
+        coefficients = self.balance.coefficients(self._balance_point(point))
+        velocity = velocity_phasors(coefficients, self.frequency, modes.mode_shape)
+        force = self.force * (point[-2] - 1j * point[-1])
+        # In phase with its own force, as the instruments see it.
+        order = jnp.arange(velocity.shape[0])[:, None]
+        phase = force / jnp.abs(force)
+        velocity = velocity * phase.conj() ** order
+        if modes.rigid_body_shape.shape[1]:
+            spectrum = self.model.load_orders()[1 : velocity.shape[0]]
+            share = spectrum / np.arange(1, 1 + spectrum.shape[0])
+            share = jnp.pad(share, (1, velocity.shape[0] - 1 - spectrum.shape[0]))
+            per_force = modes.rigid_body_shape @ modes.rigid_body_participation
+            rigid = -1j * jnp.abs(force) / self.frequency * share[:, None] * per_force
+            velocity = velocity + rigid
+        size, seen = jnp.abs(force)[None], velocity[None]
+        own = displacement_phasors(coefficients)[1, modes.mode_of_interest]
+        for effect in self.model.measurement_effects:
+            size, seen = effect.recorded(self.frequency[None], size, seen, jnp.abs(own)[None])
+        return size[0] * phase, seen[0] * phase**order
+
+    def solved(self, start: Float[Array, " unknown"]) -> Float[Array, " unknown"]:
+        """The solution near `start` by Newton's method, NaN where it did not converge.
+
+        The last step is taken with what the equations depend on: it carries the derivatives.
+        """
+        return self._solved(start)[0]
+
+    def _solved(self, start: Float[Array, " unknown"]) -> tuple[Array, Array]:
+        """The solution as `solved` finds it, and the Jacobian of its last step."""
+        fixed = jax.lax.stop_gradient(self)
+
+        def step(state: tuple) -> tuple:
+            point, left, jacobian, count, _ = state
+            move = jnp.linalg.solve(jacobian, left)
+            left, jacobian = fixed.linearised(point - move)
+            return point - move, left, jacobian, count + 1, jnp.max(jnp.abs(move))
+
+        def going(state: tuple) -> Array:
+            *_, count, size = state
+            return (count < 2) | ((count < 20) & (size > _NEAR))  # false for NaN
+
+        # The first step goes nowhere: the equations are then compiled once.
+        nothing, eye = jnp.zeros_like(start), jnp.eye(start.shape[0])
+        first = (jax.lax.stop_gradient(start), nothing, eye, jnp.array(0), jnp.array(0.0))
+        point, _, jacobian, _, size = jax.lax.while_loop(going, step, first)
+        last = jnp.linalg.solve(jacobian, self.equations(point))
+        left = jnp.max(jnp.abs(jax.lax.stop_gradient(last)))
+        return jnp.where((size <= _NEAR) & (left <= _NEAR), point - last, jnp.nan), jacobian
+
+    def solved_by_secants(
+        self,
+        inverse: Float[Array, "unknown unknown"],
+        near: Secants,
+        close: Float[Array, ""],
+        share: Float[Array, ""],
+    ) -> Secants:
+        """The solution near a point, from an inverse Jacobian and what is known of it there.
+
+        Broyden's method: no step needs another Jacobian. It ends with a step below `close` or below
+        a share of the first one, and counts as a solution below 1e-5; else its point is NaN.
+        """
+        place = jnp.arange(_SECANTS)
+
+        def step(state: tuple[Secants, Array, Array]) -> tuple[Secants, Array, Array]:
+            now, _, enough = state
+            move = now.updated(near.updated(-(inverse @ self.equations(now.point))))
+            last = now.moves[jnp.maximum(now.taken - 1, 0)]
+            back = last - move
+            length, size = last @ back, jnp.linalg.norm(last)
+            # What rounding makes of a step says nothing.
+            sure = jnp.abs(length) > 1e-3 * size * jnp.linalg.norm(back)
+            move = move * jnp.where(sure, size**2 / jnp.where(sure, length, 1.0), 1.0)
+            moves = jnp.where((place == now.taken)[:, None], move, now.moves)
+            far = jnp.max(jnp.abs(move))
+            enough = jnp.where(now.taken == 0, jnp.clip(share * far, close, _CLOSE), enough)
+            return Secants(now.point + move, moves, now.taken + 1), far, enough
+
+        def going(state: tuple[Secants, Array, Array]) -> Array:
+            now, far, enough = state
+            return (now.taken < 1) | ((now.taken < _SECANTS) & (far > enough))  # false for NaN
+
+        none = nothing_of(near.point)
+        first = (start_of(near.point), none, none)
+        found, far, _ = jax.lax.while_loop(going, step, first)
+        return found._replace(point=jnp.where(far <= _CLOSE, found.point, jnp.nan))
+
+    def grown(self) -> Float[Array, " unknown"]:
+        """The solution that grows from small amplitudes, as a start for `solved`; else NaN.
+
+        Steps are halved where Newton's method fails.
+        """
+        return self.grown_with_jacobian()[0]
+
+    def grown_with_jacobian(self) -> tuple[Array, Array]:
+        """The solution as `grown` finds it, and the equations' Jacobian at the last one found."""
+        fixed = jax.lax.stop_gradient(self)
+        first = jnp.zeros(self.balance.size + 2).at[-2].set(_SMALL)
+
+        def larger(state: tuple) -> tuple:
+            before, share, step = state
+            aim = jnp.minimum(share + step, 1.0)
+            held = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
+            after = held._solved(before[0] * (aim / share))
+            good = jnp.all(jnp.isfinite(after[0]))
+            now, share = jax.tree.map(
+                lambda a, b: jnp.where(good, a, b), (after, aim), (before, share)
+            )
+            return now, share, jnp.where(good, 1.5 * step, 0.5 * step)
+
+        def going(state: tuple) -> Array:
+            _, share, step = state
+            return (share < 1.0) & (step > _SHORTEST)
+
+        small = ((first, jnp.eye(first.shape[0])), jnp.array(_SMALL), jnp.array(_FIRST))
+        (point, jacobian), share, _ = jax.lax.while_loop(going, larger, small)
+        return jnp.where(share >= 1.0, point, jnp.nan), jacobian
+
+    def _balance_point(self, point: Array) -> Array:
+        return jnp.append(point[:-2], self.frequency / self.balance.frequency_scale)
+
+    def _load(self, parts: Float[Array, " part"]) -> Float[Array, " equation"]:
+        """Scaled load of a force with this cosine and sine.
+
+        Another phase turns its harmonics h times as far.
+        """
+        cosine = self.balance.load().reshape(self.balance.n_coefficients, -1)
+        phasor = self.force * (parts[0] - 1j * parts[1])
+        there = jnp.where(phasor != 0, phasor, 1.0)
+        turned = phasor * jnp.exp(1j * jnp.angle(there) * jnp.arange(self.balance.harmonic_order))
+        parts = jnp.stack([turned.real, -turned.imag], axis=1)
+        oscillating = (parts[:, :, None] * cosine[1::2, None]).reshape(-1)
+        return jnp.concatenate([jnp.abs(there) * cosine[0], oscillating])
+
+    def _miss(self, point: Array) -> Float[Array, " part"]:
+        velocity = self.recorded(point)[1][1, self.sensor]
+        size = jax.lax.stop_gradient(jnp.abs(self.velocity))
+        miss = (velocity - self.velocity) / size
+        return jnp.stack([miss.real, miss.imag])
+
+
+def held_motion(
+    model: Structure,
+    frequency: Float[Array, ""],
+    force: Float[Array, ""],
+    velocity: Complex[Array, ""],
+    *,
+    sensor: int,
+    harmonic_order: int,
+    scale: Float[Array, ""],
+) -> HeldMotion:
+    """The equations of a motion with a given fundamental at one sensor.
+
+    Arguments: `frequency` in rad/s; `force` in N only scales; `velocity` as it is recorded, in
+    m/s; `scale` a typical velocity in m/s, for a point to mean the same when `velocity` changes.
+    """
+    shape = model.modes.mode_shape[sensor, model.modes.mode_of_interest]
+    displacement = jax.lax.stop_gradient(jnp.abs(scale / (frequency * shape)))
+    simulated = simulated_structure(model)
+    balance = harmonic_balance(simulated, 0.0, displacement, harmonic_order=harmonic_order)
+    return HeldMotion(balance, model, frequency, force, velocity, sensor)

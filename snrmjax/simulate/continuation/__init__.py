@@ -1,0 +1,1 @@
+"""Curves of periodic motions: continuation, events and stability along them."""

@@ -1,0 +1,424 @@
+"""Folds, peaks, phase resonances and bifurcations along curves of periodic motions."""
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from snrmjax.numerics.blocks import mapped, taken
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
+from snrmjax.simulate.continuation.continuation import StepControl, correct, locate_event
+from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
+
+EVENT_KINDS = ("fold", "peak", "phase_resonance")
+BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
+_BLOCK = 8  # intervals that one call works on
+_FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
+_INSIDE = 7  # points inside an interval that is looked at more closely
+
+
+class Walked(NamedTuple):
+    """Points along one curve and what was found at them, on the host."""
+
+    points: Float[np.ndarray, "point unknown"]
+    tangents: Float[np.ndarray, "point unknown"]
+    labels: tuple[str, ...]
+
+
+def mode_velocity(balance: HarmonicBalance, point: Array) -> Complex[Array, ""]:
+    """Phasor of the velocity fundamental of the mode of interest, scaled."""
+    modes = balance.model.modes
+    x = point[:-1].reshape(balance.n_coefficients, -1)[:, modes.mode_of_interest]
+    return (
+        1j * point[-1] * (x[1] - 1j * x[2]) * jnp.sign(modes.participation[modes.mode_of_interest])
+    )
+
+
+def sensor_velocity(balance: HarmonicBalance, point: Array) -> Float[Array, ""]:
+    """|velocity fundamental|² at the first sensor, scaled."""
+    shape = balance.model.modes.mode_shape[0]
+    x = point[:-1].reshape(balance.n_coefficients, -1) @ shape
+    return point[-1] ** 2 * (x[1] ** 2 + x[2] ** 2) / jnp.max(jnp.abs(shape)) ** 2
+
+
+def test_values(balance: HarmonicBalance, point: Array, tangent: Array) -> Float[Array, " kind"]:
+    """Functions that vanish at a fold, at a peak and at a phase resonance."""
+    slope = jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
+    return jnp.stack([tangent[-1], slope, mode_velocity(balance, point).imag])
+
+
+@compiled
+def _locate(
+    balances: HarmonicBalance,
+    kind: Array,
+    here: Array,
+    tangent: Array,
+    there: Array,
+    wanted: Array,
+    steps: StepControl,
+) -> tuple:
+    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+        kind, here, tangent, there, wanted = row
+
+        def test(point: Array, direction: Array) -> Array:
+            return test_values(balance, point, direction)[kind]
+
+        return locate_event(balance.linearised, test, here, tangent, there, steps, wanted)
+
+    return mapped(one, balances, kind, here, tangent, there, wanted)
+
+
+@compiled
+def _between(
+    balances: HarmonicBalance,
+    here: Array,
+    tangent: Array,
+    there: Array,
+    share: Array,
+    wanted: Array,
+    steps: StepControl,
+) -> tuple:
+    """Points of the curve at shares of the way between neighbours, with their tangents."""
+
+    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+        here, tangent, there, share, wanted = row
+        length = tangent @ (there - here)
+        guess = here + share * (there - here)
+        guess = guess + (share * length - tangent @ (guess - here)) * tangent
+        patience = jnp.where(wanted, 2 * steps.iterations, 0)
+        found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
+        return found.point, found.tangent, found.converged
+
+    return mapped(one, balances, here, tangent, there, share, wanted)
+
+
+def _in_blocks(
+    function: Callable[..., tuple],
+    balances: HarmonicBalance,
+    owner: np.ndarray,
+    rows: tuple[np.ndarray, ...],
+    steps: StepControl,
+) -> list[np.ndarray]:
+    """A jitted function of rows, called with blocks of one size."""
+    n = len(owner)
+    parts = []
+    for begin in range(0, n, _BLOCK):
+        index = np.minimum(np.arange(begin, begin + _BLOCK), n - 1)
+        wanted = np.arange(begin, begin + _BLOCK) < n
+        arguments = tuple(row[index] for row in rows)
+        mine = taken(balances, owner[index])
+        found = function(mine, *arguments, wanted, steps)
+        parts.append([np.asarray(part)[: n - begin] for part in found])
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
+def with_events(
+    balances: HarmonicBalance, curves: list[Walked], steps: StepControl
+) -> list[Walked]:
+    """The curves with their folds, peaks and phase resonances inserted.
+
+    Arguments: `balances` stacked, one for every curve. Between neighbours every change of sign
+    is located; where the cubic through both hints at two changes, the interval is divided first.
+    A peak is a maximum of the velocity fundamental at the first sensor; a phase resonance has
+    the velocity in phase with the force.
+    """
+    known = [_heights(balances, number, curve) for number, curve in enumerate(curves)]
+    divided = _divided(balances, curves, known, steps)
+    owner, kind, position = [], [], []
+    for number, curve in enumerate(divided):
+        if len(curve.points) < 2:
+            continue
+        same = curve is curves[number]
+        heights, slopes = known[number] if same else _heights(balances, number, curve)
+        values = np.stack([slopes[:, 0], slopes[:, 1], heights[:, 2]], axis=1)
+        change = np.signbit(values[:-1]) != np.signbit(values[1:])
+        # A peak is a maximum: the slope falls through zero. A phase resonance has Re V > 0.
+        change[:, 1] &= values[:-1, 1] > 0
+        change[:, 2] &= (heights[:-1, 3] > 0) & (heights[1:, 3] > 0)
+        where, what = np.nonzero(change)
+        owner += [number] * len(where)
+        kind += what.tolist()
+        position += where.tolist()
+    if not owner:
+        return divided
+    here = np.stack([divided[o].points[k] for o, k in zip(owner, position, strict=True)])
+    ahead = np.stack([divided[o].tangents[k] for o, k in zip(owner, position, strict=True)])
+    there = np.stack([divided[o].points[k + 1] for o, k in zip(owner, position, strict=True)])
+    rows = (np.array(kind), here, ahead, there)
+    found, tangents, resolved = _in_blocks(_locate, balances, np.array(owner), rows, steps)
+    labels = [EVENT_KINDS[k] if ok else "" for k, ok in zip(kind, resolved, strict=True)]
+    return _inserted(divided, owner, position, found, tangents, labels)
+
+
+def _heights(
+    balances: HarmonicBalance, number: int, curve: Walked
+) -> tuple[np.ndarray, np.ndarray]:
+    """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength.
+
+    What `sensor_velocity` and `mode_velocity` say, on the host: for a few hundred points that is
+    done before a program would have its arguments.
+    """
+    modes, j = balances.model.modes, balances.model.modes.mode_of_interest
+    shape = np.asarray(modes.mode_shape)[number, 0]
+    sign = np.sign(np.asarray(modes.participation)[number, j])
+    size = (len(curve.points), balances.n_coefficients, len(shape))
+    x, dx = (a[:, :-1].reshape(size) for a in (curve.points, curve.tangents))
+    omega, domega = curve.points[:, -1], curve.tangents[:, -1]
+    shape = shape / np.max(np.abs(shape))
+    (a, b), (da, db) = ((part[:, 1:3] @ shape).T for part in (x, dx))
+    own, down = sign * x[:, 1:3, j], sign * dx[:, 1:3, j]  # the velocity is Ω(sine + i cosine)
+    square = a**2 + b**2
+    heights = (omega, omega**2 * square, omega * own[:, 0], omega * own[:, 1])
+    slopes = (
+        domega,
+        2 * omega * domega * square + 2 * omega**2 * (a * da + b * db),
+        domega * own[:, 0] + omega * down[:, 0],
+        domega * own[:, 1] + omega * down[:, 1],
+    )
+    return np.stack(heights, axis=1), np.stack(slopes, axis=1)
+
+
+def _divided(
+    balances: HarmonicBalance, curves: list[Walked], known: list[tuple], steps: StepControl
+) -> list[Walked]:
+    """The curves with points added where two events may lie between neighbours."""
+    owner, position, share = [], [], []
+    for number, curve in enumerate(curves):
+        if len(curve.points) < 2:
+            continue
+        heights, slopes = known[number]
+        length = np.linalg.norm(np.diff(curve.points, axis=0), axis=1)
+        doubtful = np.zeros(len(length), dtype=bool)
+        for column in range(2):
+            doubtful |= _slope_may_vanish_twice(heights[:, column], slopes[:, column], length)
+        doubtful |= _may_vanish_twice(heights[:, 2], slopes[:, 2], length)
+        for k in np.flatnonzero(doubtful):
+            owner += [number] * _INSIDE
+            position += [int(k)] * _INSIDE
+            share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
+    if not owner:
+        return curves
+    found, tangents, ok = _points_between(balances, curves, owner, position, share, steps)
+    keep = np.flatnonzero(ok)
+    return _inserted(
+        curves,
+        [owner[k] for k in keep],
+        [position[k] for k in keep],
+        found[keep],
+        tangents[keep],
+        [""] * len(keep),
+        always=True,
+    )
+
+
+def _points_between(
+    balances: HarmonicBalance,
+    curves: list[Walked],
+    owner: list,
+    position: list,
+    share: list,
+    steps: StepControl,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pairs = list(zip(owner, position, strict=True))
+    here = np.stack([curves[o].points[k] for o, k in pairs])
+    ahead = np.stack([curves[o].tangents[k] for o, k in pairs])
+    there = np.stack([curves[o].points[k + 1] for o, k in pairs])
+    rows = (here, ahead, there, np.array(share))
+    found, tangents, ok = _in_blocks(_between, balances, np.array(owner), rows, steps)
+    turned = np.einsum("ku,ku->k", tangents, ahead) < 0
+    return found, np.where(turned[:, None], -tangents, tangents), ok
+
+
+def _slope_may_vanish_twice(
+    height: np.ndarray, slope: np.ndarray, length: np.ndarray
+) -> Bool[np.ndarray, " interval"]:
+    """Whether the slope keeps its sign at both ends but the cubic between them turns back."""
+    first, last = slope[:-1], slope[1:]
+    chord = np.diff(height) / length
+    # p'(u) = first + u(6 chord − 4 first − 2 last) + u²(3 first + 3 last − 6 chord), u in 0…1.
+    a, b = 3 * (first + last) - 6 * chord, 6 * chord - 4 * first - 2 * last
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = -b / (2 * a)
+        extreme = first - b**2 / (4 * a)
+    same = np.signbit(first) == np.signbit(last)
+    least = np.minimum(np.abs(first), np.abs(last))
+    # A margin, since the cubic is only near the curve.
+    turns = extreme * np.sign(first) < 0.3 * least
+    return same & (u > 0) & (u < 1) & turns
+
+
+def _may_vanish_twice(
+    height: np.ndarray, slope: np.ndarray, length: np.ndarray
+) -> Bool[np.ndarray, " interval"]:
+    """Whether the height keeps its sign at both ends but the cubic between them comes near zero."""
+    first, last = height[:-1], height[1:]
+    same = np.signbit(first) == np.signbit(last)
+    towards = (slope[:-1] * first < 0) & (slope[1:] * last > 0)
+    # The tangents from both ends bound a convex piece from below.
+    bound = np.minimum(
+        np.abs(first) - np.abs(slope[:-1]) * length, np.abs(last) - np.abs(slope[1:]) * length
+    )
+    return same & towards & (bound < 0)
+
+
+def _inserted(
+    curves: list[Walked],
+    owner: list,
+    position: list,
+    points: np.ndarray,
+    tangents: np.ndarray,
+    labels: list[str],
+    *,
+    always: bool = False,
+) -> list[Walked]:
+    """The curves with labelled points put in their places, in order along each step."""
+    result = []
+    for number, curve in enumerate(curves):
+        mine = [e for e, o in enumerate(owner) if o == number and (always or labels[e])]
+        if not mine:
+            result.append(curve)
+            continue
+        where = np.array([position[e] for e in mine])
+        ahead = curve.tangents[where]
+        new, turn = points[mine], tangents[mine]
+        along = np.einsum("ku,ku->k", new - curve.points[where], ahead)
+        turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
+        n = len(curve.points)
+        order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
+        names = list(curve.labels) + [labels[e] for e in mine]
+        result.append(
+            Walked(
+                np.concatenate([curve.points, new])[order],
+                np.concatenate([curve.tangents, turn])[order],
+                tuple(names[k] for k in order),
+            )
+        )
+    return result
+
+
+def with_bifurcations(
+    balance: HarmonicBalance,
+    curve: Walked,
+    multipliers: Complex[np.ndarray, "point multiplier"],
+    steps: StepControl,
+) -> tuple[Walked, Complex[np.ndarray, "point multiplier"]]:
+    """The curve with the points inserted where a multiplier crosses the unit circle.
+
+    A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
+    bifurcation, and +1 away from a fold a branch point. Returns the curve and the multipliers
+    with the rows of the new points. `balance` is stacked, of one member.
+    """
+    regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
+    outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
+    rest = outside - beyond_one
+    crossings, beside_fold, quiet_folds = [], [], []
+    for k, following in itertools.pairwise(regular.tolist()):
+        if not np.all(np.isfinite(multipliers[[k, following]])):
+            continue
+        if following == k + 1:
+            crossings += [k] if outside[k] != outside[following] else []
+            continue
+        # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
+        own = abs(int(beyond_one[following]) - int(beyond_one[k]))
+        if own == 0:
+            quiet_folds.append(k + 1)
+        beside = [m for m in range(k, following) if rest[m] != rest[m + 1]]
+        beside_fold += beside
+        crossings += beside or ([following - 1] if own > 1 else [])
+    # Truncated harmonics turn the curve a little beside the place where the motion loses its
+    # stability: a crossing of +1 next to a fold without one is the fold's own.
+    for fold in quiet_folds:
+        near = [k for k in crossings if abs(k - fold) <= _FOLDS_OWN and _real_plus(multipliers, k)]
+        if near:
+            crossings.remove(min(near, key=lambda k: abs(k - fold)))
+    if not crossings:
+        return curve, multipliers
+    without_one = np.isin(crossings, beside_fold)
+    return _located_bifurcations(balance, curve, multipliers, crossings, without_one, steps)
+
+
+def _real_plus(multipliers: np.ndarray, k: int) -> bool:
+    """Whether the multiplier that crosses between a point and the next does so near +1."""
+    count = max(_outside(multipliers[k : k + 2]))
+    row = multipliers[k + 1] if _outside(multipliers[k + 1]) == count else multipliers[k]
+    last = row[np.argsort(-np.abs(row))[count - 1]]
+    return bool(abs(last.imag) < 1e-9 * abs(last) and last.real > 0)
+
+
+def _located_bifurcations(
+    balance: HarmonicBalance,
+    curve: Walked,
+    multipliers: np.ndarray,
+    crossings: list[int],
+    without_one: Bool[np.ndarray, " crossing"],
+    steps: StepControl,
+) -> tuple[Walked, np.ndarray]:
+    """Divide the intervals until the crossing is known to a millionth of a step.
+
+    Where it is to be found `without_one`, crossings of +1 do not count.
+    """
+    member = taken(balance, 0)
+    low, high = np.zeros(len(crossings)), np.ones(len(crossings))
+
+    def counted(rows: np.ndarray, without: np.ndarray) -> np.ndarray:
+        return _outside(rows) - np.where(without, _beyond_one(rows), 0)
+
+    first = counted(multipliers[crossings], without_one)
+    for _ in range(7):
+        shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
+        owner = [0] * shares.size
+        position = np.repeat(crossings, _INSIDE).tolist()
+        found, tangents, ok = _points_between(
+            balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
+        )
+        rows = _multipliers_of(member, found)
+        count = counted(rows, np.repeat(without_one, _INSIDE))
+        count = np.where(ok, count, np.repeat(first, _INSIDE)).reshape(shares.shape)
+        beyond = count != first[:, None]
+        index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
+        edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
+        pick = np.arange(len(crossings))
+        low, high = edges[pick, index], edges[pick, index + 1]
+    owner, share = [0] * len(crossings), (0.5 * (low + high)).tolist()
+    found, tangents, ok = _points_between(balance, [curve], owner, list(crossings), share, steps)
+    rows = _multipliers_of(member, found)
+    labels = [_crossing_kind(row) if good else "" for row, good in zip(rows, ok, strict=True)]
+    new = _inserted([curve], owner, list(crossings), found, tangents, labels)[0]
+    merged = np.full((len(new.points), multipliers.shape[1]), np.nan, dtype=np.complex128)
+    added = {tuple(point): row for point, row in zip(found, rows, strict=True)}
+    old = iter(multipliers)
+    for k, point in enumerate(new.points):
+        merged[k] = added[tuple(point)] if tuple(point) in added else next(old)
+    return new, merged
+
+
+def _outside(multipliers: np.ndarray) -> np.ndarray:
+    return np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1)
+
+
+def _beyond_one(multipliers: np.ndarray) -> np.ndarray:
+    """How many multipliers are real and beyond +1, where a fold sends one of them."""
+    real = np.abs(multipliers.imag) < 1e-9 * np.abs(multipliers)
+    return np.sum(real & (multipliers.real > 1.0 + MARGIN), axis=-1)
+
+
+def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:
+    size = (balance.n_coefficients, balance.model.n_modes)
+    x = points[:, :-1].reshape(-1, *size) * np.asarray(balance.displacement_scale)
+    return floquet_multipliers(
+        balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale)
+    )
+
+
+def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:
+    """What kind of bifurcation the multiplier nearest to the unit circle makes."""
+    nearest = multipliers[np.argmin(np.abs(np.abs(multipliers) - 1.0))]
+    # At a crossing of +1 or −1 two multipliers of a light damped mode may be close by.
+    if abs(nearest.imag) > 1e-4:
+        return "neimark_sacker"
+    return "period_doubling" if nearest.real < 0 else "branch_point"

@@ -1,0 +1,1 @@
+"""What a structure does: forced responses, normal modes, controlled and settled motions."""

@@ -1,0 +1,335 @@
+"""Damped backbones: extended periodic motions, and tests with controlled phase or response."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.model.averaging import averaged_effect
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import (
+    HarmonicBalance,
+    harmonic_balance,
+    linear_coefficients,
+    resonance_displacement,
+)
+from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
+from snrmjax.simulate.continuation.continuation import (
+    Curve,
+    CurveStatus,
+    StepControl,
+    follow_curve,
+    traced,
+)
+
+DEFAULT_STEPS = StepControl()
+
+
+class DampedModeBranch(NamedTuple):
+    """A damped nonlinear mode as a curve of extended periodic motions."""
+
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    damping_ratio: Float[np.ndarray, " point"]
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
+    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
+    status: CurveStatus
+    sensors: tuple[str, ...]
+
+
+class ControlledCurve(NamedTuple):
+    """Steady states under a controller: the force is an unknown."""
+
+    force: Float[np.ndarray, " point"]  # N
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # kg^1/2 m
+    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
+    status: CurveStatus
+    sensors: tuple[str, ...]
+
+
+def damped_normal_mode(
+    model: Structure,
+    largest_velocity: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 2000,
+    n_samples: int | None = None,
+) -> DampedModeBranch:
+    """The damped nonlinear mode by the extended periodic motion concept.
+
+    Solves m q̈ + (C − ξ m) q̇ + K q + f(q, q̇) = 0 for periodic motions: a negative damping ξ,
+    proportional to mass, makes up for what the structure dissipates over a cycle, so that its
+    damping ratio is ξ/(2Ω). Friction and every other effect take part.
+
+    Arguments: `largest_velocity` in m/s, of the linear mode of interest at the sensor that sees it
+    most; the curve starts at a hundredth of it and ends beyond it.
+    Returns a `DampedModeBranch` whose `status` says how it ended.
+    Raises `ValueError` for a velocity that is not positive and finite.
+    Reference: Krack, Comput. Struct. 154 (2015) 59, doi:10.1016/j.compstruc.2015.03.008.
+    """
+    _require_positive("largest_velocity", largest_velocity)
+    model = simulated_structure(model)
+    j = model.modes.mode_of_interest
+    omega = float(model.modes.natural_frequency[j])
+    scale = largest_velocity / (omega * float(np.max(np.abs(model.modes.mode_shape[:, j]))))
+    balance = harmonic_balance(
+        model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples
+    )
+    curve = _follow_damped(balance, traced(steps), max_points)
+    n = int(curve.n_points)
+    points, excitation = np.asarray(curve.points)[:n], None
+    motion = np.delete(points, -2, axis=1)
+    frequency, coefficients, velocity = _motion(balance, motion)
+    excitation = points[:, -2] * float(balance.frequency_scale)
+    return DampedModeBranch(
+        frequency,
+        excitation / (2 * frequency),
+        coefficients,
+        velocity,
+        CurveStatus(int(curve.status)),
+        model.modes.sensors,
+    )
+
+
+@compiled
+def _follow_damped(balance: HarmonicBalance, steps: StepControl, max_points: int) -> Curve:
+    model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
+    terms, fs = model.linear_terms(), balance.frequency_scale
+    basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
+    turn = jnp.kron(jnp.asarray(basis.derivative), jnp.diag(terms.mass))
+    sine = 2 * n + j
+
+    def linearised(point: Array) -> tuple[Array, Array]:
+        """Unknowns x, ξ/ω₀ and Ω/ω₀; the last equation sets the phase."""
+        x, excitation, omega = point[:-2], point[-2], point[-1]
+        residual, jacobian = balance.linearised(jnp.append(x, omega))
+        slope = turn @ x
+        by_x = jacobian[:, :-1] - excitation * omega * turn
+        by_omega = jacobian[:, -1] - excitation * slope
+        top = jnp.concatenate([by_x, (-omega * slope)[:, None], by_omega[:, None]], axis=1)
+        phase = jnp.zeros(point.shape[0]).at[sine].set(1.0)
+        equations = jnp.append(residual - excitation * omega * slope, x[sine])
+        return equations, jnp.concatenate([top, phase[None]])
+
+    # What averaging says of a small motion; friction may damp that one most.
+    small = 0.01
+    stiffness, damping = terms.stiffness[j], terms.damping[j]
+    for effect in model.effects:
+        if isinstance(effect, AbstractForce):
+            average = averaged_effect(effect, small * balance.displacement_scale, fs)
+            stiffness, damping = stiffness + average.stiffness, damping + average.damping
+    begin = jnp.sqrt(stiffness / terms.mass[j]) / fs
+    start = jnp.zeros(balance.size + 2).at[n + j].set(small)
+    start = start.at[-2].set(damping / (terms.mass[j] * fs)).at[-1].set(begin)
+    outward = jnp.zeros_like(start).at[n + j].set(1.0)
+    return follow_curve(
+        *(linearised, start, outward, jnp.array(0.0), jnp.array(jnp.inf), jnp.array(1.0)),
+        *(steps, max_points),
+        start_across=outward,
+    )
+
+
+def phase_controlled(
+    model: Structure,
+    largest_force: float,
+    *,
+    phase: float = 0.0,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 2000,
+    n_samples: int | None = None,
+) -> ControlledCurve:
+    """Steady states at a fixed phase of the mode of interest, under a rising force.
+
+    With `phase` = 0 (velocity in phase with the force) this is the force-appropriated backbone:
+    what a phase-locked loop tracks, unstable states of the open loop included. Solves the
+    harmonic balance with Im(V₁ e^{−iφ}) = 0, following the force.
+
+    Arguments: `largest_force` in N; the curve starts at a hundredth of it. `phase` φ in rad.
+    Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
+    Raises `ValueError` for a force that is not positive and a phase beyond ±π/2.
+    Reference: Peeters, Kerschen & Golinval, J. Sound Vib. 330 (2011) 486,
+    doi:10.1016/j.jsv.2010.08.028.
+    """
+    _require_positive("largest_force", largest_force)
+    if not abs(phase) < np.pi / 2:
+        raise ValueError(f"`phase` must lie between -π/2 and π/2, but is {phase:g} rad.")
+    model = simulated_structure(model)
+    balance = harmonic_balance(
+        model,
+        largest_force,
+        resonance_displacement(model, largest_force),
+        harmonic_order=harmonic_order,
+        n_samples=n_samples,
+    )
+    curve = _follow_phase(balance, jnp.asarray(float(phase)), traced(steps), max_points)
+    n = int(curve.n_points)
+    points = np.asarray(curve.points)[:n]
+    return _controlled(balance, points[:, :-1], points[:, -1] * largest_force, curve)
+
+
+@compiled
+def _follow_phase(
+    balance: HarmonicBalance, phase: Array, steps: StepControl, max_points: int
+) -> Curve:
+    model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
+    # Velocity phasor ∝ i(a − ib) = b + ia: in phase with the force turned by φ.
+    quadrature = jnp.zeros(balance.size + 2)
+    quadrature = quadrature.at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
+
+    def linearised(point: Array) -> tuple[Array, Array]:
+        """Unknowns x, Ω/ω₀ and the share of the largest force."""
+        residual, jacobian = _with_force(balance, point[:-1], point[-1])
+        return (
+            jnp.append(residual, quadrature @ point),
+            jnp.concatenate([jacobian, quadrature[None]]),
+        )
+
+    share = 0.01
+    terms = model.linear_terms()
+    own = jnp.sqrt(terms.stiffness[j] / terms.mass[j])
+    # Off resonance by the phase: tan φ = (ω² − Ω²)/(2ζωΩ), to first order in the damping.
+    begin = own - 0.5 * terms.damping[j] / terms.mass[j] * jnp.tan(phase)
+    x = linear_coefficients(model, share * balance.force, begin, balance.harmonic_order)
+    start = jnp.append(balance.point(x, begin), share)
+    rising = jnp.zeros_like(start).at[-1].set(1.0)
+    return follow_curve(
+        *(linearised, start, rising, jnp.array(0.0), jnp.array(1.0), jnp.array(jnp.inf)),
+        *(steps, max_points),
+    )
+
+
+def response_controlled(
+    model: Structure,
+    velocity: float,
+    from_frequency: float,
+    to_frequency: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 2000,
+    n_samples: int | None = None,
+) -> ControlledCurve:
+    """Steady states of a given velocity amplitude through a frequency range.
+
+    The controller holds |V₁| at the first sensor and lets the force follow; such curves have no
+    folds where the open loop has them. Solves the harmonic balance with |V₁| = `velocity`.
+
+    Arguments: `velocity` in m/s, frequencies in rad/s.
+    Returns a `ControlledCurve` from the lower to the upper frequency, followed from the upper one
+    where the lower one gives no start; its `status` is UPPER_END when it spans the range.
+    Raises `ValueError` for a velocity that is not positive and an empty range.
+    Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
+    doi:10.1016/j.ymssp.2020.107023.
+    """
+    _require_positive("velocity", velocity)
+    if not 0 < from_frequency < to_frequency < np.inf:
+        raise ValueError(
+            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
+            f"{from_frequency:g} and {to_frequency:g} rad/s."
+        )
+    model = simulated_structure(model)
+    shape = np.asarray(model.modes.mode_shape[0])
+    j = model.modes.mode_of_interest
+    if shape[j] == 0:
+        raise ValueError("the first sensor does not see the mode of interest.")
+    middle = 0.5 * (from_frequency + to_frequency)
+    scale = velocity / (abs(shape[j]) * middle)
+    # The unit of the unknown force: what a linear mode would need at half its resonance.
+    terms = model.linear_terms()
+    unit = float(terms.stiffness[j] * scale / np.abs(model.modes.participation[j])) * 0.1
+    balance = harmonic_balance(
+        model, unit, scale, harmonic_order=harmonic_order, n_samples=n_samples
+    )
+    ends = jnp.asarray([from_frequency, to_frequency])
+    held = jnp.asarray(float(velocity))
+    settings = (traced(steps), max_points)
+    curve = _follow_response(balance, held, ends, jnp.array(False), *settings)
+    points = np.asarray(curve.points)[: int(curve.n_points)]
+    if int(curve.status) == CurveStatus.NO_START:
+        # Far below a resonance the linear response may be no start where far above it is one.
+        curve = _follow_response(balance, held, ends, jnp.array(True), *settings)
+        points = np.asarray(curve.points)[: int(curve.n_points)][::-1]
+        if int(curve.status) == CurveStatus.LOWER_END:
+            curve = curve._replace(status=jnp.array(int(CurveStatus.UPPER_END)))
+    return _controlled(balance, np.delete(points, -2, axis=1), points[:, -2] * unit, curve)
+
+
+@compiled
+def _follow_response(
+    balance: HarmonicBalance,
+    velocity: Array,
+    ends: Array,
+    downward: Array,
+    steps: StepControl,
+    max_points: int,
+) -> Curve:
+    model, n = balance.model, balance.model.n_modes
+    shape = model.modes.mode_shape[0]
+    unit = velocity / (balance.frequency_scale * balance.displacement_scale)
+
+    def height(point: Array) -> Array:
+        x = point[:-2].reshape(-1, n) @ shape
+        return point[-1] ** 2 * (x[1] ** 2 + x[2] ** 2) / unit**2 - 1.0
+
+    def linearised(point: Array) -> tuple[Array, Array]:
+        """Unknowns x, the force over its unit, and Ω/ω₀."""
+        residual, jacobian = _with_force(balance, jnp.delete(point, -2), point[-2])
+        jacobian = jnp.concatenate([jacobian[:, :-2], jacobian[:, -1:], jacobian[:, -2:-1]], axis=1)
+        value, slope = jax.value_and_grad(height)(point)
+        return jnp.append(residual, value), jnp.concatenate([jacobian, slope[None]])
+
+    begin = jnp.where(downward, ends[1], ends[0])
+    one = linear_coefficients(model, balance.force, begin, balance.harmonic_order)
+    linear = jnp.abs(velocity_phasors(one, begin, model.modes.mode_shape)[1, 0])
+    share = velocity / linear
+    start = balance.point(share * one, begin)
+    start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
+    onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
+    return follow_curve(
+        *(linearised, start, onward, ends[0] / balance.frequency_scale),
+        *(ends[1] / balance.frequency_scale, jnp.array(jnp.inf), steps, max_points),
+    )
+
+
+def _with_force(
+    balance: HarmonicBalance, point: Array, share: Array
+) -> tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]:
+    """Residual and Jacobian under a share of the force, the last column for the share."""
+    now = eqx.tree_at(lambda b: b.force, balance, balance.force * share)
+    residual, jacobian = now.linearised(point)
+    column = -balance.force * balance.load()
+    return residual, jnp.concatenate([jacobian, column[:, None]], axis=1)
+
+
+def _controlled(
+    balance: HarmonicBalance, points: np.ndarray, force: np.ndarray, curve: Curve
+) -> ControlledCurve:
+    frequency, coefficients, velocity = _motion(balance, points)
+    status = CurveStatus(int(curve.status))
+    sensors = balance.model.modes.sensors
+    return ControlledCurve(force, frequency, coefficients, velocity, status, sensors)
+
+
+def _motion(
+    balance: HarmonicBalance, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frequency, coefficients and velocity of points (x, Ω), on the host."""
+    shape = (len(points), balance.n_coefficients, balance.model.n_modes)
+    coefficients = points[:, :-1].reshape(shape) * float(balance.displacement_scale)
+    frequency = points[:, -1] * float(balance.frequency_scale)
+    velocity = velocity_phasors(
+        jnp.asarray(coefficients), jnp.asarray(frequency), balance.model.modes.mode_shape
+    )
+    return frequency, coefficients, np.asarray(velocity)
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not 0 < value < np.inf:
+        raise ValueError(f"`{name}` must be positive and finite, but is {value!r}.")

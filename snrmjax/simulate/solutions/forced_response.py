@@ -1,0 +1,319 @@
+"""Forced responses by harmonic balance: whole curves, folds and resonances included."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.numerics.blocks import mapped, over_cores, taken
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import (
+    HarmonicBalance,
+    harmonic_balance,
+)
+from snrmjax.simulate.continuation.continuation import (
+    CurveStatus,
+    StepControl,
+    correct,
+    traced,
+)
+from snrmjax.simulate.continuation.curve_tracing import follow_from_rest, response_balances
+from snrmjax.simulate.continuation.response_curve import (
+    FollowedCurve,
+    ResponseCurve,
+    assembled,
+)
+
+DEFAULT_STEPS = StepControl()
+_BLOCK = 8  # curves that one job completes
+
+
+def forced_response(
+    model: Structure,
+    forces: Iterable[float],
+    from_frequency: float,
+    to_frequency: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 4000,
+    n_samples: int | None = None,
+    stability: bool = True,
+) -> list[ResponseCurve]:
+    """Follow the response to a cosine force through a frequency range, once for every force.
+
+    Starts from the linear response at `from_frequency`, or where that leads nowhere from the
+    response to a force that rises from zero, and follows the curve around its folds by
+    pseudo-arclength continuation until it leaves the range. Located between the steps and
+    inserted with a name in `event` are folds ("fold"), peaks of the velocity fundamental at the
+    first sensor ("peak"), phase resonances of the mode of interest ("phase_resonance") and, with
+    `stability`, bifurcations ("branch_point", "period_doubling", "neimark_sacker").
+
+    Arguments: `forces` in N, frequencies in rad/s.
+    Returns one `ResponseCurve` for every force; its `status` says how it ended. When the curve
+    from the lower end does not reach the upper one, it is followed from the upper end instead,
+    and when that does not reach the lower end either, both parts are returned, a part without a
+    start being empty. Where a resonance reaches beyond `to_frequency`, the branch that comes in
+    there from the linear response is returned too. Isolated branches and second wells:
+    `isolated_responses`.
+    Raises `ValueError` for a force that is not positive and for an empty or endless frequency
+    range.
+
+    >>> from snrmjax import flat_beam
+    >>> curve = forced_response(flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)[0]
+    >>> curve.status.name, curve.at_events("phase_resonance").size
+    ('UPPER_END', 1)
+    """
+    forces = list(forces)
+    for force in forces:
+        if not force > 0 or not np.isfinite(force):
+            raise ValueError(f"every force must be positive, but one is {force!r} N.")
+    batch = forced_response_batch(
+        [model] * len(forces),
+        forces,
+        from_frequency,
+        to_frequency,
+        harmonic_order=harmonic_order,
+        steps=steps,
+        max_points=max_points,
+        n_samples=n_samples,
+        stability=stability,
+    )
+    return [part for parts in batch.curves for part in parts]
+
+
+class ResponseBatch(NamedTuple):
+    """Forced responses of many members; NaN where a member has no such point."""
+
+    status: Int[np.ndarray, " member"]  # a `CurveStatus` for every member
+    n_points: Int[np.ndarray, " member"]
+    peak_frequency: Float[np.ndarray, " member"]  # rad/s, of the highest peak
+    peak_velocity: Float[np.ndarray, " member"]  # m/s, fundamental at the first sensor
+    resonance_frequency: Float[np.ndarray, " member"]  # rad/s, of the strongest phase resonance
+    resonance_velocity: Float[np.ndarray, " member"]  # m/s
+    n_folds: Int[np.ndarray, " member"]
+    curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
+
+
+def forced_response_batch(
+    models: Structure | Sequence[Structure],
+    forces: float | Sequence[float] | Float[np.ndarray, " member"],
+    from_frequency: float,
+    to_frequency: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 4000,
+    n_samples: int | None = None,
+    stability: bool = True,
+    keep_curves: bool = True,
+    chunk: int = 256,
+    progress: Callable[[int, int], None] | None = None,
+) -> ResponseBatch:
+    """Forced responses of many models, forces or both, over all cores or on an accelerator.
+
+    Every member is what `forced_response` gives. Members are followed in blocks of one size: on a
+    CPU one after the other, with a block on every core; on an accelerator side by side. Other
+    numbers, or more members, do not compile anew. Memory is bounded by `chunk`, the members at
+    work at a time, beside the curves that are kept.
+
+    Arguments: `models` one or many, with the same modes, monomials and effects; `forces` in N,
+    one or many; frequencies in rad/s. `progress` is called with the members done and all of them.
+    Returns a `ResponseBatch`. A member that fails has its status, and NaN in its values; the
+    others are untouched. Raises `ValueError` when the numbers of models and forces disagree, for
+    models of different kinds and for an empty or endless frequency range.
+    """
+    if not 0 < from_frequency < to_frequency < np.inf:
+        raise ValueError(
+            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
+            f"{from_frequency:g} and {to_frequency:g} rad/s."
+        )
+    members, loads = _paired(models, forces)
+    # Which rows of one object are many times the same model is known before it is expanded.
+    expanded = {id(m): simulated_structure(m) for m in members}
+    ends = np.array([from_frequency, to_frequency])
+    settings = _Settings(harmonic_order, n_samples, max_points, traced(steps), stability)
+    rows: list[tuple[ResponseCurve, ...]] = []
+    summaries = []
+    for begin in range(0, len(members), chunk):
+        some = [expanded[id(m)] for m in members[begin : begin + chunk]]
+        found = _chunk_of_curves(some, loads[begin : begin + chunk], ends, settings)
+        summaries += [_summary(parts) for parts in found]
+        rows += found if keep_curves else []
+        if progress is not None:
+            progress(min(begin + chunk, len(members)), len(members))
+    columns = [np.array(column) for column in zip(*summaries, strict=True)] or [np.zeros(0)] * 7
+    named = dict(zip(ResponseBatch._fields[:-1], columns, strict=True))
+    return ResponseBatch(**named, curves=tuple(rows))
+
+
+class _Settings(NamedTuple):
+    harmonic_order: int
+    n_samples: int | None
+    max_points: int
+    steps: StepControl
+    stability: bool
+
+
+def _paired(
+    models: Structure | Sequence[Structure], forces: float | Sequence[float] | np.ndarray
+) -> tuple[list[Structure], np.ndarray]:
+    loads = np.atleast_1d(np.asarray(forces, dtype=np.float64))
+    members = [models] if isinstance(models, Structure) else list(models)
+    if len(members) == 1:
+        members = members * len(loads)
+    if len(loads) == 1:
+        loads = np.repeat(loads, len(members))
+    if len(members) != len(loads):
+        raise ValueError(
+            f"`models` and `forces` must be as many, or one, but are {len(members)} and "
+            f"{len(loads)}."
+        )
+    return members, loads
+
+
+def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
+    """The numbers of one member in the order of `ResponseBatch`."""
+    best = {"peak": (np.nan, np.nan), "phase_resonance": (np.nan, np.nan)}
+    for part in parts:
+        for kind, (_, height) in list(best.items()):
+            for k in part.at_events(kind):
+                velocity = float(np.abs(part.velocity[k, 1, 0]))
+                if not velocity <= height:
+                    best[kind], height = (float(part.frequency[k]), velocity), velocity
+    status = parts[0].status
+    folds = sum(part.at_events("fold").size for part in parts)
+    points = sum(len(part.frequency) for part in parts)
+    return (int(status), points, *best["peak"], *best["phase_resonance"], folds)
+
+
+def _chunk_of_curves(
+    models: list[Structure], forces: np.ndarray, ends: np.ndarray, settings: _Settings
+) -> list[tuple[ResponseCurve, ...]]:
+    leaves = {id(m): jax.tree.leaves(m) for m in models}
+    finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
+    valid = np.isfinite(forces) & (forces > 0) & np.array([finite[id(m)] for m in models])
+    good = np.flatnonzero(valid).tolist()
+    results: list[list[ResponseCurve]] = [[] for _ in models]
+    for k in np.flatnonzero(~valid).tolist():
+        results[k].append(_no_curve(models[k], float(forces[k]), settings))
+    if not good:
+        return [tuple(curves) for curves in results]
+    balances = response_balances(
+        [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
+    )
+    walk = (ends, settings.steps, settings.max_points)
+    upward = follow_from_rest(balances, np.arange(len(good)), *walk, downward=False)
+    # Beside a superharmonic resonance the linear response is no start: let the force rise.
+    lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
+    if lost:
+        again = follow_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
+        for k, curve in zip(lost, again, strict=True):
+            upward[k] = curve
+    # Below a strong softening the lower end has several solutions and the upper end has one; and
+    # where a resonance reaches beyond the upper end, another branch comes in there.
+    reached = [c.status == CurveStatus.UPPER_END for c in upward]
+    alone = [r and _ends_near_rest(balances, k, upward[k]) for k, r in enumerate(reached)]
+    doubtful = [k for k, known in enumerate(alone) if not known]
+    downward = follow_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
+    owner: list[int] = []
+    parts: list[FollowedCurve] = []
+    for k, curve in enumerate(upward):
+        pieces = [curve]
+        if k in doubtful:
+            back = downward[doubtful.index(k)]
+            if reached[k]:
+                known = len(back.points) and _same_point(back.points[0], curve.points[-1])
+                pieces = [curve] if known or not len(back.points) else [curve, back]
+            else:
+                whole = back.status == CurveStatus.LOWER_END
+                pieces = [back.reversed()] if whole else [curve, back.reversed()]
+        owner += [k] * len(pieces)
+        parts += pieces
+    jobs = [np.arange(b, min(b + _BLOCK, len(parts))) for b in range(0, len(parts), _BLOCK)]
+
+    def finished(job: np.ndarray) -> list[ResponseCurve]:
+        own = taken(balances, np.array([owner[e] for e in job]))
+        some = [parts[e] for e in job]
+        return assembled(own, some, settings.steps, stability=settings.stability)
+
+    for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
+        for e, response in zip(job, responses, strict=True):
+            results[good[owner[e]]].append(response)
+    return [tuple(curves) for curves in results]
+
+
+def _ends_near_rest(balances: HarmonicBalance, member: int, curve: FollowedCurve) -> bool:
+    """Whether a curve's last point is about the linear response there: then it is alone."""
+    model, j = balances.model, balances.model.modes.mode_of_interest
+    omega = float(curve.points[-1, -1])  # over the natural frequency
+    damping = float(np.asarray(model.modes.damping_ratio)[member, j])
+    own = float(np.asarray(model.modes.natural_frequency)[member, j])
+    load = float(balances.force[member]) * float(np.asarray(model.modes.participation)[member, j])
+    linear = load / (own**2 * (1 - omega**2 + 2j * damping * omega))
+    x = curve.points[-1, :-1].reshape(balances.n_coefficients, -1)[1:3, j]
+    last = complex(x[0], -x[1]) * float(balances.displacement_scale[member])
+    return abs(last - linear) < 0.5 * abs(linear)
+
+
+def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
+    return bool(np.max(np.abs(first - second)) < 1e-5)
+
+
+def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCurve:
+    order = settings.harmonic_order
+    sensors = model.modes.sensors
+    return ResponseCurve(
+        force,
+        np.zeros(0),
+        np.zeros((0, 2 * order + 1, model.n_modes)),
+        np.zeros((0, order + 1, len(sensors)), dtype=np.complex128),
+        np.zeros(0, dtype=bool),
+        (),
+        CurveStatus.INVALID,
+        sensors,
+    )
+
+
+def solve_at_frequency(
+    model: Structure,
+    force: Float[Array, " state"],
+    frequency: Float[Array, " state"],
+    start: Float[Array, "state coefficient mode"],
+    *,
+    n_samples: int | None = None,
+) -> tuple[Float[Array, "state coefficient mode"], Bool[Array, " state"]]:
+    """Periodic motions at given forces (N) and frequencies (rad/s), each from its own guess.
+
+    Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
+    whether it did.
+    """
+    coefficients, converged = _solve_batch(
+        simulated_structure(model), force, frequency, start, n_samples
+    )
+    return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
+
+
+@compiled
+def _solve_batch(
+    model: Structure, force: Array, frequency: Array, start: Array, n_samples: int | None
+) -> tuple:
+    harmonic_order = (start.shape[1] - 1) // 2
+
+    def one(force: Array, frequency: Array, start: Array) -> tuple[Array, Array]:
+        # A guess of zero is allowed: the static displacement keeps the unknowns of order one.
+        static = force * model.modes.participation / model.modes.natural_frequency**2
+        scale = jnp.maximum(jnp.max(jnp.abs(start)), jnp.max(jnp.abs(static)))
+        balance = harmonic_balance(
+            model, force, scale, harmonic_order=harmonic_order, n_samples=n_samples
+        )
+        guess = balance.point(start, frequency)
+        fixed = jnp.zeros_like(guess).at[-1].set(1.0)
+        found = correct(balance.linearised, guess, fixed, 1e-10, 30)
+        return balance.coefficients(found.point), found.converged
+
+    return mapped(one, force, frequency, start)

@@ -1,0 +1,219 @@
+"""Nonlinear normal modes: periodic motions of the conservative structure."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.structure import Structure, displacement_scale, simulated_structure
+from snrmjax.numerics.blocks import by_blocks
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.balance.harmonics import velocity_phasors
+from snrmjax.simulate.continuation.continuation import (
+    Curve,
+    CurveStatus,
+    StepControl,
+    follow_curve,
+    traced,
+)
+
+DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
+
+
+_TONGUE_SHARE = 0.05  # of the energy, in a harmonic of another mode: an internal resonance
+
+
+class Tongue(NamedTuple):
+    """A stretch of a normal mode on which a harmonic of it drives another mode in resonance."""
+
+    mode: int  # the other mode, counted from zero
+    harmonic: int
+    from_frequency: float  # rad/s, lowest on the stretch
+    to_frequency: float  # rad/s, highest
+    energy_share: float  # largest share of the kinetic energy in that harmonic of that mode
+    first: int  # index of its first point on the branch; with "skip", of the first one behind it
+    last: int  # index of its last point; with "skip", of the last one before it
+
+
+class NormalModeBranch(NamedTuple):
+    """A nonlinear normal mode as a curve of periodic motions, from small amplitude on."""
+
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    coefficients: Float[np.ndarray, "point coefficient mode"]  # mean and cosines, kg^1/2 m
+    velocity: Complex[np.ndarray, "point harmonic sensor"]  # m/s, h = 0…H
+    energy: Float[np.ndarray, " point"]  # J
+    status: CurveStatus
+    sensors: tuple[str, ...]
+    tongues: tuple[Tongue, ...] = ()
+
+
+def nonlinear_normal_mode(
+    model: Structure,
+    to_frequency: float,
+    *,
+    harmonic_order: int = 9,
+    steps: StepControl = DEFAULT_STEPS,
+    max_points: int = 4000,
+    largest_amplitude: float | None = None,
+    n_samples: int | None = None,
+    tongues: Literal["follow", "skip"] = "follow",
+) -> NormalModeBranch:
+    """Follow the nonlinear normal mode that starts at the linear mode of interest.
+
+    Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
+    for motions q = Σ a_h cos hΩt, which covers every motion that starts from rest; the
+    curve is followed by arclength through folds and internal-resonance tongues.
+
+    Arguments: `to_frequency` in rad/s, on either side of the linear frequency: the curve ends
+    when it crosses it. `largest_amplitude` (kg^1/2 m; by default 30 times the displacement at
+    which the mode's own nonlinearity matters) ends a curve that never does. A curve that first
+    moves away from `to_frequency` is followed as long as it stays above a tenth and below ten
+    times the linear frequency.
+    Where a harmonic of the mode meets another mode, the curve runs out on a tongue and back: more
+    than a twentieth of the energy is then in that harmonic of that mode. Tongues are reported;
+    with `tongues="skip"` their points are left out, which leaves the backbone in pieces of one
+    curve.
+    Returns a `NormalModeBranch` whose `status` says how it ended.
+    Raises `ValueError` for a frequency that is not positive or the linear one.
+    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
+    doi:10.1016/j.ymssp.2008.04.002.
+    """
+    j = model.modes.mode_of_interest
+    omega = float(model.modes.natural_frequency[j])
+    if not to_frequency > 0 or to_frequency == omega:
+        raise ValueError(
+            "`to_frequency` must be positive and differ from the linear frequency "
+            f"{omega:g} rad/s, but is {to_frequency:g} rad/s."
+        )
+    model = simulated_structure(model)
+    kept = tuple(e for e in model.effects if not isinstance(e, AbstractHysteresis))
+    model = dataclasses.replace(model, effects=kept)
+    scale = float(displacement_scale(model)[j])
+    balance = harmonic_balance(
+        model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples, cosine_only=True
+    )
+    upward = to_frequency > omega
+    lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
+    limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
+    ends = jnp.asarray([lower, upper, limit])
+    branch = _assemble(balance, _follow(balance, ends, traced(steps), max_points))
+    return _without_tongues(branch) if tongues == "skip" else branch
+
+
+@compiled
+def _follow(
+    balance: HarmonicBalance,
+    ends: Array,
+    steps: StepControl,
+    max_points: int,
+) -> Curve:
+    j = balance.model.modes.mode_of_interest
+    modes, n = balance.model.modes, balance.model.n_modes
+    # Start a little up the mode, where Newton's method at fixed amplitude is well posed.
+    size = balance.size + 1
+    linear = jnp.zeros(size).at[-1].set(modes.natural_frequency[j] / balance.frequency_scale)
+    direction = jnp.zeros(size).at[n + j].set(1.0)
+    return follow_curve(
+        balance.linearised,
+        linear + 1e-3 * direction,
+        direction,
+        ends[0] / balance.frequency_scale,
+        ends[1] / balance.frequency_scale,
+        ends[2],
+        steps,
+        max_points,
+        start_across=direction,
+    )
+
+
+def _assemble(balance: HarmonicBalance, curve: Curve) -> NormalModeBranch:
+    points = np.asarray(curve.points)[: int(curve.n_points)]
+    frequency, coefficients, velocity, energy = by_blocks(
+        lambda block: _motion(balance, block), 128, points
+    )
+    return NormalModeBranch(
+        frequency=frequency,
+        coefficients=coefficients,
+        velocity=velocity,
+        energy=energy,
+        status=CurveStatus(int(curve.status)),
+        sensors=balance.model.modes.sensors,
+        tongues=_tongues(balance, frequency, coefficients),
+    )
+
+
+def _tongues(
+    balance: HarmonicBalance, frequency: np.ndarray, coefficients: np.ndarray
+) -> tuple[Tongue, ...]:
+    """Stretches with more than `_TONGUE_SHARE` of the kinetic energy in one other pair."""
+    j, mass = balance.model.modes.mode_of_interest, np.asarray(balance.model.linear_terms().mass)
+    order = np.arange(coefficients.shape[1])[:, None]
+    energy = mass * (order * coefficients) ** 2  # twice the mean kinetic energy, over Ω²
+    share = energy / np.maximum(energy.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+    # The mode's own harmonics are its shape in time; others' fundamentals its shape in space.
+    share[:, :, j] = 0.0
+    share[:, :2] = 0.0
+    strongest = share.max(axis=(1, 2))
+    inside = np.concatenate([[False], strongest > _TONGUE_SHARE, [False]])
+    edges = np.flatnonzero(np.diff(inside.astype(int)))
+    found = []
+    for first, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        stretch = share[first:stop].max(axis=0)
+        harmonic, mode = np.unravel_index(np.argmax(stretch), stretch.shape)
+        found.append(
+            Tongue(
+                mode=int(mode),
+                harmonic=int(harmonic),
+                from_frequency=float(frequency[first:stop].min()),
+                to_frequency=float(frequency[first:stop].max()),
+                energy_share=float(stretch.max()),
+                first=first,
+                last=stop - 1,
+            )
+        )
+    return tuple(found)
+
+
+def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
+    """The branch without the points of its tongues, which say between which points they were."""
+    keep = np.ones(len(branch.frequency), dtype=bool)
+    for tongue in branch.tongues:
+        keep[tongue.first : tongue.last + 1] = False
+    place = np.cumsum(keep)  # points that are kept up to and with each
+    return branch._replace(
+        frequency=branch.frequency[keep],
+        coefficients=branch.coefficients[keep],
+        velocity=branch.velocity[keep],
+        energy=branch.energy[keep],
+        tongues=tuple(
+            tongue._replace(first=int(place[tongue.first]), last=int(place[tongue.first]) - 1)
+            for tongue in branch.tongues
+        ),
+    )
+
+
+@compiled
+def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Frequency, coefficients, velocity and energy along a curve."""
+    model = balance.model
+    coefficients = jax.vmap(balance.coefficients)(points)
+    frequency = points[:, -1] * balance.frequency_scale
+    full = _with_sines(coefficients)
+    velocity = velocity_phasors(full, frequency, model.modes.mode_shape)
+    at_rest = jnp.sum(coefficients, axis=1)  # q(0), where the velocity vanishes
+    return frequency, coefficients, velocity, model.potential_energy(at_rest)
+
+
+def _with_sines(
+    cosines: Float[Array, "point order mode"],
+) -> Float[Array, "point coefficient mode"]:
+    """Mean and cosines with zero sines in between."""
+    pairs = jnp.stack([cosines[:, 1:], jnp.zeros_like(cosines[:, 1:])], axis=2)
+    n_points, n_coefficients, n_modes = cosines.shape
+    flat = pairs.reshape(n_points, 2 * (n_coefficients - 1), n_modes)
+    return jnp.concatenate([cosines[:, :1], flat], axis=1)

@@ -1,0 +1,324 @@
+"""Settled motions and stepped sines by time integration: what a test sees, transients included.
+
+Needs diffrax: pip install 'snrmjax[integrate]'.
+"""
+
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
+from snrmjax.simulate.solutions.hysteresis_cycles import (
+    CyclePoint,
+    integrated_cycle,
+    memory_at_rest,
+    scaled_friction,
+)
+
+_WINDOW = 4  # cycles over which the decay of a transient is judged
+LEAST_CYCLES = 2 * _WINDOW  # fewer cannot show that a motion has settled
+_SLOWEST = 0.9995  # decay per cycle that a transient is credited with at least
+
+
+class MotionStatus(IntEnum):
+    """How an integration towards a steady motion ended."""
+
+    SETTLED = 0  # repeats from cycle to cycle
+    STILL_SETTLING = 1  # changes ever less, but ran out of cycles
+    NOT_PERIODIC = 2  # keeps changing: quasi-periodic, subharmonic or chaotic
+    FAILED = 3  # grew without bound, or needed too many steps
+
+
+MOTION_MESSAGE: dict[MotionStatus, str] = {
+    MotionStatus.SETTLED: "settled: repeats from cycle to cycle",
+    MotionStatus.STILL_SETTLING: "still settling; allow more cycles",
+    MotionStatus.NOT_PERIODIC: (
+        "does not repeat after one cycle of the force: a quasi-periodic, subharmonic or chaotic "
+        "motion, or one that is about to jump; allow more cycles to be sure"
+    ),
+    MotionStatus.FAILED: (
+        "grew without bound, or friction holds it so fast that too many steps are needed"
+    ),
+}
+
+
+class IntegratedMotion(NamedTuple):
+    """Motions at the end of an integration in time, over the last cycle of the force."""
+
+    force: Float[Array, "*batch"]  # N
+    frequency: Float[Array, "*batch"]  # rad/s
+    coefficients: Float[Array, "*batch coefficient mode"]  # kg^1/2 m, as in `ResponseCurve`
+    velocity: Complex[Array, "*batch harmonic sensor"]  # m/s, h = 0…H
+    state: Float[Array, "*batch 2 mode"]  # q (kg^1/2 m) and q̇ (kg^1/2 m/s) at its end
+    status: Int[Array, "*batch"]  # a `MotionStatus`
+    distance: Float[Array, "*batch"]  # estimated, from the settled motion, relative
+    n_cycles: Int[Array, "*batch"]
+
+    @property
+    def converged(self) -> Bool[Array, "*batch"]:
+        """Whether the motion settled: repeats from cycle to cycle."""
+        return self.status == int(MotionStatus.SETTLED)
+
+
+def settled_motion(
+    model: Structure,
+    force: Float[Array, ""] | float,
+    frequency: Float[Array, ""] | float,
+    *,
+    start: Float[Array, "..."] | np.ndarray | None = None,
+    harmonic_order: int = 9,
+    max_cycles: int = 2000,
+    tolerance: float = 1e-5,
+    rtol: float = 1e-8,
+) -> IntegratedMotion:
+    """Integrate the equations of motion under a cosine force until the motion repeats.
+
+    m q̈ + d q̇ + k q + ∂V/∂q + Σ effects = Φᵀb F Σ s_h cos hΩt, by the method of Tsitouras of
+    order 5 with error control, and at least 128 steps a cycle. Contacts have their sharp kinks.
+    Sliders are moved exactly after each step, turning points included; Coulomb's force is
+    smoothed as over a cycle, with the last cycle's velocity.
+
+    Arguments: `force` in N, `frequency` Ω in rad/s; `start` is q (kg^1/2 m) at rest, with shape
+    (mode,), or q and q̇ (kg^1/2 m/s), with shape (2, mode), of the model's modes or of those of
+    `simulated_structure`; from rest where it is missing. `tolerance` is on the estimated
+    relative distance of the Fourier coefficients from those of the settled motion; `rtol` on
+    the error of a step, relative to the motion's size. Traceable: `jit` and `vmap` over forces,
+    frequencies and starts; other numbers do not compile anew.
+    Returns an `IntegratedMotion`: where `converged`, a stable periodic motion, which is a start
+    for other solvers and a seed of isolated branches. Its `status` says why not: see
+    `MOTION_MESSAGE`. Which of several stable motions is found depends on `start`.
+    Raises `ValueError` for a force or a frequency that is not positive, fewer than eight cycles
+    and a start of another shape, `ImportError` without diffrax.
+    Validity: a transient e^(−ζωt) takes about 2/ζ cycles to fall to 1e-5. Motions that friction
+    brings to a stop creep at its smoothing velocity.
+    Reference: Tsitouras, Comput. Math. Appl. 62 (2011) 770, doi:10.1016/j.camwa.2011.06.002.
+
+    >>> from snrmjax import flat_beam, linear_response
+    >>> motion = settled_motion(flat_beam(), 1e-6, 500.0, harmonic_order=1)
+    >>> exact = linear_response(flat_beam().modes, 500.0, 1e-6)
+    >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)
+    (True, True)
+    """
+    _require_positive("force", force)
+    _require_positive("frequency", frequency)
+    frequency = jnp.asarray(frequency, dtype=jnp.float64)
+    motions = _stepped(
+        simulated_structure(model),
+        jnp.asarray(force, dtype=jnp.float64),
+        frequency[None],
+        jnp.asarray(model.test_order)[None],
+        _start_state(model, start),
+        harmonic_order,
+        _settings(max_cycles, tolerance, rtol),
+    )
+    return jax.tree.map(lambda part: part[0], motions)
+
+
+def stepped_sine(
+    model: Structure,
+    force: Float[Array, ""] | float,
+    frequencies: Float[Array, " step"] | np.ndarray,
+    *,
+    cycles_per_step: int = 200,
+    start: Float[Array, "..."] | np.ndarray | None = None,
+    test_orders: Float[Array, " step"] | np.ndarray | None = None,
+    harmonic_order: int = 9,
+    tolerance: float = 1e-4,
+    rtol: float = 1e-8,
+) -> IntegratedMotion:
+    """Step the frequency of a cosine force, up or down, without ever stopping the motion.
+
+    At each step the state and the phase of the force go on from where the last one left them,
+    so that the motion jumps where it does in a test: early, when the transient of a step throws
+    it over the edge of a narrowing basin. A step lasts until the motion has settled, at most
+    `cycles_per_step` cycles; what it shows is its last cycle, settled or not.
+
+    Arguments: `force` in N; `frequencies` in rad/s, in the order of the test; `test_orders` from
+    0 to 1, the time of each step for a model that drifts; the others as in `settled_motion`.
+    Returns an `IntegratedMotion` whose arrays lead with the step. Another number of steps
+    compiles anew. Raises as `settled_motion` does.
+    """
+    _require_positive("force", force)
+    _require_positive("frequencies", frequencies)
+    frequencies = jnp.asarray(frequencies, dtype=jnp.float64)
+    if frequencies.ndim != 1 or not frequencies.size:
+        raise ValueError(
+            f"`frequencies` must be a vector of steps, but has shape {frequencies.shape}."
+        )
+    if test_orders is None:
+        test_orders = jnp.broadcast_to(model.test_order, frequencies.shape)
+    test_orders = jnp.asarray(test_orders, dtype=jnp.float64)
+    if test_orders.shape != frequencies.shape:
+        raise ValueError(
+            f"`test_orders` must have shape {frequencies.shape}, but has {test_orders.shape}."
+        )
+    return _stepped(
+        simulated_structure(model),
+        jnp.asarray(force, dtype=jnp.float64),
+        frequencies,
+        test_orders,
+        _start_state(model, start),
+        harmonic_order,
+        _settings(cycles_per_step, tolerance, rtol),
+    )
+
+
+class _Settings(NamedTuple):
+    max_cycles: Int[Array, ""]
+    tolerance: Float[Array, ""]
+    rtol: Float[Array, ""]
+
+
+def _settings(max_cycles: int, tolerance: float, rtol: float) -> _Settings:
+    if max_cycles < LEAST_CYCLES:
+        raise ValueError(
+            f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
+        )
+    return _Settings(jnp.asarray(max_cycles), jnp.asarray(tolerance), jnp.asarray(rtol))
+
+
+def _require_positive(name: str, value: Any) -> None:
+    if isinstance(value, jax.core.Tracer):
+        return
+    values = np.ravel(np.asarray(value, dtype=np.float64))
+    wrong = values[~((values > 0) & np.isfinite(values))]
+    if wrong.size:
+        raise ValueError(f"`{name}` must be positive and finite, but is {wrong[0]!r}.")
+
+
+def _start_state(model: Structure, start: Any) -> Float[Array, "2 mode"]:
+    """Displacement and velocity of every simulated mode; further modes are at rest."""
+    n = simulated_structure(model).n_modes
+    if start is None:
+        return jnp.zeros((2, n))
+    state = jnp.asarray(start, dtype=jnp.float64)
+    if state.ndim == 1:
+        state = jnp.stack([state, jnp.zeros_like(state)])
+    if state.ndim != 2 or state.shape[0] != 2 or state.shape[1] not in (model.n_modes, n):
+        raise ValueError(
+            f"`start` must have shape ({n},) or (2, {n}), for {n} modes, but has {np.shape(start)}."
+        )
+    return jnp.pad(state, ((0, 0), (0, n - state.shape[1])))
+
+
+class _Settling(NamedTuple):
+    """A settling motion: the last cycle's coefficients and how much they still change."""
+
+    point: CyclePoint
+    coefficients: Float[Array, "coefficient mode"]
+    changes: Float[Array, " cycle"]  # relative, the last ones, newest first
+    marks: Float[Array, " mark"]  # the change when the cycles were the last two powers of two
+    distance: Float[Array, ""]
+    n_cycles: Int[Array, ""]
+
+
+@eqx.filter_jit
+def _stepped(
+    model: Structure,
+    force: Float[Array, ""],
+    frequencies: Float[Array, " step"],
+    test_orders: Float[Array, " step"],
+    start: Float[Array, "2 mode"],
+    harmonic_order: int,
+    settings: _Settings,
+) -> IntegratedMotion:
+    """The motions at all steps, of the structure as simulated."""
+    q, v = start
+    memory = tuple(
+        memory_at_rest(effect, q[model.modes.mode_of_interest])
+        for effect in scaled_friction(model, 1.0)
+    )
+    begin = CyclePoint(q, v, memory, jnp.asarray(0.01), *jnp.zeros((3,)))
+
+    def dwell(point: CyclePoint, step: tuple[Array, Array]) -> tuple[CyclePoint, IntegratedMotion]:
+        frequency, order = step
+        now = eqx.tree_at(lambda m: m.test_order, model, order)
+        settled = _settle(now, force, frequency, point, harmonic_order, settings)
+        end = settled.point
+        motion = IntegratedMotion(
+            force=force,
+            frequency=frequency,
+            coefficients=settled.coefficients,
+            velocity=velocity_phasors(settled.coefficients, frequency, model.modes.mode_shape),
+            state=jnp.stack([end.q, end.v]),
+            status=_status(now, frequency, settled, settings),
+            distance=settled.distance,
+            n_cycles=settled.n_cycles,
+        )
+        return end, motion
+
+    return jax.lax.scan(dwell, begin, (frequencies, test_orders))[1]
+
+
+def _settle(
+    model: Structure,
+    force: Array,
+    frequency: Array,
+    point: CyclePoint,
+    harmonic_order: int,
+    settings: _Settings,
+) -> _Settling:
+    """Cycle after cycle until the motion repeats."""
+    n_samples = max(256 if model.hysteretic else 128, 8 * harmonic_order)
+    analysis = jnp.asarray(harmonic_basis(harmonic_order, n_samples).analysis)
+    begin = _Settling(
+        point=point,
+        coefficients=jnp.zeros((2 * harmonic_order + 1, model.n_modes)),
+        changes=jnp.full(2 * _WINDOW, jnp.inf),
+        marks=jnp.full(2, jnp.inf),
+        distance=jnp.asarray(jnp.inf),
+        n_cycles=jnp.asarray(0),
+    )
+
+    def going(now: _Settling) -> Array:
+        more = (now.n_cycles < settings.max_cycles) & ~(now.distance <= settings.tolerance)
+        return more & jnp.all(jnp.isfinite(now.coefficients))
+
+    def cycle(now: _Settling) -> _Settling:
+        point, samples = integrated_cycle(
+            model, force, frequency, now.point, n_samples, settings.rtol
+        )
+        coefficients = analysis @ samples
+        largest = jnp.maximum(jnp.max(jnp.abs(coefficients)), jnp.finfo(jnp.float64).tiny)
+        change = jnp.max(jnp.abs(coefficients - now.coefficients)) / largest
+        changes = jnp.concatenate([change[None], now.changes[:-1]])
+        n_cycles = now.n_cycles + 1
+        recent, before = jnp.max(changes[:_WINDOW]), jnp.max(changes[_WINDOW:])
+        # A change d that shrinks by ρ in every cycle has dρ/(1 − ρ) still to go.
+        decay = (recent / jnp.maximum(before, jnp.finfo(jnp.float64).tiny)) ** (1 / _WINDOW)
+        decay = jnp.minimum(decay, _SLOWEST)
+        # The first change is that from nothing.
+        known = n_cycles > 2 * _WINDOW - 1
+        distance = jnp.where(known, recent / (1 - decay), jnp.inf)
+        marked = (n_cycles & (n_cycles - 1)) == 0
+        return _Settling(
+            point=point,
+            coefficients=coefficients,
+            changes=changes,
+            marks=jnp.where(marked, jnp.stack([recent, now.marks[0]]), now.marks),
+            distance=distance,
+            n_cycles=n_cycles,
+        )
+
+    return jax.lax.while_loop(going, cycle, begin)
+
+
+def _status(
+    model: Structure, frequency: Array, settled: _Settling, settings: _Settings
+) -> Int[Array, ""]:
+    recent, before = jnp.max(settled.changes[:_WINDOW]), settled.marks[1]
+    # Linear modes alone would take a quarter of the cycles or more to shrink it by this much.
+    terms = model.linear_terms()
+    slowest = jnp.min(terms.damping / (2 * terms.mass)) * 2 * jnp.pi / frequency
+    shrinks = recent < before * jnp.maximum(0.5, jnp.exp(-0.25 * slowest * settled.n_cycles))
+    running = jnp.where(shrinks, int(MotionStatus.STILL_SETTLING), int(MotionStatus.NOT_PERIODIC))
+    done = settled.distance <= settings.tolerance
+    status = jnp.where(done, int(MotionStatus.SETTLED), running)
+    finite = jnp.all(jnp.isfinite(settled.coefficients))
+    return jnp.where(finite, status, int(MotionStatus.FAILED))

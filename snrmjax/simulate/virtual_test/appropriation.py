@@ -1,0 +1,157 @@
+"""States at given phases of the mode of interest: where a test records, and what is there."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.numerics.blocks import padded
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.harmonic_balance import harmonic_balance
+from snrmjax.simulate.continuation.continuation import correct
+from snrmjax.simulate.virtual_test.recording import VisitedStates
+
+
+def phase_limits(appropriation: tuple[float, float]) -> tuple[float, float]:
+    """The smallest and the largest |phase| (rad) for a range of the indicator, cos² of the phase.
+
+    Raises `ValueError` for an empty range. Reference: Kwarta & Allen, Eq. (20).
+    """
+    low, high = appropriation
+    if not 0 <= low < high <= 1:
+        raise ValueError(f"`appropriation` must be a range inside 0…1, but is {appropriation}.")
+    smallest, largest = np.arccos(np.sqrt([high, low])).tolist()
+    return smallest, largest
+
+
+def mode_phase(
+    model: Structure, coefficients: Float[np.ndarray, "state coefficient mode"]
+) -> Float[np.ndarray, " state"]:
+    """Phase of the velocity fundamental of the mode of interest, 0 at phase resonance."""
+    j = model.modes.mode_of_interest
+    cosine, sine = coefficients[:, 1, j], coefficients[:, 2, j]
+    return np.angle(1j * (cosine - 1j * sine) * np.sign(float(model.modes.participation[j])))
+
+
+def around(phase: Float[np.ndarray, " point"], centre: int, largest: float) -> np.ndarray:
+    """Points from `centre` on, either way, until the phase is too far off.
+
+    At a superharmonic resonance, far below, the phase may come back into the range: no test for
+    the mode would look there.
+    """
+    # One point beyond the limit is kept on either side: states lie between points.
+    far = np.flatnonzero(np.abs(phase) > largest)
+    below, above = far[far < centre], far[far > centre]
+    first = below[-1] if below.size else 0
+    last = above[0] if above.size else len(phase) - 1
+    index = np.arange(len(phase))
+    return (index >= first) & (index <= last)
+
+
+def spread_in_phase(
+    phase: np.ndarray, reached: np.ndarray, smallest: float, largest: float, count: int
+) -> list[tuple[int, float]]:
+    """Places (point, share of the way to the next) on a curve with |phase| inside a range.
+
+    `count` of them, shared among the sides of resonance and spread evenly in phase over what is
+    reached of a side, so that none lies in a gap between two branches.
+    """
+    pair = np.flatnonzero(reached[:-1] & reached[1:] & (np.abs(np.diff(phase)) < 1.0))
+    sides = []
+    for sign in (1, -1):
+        begin, end = (np.clip(sign * phase[pair + k], smallest, largest) for k in (0, 1))
+        used = begin != end
+        if used.any():
+            sides.append((pair[used], sign * begin[used], sign * end[used]))
+    places: list[tuple[int, float]] = []
+    for k, (here, begin, end) in enumerate(sides):
+        n = len(np.array_split(np.arange(count), len(sides))[k])
+        along = np.concatenate([[0.0], np.cumsum(np.abs(end - begin))])
+        wanted = along[-1] * (np.arange(n) + 0.5) / n  # the middles of equal parts
+        index = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, here.size - 1)
+        target = begin[index] + np.sign(end - begin)[index] * (wanted - along[index])
+        first, last = phase[here[index]], phase[here[index] + 1]
+        places += zip(
+            here[index].tolist(), ((target - first) / (last - first)).tolist(), strict=True
+        )
+    return places
+
+
+def between(values: np.ndarray, point: int, share: float) -> np.ndarray:
+    """Linear interpolation between a point of a curve and the next."""
+    return values[point] + share * (values[point + 1] - values[point])
+
+
+def states_at_phases(
+    model: Structure,
+    near: VisitedStates,
+    phase: Float[np.ndarray, " state"],
+    velocity: Float[np.ndarray, " state"] | None = None,
+) -> VisitedStates:
+    """The motions near given ones that have exactly these phases of the mode of interest.
+
+    Solves the harmonic balance for the motion and its frequency, at the force of `near`, or with
+    `velocity` (m/s, fundamental at the first sensor) for the force too. A structure that drifts
+    is looked at in each state's own `order`. States that are not found are left out.
+    """
+    asked = (near.order, near.force, phase, near.frequency, near.coefficients)
+    given = np.full(len(phase), np.nan) if velocity is None else velocity
+    rows = (jnp.asarray(padded(part, 64)) for part in (*asked, given))
+    solved = _at_phases(simulated_structure(model), *rows)
+    force, frequency, coefficients, converged = (np.asarray(a)[: len(phase)] for a in solved)
+    found = near._replace(force=force, frequency=frequency, coefficients=coefficients)
+    # Newton's method may leave for another branch.
+    size, was = (np.linalg.norm(x[:, 1:3], axis=(1, 2)) for x in (coefficients, near.coefficients))
+    off = np.exp(1j * (mode_phase(model, coefficients) - phase))
+    return found.only(converged & (np.abs(size / was - 1) < 0.2) & (off.real > 0))
+
+
+@compiled
+def _at_phases(
+    model: Structure,
+    order: Array,
+    force: Array,
+    phase: Array,
+    frequency: Array,
+    start: Array,
+    velocity: Array,
+) -> tuple[Array, Array, Array, Bool[Array, " state"]]:
+    n, j = model.n_modes, model.modes.mode_of_interest
+    harmonic_order = (start.shape[1] - 1) // 2
+
+    def one(row: tuple) -> tuple[Array, Array, Array, Array]:
+        order, force, phase, frequency, start, velocity = row
+        now = eqx.tree_at(lambda m: m.test_order, model, order)
+        scale = jnp.max(jnp.abs(start))
+        balance = harmonic_balance(now, force, scale, harmonic_order=harmonic_order)
+        held = jnp.isfinite(velocity)
+        unit = jnp.where(held, velocity, 1.0) / (balance.frequency_scale * scale)
+
+        def condition(point: Array) -> Array:
+            seen = point[n : 3 * n].reshape(2, n) @ model.modes.mode_shape[0]
+            miss = point[-2] ** 2 * (seen @ seen) / unit**2 - 1.0
+            return jnp.where(held, miss, point[-1] - 1.0)
+
+        def linearised(point: Array) -> tuple[Array, Array]:
+            """Unknowns x, Ω/ω₀ and the force over the one given."""
+            loaded = eqx.tree_at(lambda b: b.force, balance, force * point[-1])
+            residual, jacobian = loaded.linearised(point[:-1])
+            column = -force * balance.load()
+            value, slope = jax.value_and_grad(condition)(point)
+            wide = jnp.concatenate([jacobian, column[:, None]], axis=1)
+            return jnp.append(residual, value), jnp.concatenate([wide, slope[None]])
+
+        guess = jnp.append(balance.point(start, frequency), 1.0)
+        # Velocity phasor ∝ i(a − ib) = b + ia: on the line at the phase φ.
+        line = (
+            jnp.zeros_like(guess).at[n + j].set(jnp.cos(phase)).at[2 * n + j].set(-jnp.sin(phase))
+        )
+        found = correct(linearised, guess - (line @ guess) * line, line, 1e-10, 30)
+        point = found.point
+        motion = balance.coefficients(point)
+        omega = point[-2] * balance.frequency_scale
+        return force * point[-1], omega, motion, found.converged
+
+    return jax.lax.map(one, (order, force, phase, frequency, start, velocity))

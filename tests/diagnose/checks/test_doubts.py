@@ -1,0 +1,116 @@
+"""Answers that a law outside the library could imitate are marked."""
+
+import numpy as np
+import pytest
+
+from snrmjax.diagnose.checks.doubts import doubts, never_seen
+from snrmjax.diagnose.misfit.candidates import decide_by
+from snrmjax.diagnose.search.locating import Located
+
+
+def grows(part, exponent, std=0.05):
+    return (Located(part, (0.1, 1.0), 1e-9, exponent, std),)
+
+
+def test_a_law_of_the_located_power_is_not_doubted():
+    assert doubts(("coulomb_friction",), grows("damping", -1.05)) == []
+    assert doubts(("cubic_stiffness",), grows("stiffness", 2.1, 0.1)) == []
+    both_ways = frozenset({"quadratic_damping"})
+    two = ("quadratic_damping", "cubic_stiffness")
+    assert doubts(two, grows("damping", 1.0), (2, 3), both_ways) == []
+
+
+def test_a_law_of_another_power_is_refuted():
+    # Damping by the square root of the velocity goes with the power −1/2.
+    (doubt,) = doubts(("coulomb_friction",), grows("damping", -0.5))
+    assert doubt.refutes
+    assert "-0.50" in doubt.reason
+
+
+def test_a_power_that_is_hardly_known_refutes_nothing_but_leaves_the_rival():
+    (doubt,) = doubts(("coulomb_friction",), grows("damping", -0.8, 0.3))
+    assert not doubt.refutes
+    assert "decay" in doubt.decide_by
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        ("gap_stiffness", "quintic_stiffness"),
+        ("quadratic_damping", "cubic_stiffness", "cubic_damping"),
+        ("iwan_microslip", "jenkins_slider"),
+        ("coulomb_friction", "linear_damping_change"),
+        ("internal_resonance_1_3", "quintic_stiffness"),
+        ("iwan_microslip",),
+    ],
+)
+def test_imitations_are_marked_with_what_would_decide(effects):
+    found = doubts(effects, ())
+    assert found
+    assert not any(doubt.refutes for doubt in found)
+    assert all(doubt.decide_by for doubt in found)
+
+
+def test_a_mode_close_by_is_a_twin_of_much():
+    (doubt,) = doubts(("close_mode",), ())
+    assert doubt.twin
+    assert "second sensor" in doubt.decide_by
+
+
+def test_an_internal_resonance_wider_than_the_frequencies_measured_was_never_seen():
+    kind, stepped = "internal_resonance_1_3", 2 * np.pi * np.array([49.0, 50.0, 51.0])
+    # Half-power points of a mode of 150 Hz and 1 %: 3 Hz apart, passed by the force within 1 Hz.
+    assert not never_seen(kind, (150.0, 0.01), stepped)
+    assert never_seen(kind, (150.0, 0.021), stepped)
+    assert never_seen("internal_resonance_1_2", (150.0, 0.015), stepped)
+    assert not never_seen("gap_stiffness", (0.1,), stepped)
+    assert doubts((kind,), ()) == []
+    (doubt,) = doubts((kind,), (), wide=frozenset({kind}))
+    assert not doubt.twin
+    assert not doubt.refutes
+    assert "wider range" in doubt.decide_by
+
+
+@pytest.mark.parametrize("orders", [(), (2, 3)])
+def test_damping_of_one_direction_is_a_twin_until_harmonic_2_excludes_it(orders):
+    (doubt,) = doubts(("quadratic_damping",), grows("damping", 1.0), orders)
+    assert doubt.twin
+    assert "one direction" in doubt.reason
+    assert ("less noise" in doubt.decide_by) == bool(orders)
+
+
+def test_damping_that_feeds_the_motion_may_be_a_loop():
+    """A loop with the force cos³(θ − 90°) = sin³θ has the fundamental of a cubic damping."""
+    angle = np.linspace(0.0, 2 * np.pi, 65)[:-1]
+    lagging, speed = np.cos(angle - np.pi / 2) ** 3, -np.sin(angle)
+    fed = -np.mean(lagging * speed) / np.mean(speed**4)
+    assert fed == pytest.approx(1.0)  # q̇³ with the coefficient −1
+    feeding = frozenset({"van_der_pol_damping"})
+    (doubt,) = doubts(("van_der_pol_damping",), (), (2, 3), feeding=feeding)
+    assert doubt.twin
+    assert "feedback" in doubt.reason
+    assert doubts(("van_der_pol_damping",), (), (2, 3)) == []
+
+
+def test_a_sensor_that_saturates_is_told_by_harmonic_3():
+    (doubt,) = doubts(("mode_shape_change",), (), ())
+    assert not doubt.twin
+    assert doubts(("mode_shape_change",), (), (2, 3)) == []
+
+
+def test_three_effects_are_doubted():
+    (doubt,) = doubts(("coulomb_friction", "frequency_drift", "cubic_stiffness"), (), (2, 3))
+    assert "three" in doubt.reason
+
+
+def test_a_located_power_of_the_other_part_says_nothing():
+    assert doubts(("coulomb_friction",), grows("stiffness", -0.5)) == []
+
+
+def test_what_would_decide_is_asked_for_and_nothing_beside_it():
+    gains = decide_by({"force_gain_error", "sensor_gain_error"}, harmonics=False)
+    assert "calibrate" in gains.lower()
+    assert "harmonic" not in gains
+    assert "harmonic 2" in decide_by({"gap_stiffness", "one_sided_stop"}, harmonics=False)
+    assert "harmonics" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=False)
+    assert "levels" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=True)

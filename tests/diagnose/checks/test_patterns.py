@@ -1,0 +1,129 @@
+"""What is left of a fit to a linear mode whose natural frequency does what a test makes it do."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from snrmjax.diagnose.checks.patterns import left_curve, pattern
+from snrmjax.diagnose.misfit.effect_fit import Fit, Weighing
+
+LEVELS, PER_LEVEL, DAMPING = 5, 16, 0.01
+N = LEVELS * PER_LEVEL
+LEVEL = np.repeat(np.arange(LEVELS), PER_LEVEL)
+ANGLE = np.tile(np.linspace(-1.0, 1.0, PER_LEVEL), LEVELS)  # phase of the velocity
+SIZE = 1.6**LEVEL * np.cos(ANGLE)
+ORDER = np.linspace(0.0, 1.0, N)
+AMPLITUDE_STD, PHASE_STD = 0.01, np.radians(0.7)
+
+
+def bench_of(phase_unknown=False):
+    """A mode of unit frequency: K = 1 − Ω² + 2iζΩ, and what its errors make of K over noise.
+
+    A velocity with an error ε + iφ needs the force K(1 + ε + iφ): whitening divides by K, and
+    by the two errors' 1σ.
+    """
+    omega = 1 - DAMPING * np.tan(ANGLE)  # the velocity leads below resonance
+    stiffness = 1 - omega**2 + 2j * DAMPING * omega
+    whiten = np.zeros((N, 2, 2))
+    inverse = 1 / stiffness
+    whiten[:, 0, 0], whiten[:, 0, 1] = inverse.real, -inverse.imag
+    whiten[:, 1, 0], whiten[:, 1, 1] = inverse.imag, inverse.real
+    whiten = np.array([1 / AMPLITUDE_STD, 1 / PHASE_STD])[:, None] * whiten
+    # One unit of ω₀² adds 1, one of damping adds iΩ.
+    parts = np.stack([np.ones(N), 1j * omega], axis=1)
+    by_linear = np.einsum("sij,jsk->sik", whiten, np.stack([parts.real, parts.imag]))
+    state, column = np.repeat(np.arange(N), 2), np.tile([0, 1], N)
+    known = np.ones((N, 2), dtype=bool)
+    shared = 0.002 * by_linear.reshape(2 * N, 2)[:, :1]  # of the linear test
+    lower = np.linalg.cholesky(np.eye(2 * N) + shared @ shared.T)
+    velocity = (SIZE * np.exp(1j * ANGLE))[:, None]
+    chosen = SimpleNamespace(
+        states=SimpleNamespace(level=LEVEL, velocity=velocity),
+        rows=np.arange(N),
+        n_levels=LEVELS,
+        phase_unknown=np.full((N, 1), phase_unknown),
+    )
+    return SimpleNamespace(
+        weighing=Weighing(whiten, known, shared, lower, state, column),
+        predictions=SimpleNamespace(chosen=chosen),
+        level_numbers=np.arange(1, LEVELS + 1),
+        by_linear=by_linear.reshape(2 * N, 2),
+        n_rows=2 * N,
+    )
+
+
+def noise(seed=0):
+    return np.random.default_rng(seed).normal(size=2 * N)
+
+
+def misfit(bench, law, part=0):
+    """Of a change of the square of the natural frequency (part 0) or of the damping (1)."""
+    return bench.by_linear[:, part] * np.repeat(law, 2)
+
+
+def fitted(bench, rows, law, part=0):
+    """What is left when so much of a law is taken as fits."""
+    slopes = misfit(bench, law, part)[:, None]
+    left, arms = bench.weighing.decorrelated(rows), bench.weighing.decorrelated(slopes.T).T
+    rows = rows - slopes @ np.linalg.lstsq(arms, left)[0]
+    bounds = np.full(1, np.inf)
+    square = float(np.sum(bench.weighing.decorrelated(rows) ** 2))
+    return Fit(("law",), (), np.zeros(1), square, rows, slopes, -bounds, bounds)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
+def test_noise_of_any_size_has_no_pattern(size):
+    bench = bench_of()
+    for seed in range(8):
+        fit = fitted(bench, size * noise(seed), SIZE**2)
+        assert pattern(bench, fit) is None
+        assert left_curve(bench, fit) is None
+
+
+def test_a_natural_frequency_that_jumps_is_no_drift():
+    bench = bench_of()
+    drift = noise() + misfit(bench, 1e-3 * ORDER)
+    assert left_curve(bench, fitted(bench, drift, ORDER)) is None
+    jump = noise() + misfit(bench, 1e-3 * (ORDER > 0.5))
+    reason = left_curve(bench, fitted(bench, jump, ORDER))
+    assert reason is not None
+    assert "order of the test" in reason
+
+
+@pytest.mark.parametrize(("part", "name"), [(0, "stiffness"), (1, "damping")])
+def test_a_law_of_another_power_leaves_a_curve_of_amplitude(part, name):
+    bench, share = bench_of(), SIZE / SIZE.max()
+    rows = noise() + misfit(bench, 3e-3 * share**4, part)
+    assert left_curve(bench, fitted(bench, rows, share**4, part)) is None
+    reason = left_curve(bench, fitted(bench, rows, share**2, part))
+    assert reason is not None
+    assert f"the {name} as a free function of the amplitude" in reason
+
+
+def test_what_the_answer_itself_could_still_do_is_no_curve():
+    """A fit a little away from its best is no other law."""
+    bench = bench_of()
+    fit = fitted(bench, noise(), SIZE**2)
+    away = fit._replace(rows=fit.rows + misfit(bench, 2e-3 * (SIZE / SIZE.max()) ** 2))
+    assert left_curve(bench, away) is None
+    assert left_curve(bench, away._replace(slopes=np.zeros((2 * N, 0)))) is not None
+
+
+def test_states_at_temperatures_of_their_own_are_no_noise():
+    """Every state has a natural frequency of its own: misfits have one direction."""
+    bench = bench_of()
+    scatter = np.random.default_rng(5).normal(size=N)
+    rows = noise() + misfit(bench, 1e-3 * scatter)
+    reason = pattern(bench, fitted(bench, rows, SIZE**2))
+    assert reason is not None
+    assert "temperatures" in reason
+    # The same number of misfits as large, in all directions, is noise.
+    large = float(np.sqrt(np.mean(rows**2)))
+    assert pattern(bench, fitted(bench, large * noise(1), SIZE**2)) is None
+
+
+def test_curves_are_not_asked_of_sizes():
+    bench = bench_of(phase_unknown=True)
+    rows = noise() + misfit(bench, 1e-3 * (ORDER > 0.5))
+    assert left_curve(bench, fitted(bench, rows, ORDER)) is None

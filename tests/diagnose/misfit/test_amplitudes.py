@@ -1,0 +1,264 @@
+"""Diagnoses without phases: of sets that time integration made, whose phases were taken away."""
+
+import csv
+import dataclasses
+import functools
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truth.balanced_sets import HERE, KEYS, balanced, files, linear_model, quadratic
+
+import snrmjax as sj
+from snrmjax.cli import diagnose
+from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
+from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.effect_fit import Bench
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.identify.calibrate.calibration import calibrate_model
+from snrmjax.identify.calibrate.inverse_force import needed_force
+from snrmjax.model.effects import EFFECTS
+
+
+def without_phases(data, rows=slice(None), seed=0):
+    """The data with phases of some rows turned at random and stated as unknown."""
+    turn = np.exp(2j * np.pi * np.random.default_rng(seed).uniform(size=data.n_states))
+    mine = np.zeros(data.n_states, dtype=bool)
+    mine[rows] = True
+    turn = np.where(mine, turn, 1.0)[:, None]
+    order = np.array(data.harmonic_order)
+    return dataclasses.replace(
+        data,
+        velocity=data.velocity * turn,
+        harmonics=data.harmonics * turn[..., None] ** order,
+        phase_std=jnp.where(mine[:, None], np.radians(90.0), data.phase_std),
+    )
+
+
+@functools.cache
+def stripped(name):
+    """A set without its phases, diagnosed, and its key."""
+    model, data = files(name)
+    return sj.diagnose_model(model, without_phases(data)), KEYS[name]
+
+
+def at_starts(predictions, kind):
+    """What the first start of a kind makes of the states, by its first parameter."""
+    one = candidate(kind, scales_of(predictions))
+    group, labels = predictions.group(kind), parameter_labels(kind)
+    values = group.values.copy()
+    values[[group.place(label) for label in labels]] = one.starts[0]
+    found = predictions.of(group, values[None], labels[:1])
+    slopes = (one.unit[0] * found.slopes, one.unit[0] * found.force_slopes)
+    return found._replace(slopes=slopes[0], force_slopes=slopes[1])
+
+
+def test_every_effect_has_the_same_sizes_whatever_the_phases():
+    """A motion has its force, whatever the time is counted from."""
+    model, data = files("blind_03")
+    measured, none = Predictions(model, data), Predictions(model, without_phases(data))
+    base = alone(none).columns
+    for kind in EFFECTS:
+        known, unknown = at_starts(measured, kind), at_starts(none, kind)
+        # Friction is sampled at other instants of the cycle.
+        np.testing.assert_allclose(
+            np.abs(unknown.phasors), np.abs(known.phasors), rtol=0, atol=2e-4, err_msg=kind
+        )
+        force = known.phasors[:, :, 0]
+        size, change = np.abs(force), known.force_slopes[..., 0]
+        np.testing.assert_allclose(
+            unknown.columns[:, :, 0], size - 1, rtol=0, atol=2e-4, err_msg=kind
+        )
+        slope = np.real(force.conj() * change) / size
+        np.testing.assert_allclose(
+            unknown.slopes[:, :, 0, 0], slope, rtol=0, atol=2e-4, err_msg=kind
+        )
+        assert not np.any(unknown.columns[:, :, 1])
+        # It has strength at all, but for what acts on phases or on harmonics not seen here.
+        change = np.abs(unknown.columns - base)
+        assert (np.max(change) < 1e-6) == (kind == "sensor_phase_error"), kind
+
+
+def alone(predictions):
+    """The baseline by itself."""
+    group = predictions.group("cubic_stiffness")
+    return predictions.of(group, group.values[None])
+
+
+def test_given_phases_of_unknown_worth_are_not_used():
+    model, data = files("blind_03")
+    one, other = (Predictions(model, without_phases(data, seed=k)).chosen.states for k in (0, 1))
+    for name, a, b in zip(one._fields, one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, err_msg=name)
+
+
+def sizes(noise):
+    """One part of every state, a harmonic."""
+    n = len(noise)
+    nowhere = np.zeros((1, 3), dtype=complex)
+    return Sizes(np.ones((n, 1), complex), nowhere, noise[:, None], np.ones((n, 1), bool))
+
+
+def test_small_harmonics_are_expected_as_noise_makes_them():
+    true = np.array([0.0, 0.5, 1.0, 3.0, 8.0])
+    rng, n, noise = np.random.default_rng(0), 400_000, 1.3
+    errors = (rng.normal(size=(n, 1)) + 1j * rng.normal(size=(n, 1))) * noise / np.sqrt(2)
+    measured = np.abs(true + errors)
+    found = sizes(np.full(5, noise))
+    columns = np.zeros((1, 5, 2))
+    columns[0, :, 0] = true - 1
+    slopes = np.zeros((1, 5, 2, 1))
+    slopes[0, :, 0, 0] = 1.0
+    expected, slope = found.compared(columns, slopes)
+    # Five standard errors of the mean, and of the standard deviation.
+    np.testing.assert_allclose(expected[0, :, 0] + 1, measured.mean(axis=0), atol=5 * noise / 632)
+    std = found.own_std(np.zeros((5, 2)), found.phasors(columns)[0])[:, 0]
+    np.testing.assert_allclose(std, measured.std(axis=0), rtol=0.01)
+    step = 1e-6
+    further = found.compared(columns + step, slopes)[0][0, :, 0]
+    # A step along both parts: that across the phasor changes no size to first order.
+    np.testing.assert_allclose((further - expected[0, :, 0]) / step, slope[0, :, 0, 0], atol=1e-5)
+
+
+def test_errors_are_passed_on_to_sizes():
+    model, data = files("blind_03")
+    predictions = Predictions(model, without_phases(data))
+    group = predictions.group("cubic_stiffness")
+    slopes, _ = predictions.by_error(group, group.values)
+    data, step = without_phases(data), 1e-3
+    louder, softer = (
+        Predictions(model, dataclasses.replace(data, velocity=np.exp(sign * step) * data.velocity))
+        for sign in (1, -1)
+    )
+    ends = [alone(p).columns[0, :, 0] for p in (louder, softer)]
+    slope = (ends[0] - ends[1]) / (2 * step)
+    # The force's size grows with the velocity, and more where the stiffness is cubic.
+    # Central differences are off by the square of the step.
+    np.testing.assert_allclose(slopes[:, 0, 1], slope, rtol=1e-4, atol=1e-4)
+    # Differences over a step of 2.5e-5 are off by as much.
+    np.testing.assert_allclose(slopes[:, 0, 0], -1.0, atol=4e-5)
+    # A turn by so little makes parts shorter by half its square.
+    np.testing.assert_allclose(slopes[:, :, 2], 0.0, atol=4e-5)
+
+
+def test_the_hidden_damping_is_named_without_phases():
+    found, key = stripped("blind_12")
+    (truth,) = key["effects"]
+    assert found.verdict in ("named", "ambiguous")
+    assert truth in found.candidates[0]
+    assert len(found.candidates) == 1
+    value, std = found.parameters[f"{truth}.coefficient"]
+    expected = key["parameters"][f"{truth}.coefficient"]
+    assert abs(value - expected) < 4 * std
+    assert value == pytest.approx(expected, rel=0.1)
+    assert [part.part for part in found.located] == ["damping"]
+    out = found.gap.interpolated
+    assert found.gap.before > 1.5
+    assert out.after - 1 < 0.25 * max(out.before - 1, 1.0)
+    assert any("phases of 36 of 36 states are unknown" in note for note in found.notes)
+    assert found.after.shape == (36, 2)
+    assert np.isfinite(found.after[:, 0]).all()
+    assert np.isnan(found.after[:, 1]).all()
+    # The velocities are put where the answer has them: that is where they were measured.
+    measured = np.angle(np.asarray(files("blind_12")[1].velocity)[:, 0])
+    model, data = files("blind_12")
+    bench = Bench(Predictions(model, without_phases(data)))
+    one = candidate(truth, scales_of(bench.predictions))
+    fit = bench.fitted(one._replace(starts=((value,),)))
+    turned = np.angle(np.asarray(bench.turned(fit).predictions.chosen.states.velocity)[:, 0])
+    assert np.degrees(np.abs(turned - measured)).max() < 4  # 0.7° of noise, and the model's own
+
+
+@pytest.mark.long
+def test_an_error_of_the_phase_cannot_be_seen_without_phases():
+    found, key = stripped("blind_09")
+    assert key["effects"] == ["sensor_phase_error"]
+    assert found.verdict == "none"
+    assert any("sensor's phase cannot be seen" in note for note in found.notes)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["blind_08", "blind_10"])
+def test_a_hidden_gap_or_friction_is_in_the_answer_without_phases(name):
+    found, key = stripped(name)
+    assert found.verdict in ("named", "ambiguous")
+    assert key["effects"][0] in found.candidates[0]
+    assert found.gap.after == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
+    """No effect, with harmonics: nothing is found, and limits are given for what can be seen."""
+    with (HERE / "blind" / "blind_03.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = tmp_path / "amplitudes.csv"
+    with table.open("w", newline="") as file:
+        kept = [c for c in rows[0] if c not in ("velocity_re_m_s", "velocity_im_m_s")]
+        writer = csv.DictWriter(file, [*kept, "velocity_m_s"], extrasaction="ignore")
+        writer.writeheader()
+        for row in rows:
+            size = np.hypot(float(row["velocity_re_m_s"]), float(row["velocity_im_m_s"]))
+            writer.writerow(row | {"velocity_m_s": repr(float(size))})
+    out = tmp_path / "out"
+    diagnose([table], HERE / "blind" / "blind_03.toml", out)
+    told = json.loads((out / "diagnosis.json").read_text())
+    assert told["verdict"] == "none"
+    assert told["effects"] == []
+    assert told["gap"]["after"] == pytest.approx(1.0, abs=0.2)
+    limits = told["detection_limits"]
+    # Errors of phase do not show without phases, and a mode close by is no candidate.
+    unlimited = {"sensor_phase_error", "close_mode"}
+    assert {name.split(".")[0] for name in limits} == set(EFFECTS) - unlimited
+    assert all(0 < limit < np.inf for limit in limits.values())
+    notes = " ".join(told["notes"])
+    assert "phases of 50 of 50 states are unknown" in notes
+    assert "of harmonics the sizes alone" in notes
+    assert (out / "residuals.png").stat().st_size > 10_000
+    # An effect as large as its limit moves χ² by what detection asks for.
+    model, data = files("blind_03")
+    bench = Bench(Predictions(model, without_phases(data)))
+    for kind in ("linear_damping_change", "linear_frequency_shift", "cubic_stiffness"):
+        one = candidate(kind, scales_of(bench.predictions))
+        limit = limits[parameter_labels(kind)[0]]
+        rows = bench.at_start(one._replace(starts=((limit,),))).rows
+        need = 10.0 + np.log(bench.n_rows)
+        assert bench.chi_square(rows - bench.base) == pytest.approx(need, rel=0.1), kind
+
+
+def test_states_with_and_without_phases_stand_side_by_side():
+    model = linear_model()
+    found = sj.diagnose_model(model, without_phases(balanced(quadratic), slice(0, None, 2)))
+    assert "quadratic_damping" in found.candidates[0]
+    assert any("phases of 23 of 45 states" in note for note in found.notes)
+    assert "sensor_phase_error.phase_deg" in found.detection_limits
+    assert np.isnan(found.after[::2, 1]).all()
+    assert np.isfinite(found.after[1::2]).all()
+    assert np.isfinite(found.p_value)
+
+
+def test_amplitudes_count_once():
+    model, data = linear_model(), without_phases(balanced(quadratic))
+    bench = Bench(Predictions(model, data))
+    assert bench.n_rows == data.n_states
+    assert sizes_of(bench.predictions.chosen).alone.all()
+    few = balanced(quadratic, levels=1, per_level=11)
+    sj.diagnose_model(model, few)
+    with pytest.raises(ValueError, match="or 12 where phases are unknown, not 11"):
+        sj.diagnose_model(model, without_phases(few))
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        lambda model, data: sj.identify_points(data, model.modes),
+        lambda model, data: sj.fit_jointly(data, model.modes),
+        lambda model, data: calibrate_model(model, data, ["mode_1.damping_ratio"]),
+        needed_force,
+    ],
+)
+def test_what_needs_phases_says_so(verb):
+    data = without_phases(balanced(quadratic), slice(0, 2))
+    with pytest.raises(
+        ValueError, match=r"needs the phases .* 2 of 45 .*`velocity_m_s`.* diagnosis"
+    ):
+        verb(linear_model(), data)

@@ -1,0 +1,156 @@
+"""Predictions of the quick programs against Newton's method and finite differences."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+import snrmjax as sj
+from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.programs import HARMONICS
+from snrmjax.identify.calibrate.inverse_force import needed_force
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+
+OMEGA, ZETA = 300.0, 0.01
+QUICK = ("gap_stiffness", "iwan_microslip", "internal_resonance_1_3", "mode_shape_change")
+EVERY = [k if k in QUICK else pytest.param(k, marks=pytest.mark.long) for k in EFFECTS]
+
+
+@pytest.fixture(scope="module")
+def predictions():
+    """States that a linear model needs two per cent more force for."""
+    modes = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    model = dataclasses.replace(sj.structure(modes), name="")
+    frequency = OMEGA * np.tile(np.linspace(0.98, 1.02, 4), 2)
+    q = np.repeat([1e-3, 3e-3], 4) * np.exp(1j * np.tile([-0.5, -1.2, -2.0, -2.6], 2))
+    needed = np.abs((OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency) * q) / 3.0
+    level = np.repeat([1, 2], 4)
+    data = sj.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
+    return Predictions(model, data), data
+
+
+class SmoothFriction(sj.AbstractMemoryless):
+    """f = c tanh(q̇/knee): an effect of a user, who says nothing of what is typical."""
+
+    kind: ClassVar[str] = "smooth_friction"
+    coefficient: Array
+    knee: Array
+
+    def force(self, displacement, velocity):
+        """See `AbstractMemoryless.force`."""
+        return self.coefficient * jnp.tanh(velocity / self.knee)
+
+
+@pytest.fixture
+def own_friction(predictions):
+    """Predictions with an effect of one's own, its structure and its parameters."""
+    ours, data = predictions
+    sj.register_effect(SmoothFriction)
+    own = Predictions(ours.model, data)
+    yield own, own.group("smooth_friction"), parameter_labels("smooth_friction")
+    del EFFECTS["smooth_friction"]
+
+
+def moderate(kind, scales):
+    """Parameters that change the motion plainly, but not greatly."""
+    start = list(candidate(kind, scales).starts[-1])
+    start[0] *= 0.5
+    return np.array(start)
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
+    ours, data = predictions
+    values = moderate(kind, scales_of(ours))
+    found = asked(ours, kind, values[None])[0]
+    effect = make_effect(kind, dict(zip(effect_parameters(kind), values, strict=True)))
+    model = dataclasses.replace(ours.model, effects=(effect,))
+    needed = needed_force(model, data, harmonic_order=HARMONICS)
+    assert needed.converged.all()
+    missed = np.asarray(needed.force) / np.asarray(data.force) - 1
+    # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.
+    # Steps end below 1e-5.
+    tolerance = 1e-4 if kind == "iwan_microslip" else 1e-5
+    change = np.max(np.abs(missed - missed_by(ours)))
+    assert np.max(np.abs(found - missed)) < tolerance * max(change, 1e-3)
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_slopes_are_those_of_finite_differences(predictions, kind):
+    ours, _ = predictions
+    values = moderate(kind, scales_of(ours))
+    group, labels = ours.group(kind), parameter_labels(kind)
+    every = group.values.copy()
+    every[[group.place(label) for label in labels]] = values
+    slopes = ours.of(group, every[None], labels).slopes[0]
+    for k in range(len(labels)):
+        step = np.zeros(len(labels))
+        step[k] = 1e-3 * (abs(values[k]) or 1.0)
+        up, down = asked(ours, kind, np.stack([values + step, values - step]))
+        expected = (up - down) / (2 * step[k])
+        found = slopes[:, 0, k] + 1j * slopes[:, 1, k]
+        # They carry the baseline's Jacobian: exact for what an effect does by itself.
+        assert np.max(np.abs(found - expected)) < 0.03 * np.max(np.abs(expected)) + 1e-12
+
+
+def asked(ours, kind, values):
+    """Complex force misfits of trials, over the measured force."""
+    group, labels = ours.group(kind), parameter_labels(kind)
+    every = np.tile(group.values, (len(values), 1))
+    every[:, [group.place(label) for label in labels]] = values
+    found = ours.of(group, every)
+    return found.columns[..., 0] + 1j * found.columns[..., 1]
+
+
+def missed_by(ours):
+    """The same of the baseline."""
+    group = ours.group("cubic_stiffness")
+    found = ours.of(group, group.values[None])
+    return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
+
+
+def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions):
+    ours, _ = predictions
+    group, label = ours.group("cubic_stiffness"), "cubic_stiffness.coefficient"
+    usual = ours.of(group, group.values[None], [label]).slopes[0, :, :2, 0]
+    far = group._replace(unit=1e7 * group.unit)
+    there = group.values.copy()
+    there[group.place(label)] = 2.5e-4 * far.unit[group.place(label)]
+    lost = ~np.isfinite(ours.of(group, there[None]).columns).all(axis=(0, 2))
+    assert lost[4:].all()  # the larger motions
+    slopes = ours.of(far, group.values[None], [label]).slopes[0, :, :2, 0]
+    # What holds the motion is linear in the coefficient, and so is the first step.
+    np.testing.assert_allclose(slopes[lost], usual[lost], rtol=0, atol=1e-2 * np.abs(usual).max())
+
+
+def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions):
+    """A coefficient is 1e-3 of its own 1σ: the slope is that of the force of a cubic spring."""
+    _, data = predictions
+    linear = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    potential = sj.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
+    ours = Predictions(dataclasses.replace(sj.structure(linear, potential), name=""), data)
+    group = ours.group("cubic_stiffness")
+    slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
+    frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
+    # ∂V/∂q = 4 a q³, whose fundamental is 3 a |q|² q.
+    q = velocity / (2j * frequency)
+    expected = 3 * np.abs(q) ** 2 * q / 3.0 / np.asarray(data.force)
+    np.testing.assert_allclose(slopes[:, 0] + 1j * slopes[:, 1], expected[:, None], rtol=1e-2)
+
+
+def test_shapes_of_ones_own_effect_have_slopes_whatever_their_size(own_friction):
+    """A knee of 3e-4 m/s, of which nothing says that one is no unit for it."""
+    ours, group, labels = own_friction
+    values = group.values.copy()
+    places = [group.place(label) for label in labels]
+    values[places] = 0.3 * group.unit[places[0]], 3e-4
+    slopes = ours.of(group, values[None], labels).slopes[0, :, :, 1]
+    ends = np.stack([values, values])
+    ends[:, places[1]] += np.array([1e-3, -1e-3]) * 3e-4
+    columns = ours.of(group, ends).columns
+    expected = (columns[0] - columns[1]) / (2e-3 * 3e-4)
+    np.testing.assert_allclose(slopes, expected, atol=0.03 * np.abs(expected).max())

@@ -1,0 +1,117 @@
+"""The power of amplitude that a free curve follows, from curves whose power is known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from snrmjax.diagnose.checks.doubts import doubts
+from snrmjax.diagnose.misfit.effect_fit import Fit, Weighing
+from snrmjax.diagnose.search.locating import located, own_power, power_of_amplitude
+
+AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
+OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common
+COVARIANCE = OWN**2 * np.eye(6) + SHARED**2 * np.ones((6, 6))
+
+
+def drawn(rng, power):
+    """A free curve, one at its largest, with its errors."""
+    exact = np.exp(power * AMPLITUDE)
+    return exact / exact.max() + OWN * rng.normal(size=6) + SHARED * rng.normal()
+
+
+def test_the_power_and_its_error_are_right_with_an_offset_that_is_not_known():
+    rng = np.random.default_rng(0)
+    for power in (1.0, 2.0, 4.0, -1.0):
+        found = [power_of_amplitude(AMPLITUDE, drawn(rng, power), COVARIANCE) for _ in range(200)]
+        told = np.array([pair for pair in found if pair[0] is not None])
+        assert len(told) > 180
+        off = (told[:, 0] - power) / told[:, 1]
+        assert abs(np.mean(off)) < 0.25
+        assert 0.8 < np.std(off) < 1.25
+
+
+def test_small_changes_are_kept_although_they_are_not_seen_one_by_one():
+    """Of those beyond two standard deviations alone the power would come out too low."""
+    rng = np.random.default_rng(1)
+    covariance = 0.15**2 * np.eye(6)
+    found = [
+        power_of_amplitude(AMPLITUDE, np.exp(2 * AMPLITUDE) + 0.15 * rng.normal(size=6), covariance)
+        for _ in range(300)
+    ]
+    told = np.array([pair for pair in found if pair[0] is not None])
+    assert np.median(told[:, 0]) > 1.85
+    assert np.mean(np.abs(told[:, 0] - 2.0) < 1.96 * told[:, 1]) > 0.9
+
+
+def test_a_curve_of_no_power_has_none():
+    rng = np.random.default_rng(2)
+    covariance = OWN**2 * np.eye(6)
+    peak = np.array([0.0, 0.8, 1.0, 0.6, 0.3, 0.1])
+    assert power_of_amplitude(AMPLITUDE, peak, covariance) == (None, None)
+    assert power_of_amplitude(AMPLITUDE, OWN * rng.normal(size=6), covariance) == (None, None)
+
+
+def softened(amplitude):
+    """Fundamental amplitude and ω² of q̈ + q + q² = 0, whose motion begins at rest at −amplitude.
+
+    By quadrature over the angle θ in q = middle − half·cos θ between the turning points.
+    """
+    theta = (np.arange(400) + 0.5) * np.pi / 400
+    low = -amplitude
+    # ½q² + ⅓q³ has one value at both ends: the other root beside q = low, within the well.
+    high = np.max(np.roots([1 / 3, 0.5 + low / 3, low * (0.5 + low / 3)]).real)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    q = middle - half * np.cos(theta)
+    # 2(V(low) − V(q)) = (q − low)(high − q)(⅔(q + low + high) + 1)
+    slow = 1 / np.sqrt(2 / 3 * (q + low + high) + 1)
+    time = np.cumsum(slow) - 0.5 * slow
+    omega = 1 / np.mean(slow)
+    phase = np.pi * time / np.sum(slow)
+    # Over half a period in time; the other half mirrors it.
+    return abs(2 * np.sum(q * np.cos(phase) * slow) / np.sum(slow)), omega**2
+
+
+def test_quadratic_softening_has_the_power_of_its_own_motion():
+    """To lowest order it goes with the square of the amplitude; at large ones with more."""
+    pairs = np.array([softened(a) for a in np.repeat(np.linspace(0.1, 0.62, 40), 2)])
+    small = softened(0.01)
+    # −5/6 X₁², the next term X₁⁴ of order one.
+    assert small[1] - 1 == pytest.approx(-5 / 6 * small[0] ** 2, rel=1e-3)
+    size, change = pairs[:, 0], pairs[:, 1] - 1
+    n = len(size)
+    by_linear = np.tile(np.eye(2), (n, 1)) / 1e-3
+    known, state = np.ones((n, 2), dtype=bool), np.repeat(np.arange(n), 2)
+    weighing = Weighing(
+        np.tile(np.eye(2) / 1e-3, (n, 1, 1)), known, np.zeros((2 * n, 0)), np.eye(2 * n), state,
+        np.tile([0, 1], n),
+    )  # fmt: skip
+    bench = SimpleNamespace(
+        weighing=weighing,
+        by_linear=by_linear,
+        force=np.ones(n, dtype=complex),
+        force_by_linear=np.zeros((n, 2), dtype=complex),
+        predictions=SimpleNamespace(
+            states=[None] * 4 + [size[:, None]],
+            sizes=SimpleNamespace(alone=np.zeros((n, 1), dtype=bool)),
+            chosen=SimpleNamespace(orders=(), phase_unknown=np.zeros((n, 1), dtype=bool)),
+        ),
+    )
+    left = np.random.default_rng(0).normal(size=2 * n)
+    none, no_slopes = np.zeros(0), np.zeros((2 * n, 0))
+    law = by_linear[:, 0] * np.repeat(change, 2)
+    nothing = Fit((), (), none, 0.0, left - law, no_slopes, none, none)
+    fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
+    parts = located(bench, nothing).parts
+    (part,) = (one for one in parts if one.part == "stiffness")
+    own = own_power(bench, nothing, fit, "stiffness")
+    assert own_power(bench, nothing, fit, "damping") is None
+    assert abs(part.exponent - 2) > 4 * part.exponent_std
+    assert abs(part.exponent - own) < 2 * part.exponent_std
+    for seed in range(1, 5):  # what noise leaves is no part of the answer's own
+        other = np.random.default_rng(seed).normal(size=2 * n)
+        again = nothing._replace(rows=other - law), fit._replace(rows=other)
+        assert own_power(bench, *again, "stiffness") == own
+    (doubt,) = doubts(fit.kinds, parts)
+    assert doubt.refutes
+    assert doubts(fit.kinds, parts, own_power=own) == []

@@ -1,0 +1,155 @@
+"""What models foretell of a test, against closed forms of a linear mode."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.diagnose.misfit.predictions import without_strength
+from snrmjax.diagnose.response_prediction import (
+    level_forces,
+    level_responses,
+    level_simulations,
+    measured_resonance,
+    responses,
+    simulated_resonance,
+)
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+
+OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
+FORCES = (1.0, 4.0)
+FEW = ("one_sided_stop", "quadratic_damping", "force_gain_error", "residual_mode")
+
+
+def linear():
+    """One mode, driven and seen at the same place."""
+    modes = sj.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE])
+    return sj.structure(modes)
+
+
+def states(model, phases=(-40.0, -15.0, 20.0, 45.0)):
+    """Exact states of the linear mode: V = iΩ·φ²F/(ω² − Ω² + 2iζωΩ)."""
+    rows = []
+    for level, force in enumerate(FORCES):
+        for phase in np.radians(phases):
+            # tan φ = (ω² − Ω²)/(2ζωΩ), solved for Ω.
+            b = ZETA * OMEGA * np.tan(phase)
+            frequency = -b + np.sqrt(b**2 + OMEGA**2)
+            stiffness = OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency
+            rows.append((level, frequency, force, 1j * frequency * SHAPE**2 * force / stiffness))
+    return sj.steady_states(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def test_resonances_of_a_linear_mode_are_its_own():
+    model = linear()
+    data = states(model)
+    curves = responses(model, data, FORCES)
+    for level, force in enumerate(FORCES):
+        exact = SHAPE**2 * force / (2 * ZETA * OMEGA)
+        for found in (measured_resonance(data, level, 0), simulated_resonance(curves[level], 0)):
+            # Ω is not quite straight against tan φ: ζ² tan φ₁ tan φ₂/2 is 5e-6 here.
+            assert found.frequency == pytest.approx(50.0, rel=1e-5)
+            assert found.velocity == pytest.approx(exact, rel=1e-6)
+
+
+def with_kinds(model, kinds):
+    """The model with effects of these kinds."""
+    effects = [
+        make_effect(k, {n: 1.5 if n == "exponent" else 0.1 for n in effect_parameters(k)})
+        for k in kinds
+    ]
+    return dataclasses.replace(model, effects=tuple(effects))
+
+
+@pytest.mark.parametrize("kinds", [FEW, pytest.param(tuple(EFFECTS), marks=pytest.mark.long)])
+def test_without_strength_no_kind_counts(kinds):
+    model, data = linear(), states(linear())
+    same = without_strength(model, with_kinds(model, kinds))
+    assert [effect.kind for effect in same.effects] == list(kinds)
+    for force, curves in zip(FORCES, responses(same, data, FORCES), strict=True):
+        found = simulated_resonance(curves, 0)
+        assert found.frequency == pytest.approx(50.0, rel=1e-9)
+        assert found.velocity == pytest.approx(SHAPE**2 * force / (2 * ZETA * OMEGA), rel=1e-9)
+
+
+def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
+    model, data = linear(), states(linear())
+    # ζ + Δ: at resonance the velocity is ζ/(ζ + Δ) of what it was.
+    doubled, tripled = (
+        dataclasses.replace(
+            model, effects=(make_effect("linear_damping_change", {"damping_ratio_change": more}),)
+        )
+        for more in (ZETA, 2 * ZETA)
+    )
+    found = level_simulations(model, doubled, {1: tripled}, data, 0)
+    assert [len(part) for part in found] == [2, 2, 1]
+    rows = level_responses(found, data, 0)
+    assert [row.held_out for row in rows] == [False, True]
+    for row, factor in zip(rows, (2.0, 3.0), strict=True):
+        tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
+        assert row.before.velocity == pytest.approx(tip, rel=1e-9)
+        assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
+    louder = level_responses(level_simulations(model, doubled, {}, data, 0, 1.5), data, 0)
+    for row, same in zip(louder, rows, strict=True):
+        assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)
+        tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
+        assert row.after.velocity == pytest.approx(1.5 * tip / 2.0, rel=1e-9)
+
+
+def test_responses_are_those_that_instruments_record():
+    """A force and a velocity of the mode become others; in phase they are elsewhere."""
+    chain = (
+        make_effect("force_gain_error", {"gain": 0.2}),
+        make_effect("force_offset_error", {"offset": 0.3}),
+        make_effect("sensor_gain_error", {"gain": 0.1}),
+        make_effect("sensor_phase_error", {"phase_deg": 5.0}),
+        make_effect("mode_shape_change", {"coefficient": 1e4}),
+    )
+    model = dataclasses.replace(linear(), effects=chain)
+    for force, curves in zip(FORCES, responses(model, states(linear()), FORCES), strict=True):
+        seen = simulated_resonance(curves, 0)
+        acting = 1.2 * (force + 0.3)  # the gain stands first: it acts first
+        assert curves[0].force == pytest.approx(force, rel=1e-12)
+        at = 2 * np.pi * seen.frequency
+        q = SHAPE * acting / (OMEGA**2 - at**2 + 2j * ZETA * OMEGA * at)
+        own = 1j * at * SHAPE * q
+        assert np.degrees(np.angle(own)) == pytest.approx(-5.0, abs=0.02)
+        size = abs(own) * (1 + 1e4 * abs(q) ** 2) * 1.1
+        assert seen.velocity == pytest.approx(size, rel=1e-3)
+
+
+def test_a_level_on_one_side_of_resonance_has_no_measured_one():
+    assert np.isnan(measured_resonance(states(linear(), (10.0, 30.0)), 0, 0).frequency)
+
+
+def test_the_force_of_a_level_is_that_at_its_resonance():
+    data = states(linear(), (-40.0, -10.0, 10.0, 40.0))
+    # Holding the response takes more force away from resonance.
+    held = data.force * np.tile([1.4, 1.1, 1.1, 1.4], len(FORCES))
+    found = level_forces(eqx.tree_at(lambda d: d.force, data, held))
+    assert found == pytest.approx({0: 1.1 * FORCES[0], 1: 1.1 * FORCES[1]})
+    aside = states(linear(), (10.0, 40.0))
+    assert level_forces(aside) == pytest.approx(dict(enumerate(FORCES)))
+
+
+def test_without_phases_a_resonance_is_the_largest_velocity_over_force():
+    model = linear()
+    known = states(model, phases=(-40.0, -15.0, 5.0, 45.0))
+    blind = dataclasses.replace(
+        known,
+        velocity=np.abs(known.velocity) + 0j,
+        phase_std=np.full(known.velocity.shape, np.pi),
+    )
+    assert level_forces(blind) == dict(enumerate(FORCES))
+    for level, force in enumerate(FORCES):
+        found = measured_resonance(blind, level, 0)
+        # The state 5° off resonance: |V| is that at resonance times cos 5°.
+        tip = SHAPE**2 * force / (2 * ZETA * OMEGA)
+        assert found.velocity == pytest.approx(tip * np.cos(np.radians(5)), rel=1e-9)
+        assert found.frequency == pytest.approx(OMEGA / (2 * np.pi), rel=1e-3)
+    # One side alone says nothing of where the resonance is.
+    side = states(model, phases=(10.0, 30.0, 50.0))
+    side = dataclasses.replace(side, phase_std=np.full(side.velocity.shape, np.pi))
+    assert np.isnan(measured_resonance(side, 0, 0).frequency)

@@ -1,0 +1,216 @@
+"""Responses of a joint fit against its curves' closed form, bands against differences."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truth.exact_states import CONSTANT, damping, modes, noisy, squared
+
+import snrmjax as sj
+from snrmjax.identify.inference.fitted_response import as_backbone, point_slopes
+
+FORCE = 2.2  # N: folds are there
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """A fit of noisy states: stiffness of the displacement, damping of the velocity."""
+    return sj.fit_jointly(
+        noisy(1, gain=0.01),
+        modes(),
+        level_gain_std=0.01,
+        backbone="polynomial:1@displacement",
+        damping="viscous_quadratic@velocity",
+    )
+
+
+@pytest.fixture(scope="module")
+def exact_fit():
+    """The same of exact states: its curves are the known ones."""
+    return sj.fit_jointly(
+        noisy(),
+        modes(),
+        backbone="polynomial:1@displacement",
+        damping="viscous_quadratic@velocity",
+    )
+
+
+def moved(fit, vector):
+    """The fit with other unknowns."""
+    return eqx.tree_at(lambda f: f.unknowns, fit, fit.vector()[1](jnp.asarray(vector)))
+
+
+def test_resonance_of_known_curves(exact_fit):
+    found = sj.fitted_response(exact_fit, FORCE)[0].resonances[0]
+    low, high = 1e-5, 1e-2
+    for _ in range(200):  # X with X ω̃ δ(X ω̃) = A F, by bisection
+        middle = 0.5 * (low + high)
+        speed = middle * np.sqrt(squared(middle))
+        low, high = (middle, high) if speed * damping(speed) < CONSTANT * FORCE else (low, middle)
+    assert found.frequency == pytest.approx(np.sqrt(squared(low)), rel=1e-8)
+    assert found.velocity == pytest.approx(low * np.sqrt(squared(low)), rel=1e-8)
+    assert not found.continued
+
+
+def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
+    # ω̃² = a(1 − 0.4 u): X ω̃ has its largest value at u = 1.25, short of 1.5² times the data.
+    vector = np.array(exact_fit.vector()[0])
+    vector[1] = -0.4 * vector[0]
+    falling = moved(exact_fit, vector)
+    x = 0.5 * float(falling.unknowns.squared_frequency.scale)
+    speed = x * np.sqrt(vector[0] * (1 - 0.4 * 0.25))
+    force = speed * float(falling.unknowns.modal_damping(speed)) / CONSTANT
+    # Beyond that turn the velocity falls, and the force has a second resonance there.
+    tips = sj.fitted_response(falling, force)[0].resonances
+    (found,) = (point for point in tips if not point.continued)
+    assert found.frequency == pytest.approx(speed / x, rel=1e-9)
+    assert found.velocity == pytest.approx(speed, rel=1e-9)
+
+
+def test_every_point_obeys_the_known_curves(exact_fit):
+    curve = sj.fitted_response(exact_fit, FORCE)[0]
+    speed = np.abs(curve.velocity)
+    x = speed / curve.frequency
+    needed = squared(x) - curve.frequency**2 + 1j * curve.frequency * damping(speed)
+    # Newton steps end at rounding, which a steep flank of the curve enlarges.
+    np.testing.assert_allclose(np.abs(needed) * x / CONSTANT, FORCE, rtol=1e-8)
+    np.testing.assert_allclose(np.angle(needed) + np.angle(curve.velocity), np.pi / 2, atol=1e-8)
+
+
+def test_folds_are_where_the_frequency_turns(exact_fit):
+    found = sj.fitted_response(exact_fit, FORCE)[0].folds
+    assert len(found) == 2
+    # Ω against X at fixed force, scanned: |(ω̃² − Ω²) + iΩδ| X = A F by bisection above ω̃.
+    x = np.linspace(4e-4, 2.2e-3, 4001)
+
+    def needed(omega):
+        return np.abs(squared(x) - omega**2 + 1j * omega * damping(x * omega)) * x
+
+    upper = np.sqrt(squared(x))
+    there = needed(upper) < CONSTANT * FORCE
+    low, high = upper.copy(), 3 * upper
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        below = needed(middle) < CONSTANT * FORCE
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    omega = np.where(there, low, np.nan)
+    turns = [np.nanmin(omega[: int(np.nanargmax(omega))]), np.nanmax(omega)]
+    np.testing.assert_allclose(sorted(p.frequency for p in found), sorted(turns), rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["resonance", "fold"])
+def test_slopes_of_points_are_central_differences(fit, kind):
+    curve = sj.fitted_response(fit, FORCE)[0]
+    best = max(curve.resonances if kind == "resonance" else curve.folds, key=lambda p: p.velocity)
+    slopes = point_slopes(fit, FORCE, kind, best)
+    vector = np.asarray(fit.vector()[0])
+    for k in range(4):  # the curves' own parameters
+        step = 1e-5 * max(abs(vector[k]), 1.0)
+        values = []
+        for sign in (1, -1):
+            there = moved(fit, vector + sign * step * np.eye(len(vector))[k])
+            one = sj.fitted_response(there, FORCE)[0]
+            points = one.resonances if kind == "resonance" else one.folds
+            near = max(points, key=lambda p: p.velocity)
+            values.append([near.frequency, near.velocity])
+        difference = (np.array(values[0]) - np.array(values[1])) / (2 * step)
+        # Differences are good to step² and to the points' 1e-9 over the step.
+        np.testing.assert_allclose(slopes[:, k], difference, rtol=1e-4, atol=1e-7)
+    std = np.sqrt(np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes))
+    np.testing.assert_allclose([best.frequency_std, best.velocity_std], std, rtol=1e-9)
+
+
+def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
+    rng = np.random.default_rng(0)
+    vector = np.asarray(fit.vector()[0])
+    root = np.linalg.cholesky(fit.covariance + 1e-14 * np.eye(len(vector)))
+    speeds = np.array([0.3, 0.6, 0.85])
+    drawn = [
+        np.asarray(
+            sj.fitted_values(
+                moved(fit, vector + root @ rng.normal(size=len(vector))), speeds
+            ).modal_damping
+        )
+        for _ in range(150)
+    ]
+    values = sj.fitted_values(fit, speeds)
+    # 150 draws know a spread to 1/sqrt(300).
+    np.testing.assert_allclose(np.std(drawn, axis=0), values.modal_damping_std, rtol=3 * 0.058)
+
+
+def test_a_new_level_has_a_wider_band(fit):
+    spread = dataclasses.replace(fit.spread, level=np.array([0.01, 0.0, 0.004, 0.05]))
+    scattering = dataclasses.replace(fit, spread=spread)
+    speeds = np.array([0.3, 0.8])
+    plain = sj.fitted_values(scattering, speeds)
+    wide = sj.fitted_values(scattering, speeds, of_a_new_level=True)
+    extra = np.sqrt(wide.modal_damping_std**2 - plain.modal_damping_std**2)
+    np.testing.assert_allclose(extra, 0.05 * np.asarray(plain.modal_damping), rtol=1e-9)
+
+
+def test_the_backbone_for_other_tools_is_the_same_curve(fit):
+    backbone = as_backbone(fit)
+    amplitude = np.linspace(2e-4, 1.9e-3, 9)
+    speed = np.asarray(backbone.velocity(amplitude))
+    values = sj.fitted_values(fit, speed)
+    # 120 knots of a shape-preserving cubic.
+    np.testing.assert_allclose(
+        backbone.natural_frequency(amplitude), values.natural_frequency, rtol=1e-5
+    )
+    np.testing.assert_allclose(backbone.modal_damping(amplitude), values.modal_damping, rtol=1e-4)
+
+
+def test_advice_narrows_the_band_and_avoids_what_cannot_be_measured(fit):
+    advice = sj.next_measurements(fit, 4)
+    ratios = [one.expected_band_ratio for one in advice]
+    assert all(np.diff(ratios) < 0)
+    assert 0 < ratios[-1] < ratios[0] < 1
+    for one in advice:
+        curve = sj.fitted_response(fit, one.force)[0]
+        near = np.argmin(np.abs(curve.velocity - one.velocity * np.exp(1j * one.phase)))
+        assert curve.stable[near]
+        assert not curve.continued[near]
+        assert all(abs(one.frequency / f.frequency - 1) > 0.002 for f in curve.folds)
+        assert one.reason
+
+
+def test_advice_holds_what_it_promises():
+    """The measured ratio of bands after adding the advised state is the expected one."""
+    settings = {"level_gain_std": 0.01, "backbone": "polynomial:1@displacement"}
+    settings["damping"] = "viscous_quadratic@velocity"
+    data = noisy(3, gain=0.01)
+    fit = sj.fit_jointly(data, modes(), **settings)
+    level = np.asarray(fit.data.level)
+    one = sj.next_measurements(fit, 1, target="damping")[0]
+    velocity = one.velocity * np.exp(1j * one.phase)
+    more = sj.steady_states(
+        [level.max() + 1],
+        [one.frequency],
+        [one.force],
+        [velocity],
+        velocity_std=np.array([0.01 * one.velocity]),
+        phase_std=np.array([0.012]),
+        force_std=np.array([0.003 * one.force]),
+    )
+    again = sj.fit_jointly(sj.join_steady_states(data, more), modes(), **settings)
+    assert not fit.level_std[1:].any()  # scatter that one fit finds and the other does not
+    assert not again.level_std[1:].any()  # would move the bands too
+    speeds = np.abs(np.asarray(fit.motion().velocity))
+    at = np.linspace(speeds.min(), speeds.max(), 25)
+    bands = [
+        np.mean(np.asarray(v.modal_damping_std / v.modal_damping))
+        for v in (sj.fitted_values(f, at) for f in (again, fit))
+    ]
+    # The state said nothing new (it lies on the fit's curve): only the bands move.
+    assert bands[0] / bands[1] == pytest.approx(one.expected_band_ratio, abs=0.01)
+
+
+def test_wrong_targets_are_said(fit):
+    with pytest.raises(ValueError, match="target_force"):
+        sj.next_measurements(fit, 1, target="fold")
+    with pytest.raises(ValueError, match="has no fold"):
+        sj.next_measurements(fit, 1, target="fold", target_force=0.05)
+    with pytest.raises(ValueError, match="no stable state"):
+        sj.next_measurements(fit, 1, from_frequency=5000.0)

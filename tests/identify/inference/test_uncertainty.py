@@ -1,0 +1,143 @@
+"""Uncertainty of a joint fit: derivatives against refits, and its ways against each other."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truth.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
+
+import snrmjax as sj
+from snrmjax.identify.inference.uncertainty import (
+    bootstrap,
+    compare_bands,
+    contributions,
+    profile,
+    sensitivity,
+)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """A fit of noisy states, level gains included."""
+    return sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+
+
+def test_derivatives_by_measurements_are_those_of_refits(fit):
+    import optimistix as optx
+
+    from snrmjax.identify.joint.force_balance import weighing_at
+    from snrmjax.identify.joint.free_unknowns import Restore
+    from snrmjax.identify.joint.joint_fit import SOLVER
+    from snrmjax.identify.joint.residuals import freed_residuals
+
+    slopes = sensitivity(fit).by_measurement
+    vector, restore = fit.vector()
+    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
+    unit = np.sqrt(np.diag(fit.covariance))
+
+    def refit(state, kind, change):
+        """The same least squares with one record changed."""
+        factor = jnp.ones(len(fit.data.level)).at[state].set(np.exp(change))
+        name, by = {
+            0: ("force", factor),
+            1: ("velocity", factor),
+            2: ("velocity", factor.astype(complex) ** 1j),
+        }[kind]
+        data = eqx.tree_at(lambda d: getattr(d, name), fit.data, getattr(fit.data, name) * by)
+        return np.asarray(refitted(data))
+
+    @eqx.filter_jit
+    def refitted(data):
+        found = optx.least_squares(
+            lambda y, own: freed_residuals(
+                *(vector + y * unit, Restore(fit.unknowns, ()), own, fit.modes, fit.spread),
+                *(weighing, jnp.asarray(True)),
+            ),
+            *(SOLVER, jnp.zeros_like(vector)),
+            args=data,
+        )
+        return vector + found.value * unit
+
+    for state, kind in ((3, 0), (20, 1), (41, 2)):
+        step = 1e-4
+        difference = (refit(state, kind, step) - refit(state, kind, -step)) / (2 * step)
+        # Central differences are good to 1e-8, the solver's end to 1e-6 of a standard deviation.
+        error = np.abs(slopes[:, state, kind] - difference) / unit
+        assert np.max(error) < 2e-3 * np.max(np.abs(difference) / unit)
+
+
+def test_the_implicit_covariance_is_gauss_newtons_where_residuals_are_small():
+    exact = sj.fit_jointly(noisy(), modes(), level_gain_std=0.01, **TRUE)
+    found = sensitivity(exact).covariance[:4, :4]
+    # Without residuals the second-order terms vanish.
+    np.testing.assert_allclose(found, exact.covariance[:4, :4], rtol=1e-6)
+
+
+def test_contributions_sum_to_one_and_name_the_level_errors(fit):
+    rows = contributions(fit)
+    assert sum(row.frequency_share for row in rows) == pytest.approx(1, abs=1e-6)
+    assert sum(row.damping_share for row in rows) == pytest.approx(1, abs=1e-6)
+    assert {row.source for row in rows} >= {"random error of phase", "gain of level 5"}
+    # At resonance a level's gain counts as the velocities of its nine states do together; states
+    # off resonance tell it, since stiffness against frequency has the same factor.
+    near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), level_gain_std=0.01, **TRUE))
+    gains, far = (
+        sum(row.damping_share for row in found if row.source.startswith("gain"))
+        for found in (near, rows)
+    )
+    (velocity,) = (r.damping_share for r in near if r.source == "random error of velocity")
+    assert gains / velocity == pytest.approx(9, rel=0.1)
+    assert far < 0.5 * gains
+
+
+def test_contributions_near_resonance_of_a_linear_mode_are_known():
+    rng, n, constant = np.random.default_rng(3), 60, 12.0
+    omega = OMEGA + 0.5 * constant * np.tan(np.radians(np.linspace(-4, 4, n)))
+    force = np.full(n, 2.0)
+    velocity = 1j * omega * CONSTANT * force / (OMEGA**2 - omega**2 + 1j * omega * constant)
+    own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
+    data = stated(np.arange(n) % 5, omega, force, velocity * np.exp(own))
+    rows = contributions(sj.fit_jointly(data, modes(), backbone="polynomial:0", damping="constant"))
+    shares = {row.source.removeprefix("random error of "): row for row in rows}
+    # 2ζω = A F cos φ/v: shares as the squares of 0.3 and 1 %, and of 4° of phase at most.
+    assert shares["force"].damping_share / shares["velocity"].damping_share == pytest.approx(
+        (NOISE["force"] / NOISE["velocity"]) ** 2, rel=0.01
+    )
+    # Beside them stands what levels seem to scatter: shares are compared with one another.
+    assert shares["phase"].damping_share < 0.01 * shares["velocity"].damping_share
+    # tan φ = (ω² − Ω²)/(Ω 2ζω): the natural frequency hinges on the phase.
+    for other in ("force", "velocity"):
+        assert shares[other].frequency_share < 0.01 * shares["phase"].frequency_share
+
+
+def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
+    found = profile(fit, "damping.viscous")
+    std = np.sqrt(fit.covariance[2, 2])
+    value = float(fit.vector()[0][2])
+    assert found.lower == pytest.approx(value - 1.96 * std, abs=0.1 * std)
+    assert found.upper == pytest.approx(value + 1.96 * std, abs=0.1 * std)
+    assert np.all(found.rise > -1e-6)
+    with pytest.raises(ValueError, match="no unknown"):
+        profile(fit, "damping.dry")
+
+
+@pytest.mark.long
+def test_bootstrap_and_posterior_agree_with_the_covariance_for_independent_noise():
+    independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
+    assert not independent.level_std.any()  # the bootstrap would not see what levels share
+    rows = compare_bands(independent, np.array([0.3, 0.7]), n_samples=150, posterior=True)
+    for row in rows:
+        assert row.implicit == pytest.approx(row.gauss_newton, rel=0.1)
+        # 150 draws know a spread to 6 %, drawing 25 states a level adds as much.
+        assert row.bootstrap == pytest.approx(row.gauss_newton, rel=0.3)
+        assert row.posterior == pytest.approx(row.gauss_newton, rel=0.25)
+
+
+def test_a_bootstrap_of_levels_sees_their_scatter():
+    # Gains of 5 % outweigh 1 % of nine states near resonance, where the states do not tell them.
+    scattered = sj.fit_jointly(noisy(1, gain=0.05, widest=4), modes(), level_gain_std=0.05, **TRUE)
+    found = bootstrap(scattered, 60, levels=True)
+    inside = bootstrap(scattered, 60)
+    good = np.all(np.isfinite(found), axis=1)
+    assert np.mean(good) > 0.5
+    assert np.std(found[good, 3]) > np.std(inside[:, 3])

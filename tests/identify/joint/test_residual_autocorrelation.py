@@ -1,0 +1,102 @@
+"""What neighbours share, against processes that are drawn and fits that are repeated."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from truth.exact_states import LEVELS, NOISE, TRUE, exact, modes, stated, truth_at
+
+import snrmjax as sj
+from snrmjax.identify.joint.joint_fit import fit_jointly
+from snrmjax.identify.joint.residual_autocorrelation import (
+    added_covariance,
+    along_resonance,
+    neighbour_correlation,
+)
+
+
+def drawn(rng, rho, *shape):
+    """Unit noise whose neighbours along the last axis are correlated."""
+    white = rng.normal(size=shape)
+    white[..., 1:] *= np.sqrt(1 - rho**2)
+    return lfilter([1.0], [1.0, -rho], white, axis=-1)
+
+
+def test_states_of_a_level_are_taken_by_frequency():
+    level, frequency = np.array([1, 0, 1, 0, 1]), np.array([3.0, 2.0, 1.0, 1.0, 2.0])
+    found = along_resonance(level, frequency)
+    assert [some.tolist() for some in found] == [[3, 1], [2, 4, 0]]
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
+def test_the_correlation_of_a_process_is_found(rho):
+    rng, levels = np.random.default_rng(1), list(np.arange(30000).reshape(10, 3000))
+    found = neighbour_correlation(drawn(rng, rho, 2, 10, 3000).reshape(2, -1).T, levels)
+    np.testing.assert_allclose(found, rho, atol=0.03)
+
+
+def test_a_slow_misfit_under_noise_counts_by_all_that_it_correlates():
+    rng, levels = np.random.default_rng(2), list(np.arange(8000).reshape(20, 400))
+    slow = (drawn(rng, 0.9, 20, 400) + rng.normal(size=(20, 400))) / np.sqrt(2)
+    (found,) = neighbour_correlation(slow.reshape(-1, 1), levels)
+    # Means of it scatter as those of a process with half of 0.9's sum of correlations, 10 for 19.
+    assert (1 + found) / (1 - found) == pytest.approx(10.0, rel=0.2)
+
+
+def test_white_noise_is_seldom_correlated():
+    rng, levels = np.random.default_rng(3), along_resonance(np.arange(80) % 4, np.arange(80.0))
+    parts = neighbour_correlation(rng.normal(size=(80, 2000)), levels)
+    # 4 standard deviations: one in 30 000 of a long series.
+    assert np.sum(parts > 0) <= 2
+
+
+def test_what_is_left_of_exact_states_is_no_matter():
+    levels = [np.arange(60)]
+    slow = drawn(np.random.default_rng(7), 0.95, 1, 60).T
+    assert neighbour_correlation(slow, levels) > 0
+    assert neighbour_correlation(1e-6 * slow, levels) == 0
+
+
+def test_the_covariance_is_that_of_repeated_straight_lines():
+    rng, rho = np.random.default_rng(4), 0.8
+    at = np.tile(np.linspace(-1, 1, 30), 3)
+    levels = along_resonance(np.repeat(np.arange(3), 30), at)
+    jacobian = np.stack([np.ones(90), at], axis=1)
+    noise = drawn(rng, rho, 20000, 3, 30).reshape(20000, -1)
+    fits = np.linalg.lstsq(jacobian, noise.T, rcond=None)[0]
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    rows, root = np.stack([jacobian, 0 * jacobian], axis=1), np.linalg.cholesky(inverse)
+    found = inverse + added_covariance(root, rows, np.array([rho, 0.0]), levels)
+    np.testing.assert_allclose(found, np.cov(fits), rtol=0.05, atol=0.02 * found.max())
+
+
+def test_no_band_becomes_narrower():
+    jacobian = np.vander(np.linspace(-1, 1, 25), 5)
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    levels, rows = [np.arange(25)], jacobian[:, None, :]
+    added = added_covariance(np.linalg.cholesky(inverse), rows, np.array([0.98]), levels)
+    # Of differences between neighbours this process has far less than white noise.
+    along = np.random.default_rng(6).normal(size=(5, 1000))
+    more = np.sum(along * (added @ along), axis=0) / np.sum(along * (inverse @ along), axis=0)
+    assert more.min() > -1e-9
+    assert more.max() > 1
+
+
+def test_bands_hold_curves_under_misfits_that_neighbours_share():
+    level, omega, force, velocity = exact(per_level=25)
+    speeds = np.linspace(0.3, 0.9, 4)
+    natural, modal_damping = truth_at(speeds)
+    want = np.stack([np.sqrt(natural), modal_damping])
+    rng, scores, notes = np.random.default_rng(5), [], 0
+    for _ in range(30):
+        error = drawn(rng, 0.9, 2, LEVELS, 25).reshape(2, -1)
+        own = np.exp(NOISE["velocity"] * error[0] + 1j * NOISE["phase"] * error[1])
+        fit = fit_jointly(stated(level, omega, force, velocity * own), modes(), **TRUE)
+        values = sj.fitted_values(fit, speeds)
+        found = np.stack([values.natural_frequency, values.modal_damping])
+        std = np.stack([values.natural_frequency_std, values.modal_damping_std])
+        scores.append(np.abs(found - want) / std)
+        notes += any("neighbours" in note for note in fit.notes)
+    assert notes == 30
+    # As if every state were apart, 85 % would be inside, for all that the fits take for levels
+    # that differ.
+    assert np.mean(np.array(scores) < 1.96) > 0.9

@@ -1,0 +1,187 @@
+"""The whole inverse method: a measured bolted beam, a linear mode, and what the notes say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+
+HERTZ = 2 * np.pi
+MEASURED = Path(__file__).resolve().parents[4] / "shared" / "data" / "brake_reuss_beam"
+
+W0, ZETA, SHAPE, PARTICIPATION = 500.0, 0.01, 2.0, 1.5
+MODES = sj.linear_modes([W0], [ZETA], [[SHAPE]], [PARTICIPATION])
+
+
+def linear_test(seed, noise, *, stated=False, more_off_it=0.0, levels=6):
+    """States of a linear mode by its own formula, with a relative error of the phasor.
+
+    `more_off_it` makes the error grow with the distance from resonance.
+    """
+    rng = np.random.default_rng(seed)
+    level = np.repeat(np.arange(levels), 5)
+    force = np.linspace(0.2, 1.0, levels)[level]
+    frequency = W0 * (1 + ZETA * np.tile([-1.2, -0.5, 0.1, 0.6, 1.1], levels))
+    dynamic = W0**2 - frequency**2 + 2j * ZETA * W0 * frequency
+    exact = 1j * frequency * SHAPE * PARTICIPATION * force / dynamic
+    error = noise * (rng.normal(size=exact.size) + 1j * rng.normal(size=exact.size))
+    error *= np.sqrt(1 + (more_off_it * np.sin(np.angle(exact))) ** 2)
+    velocity = exact * (1 + error)
+    spread = {"velocity_std": noise * np.abs(velocity), "phase_std": np.full(level.size, noise)}
+    return sj.steady_states(level, frequency, force, velocity, **(spread if stated else {}))
+
+
+@pytest.fixture(scope="module")
+def data(model):
+    table = MEASURED / "response_controlled.csv"
+    return read_steady_states(table, sensors=model.modes.sensors).steady_states
+
+
+@pytest.fixture(scope="module")
+def model():
+    if not MEASURED.is_dir():
+        pytest.skip(f"the measured beam is not beside the project: {MEASURED} is missing")
+    return read_model(MEASURED / "model.toml")
+
+
+@pytest.fixture(scope="module")
+def found(data, model):
+    return sj.identify_backbone(data, model.modes)
+
+
+@pytest.fixture(scope="module")
+def crossings(data, model):
+    """Of every level, read off its phase alone: resonance, velocity and damping there.
+
+    Where the velocity is in phase with the force, Ω = ω̃ and 2ζ̃ω̃ = |A|F/v.
+    """
+    constant = float(model.modes.mode_shape[0, 0] * model.modes.participation[0])
+    rows = []
+    for level in np.unique(data.level):
+        here = np.asarray(data.level) == level
+        phase = np.angle(np.asarray(data.velocity)[here, 0])
+        # Points are in order of frequency, and the phase falls with it.
+        order = np.argsort(phase)
+        frequency, force, speed = (
+            np.interp(0.0, phase[order], np.asarray(values)[here][order])
+            for values in (data.frequency, data.force, np.abs(data.velocity[:, 0]))
+        )
+        rows.append((frequency, speed, constant * force / speed / (2 * frequency)))
+    return np.array(rows).T
+
+
+class TestMeasuredBeam:
+    def test_bands_cover_where_every_level_is_in_phase(self, found, crossings):
+        backbone = found.fit.backbone
+        frequency, speed, damping = crossings
+        values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
+        off = np.abs(values.natural_frequency - frequency) / values.natural_frequency_std
+        assert off.max() < 1.96
+        # Damping of the levels repeats to about 10 %, as those who measured it say.
+        np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
+
+    def test_a_joint_fit_settles_where_every_level_is_in_phase(self, data, model, crossings):
+        """Near folds a state of exact force would be exact in one direction, and fits wandered."""
+        families = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
+        fit = sj.fit_jointly(data, model.modes, **families)
+        frequency, speed, damping = crossings
+        values = sj.fitted_values(fit, speed)
+        assert fit.converged
+        # Levels cross within 0.05 Hz of a curve; an error of phase of 7°, which the fit finds at
+        # the highest, is worth tan(7°)·0.7 % of 80 Hz there.
+        np.testing.assert_allclose(values.natural_frequency, frequency, atol=0.1 * HERTZ)
+        np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
+        stiffness = fit.level_std[2]
+        assert 0.5 * stiffness * 80.4 < 0.1  # Hz
+
+    def test_the_backbone_softens_and_stiffens(self, found):
+        backbone = found.fit.backbone
+        amplitude = np.linspace(float(backbone.smallest), float(backbone.largest), 400)
+        values = backbone.values(amplitude)
+        hertz = np.asarray(values.natural_frequency) / HERTZ
+        lowest = int(np.argmin(hertz))
+        # The beam's published course; levels repeat to 0.1 Hz.
+        assert hertz[0] == pytest.approx(80.37, abs=0.05)
+        assert hertz[lowest] == pytest.approx(80.11, abs=0.05)
+        assert hertz[-1] == pytest.approx(80.45, abs=0.05)
+        acceleration = values.velocity[lowest] * hertz[lowest] * HERTZ
+        assert 30 < acceleration < 50
+        assert values.damping_ratio[0] == pytest.approx(0.0015, rel=0.1)
+        assert values.damping_ratio[-1] == pytest.approx(0.007, rel=0.1)
+
+    def test_scatter_is_told(self, found):
+        assert found.fit.level_frequency_std / HERTZ == pytest.approx(0.05, abs=0.03)
+        assert any("no noise is stated" in note for note in found.notes)
+        assert any("levels differ from one another by 0.0" in note for note in found.notes)
+        # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
+        assert any("inside the levels damping rises by" in note for note in found.notes)
+
+
+class TestLinearMode:
+    def test_exact_states_give_the_linear_mode(self):
+        found = sj.identify_backbone(linear_test(0, 0.0), MODES)
+        backbone = found.fit.backbone
+        at = np.linspace(float(backbone.smallest), float(backbone.largest), 7)
+        np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-8)  # steps of a fit
+        np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-8)
+
+    def test_point_errors_that_were_not_stated_come_from_the_scatter(self):
+        scores = []
+        for seed in range(20):
+            points = sj.identify_backbone(linear_test(seed, 0.005, more_off_it=4.0), MODES).points
+            scores.append((points.natural_frequency - W0) / points.natural_frequency_std)
+            scores.append((points.damping_ratio - ZETA) / points.damping_ratio_std)
+        # Twenty seeds of 24 degrees of freedom know their rms to 3 %, but every fit bends with
+        # its points: smaller residuals, too small a scale.
+        assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.2
+
+    def test_stated_errors_are_left_as_stated(self):
+        data = linear_test(0, 0.01, stated=True)
+        found = sj.identify_backbone(data, MODES)
+        points = sj.identify_points(data, MODES)
+        np.testing.assert_array_equal(
+            found.points.natural_frequency_std, points.natural_frequency_std
+        )
+        assert not any("no noise is stated" in note for note in found.notes)
+
+    def test_noise_larger_than_stated_is_noted(self):
+        data = linear_test(0, 0.03)
+        little = np.full(data.force.shape[0], 0.01)
+        stated = sj.steady_states(
+            data.level,
+            data.frequency,
+            data.force,
+            data.velocity[:, 0],
+            velocity_std=0.01 * np.abs(data.velocity[:, 0]),
+            phase_std=little,
+        )
+        notes = sj.identify_backbone(stated, MODES).notes
+        assert any("times as much as the stated noise" in note for note in notes)
+
+    @pytest.mark.parametrize(("turn", "told"), [(0.0, None), (0.2, "falls"), (-0.2, "rises")])
+    def test_a_phase_that_is_off_shows_in_the_damping(self, turn, told):
+        data = linear_test(0, 0.003)
+        velocity = data.velocity[:, 0] * np.exp(1j * turn)
+        turned = sj.steady_states(data.level, data.frequency, data.force, velocity)
+        notes = [n for n in sj.identify_backbone(turned, MODES).notes if "inside the levels" in n]
+        # 2ζ̃ω̃ is |A|F cos φ/v: a phase that reads too high makes it fall towards the lead side.
+        assert len(notes) == (told is not None)
+        assert all(f"damping {told} by" in note for note in notes)
+
+    def test_points_without_a_solution_are_counted(self):
+        data = linear_test(0, 0.0)
+        velocity = np.asarray(data.velocity[:, 0]).copy()
+        velocity[3] = np.nan
+        spoilt = sj.steady_states(data.level, data.frequency, data.force, velocity)
+        found = sj.identify_backbone(spoilt, MODES)
+        assert any(note.startswith("1 of 30 points are left out") for note in found.notes)
+
+    def test_an_anchor_is_told(self):
+        found = sj.identify_backbone(linear_test(0, 0.01), MODES, anchor=True)
+        assert any(note.startswith("anchored at the linear mode") for note in found.notes)
+        assert not any(
+            "anchored" in note for note in sj.identify_backbone(linear_test(0, 0.01), MODES).notes
+        )

@@ -1,0 +1,198 @@
+"""Reports and figures of joint fits: the numbers of the fit, and bars of the whole variance."""
+
+import re
+
+import numpy as np
+import pytest
+from truth.exact_states import damping, modes, noisy, squared
+
+import snrmjax as sj
+from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.report import joint_figures as joint_plot
+from snrmjax.report import joint_report
+from snrmjax.report import sampling as plot_data
+from snrmjax.report import style as drawing
+from snrmjax.report.html import Report, report_html
+
+TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """A fit of noisy states, level gains included."""
+    return sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+
+
+@pytest.fixture(scope="module")
+def told(fit):
+    return joint_report.tell_fit(fit, sj.next_measurements(fit, 3))
+
+
+@pytest.fixture(scope="module")
+def figures(told):
+    points = sj.identify_points(noisy(1, gain=0.01), modes())
+    return joint_report.joint_figures(told, points)
+
+
+@pytest.fixture(scope="module")
+def sections(told, figures):
+    return joint_report.joint_sections(told, figures)
+
+
+def close_to(text, value, rel=0.0):
+    """Whether a printed number is a value, rounded to the digits that are printed."""
+    text = text.replace("−", "-")
+    last = 10.0 ** -len(text.partition(".")[2])
+    assert float(text) == pytest.approx(value, abs=0.501 * last, rel=rel)
+
+
+def test_the_table_of_parameters_has_the_numbers_of_the_file(fit, sections, tmp_path):
+    write_joint_fit(tmp_path / "fit.json", fit)
+    again = read_joint_fit(tmp_path / "fit.json")
+    values, std = np.asarray(again.vector()[0]), np.sqrt(np.diag(again.covariance))
+    rows = sections[0].tables[0].rows
+    assert [row[0] for row in rows] == list(again.names())[: len(rows)]
+    assert len(rows) == 4
+    for row, value, spread in zip(rows, values, std, strict=False):
+        printed = row[1].split(" ± ")
+        close_to(printed[0], value)
+        close_to(printed[1], spread)
+    # ω at rest is 500 rad/s; its square's 1σ is 2ω times that of ω.
+    hertz = re.fullmatch(r"(\S+) ± (\S+) Hz", rows[0][3]).groups()
+    close_to(hertz[0], np.sqrt(values[0]) / HERTZ)
+    close_to(hertz[1], std[0] / (2 * np.sqrt(values[0])) / HERTZ)
+    assert abs(float(hertz[0]) - 500 / HERTZ) < 4 * float(hertz[1])
+    html = report_html(Report("Fit", sections=sections))
+    assert all(row[1] in html for row in rows)
+
+
+def test_errors_found_are_those_of_the_fit(fit, sections):
+    rows = dict(sections[0].tables[1].rows)
+    scale = rows["random noise, from the residuals"]
+    assert scale.endswith("× the stated one")
+    close_to(scale.split(" ± ")[0], fit.noise_scale)
+    assert rows["gain of a level"] == "1 %"
+    assert rows["natural frequency, from state to state"] == "0 %"
+
+
+def test_bars_of_one_colour_are_the_whole_variance(told, figures):
+    (axes,) = figures["contributions"].axes
+    bars = {b.get_label(): [patch.get_width() for patch in b] for b in axes.containers}
+    assert sum(bars["natural frequency"]) == pytest.approx(100, abs=1e-6)
+    assert sum(bars["damping"]) == pytest.approx(100, abs=1e-6)
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    # Five levels' gains are one bar.
+    gains = sum(s.damping_share for s in told.shares if s.source.startswith("gain of level"))
+    assert bars["damping"][names.index("gain of levels")] == pytest.approx(100 * gains)
+    assert axes.yaxis_inverted()
+
+
+def test_small_contributions_share_a_bar():
+    rows = [Contribution(n, *s, n) for n, s in {"a": (0.995, 0.998), "b": (0.003, 0.001)}.items()]
+    rows.append(Contribution("c", 0.002, 0.001, "c"))
+    (axes,) = joint_plot.contributions_figure(rows).axes
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    assert names == ["a", "2 smaller ones together"]
+    widths = [[patch.get_width() for patch in bars] for bars in axes.containers]
+    np.testing.assert_allclose(widths, [[99.5, 0.5], [99.8, 0.2]], rtol=1e-12)
+
+
+def test_the_table_of_contributions_sums_to_one_hundred(told, sections):
+    rows = sections[1].tables[0].rows
+    for column in (1, 2):
+        # Each row is rounded to 0.05.
+        assert sum(float(row[column]) for row in rows) == pytest.approx(100, abs=0.05 * len(rows))
+    many = [Contribution(f"s{k}", 0.05, 0.05, "s") for k in range(20)]
+    last = joint_report.contribution_table(many).rows[-1]
+    assert last == ("8 further ones together", "40.0", "40.0")
+
+
+def test_lines_are_the_known_curves():
+    exact = sj.fit_jointly(noisy(), modes(), **TRUE)
+    figure = joint_plot.fitted_curves_figure([joint_plot.FitSeries("fit", exact)])
+    natural, ratio = figure.axes
+    (line,), (ratios,) = natural.lines, ratio.lines
+    velocity, omega = line.get_xdata(), HERTZ * line.get_ydata()
+    # The states are exact; what is left is the end of the solver.
+    np.testing.assert_allclose(omega**2, squared(velocity / omega), rtol=1e-7)
+    np.testing.assert_allclose(
+        ratios.get_ydata(), 100 * damping(velocity) / (2 * omega), rtol=1e-7, atol=0
+    )
+    assert natural.get_ylabel() == "Natural frequency (Hz)"
+    assert natural.get_xlabel() == ratio.get_xlabel() == "Velocity amplitude (m/s)"
+
+
+def test_bands_are_ninety_five_per_cent(fit, figures):
+    natural, ratio = figures["joint_fit"].axes
+    values = sj.fitted_values(fit, np.array([0.0, fit.largest[1]]))
+    for axes, value, std, unit in (
+        (natural, values.natural_frequency, values.natural_frequency_std, 1 / HERTZ),
+        (ratio, values.damping_ratio, values.damping_ratio_std, 100.0),
+    ):
+        band = axes.collections[-1]  # the paler one of a further level is below it
+        corners = band.get_paths()[0].vertices
+        for k, x in ((0, 0.0), (1, fit.largest[1])):
+            y = corners[np.isclose(corners[:, 0], x), 1]
+            expected = unit * (float(value[k]) + 1.96 * float(std[k]) * np.array([-1, 1]))
+            np.testing.assert_allclose([y.min(), y.max()], expected, rtol=1e-9)
+
+
+def test_residuals_are_drawn_and_counted(fit, figures):
+    speeds, phases, spread = figures["residuals"].axes
+    drawn = [line for line in speeds.lines if line.get_marker() == "o"]
+    np.testing.assert_array_equal(np.array([d.get_ydata() for d in drawn]).T, fit.residuals)
+    # The states lie within 60° of resonance, noise of 0.7° aside.
+    angles = np.concatenate([one.get_xdata() for one in phases.lines if one.get_marker() == "o"])
+    assert 55 < np.abs(angles).max() < 64
+    outside = 100 * np.mean(np.abs(fit.residuals) > 1.96)
+    assert f"{outside:.1f} % outside ±1.96" in spread.get_title(loc="left")
+    assert f"rms {np.sqrt(np.mean(fit.residuals**2)):.2f}" in spread.get_title(loc="left")
+    assert plot_data.fit_residuals(fit).level.min() == 1
+
+
+def test_advised_states_are_marked_and_listed(told, figures, sections):
+    speeds, phases = figures["next"].axes
+    marks = [line for line in speeds.lines if line.get_marker() == "o"]
+    assert len(marks) == len(told.advice) == 3
+    for mark, one in zip(marks, told.advice, strict=True):
+        assert mark.get_xdata() == pytest.approx(one.frequency / HERTZ)
+    said = ", ".join(text.get_text() for text in speeds.texts)
+    assert sorted(said.split(", ")) == ["1", "2", "3"]
+    turned = [line.get_ydata() for line in phases.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(np.ravel(turned), [a.phase / DEGREE for a in told.advice])
+    rows = sections[2].tables[0].rows
+    assert [row[-1] for row in rows] == [one.reason for one in told.advice]
+    close_to(rows[0][2], told.advice[0].frequency / HERTZ)
+
+
+def test_states_that_lie_together_share_a_label(told):
+    first = told.advice[0]
+    advice = [first, first._replace(rank=2, frequency=1.001 * first.frequency)]
+    figure = joint_plot.advice_figure(told.responses, advice, "tip")
+    assert [text.get_text() for text in figure.axes[0].texts] == ["1, 2"]
+
+
+def test_families_are_listed_best_first():
+    tried = sj.fit_jointly(noisy(1), modes(), backbone="polynomial", damping="constant")
+    table = joint_report.joint_sections(
+        joint_report.tell_fit(tried),
+        dict.fromkeys(("joint_fit", "residuals", "contributions"), drawing.panels(1, 1, 1, 1)[0]),
+    )[-1].tables[0]
+    scores = [c.score for c in tried.candidates if c.curve == "backbone"]
+    listed = [row for row in table.rows if row[0] == "backbone"]
+    assert len(listed) == len(scores) > 1
+    assert listed[0][3] == "0.0"
+    close_to(listed[-1][3].split(" ± ")[0], min(scores))
+    assert sum(row[-1] == "taken" for row in listed) == 1
+
+
+def test_nothing_to_show_is_an_error():
+    for draw, named in (
+        (joint_plot.contributions_figure, "nothing to show"),
+        (joint_plot.fitted_curves_figure, "no fit"),
+        (lambda rows: joint_plot.advice_figure(rows, [], "tip"), "no response"),
+    ):
+        with pytest.raises(ValueError, match=named):
+            draw([])

@@ -1,0 +1,265 @@
+"""Folds, peaks, resonances and bifurcations against a balance and period maps from outside."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structure import structure
+from snrmjax.simulate.continuation.continuation import StepControl
+from snrmjax.simulate.continuation.events import BIFURCATIONS, EVENT_KINDS
+from snrmjax.simulate.solutions.forced_response import forced_response
+
+HZ = 2 * np.pi
+# How often each event comes along the curved beam's three responses from 20 to 150 Hz.
+CURVED = {"fold": (2, 4, 4), "peak": (1, 3, 2), "phase_resonance": (1, 1, 1)}
+
+
+def in_steps(step):
+    return StepControl(first=step, largest=step)
+
+
+def counts(curve):
+    return {kind: curve.at_events(kind).size for kind in EVENT_KINDS}
+
+
+def turns(values):
+    """Maxima and minima along a sequence of values."""
+    rising = np.sign(np.diff(values))
+    return int(np.sum(rising[1:] < rising[:-1])), int(np.sum(rising[1:] > rising[:-1]))
+
+
+@pytest.fixture(scope="module")
+def curved_in_steps():
+    """The curved beam's responses at the paper's forces, by the largest step."""
+    model = curved_beam()
+    return model, {
+        step: forced_response(
+            *(model, CURVED_BEAM_FORCES, 20 * HZ, 150 * HZ),
+            steps=in_steps(step),
+            stability=False,
+        )
+        for step in (0.003, 0.02, 0.05, 0.15, 0.3)
+    }
+
+
+def test_no_event_is_lost_in_steps_of_any_size(curved_in_steps):
+    _, curves = curved_in_steps
+    for step, responses in curves.items():
+        assert len(responses) == 3
+        for number, curve in enumerate(responses):
+            wanted = {kind: CURVED[kind][number] for kind in EVENT_KINDS}
+            assert counts(curve) == wanted, (step, number)
+            for kind in EVENT_KINDS:  # and they are the same events
+                fine = curves[0.003][number]
+                found, exact = (c.frequency[c.at_events(kind)] for c in (curve, fine))
+                # Located to 1e-12 in the scaled unknowns, a peak by its tangent to 1e-6.
+                np.testing.assert_allclose(found, exact, rtol=1e-6, err_msg=f"{step}, {kind}")
+    # The numbers are right: in fine steps every turn of frequency and velocity can be counted.
+    for number, curve in enumerate(curves[0.003]):
+        assert len(curve.frequency) > 1000
+        assert sum(turns(curve.frequency)) == CURVED["fold"][number]
+        assert turns(np.abs(curve.velocity[:, 1, 0]))[0] == CURVED["peak"][number]
+        x = curve.coefficients[:, :, 0]
+        in_phase = np.sign(x[1:, 1]) != np.sign(x[:-1, 1])
+        assert np.sum(in_phase & (x[1:, 2] > 0)) == CURVED["phase_resonance"][number]
+
+
+def assert_located(curve, model, numpy_balance):
+    """Every event of a curve where the balance from outside has it."""
+    order = (curve.coefficients.shape[1] - 1) // 2
+    balance = numpy_balance(model, curve.force, order, np.abs(curve.coefficients).max())
+    seen = 0
+    for kind in EVENT_KINDS:
+        for k in curve.at_events(kind):
+            omega, velocity = balance.event(kind, curve.coefficients[k], curve.frequency[k])
+            assert curve.frequency[k] == pytest.approx(omega, rel=1e-6), kind
+            # At a fold the velocity changes with the root of the frequency.
+            tolerance = 1e-5 if kind == "fold" else 1e-6
+            assert np.abs(curve.velocity[k, 1, 0]) == pytest.approx(velocity, rel=tolerance), kind
+            seen += 1
+    return seen
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3])
+def test_events_of_the_curved_beam_are_located(step, curved_in_steps, numpy_balance):
+    model, curves = curved_in_steps
+    seen = [assert_located(curve, model, numpy_balance) for curve in curves[step]]
+    assert seen == [4, 8, 7]
+
+
+def test_events_of_the_flat_beam_are_located(flat_curve, numpy_balance):
+    model, curve = flat_curve
+    assert counts(curve) == {"fold": 2, "peak": 1, "phase_resonance": 1}
+    assert assert_located(curve, model, numpy_balance) == 4
+    assert sum(turns(curve.frequency)) == 2
+
+
+# --------------------------------------------------------------------------------- near a cusp
+
+SQUARED, VISCOUS, HARDENING = 4.0, 0.08, 0.9  # ω², 2ζω and ¾·4c of the mode below
+
+
+def duffing():
+    """q̈ + 0.08 q̇ + 4 q + 1.2 q³ = P cos Ωt."""
+    modes = linear_modes([2.0], [0.02], [[1.0]], [1.0])
+    return structure(modes, polynomial_potential({"1111": 0.3}, 1))
+
+
+def parts(amplitude, load):
+    """m and r of Ω² = m ± √r, a single harmonic: ((ω² + ¾·4c Q² − Ω²)² + (2ζωΩ)²) Q² = P²."""
+    stiffness = SQUARED + HARDENING * amplitude**2
+    middle = stiffness - 0.5 * VISCOUS**2
+    return middle, middle**2 - stiffness**2 + (load / amplitude) ** 2
+
+
+def exact_folds(load):
+    """Frequencies of the folds: the upper root turns, dm/dQ + (dr/dQ)/(2√r) = 0, times √r."""
+
+    def slope(amplitude):
+        by_root = -HARDENING * amplitude * VISCOUS**2 - load**2 / amplitude**3
+        return 2 * HARDENING * amplitude * np.sqrt(parts(amplitude, load)[1]) + by_root
+
+    def outermost(amplitude):
+        return parts(amplitude, load)[1]
+
+    largest = brentq(outermost, 0.1 * load / VISCOUS, load / VISCOUS)  # both roots meet there
+    amplitude = np.linspace(0.2 * largest, largest * (1 - 1e-9), 4001)
+    values = slope(amplitude)
+    where = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
+    ends = [brentq(slope, amplitude[k], amplitude[k + 1], xtol=1e-15) for k in where]
+    exact = [parts(q, load) for q in ends]
+    return np.array([np.sqrt(middle + np.sqrt(root)) for middle, root in exact])
+
+
+@pytest.fixture(scope="module")
+def cusp():
+    """The load at which the two folds of the Duffing oscillator are born."""
+    low, high = 0.05, 0.2
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if len(exact_folds(middle)) else (middle, high)
+    return high
+
+
+@pytest.mark.parametrize("above", [0.1, 1e-2, 1e-3, -1e-3])
+@pytest.mark.parametrize("step", [0.05, 0.3])
+def test_two_close_folds_inside_one_step_are_found(above, step, cusp):
+    load = cusp * (1 + above)
+    wanted = np.sort(exact_folds(load))
+    assert len(wanted) == (2 if above > 0 else 0)
+    for begin in (1.0, 1.1, 1.2, 1.3):  # the steps fall differently
+        (curve,) = forced_response(
+            *(duffing(), [load], begin, 4.0),
+            harmonic_order=1,
+            steps=in_steps(step),
+            stability=False,
+        )
+        folds = curve.at_events("fold")
+        np.testing.assert_allclose(np.sort(curve.frequency[folds]), wanted, rtol=1e-9)
+        if 0 < above < 0.1:  # indeed between two points of the curve that was followed
+            assert np.ptp(wanted) < 1e-3
+            assert abs(folds[1] - folds[0]) <= 8
+
+
+# ------------------------------------------------------------------------------- bifurcations
+
+
+def coupled_by_a_square():
+    """A second mode at twice the first one's frequency: their energy goes to and fro."""
+    modes = linear_modes([2.0, 4.0], [0.01, 0.01], [[1.0, 0.0]], [1.0, 0.0])
+    return structure(modes, polynomial_potential({"112": 0.5}, 2))
+
+
+def symmetric():
+    """The oscillator of `duffing` with the curved beam's names: both share what is compiled."""
+    beam = curved_beam()
+    numbers = (
+        *(beam.modes.natural_frequency, beam.modes.damping_ratio, beam.modes.mode_shape),
+        *(beam.modes.participation, beam.potential.coefficient),
+    )
+    values = [2.0], [0.02], [[1.0]], [1.0], [0.0, 0.3]
+    return eqx.tree_at(
+        lambda m: (
+            *(m.modes.natural_frequency, m.modes.damping_ratio, m.modes.mode_shape),
+            *(m.modes.participation, m.potential.coefficient),
+        ),
+        beam,
+        tuple(jnp.asarray(v).reshape(n.shape) for v, n in zip(values, numbers, strict=True)),
+    )
+
+
+# model, force, range, harmonics, and how often
+CROSSINGS = {
+    "period_doubling": (curved_beam, CURVED_BEAM_FORCES[1], (20 * HZ, 80 * HZ), 31, 5),
+    "neimark_sacker": (coupled_by_a_square, 0.4, (1.7, 2.3), 5, 2),
+    "branch_point": (symmetric, 15.0, (0.9, 3.0), 31, 2),
+}
+
+
+def crossing(kind, multipliers):
+    """A function of the multipliers that changes sign at a bifurcation of this kind."""
+    if kind == "neimark_sacker":
+        return np.abs(multipliers[np.abs(multipliers.imag) > 1e-3]).max() - 1
+    return np.prod(multipliers + (1 if kind == "period_doubling" else -1)).real
+
+
+@pytest.mark.parametrize("kind", CROSSINGS)
+def test_bifurcations_lie_where_multipliers_cross(kind, numpy_balance, time_domain, state_of):
+    model, force, ends, order, number = CROSSINGS[kind]
+    model = model()
+    (curve,) = forced_response(model, [force], *ends, harmonic_order=order)
+    where = curve.at_events(kind)
+    assert len(where) == number
+    assert not any(curve.at_events(other).size for other in BIFURCATIONS if other != kind)
+    balance = numpy_balance(model, force, order, np.abs(curve.coefficients).max())
+    for k in where:
+        start = np.append(curve.coefficients[k].ravel(), curve.frequency[k])
+        start /= np.append(np.full(len(start) - 1, balance.scale), balance.unit)
+        along = balance.tangent(start, np.ones(len(start)))
+        fixed = int(np.argmax(np.abs(along)))
+        values, frequencies = [], []
+        for shift in (0.0, 1e-5):  # along the unknown that changes fastest
+            y = balance.solved(start + along * (shift / along[fixed]), fixed)
+            omega = y[-1] * balance.unit
+            x = y[:-1].reshape(-1, balance.n) * balance.scale
+            multipliers = time_domain(model, force, omega).multipliers(state_of(x, omega))
+            values.append(crossing(kind, multipliers))
+            frequencies.append(omega)
+        share = values[0] / (values[0] - values[1])
+        # The multiplier is 1e-6 beyond the circle; the map's slope by differences is good to
+        # 1e-7; the motions by their truncation to 5e-7 at the lowest, to 1e-10 elsewhere.
+        error = share * (frequencies[1] - frequencies[0]) / curve.frequency[k]
+        assert abs(error) < 1e-6, (kind, k)
+        assert abs(share) < 1  # and it is this crossing, not another one far away
+    # The stability changes there and at folds, and nowhere else.
+    change = np.flatnonzero(curve.stable[1:] != curve.stable[:-1])
+    labelled = np.concatenate([where, curve.at_events("fold")])
+    assert all(np.min(np.abs(labelled - k)) <= 1 for k in change)
+
+
+def test_folds_of_the_flat_beam_do_not_depend_on_the_steps():
+    found = []
+    for step in (0.003, 0.05, 0.3):
+        (curve,) = forced_response(
+            *(flat_beam(), [FLAT_BEAM_FORCES[-1]], 60 * HZ, 120 * HZ),
+            steps=in_steps(step),
+            stability=False,
+        )
+        assert counts(curve) == {"fold": 2, "peak": 1, "phase_resonance": 1}
+        found.append(np.concatenate([curve.frequency[curve.at_events(k)] for k in EVENT_KINDS]))
+    # Located to 1e-12 in the scaled unknowns, the peak by its tangent to 1e-6.
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-6)
+    assert sum(turns(curve.frequency)) == 2
+
+
+def test_flat_beam_folds_at_all_forces_are_as_many_as_its_turns():
+    model = flat_beam()
+    curves = forced_response(model, FLAT_BEAM_FORCES, 60 * HZ, 120 * HZ, stability=False)
+    assert [counts(curve)["fold"] for curve in curves] == [0, 0, 2, 2]
+    for curve in curves:
+        assert counts(curve)["peak"] == counts(curve)["phase_resonance"] == 1

@@ -1,0 +1,371 @@
+"""Every effect that makes a force: harmonic balance against integration in time from outside.
+
+The equations of motion and the laws are written here again, in NumPy. Smooth and kinked forces
+are integrated by SciPy's Dormand-Prince of order 8, Coulomb's oscillator from one stop to the
+next in closed form, sliders marched in small steps with their exact return map.
+"""
+
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.structure import simulated_structure, structure
+from snrmjax.simulate.continuation.stability import floquet_multipliers, is_stable
+from snrmjax.simulate.solutions.forced_response import solve_at_frequency
+from snrmjax.simulate.solutions.time_integration import settled_motion
+
+OMEGA, RATIO, PARTICIPATION = 500.0, 0.03, 3.0  # rad/s, -, kg^-1/2
+STATIC = PARTICIPATION / OMEGA**2  # kg^1/2 m, of 1 N
+SIZE = STATIC / (2 * RATIO)  # kg^1/2 m, at resonance under 1 N
+SQUARED, VISCOUS = OMEGA**2, 2 * RATIO * OMEGA
+FREQUENCIES = np.array([0.97, 1.0, 1.03]) * OMEGA
+CYCLES = 64  # e^{−2π·0.03·64} = 6e-6 is left of the transient of a linear mode
+MORE_CYCLES = 160  # beside a fold, where transients last longer
+SAMPLES = 256  # of the last cycle
+
+
+# -------------------------------------------------------------------------- truth from outside
+
+
+def phasors(samples, highest=3):
+    """Phasors of harmonics 0…`highest` of samples (time, row) over one cycle."""
+    spectrum = np.fft.rfft(samples, axis=0)[: highest + 1] * (2 / len(samples))
+    spectrum[0] *= 0.5
+    return spectrum.T
+
+
+def settled(
+    law,
+    omega,
+    *,
+    start=0.0,
+    orders=(0.0, 1.0),
+    linear=None,
+    added=None,
+    cycles=MORE_CYCLES,
+    rtol=1e-7,
+):
+    """Samples (time, row, mode) of the last cycle for each frequency, by Dormand & Prince.
+
+    `law(q, v)` is the force on the mode of interest, `linear` its mass, damping and stiffness.
+    `added` is a further mode: its ω, ζ and the coupling (q, r) ↦ (∂V/∂q, ∂V/∂r).
+    """
+    mass, viscous, squared = linear or (1.0, VISCOUS, SQUARED)
+    n = len(omega)
+
+    def slope(phase, flat):
+        x, u, *other = flat.reshape(-1, n)
+        q, v = SIZE * x, SIZE * omega * u
+        drive = PARTICIPATION * sum(s * np.cos(h * phase) for h, s in enumerate(orders))
+        force = drive - viscous * v - squared * q - law(q, v)
+        if added is None:
+            return np.concatenate([u, force / (mass * SIZE * omega**2)])
+        own, ratio, coupling = added
+        y, w = other
+        r, s = SIZE * y, SIZE * omega * w
+        pull, back = coupling(q, r)
+        further = -2 * ratio * own * s - own**2 * r - back
+        rates = (u, (force - pull) / (mass * SIZE * omega**2), w, further / (SIZE * omega**2))
+        return np.concatenate(rates)
+
+    begin = np.zeros((2 if added is None else 4, n))
+    begin[0] = start / SIZE
+    times = 2 * np.pi * (cycles - 1 + np.arange(SAMPLES) / SAMPLES)
+    solved = solve_ivp(
+        *(slope, (0.0, times[-1]), begin.ravel()),
+        method="DOP853",
+        rtol=rtol,
+        atol=0.1 * rtol,
+        t_eval=times,
+    )
+    assert solved.success
+    rows = solved.y.reshape(-1, n, SAMPLES)[::2] * SIZE
+    return np.moveaxis(rows, (0, 1, 2), (2, 1, 0))
+
+
+def coulomb_oscillator(friction, omega):
+    """Samples of the settled motion with sgn q̇, from stop to stop in closed form."""
+    root = OMEGA * (-RATIO + 1j * np.sqrt(1 - RATIO**2))
+    steady = PARTICIPATION / (SQUARED - omega**2 + 1j * VISCOUS * omega)
+
+    def piece(time, q, v, sign):
+        """q(t) and q̇(t) from `time` on while q̇ has one sign."""
+        forced = steady * np.exp(1j * omega * time)
+        shift = -sign * friction / SQUARED
+        free = np.array([q - shift - forced.real, v - (1j * omega * forced).real])
+        weight = np.linalg.solve(np.array([[1.0, 0.0], [root.real, -root.imag]]), free)
+        weight = weight[0] + 1j * weight[1]
+
+        def motion(t):
+            wave = steady * np.exp(1j * omega * t)
+            rest = weight * np.exp(root * (t - time))
+            return shift + (wave + rest).real, (1j * omega * wave + root * rest).real
+
+        return motion
+
+    end, period = CYCLES * 2 * np.pi / omega, 2 * np.pi / omega
+    wanted = end - period + period * np.arange(SAMPLES) / SAMPLES
+    samples = np.zeros(SAMPLES)
+    time, q = 0.0, 0.0
+    while time < end:
+        pull = PARTICIPATION * np.cos(omega * time) - SQUARED * q
+        assert abs(pull) > friction, "it sticks, which is not provided for here"
+        sign = np.sign(pull)
+        motion = piece(time, q, 0.0, sign)
+        grid = time + period * np.arange(1, 200) / 200
+        turned = grid[np.argmax(sign * motion(grid)[1] < 0)]
+        stop = brentq(
+            lambda t, motion=motion: motion(t)[1], turned - period / 200, turned, xtol=1e-14
+        )
+        here = (wanted >= time) & (wanted < stop)
+        samples[here] = motion(wanted[here])[0]
+        time, q = stop, motion(stop)[0]
+    return samples
+
+
+def marched(stiffness, slip, omega, *, cycles=CYCLES, steps=512):
+    """Samples of the settled motion with sliders, by Runge & Kutta of order 4 in fixed steps.
+
+    A slider's block follows the spring that would be stretched beyond its slip displacement.
+    """
+    n = len(omega)
+    q, v, blocks = np.zeros(n), np.zeros(n), np.zeros((n, len(slip)))
+    step = 2 * np.pi / steps / omega
+    tau = 2 * np.pi * np.arange(2 * steps + 1) / (2 * steps)
+    drive = PARTICIPATION * np.cos(tau)
+
+    def moved(q):
+        return np.minimum(np.maximum(blocks, q[:, None] - slip), q[:, None] + slip)
+
+    def acceleration(load, q, v):
+        return load - VISCOUS * v - SQUARED * q + moved(q) @ stiffness
+
+    samples = np.zeros((steps, n))
+    for _ in range(cycles):
+        for k in range(steps):
+            samples[k] = q
+            a1 = acceleration(drive[2 * k], q, v)
+            v2 = v + 0.5 * step * a1
+            a2 = acceleration(drive[2 * k + 1], q + 0.5 * step * v, v2)
+            v3 = v + 0.5 * step * a2
+            a3 = acceleration(drive[2 * k + 1], q + 0.5 * step * v2, v3)
+            v4 = v + step * a3
+            a4 = acceleration(drive[2 * k + 2], q + step * v3, v4)
+            before = q
+            q = q + step * (v + 2 * v2 + 2 * v3 + v4) / 6
+            new = v + step * (a1 + 2 * a2 + 2 * a3 + a4) / 6
+            # Where q turned within the step, the blocks went along to the turning point.
+            turned = v * new < 0
+            until = v / np.where(turned, v - new, 1.0)
+            blocks = moved(np.where(turned, before + 0.5 * step * until * v, before))
+            blocks, v = moved(q), new
+    return samples
+
+
+# -------------------------------------------------------------------------------- the effects
+
+# The linear force at the linear resonance is ω²·SIZE; parameters are relative to it.
+CUBIC = SQUARED / SIZE**2
+DAMPING = VISCOUS / (OMEGA * SIZE)
+GAP = 0.3 * SIZE
+
+SMOOTH = {
+    "cubic_stiffness": {"coefficient": 0.05 * CUBIC},
+    "quadratic_stiffness": {"coefficient": 0.25 * SQUARED / SIZE},
+    "quintic_stiffness": {"coefficient": 0.05 * CUBIC / SIZE**2},
+    "quadratic_damping": {"coefficient": 0.5 * DAMPING},
+    "cubic_damping": {"coefficient": 0.5 * DAMPING / (OMEGA * SIZE)},
+    "van_der_pol_damping": {"coefficient": 2.0 * VISCOUS / SIZE**2},
+    "static_preload": {"constant_force": 0.3 * SQUARED * SIZE},
+    "linear_frequency_shift": {"relative_shift": 0.02},
+    "linear_damping_change": {"damping_ratio_change": 0.01},
+    "frequency_drift": {"relative_drift": 0.03},
+    "added_mass": {"mass": 0.05},
+    "force_harmonics": {"second": 0.8, "third": 0.5},
+}
+KINKED = {
+    "bilinear_stiffness": {"stiffness": 0.3 * SQUARED},
+    "gap_stiffness": {"stiffness": 0.15 * SQUARED, "gap": GAP},
+    "one_sided_stop": {"stiffness": 0.2 * SQUARED, "gap": GAP},
+}
+FRICTION = {
+    "coulomb_friction": {"force": 0.2 * PARTICIPATION},
+    "jenkins_slider": {"stiffness": 0.2 * SQUARED, "slip_displacement": 0.1 * SIZE},
+    "iwan_microslip": {"coefficient": 0.1 * SQUARED / SIZE**0.5, "exponent": 1.5},
+}
+COUPLED = {
+    "internal_resonance_1_3": {
+        "coefficient": 0.5 * CUBIC,
+        "frequency_hz": 3.02 * OMEGA / (2 * np.pi),
+        "damping_ratio": 0.01,
+    },
+    "internal_resonance_1_2": {
+        "coefficient": 0.2 * SQUARED / SIZE,
+        "frequency_hz": 2.02 * OMEGA / (2 * np.pi),
+        "damping_ratio": 0.02,
+    },
+}
+GROUPS = {"smooth": SMOOTH, "kinked": KINKED, "friction": FRICTION, "coupled": COUPLED}
+# Effects that show at the fundamental only beside another one.
+BESIDE = {
+    "static_preload": {"cubic_stiffness": {"coefficient": 0.05 * CUBIC}},
+    "force_harmonics": {
+        "cubic_stiffness": {"coefficient": 0.05 * CUBIC},
+        "quadratic_stiffness": {"coefficient": 0.25 * SQUARED / SIZE},
+    },
+}
+ORDER = 0.6  # test order, for drift
+HARMONICS = {"smooth": 11, "kinked": 15, "friction": 15, "coupled": 11}
+# What separates the two, of the fundamental. Smooth laws: what SciPy's 1e-7 in a step adds up
+# to. Contacts: rounding over 2 % of half the range, which changes their stiffness by up to 1e-4.
+# Coulomb: smoothing takes 5.1e-4 of 4F/π. Sliders: turning points between 256 samples, 1e-4.
+TOLERANCE = {"smooth": 1e-5, "kinked": 1e-4, "friction": 1e-4, "coupled": 1e-5}
+COULOMB = 5e-4
+
+
+def law_of(kind, p):
+    """Force of a memoryless effect, from its definition in words."""
+    laws = {
+        "cubic_stiffness": lambda q, v: p["coefficient"] * q**3,
+        "quadratic_stiffness": lambda q, v: p["coefficient"] * q**2,
+        "quintic_stiffness": lambda q, v: p["coefficient"] * q**5,
+        "bilinear_stiffness": lambda q, v: 0.5 * p["stiffness"] * np.abs(q),
+        "gap_stiffness": lambda q, v: p["stiffness"] * (q - np.clip(q, -p["gap"], p["gap"])),
+        "one_sided_stop": lambda q, v: p["stiffness"] * np.maximum(q - p["gap"], 0.0),
+        "quadratic_damping": lambda q, v: p["coefficient"] * np.abs(v) * v,
+        "cubic_damping": lambda q, v: p["coefficient"] * v**3,
+        "van_der_pol_damping": lambda q, v: p["coefficient"] * q**2 * v,
+        "static_preload": lambda q, v: p["constant_force"] + 0.0 * q,
+    }
+    return laws.get(kind, lambda q, v: 0.0 * q)
+
+
+def linear_terms_of(kind, p):
+    """Mass, damping and stiffness with a linear change."""
+    shift = p.get("relative_shift", ORDER * p.get("relative_drift", 0.0))
+    moved, ratio = OMEGA * (1 + shift), RATIO + p.get("damping_ratio_change", 0.0)
+    return 1.0 + p.get("mass", 0.0), 2 * ratio * moved, moved**2
+
+
+def coupling_of(kind, p):
+    """The further mode and the slopes of V = b qⁿ r."""
+    n, b = int(kind[-1]), p["coefficient"]
+    own = 2 * np.pi * p["frequency_hz"]
+    return own, p["damping_ratio"], lambda q, r: (n * b * q ** (n - 1) * r, b * q**n)
+
+
+@lru_cache
+def truth(kind):
+    """Phasors (frequency, harmonic) of the mode of interest in the settled motion."""
+    parameters = next(kinds[kind] for kinds in GROUPS.values() if kind in kinds)
+    if kind == "coulomb_friction":
+        rows = [coulomb_oscillator(parameters["force"], omega) for omega in FREQUENCIES]
+        return phasors(np.stack(rows, axis=1))
+    if kind == "jenkins_slider":
+        # k(q − z) − kq: the linear frequency holds the stuck spring.
+        sliders = np.array([parameters["stiffness"]]), np.array([parameters["slip_displacement"]])
+        return phasors(marched(*sliders, FREQUENCIES, cycles=40))
+    if kind == "iwan_microslip":
+        # Density c p (p − 1) s^{p−2}, summed up over cells of a grid that is finer at small s.
+        c, p = parameters["coefficient"], parameters["exponent"]
+        edges = SIZE * np.linspace(0.0, 1.0, 201) ** 2
+        cells = c * p * np.diff(edges ** (p - 1))
+        return phasors(marched(cells, 0.5 * (edges[1:] + edges[:-1]), FREQUENCIES, cycles=40))
+    if kind in COUPLED:
+        added = coupling_of(kind, parameters)
+        found = settled(lambda q, v: 0.0 * q, FREQUENCIES, added=added)
+        return phasors(found[:, :, 0])
+    laws = [law_of(kind, parameters)]
+    laws += [law_of(other, values) for other, values in BESIDE.get(kind, {}).items()]
+    orders = (0.0, 1.0, parameters.get("second", 0.0), parameters.get("third", 0.0))
+    found = settled(
+        lambda q, v: sum(law(q, v) for law in laws),
+        FREQUENCIES,
+        orders=orders,
+        linear=linear_terms_of(kind, parameters),
+        # A kink in a step costs many: less is asked of it, as the tolerance allows.
+        **({"cycles": 104, "rtol": 1e-6} if kind in KINKED else {}),
+    )
+    return phasors(found[:, :, 0])
+
+
+def model_with(group, kind, *, without=False):
+    """All effects of a group, so that one program serves them, all but one of them at zero."""
+    silent = ("coefficient", "stiffness", "force", "constant_force", "second", "third", "mass")
+    silent += ("relative_shift", "relative_drift", "damping_ratio_change")
+    effects = []
+    for name, parameters in GROUPS[group].items():
+        values = {key: 0.0 if key in silent else value for key, value in parameters.items()}
+        if name == kind and not without:
+            values = parameters
+        values = BESIDE.get(kind, {}).get(name, values)
+        effects.append(make_effect(name, values))
+    modes = linear_modes([OMEGA], [RATIO], [[1.0]], [PARTICIPATION])
+    return structure(modes, effects=tuple(effects), test_order=ORDER)
+
+
+def balanced(model, guess, order):
+    """Harmonic balance at all frequencies from phasors (frequency, harmonic) of the first mode."""
+    simulated = simulated_structure(model)
+    start = np.zeros((len(FREQUENCIES), 2 * order + 1, simulated.n_modes))
+    start[:, 0, 0] = guess[:, 0].real
+    start[:, 1:7:2, 0], start[:, 2:8:2, 0] = guess[:, 1:].real, -guess[:, 1:].imag
+    return solve_at_frequency(
+        simulated, jnp.ones(len(FREQUENCIES)), jnp.asarray(FREQUENCIES), jnp.asarray(start)
+    )
+
+
+def as_phasors(coefficients):
+    """Phasors of harmonics 0…3 of the mode of interest from the package's coefficients."""
+    x = np.asarray(coefficients)[:, :, 0]
+    return np.concatenate([x[:, :1], x[:, 1:7:2] - 1j * x[:, 2:8:2]], axis=1)
+
+
+def tolerance(group, kind):
+    return COULOMB if kind == "coulomb_friction" else TOLERANCE[group]
+
+
+ALL = [(group, kind) for group, kinds in GROUPS.items() for kind in kinds]
+
+
+@pytest.mark.parametrize(("group", "kind"), ALL, ids=[kind for _, kind in ALL])
+def test_harmonic_balance_is_the_settled_motion(group, kind):
+    wanted = truth(kind)
+    model = model_with(group, kind)
+    coefficients, converged = balanced(model, wanted, HARMONICS[group])
+    assert np.all(converged)
+    found = as_phasors(coefficients)
+    scale = np.abs(wanted[:, 1:2])
+    # The mean and the second and third harmonic to the same share of the fundamental.
+    np.testing.assert_allclose(found / scale, wanted / scale, atol=tolerance(group, kind))
+    # And the effect is no small one.
+    without, _ = balanced(model_with(group, kind, without=True), wanted, HARMONICS[group])
+    change = np.abs(as_phasors(without)[:, 1] / wanted[:, 1] - 1)
+    assert change.max() > 0.05
+    # What a motion settles to is stable.
+    multipliers = floquet_multipliers(simulated_structure(model), coefficients, FREQUENCIES)
+    assert np.all(is_stable(multipliers))
+
+
+@pytest.mark.parametrize("kind", ["gap_stiffness", *FRICTION])
+def test_the_packages_integration_settles_there_too(kind):
+    group = "kinked" if kind in KINKED else "friction"
+    motion = settled_motion(model_with(group, kind), 1.0, FREQUENCIES[0])
+    wanted = truth(kind)[:1]
+    assert motion.converged
+    found = as_phasors(motion.coefficients[None])
+    scale = abs(wanted[0, 1])
+    # Contacts are sharp here and Coulomb's force is not; the motion may be 1e-5 from the settled.
+    np.testing.assert_allclose(found / scale, wanted / scale, atol=tolerance(group, kind))
+
+
+def test_no_effect_with_a_force_is_left_out():
+    silent = {"force_gain_error", "force_offset_error", "sensor_gain_error", "sensor_phase_error"}
+    silent |= {"residual_mode", "mode_shape_change", "close_mode"}
+    assert {kind for _, kind in ALL} == set(EFFECTS) - silent

@@ -1,0 +1,310 @@
+"""Integration in time against closed forms, SciPy's integrators and folds of harmonic balance."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.model.beams import curved_beam, flat_beam
+from snrmjax.model.effects import make_effect
+from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structure import simulated_structure, structure
+from snrmjax.simulate.solutions import time_integration
+from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
+from snrmjax.simulate.solutions.time_integration import (
+    MOTION_MESSAGE,
+    MotionStatus,
+    settled_motion,
+    stepped_sine,
+)
+
+HZ = 2 * np.pi
+OMEGA, RATIO, SHAPE, PARTICIPATION = 500.0, 0.02, 2.0, 3.0
+STATIC = PARTICIPATION / OMEGA**2  # kg^1/2 m, of 1 N
+RESONANT = STATIC / (2 * RATIO)
+
+
+def oscillator(cubic=0.0, effects=(), ratio=RATIO):
+    """One mode; `cubic` is the coefficient of q³ over ω²/Q² at the linear resonance of 1 N."""
+    modes = linear_modes([OMEGA], [ratio], [[SHAPE]], [PARTICIPATION])
+    value = cubic * OMEGA**2 / RESONANT**2 / 4
+    return structure(modes, polynomial_potential({"1111": value}, 1), effects=effects)
+
+
+@pytest.fixture(scope="module")
+def stiffening():
+    """A stiffening oscillator and its response to 1 N, with two folds."""
+    model = oscillator(cubic=0.5)
+    curve = forced_response(model, [1.0], 0.8 * OMEGA, 1.4 * OMEGA)[0]
+    assert curve.at_events("fold").size == 2
+    return model, curve
+
+
+def fundamental(motion):
+    return np.asarray(motion.velocity)[..., 1, 0]
+
+
+# ------------------------------------------------------------------------------ settled motions
+
+
+@pytest.mark.parametrize("frequency", [300.0, 495.0, 2700.0])
+def test_a_small_motion_is_the_linear_response(frequency):
+    beam = flat_beam()
+    motion = settled_motion(beam, 1e-7, frequency, tolerance=1e-6, max_cycles=4000)
+    exact = linear_response(beam.modes, frequency, 1e-7)
+    assert motion.converged
+    # The tolerance is on an estimate of the distance: three of them.
+    np.testing.assert_allclose(motion.velocity[1], exact, rtol=3e-6)
+
+
+def test_a_transient_is_the_closed_form():
+    """From rest, q = q_p − e^{−ζωt}(…): the state after eight cycles, not settled."""
+    omega, force = 480.0, 0.7
+    motion = settled_motion(oscillator(), force, omega, max_cycles=8, tolerance=0.0)
+    time = 8 * 2 * np.pi / omega
+    steady = force * PARTICIPATION / (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)
+    roots = OMEGA * (-RATIO + np.array([1j, -1j]) * np.sqrt(1 - RATIO**2))
+    at_rest = np.array([-steady.real, -(1j * omega * steady).real])
+    weights = np.linalg.solve(np.array([[1, 1], roots]), at_rest)
+    free = np.array([weights, weights * roots]) @ np.exp(roots * time)
+    exact = free.real + np.array([steady.real, (1j * omega * steady).real])
+    # 8 · 128 steps, each of them right to 1e-8 of the motion.
+    scale = abs(steady) * np.array([1.0, omega])
+    np.testing.assert_allclose(motion.state[:, 0] / scale, exact / scale, atol=1e-5)
+    tight = settled_motion(oscillator(), force, omega, max_cycles=8, tolerance=0.0, rtol=1e-12)
+    np.testing.assert_allclose(tight.state[:, 0] / scale, exact / scale, atol=1e-9)
+    assert motion.n_cycles == 8
+    assert not motion.converged
+
+
+def test_a_strong_motion_is_what_scipy_finds(time_domain):
+    model, force, omega = curved_beam(), 1.779e-3, 60 * HZ
+    motion = settled_motion(model, force, omega, tolerance=1e-6)
+    assert motion.converged
+    truth = time_domain(model, force, omega)
+    period = 2 * np.pi / omega
+    # ζ = 0.05: forty periods leave e^{−12}; Dormand & Prince to 1e-10.
+    end = truth.integrate([[1e-12, 0.0]], 40 * period, rtol=1e-10)[-1]
+    times = np.arange(64) * period / 64
+    orbit = truth.integrate(end, times[-1], rtol=1e-10, t_eval=times)[:, 0, 0]
+    wanted = np.fft.rfft(orbit)[:10] / 32
+    found = np.asarray(motion.coefficients)[:, 0]
+    phasors = np.concatenate([[2 * found[0]], found[1::2] - 1j * found[2::2]])
+    assert abs(wanted[2]) > 0.03 * abs(wanted[1])
+    np.testing.assert_allclose(phasors, wanted, atol=2e-5 * abs(wanted[1]))
+    # And it starts other solvers.
+    exact, converged = solve_at_frequency(
+        model, jnp.array([force]), jnp.array([omega]), motion.coefficients[None]
+    )
+    assert converged[0]
+    np.testing.assert_allclose(
+        exact[0, :, 0], found, atol=1e-4 * abs(wanted[1])
+    )  # truncation after nine harmonics
+
+
+def test_the_start_decides_between_stable_motions(stiffening):
+    (model, curve), omega = stiffening, 1.12 * OMEGA
+    low = settled_motion(model, 1.0, omega)
+    high = settled_motion(model, 1.0, omega, start=[RESONANT])
+    assert low.converged
+    assert high.converged
+    assert abs(fundamental(high)) > 3 * abs(fundamental(low))
+    for motion in (low, high):
+        near = np.abs(curve.frequency / omega - 1) + np.abs(
+            curve.velocity[:, 1, 0] / fundamental(motion) - 1
+        )
+        k = np.argmin(near)
+        assert near[k] < 0.05
+        assert curve.stable[k]
+        exact, _ = solve_at_frequency(
+            model, jnp.array([1.0]), jnp.array([omega]), jnp.asarray(curve.coefficients[k])[None]
+        )
+        # The tolerance of 1e-5, three times, and nine harmonics.
+        scale = np.abs(exact).max()
+        np.testing.assert_allclose(motion.coefficients / scale, exact[0] / scale, atol=5e-5)
+    # A state goes on where it stopped.
+    again = settled_motion(model, 1.0, omega, start=high.state)
+    assert again.n_cycles <= 12
+    np.testing.assert_allclose(fundamental(again), fundamental(high), rtol=2e-5)
+
+
+def test_a_start_of_the_model_is_one_of_the_simulated_structure():
+    added = make_effect(
+        "internal_resonance_1_3",
+        {"coefficient": 0.0, "frequency_hz": 1500 / HZ, "damping_ratio": 0.02},
+    )
+    model = oscillator(effects=[added])
+    assert simulated_structure(model).n_modes == 2
+    options = {"max_cycles": 10, "tolerance": 0.0}
+    short = settled_motion(model, 1.0, 480.0, start=[RESONANT], **options)
+    whole = settled_motion(model, 1.0, 480.0, start=[RESONANT, 0.0], **options)
+    np.testing.assert_array_equal(short.state, whole.state)
+    assert short.coefficients.shape == (19, 2)
+
+
+# ----------------------------------------------------------------------------------- stepping
+
+
+def stepped_by_scipy(truth_of, frequencies, cycles):
+    """The same programme by Dormand & Prince, state and phase going on from step to step."""
+    state, found = [[1e-15, 0.0]], []
+    for omega in frequencies:
+        truth, period = truth_of(omega), 2 * np.pi / omega
+        times = np.concatenate([np.arange(128) / 128 + cycles - 1, [cycles]]) * period
+        rows = truth.integrate(state, times[-1], rtol=1e-9, t_eval=times)
+        state = rows[-1]
+        found.append(1j * omega * SHAPE * np.fft.rfft(rows[:-1, 0, 0])[1] / 64)
+    return np.array(found)
+
+
+def test_a_coarse_sweep_jumps_early_as_scipy_says(stiffening, time_domain):
+    model, curve = stiffening
+    fold = curve.frequency[curve.at_events("fold")].max()
+    height, steps = {}, {}
+    for n_steps in (16, 31):
+        grid = np.linspace(0.95, 1.35, n_steps)
+        steps[n_steps] = grid[grid < 1.17] * OMEGA
+        options = {"cycles_per_step": 40, "tolerance": 0.0, "rtol": 1e-10}
+        sweep = stepped_sine(model, 1.0, steps[n_steps], **options)
+        assert np.all(sweep.n_cycles == 40)
+        height[n_steps] = np.abs(fundamental(sweep))
+        if n_steps == 16:
+            wanted = stepped_by_scipy(
+                lambda omega: time_domain(model, 1.0, omega), steps[n_steps], 40
+            )
+            # They err by 1e-9 and 1e-10 in a step; beside the jump the motion magnifies that a lot.
+            np.testing.assert_allclose(fundamental(sweep), wanted, rtol=1e-4)
+    last = steps[31][steps[31] < fold].max()
+    assert last in steps[16]
+    before = {n: float(height[n][steps[n] == last][0]) for n in height}
+    after = {n: float(height[n][np.argmax(steps[n] > fold)]) for n in height}
+    # At one and the same frequency, below the fold, the finer sweep is still on the upper branch.
+    assert before[16] < 0.6 * before[31]  # and falling
+    assert after[16] < 0.3 * before[31]
+    assert after[31] < 0.3 * before[31]
+
+
+def test_a_sweep_down_jumps_up_at_the_other_fold(stiffening):
+    model, curve = stiffening
+    lower = curve.frequency[curve.at_events("fold")].min()
+    steps = np.linspace(1.2, 0.95, 51) * OMEGA
+    sweep = stepped_sine(model, 1.0, steps, cycles_per_step=400)
+    jump = int(np.argmax(np.diff(np.abs(fundamental(sweep)))))
+    assert steps[jump + 1] < 1.0005 * lower
+    assert steps[jump] > lower - 0.005 * OMEGA
+    assert np.all(sweep.converged)
+    # A step ends as soon as the motion has settled.
+    assert sweep.n_cycles.max() < 400
+
+
+def test_drift_moves_the_resonance_from_step_to_step():
+    drift = make_effect("frequency_drift", {"relative_drift": 0.02})
+    steps, orders = np.linspace(490.0, 510.0, 4), np.array([0.0, 0.25, 0.75, 1.0])
+    sweep = stepped_sine(oscillator(effects=[drift]), 1.0, steps, test_orders=orders)
+    moved = OMEGA * (1 + 0.02 * orders)
+    phasor = PARTICIPATION / (moved**2 - steps**2 + 2j * RATIO * moved * steps)
+    np.testing.assert_allclose(fundamental(sweep), 1j * steps * SHAPE * phasor, rtol=3e-4)
+
+
+# ------------------------------------------------------------------------------- how it ended
+
+
+def test_a_motion_that_needs_more_cycles_says_so():
+    motion = settled_motion(oscillator(), 1.0, OMEGA, max_cycles=20)
+    assert motion.status == MotionStatus.STILL_SETTLING
+    # e^{−ζω·20T} = e^{−2.5} is left of it.
+    assert 0.05 < motion.distance < 0.3
+
+
+def test_a_chaotic_motion_is_not_periodic():
+    motion = settled_motion(curved_beam(), 1.779e-3, 95 * HZ, max_cycles=300)
+    assert motion.status == MotionStatus.NOT_PERIODIC
+    assert np.all(np.isfinite(motion.coefficients))
+
+
+def test_a_motion_without_bounds_fails():
+    motion = settled_motion(oscillator(cubic=-20.0), 1.0, OMEGA, max_cycles=300)
+    assert motion.status == MotionStatus.FAILED
+    assert motion.n_cycles < 300
+
+
+def test_every_end_has_a_message():
+    assert set(MOTION_MESSAGE) == set(MotionStatus)
+
+
+# ------------------------------------------------------------------------------ transformations
+
+
+def test_motions_are_mapped_over_forces_and_compile_once():
+    model, forces = oscillator(cubic=0.5), jnp.array([0.2, 0.5, 0.9])
+
+    def motion(force):
+        return settled_motion(model, force, 1.02 * OMEGA)
+
+    before = time_integration._stepped._cached._cache_size()
+    single = [motion(force) for force in (0.2, 0.5, 0.9)]
+    assert time_integration._stepped._cached._cache_size() <= before + 1
+    many = jax.jit(jax.vmap(motion))(forces)
+    assert np.all(many.converged)
+    wanted = [fundamental(one) for one in single]
+    # The lanes take the same steps.
+    np.testing.assert_allclose(fundamental(many), wanted, rtol=1e-7)
+
+
+def test_units_do_not_matter():
+    """In millimetres and milliseconds the same numbers come out."""
+    long, slow = 1e3, 1e3
+    one = oscillator(cubic=0.5)
+    modes = linear_modes([OMEGA / slow], [RATIO], [[SHAPE]], [PARTICIPATION])
+    quartic = float(one.potential.coefficient[0]) / slow**2 / long**2
+    other = structure(modes, polynomial_potential({"1111": quartic}, 1))
+    first = settled_motion(one, 1.0, 1.02 * OMEGA)
+    second = settled_motion(other, long / slow**2, 1.02 * OMEGA / slow)
+    # Rounding, which may turn a step at the tolerance.
+    np.testing.assert_allclose(
+        first.coefficients * long, second.coefficients, atol=1e-6 * RESONANT * long
+    )
+
+
+# -------------------------------------------------------------------------------- failing well
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"force": 0.0}, "`force` must be positive and finite, but is"),
+        ({"frequency": np.nan}, "`frequency` must be positive"),
+        ({"max_cycles": 7}, "needs 8 cycles or more to settle, but gets 7"),
+        ({"start": [1.0, 2.0]}, r"`start` must have shape \(1,\) or \(2, 1\)"),
+        ({"start": np.zeros((3, 1))}, "`start` must have shape"),
+    ],
+)
+def test_wrong_settings_of_a_settled_motion_are_named(options, message):
+    given = {"force": 1.0, "frequency": OMEGA} | options
+    with pytest.raises(ValueError, match=message):
+        settled_motion(oscillator(), **given)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frequencies": []}, "`frequencies` must be a vector of steps"),
+        ({"frequencies": [500.0, -1.0]}, "`frequencies` must be positive and finite, but is"),
+        ({"test_orders": [0.0]}, r"`test_orders` must have shape \(2,\), but has \(1,\)"),
+        ({"cycles_per_step": 3}, "needs 8 cycles"),
+        ({"force": -1.0}, "`force`"),
+    ],
+)
+def test_wrong_settings_of_a_sweep_are_named(options, message):
+    given = {"force": 1.0, "frequencies": [500.0, 510.0]} | options
+    with pytest.raises(ValueError, match=message):
+        stepped_sine(oscillator(), **given)
+
+
+def test_without_diffrax_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "diffrax", None)
+    with pytest.raises(ImportError, match=r"pip install 'snrmjax\[integrate\]'"):
+        settled_motion(oscillator(), 1.0, OMEGA, harmonic_order=2)  # not compiled yet

@@ -1,0 +1,526 @@
+"""The virtual test: which states it records, that they are true, and what errors it adds."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
+from snrmjax.model.effects import make_effect
+from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.structure import structure
+from snrmjax.simulate.virtual_test.controlled_test import (
+    phase_controlled_test,
+    response_controlled_test,
+)
+from snrmjax.simulate.virtual_test.phase_resonance_test import (
+    NO_ERRORS,
+    MeasurementErrors,
+    _swept,
+    phase_resonance_test,
+)
+from snrmjax.simulate.virtual_test.recording import VisitedStates, recorded_states
+
+HZ = 2 * np.pi
+RANGE = (30 * HZ, 110 * HZ)
+FORCES = CURVED_BEAM_FORCES[:2]
+TINY = (1e-9, 2e-9)  # N: nonlinear terms change the response by 1e-6 and less
+
+
+def run(forces=FORCES, **options):
+    """The curved beam's test with what is compiled already: two levels of eight states."""
+    options = {"points_per_level": 8} | options
+    return phase_resonance_test(curved_beam(), forces, *RANGE, **options)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return run(keep_harmonics=(2, 3))
+
+
+def phases(states):
+    return np.angle(np.asarray(states.velocity)[:, 0])
+
+
+def distinct(states):
+    """How many different states there are."""
+    rows = np.stack([states.level, states.frequency, np.abs(states.velocity[:, 0])], axis=1)
+    return len(np.unique(np.round(rows, 6), axis=0))
+
+
+# ------------------------------------------------------------------------------ which and how true
+
+
+@pytest.mark.parametrize("appropriation", [(0.5, 0.7), (0.0, 1.0), (0.7, 0.99)])
+def test_states_lie_inside_the_range_and_are_different(appropriation):
+    states = run(appropriation=appropriation).steady_states
+    # One sensor and one mode: the sensor's phase is the mode's. The states are the middles of
+    # equal parts of the range: inside by half a part, less what interpolation misses (1e-3).
+    indicator = np.cos(phases(states)) ** 2
+    assert np.all((indicator >= appropriation[0]) & (indicator <= appropriation[1]))
+    assert np.all(np.cos(phases(states)) > 0)  # near resonance, not opposite to it
+    assert states.level.tolist() == [1] * 8 + [2] * 8
+    assert distinct(states) == 16
+    np.testing.assert_array_equal(states.force, np.repeat(FORCES, 8))
+
+
+def test_a_superharmonic_resonance_is_passed_over():
+    # At 1.8 mN the phase comes back to 42° at 27.6 Hz, a quarter of the resonance's frequency,
+    # on a branch that a sweep from 8 Hz visits.
+    test = phase_resonance_test(curved_beam(), [1.8e-3], 8 * HZ, 140 * HZ)
+    (curve,) = test.curves
+    phase = np.angle(curve.velocity[:, 1, 0])
+    below = curve.stable & (curve.frequency < 40 * HZ)
+    assert np.any(below & (np.cos(phase) ** 2 > 0.5)), "there is nothing to pass over"
+    assert np.all(test.steady_states.frequency > 80 * HZ)
+    assert len(test.steady_states.frequency) == 5
+
+
+def test_a_linear_structure_is_recorded_evenly_and_exactly():
+    states = run(TINY).steady_states
+    model = curved_beam()
+    wanted = linear_response(model.modes, states.frequency, states.force)
+    # The nonlinear terms: αQ/ω² = 3.4e9·1e-9·3342/(0.1·4e5²)… ≈ 1e-4, in second order 1e-7.
+    np.testing.assert_allclose(states.velocity, wanted, rtol=1e-5)
+    # 0.5 ≤ cos² ≤ 0.7 is 0.5796 ≤ |phase| ≤ π/4, of which four states take the middles.
+    ends = np.arccos(np.sqrt([0.7, 0.5]))
+    middles = ends[0] + (ends[1] - ends[0]) * (np.arange(4) + 0.5) / 4
+    for level in (1, 2):
+        found = np.sort(phases(states)[np.asarray(states.level) == level])
+        # Linear interpolation along a step of 0.08 rad misses by 0.08²/8.
+        np.testing.assert_allclose(found, np.concatenate([-middles[::-1], middles]), atol=1e-3)
+
+
+def test_recorded_states_are_settled_motions(exact, time_domain, state_of):
+    """Integrated from the nearest point of the curve, the motion settles to what was recorded."""
+    model, states = curved_beam(), exact.steady_states
+    shape = float(model.modes.mode_shape[0, 0])
+    for row in (0, 6, 9, 13):
+        omega, force = float(states.frequency[row]), float(states.force[row])
+        curve = exact.curves[int(states.level[row]) - 1]
+        recorded = complex(states.velocity[row, 0])
+        distance = np.abs(curve.frequency / omega - 1) + np.abs(
+            curve.velocity[:, 1, 0] / recorded - 1
+        )
+        near = int(np.argmin(distance))
+        truth = time_domain(model, force, omega)
+        period = 2 * np.pi / omega
+        # 30 periods of ζ = 0.05 leave e^{−9} of a distance of 2 %.
+        start = state_of(curve.coefficients[near], curve.frequency[near])
+        settled = truth.integrate(start, 30 * period, rtol=1e-8)[-1][0]
+        times = np.arange(64) * period / 64
+        orbit = truth.integrate(settled, times[-1], rtol=1e-10, t_eval=times)[:, 0, 1] * shape
+        spectrum = np.fft.rfft(orbit) / 32
+        # Nine harmonics of this strong motion leave up to 3e-4 (see the closed orbits).
+        assert spectrum[1] == pytest.approx(recorded, rel=1e-3)
+        for place, order in enumerate((2, 3)):
+            got = complex(states.harmonics[row, 0, place])
+            assert abs(spectrum[order] - got) < 1e-3 * abs(recorded)
+
+
+def test_states_between_two_branches_are_not_reached(exact):
+    # Where a test jumps, it leaves at a fold of the curve, within one step of it.
+    for level, frequency in exact.jumps:
+        curve = exact.curves[level - 1]
+        folds = curve.frequency[curve.at_events("fold")]
+        unstable = curve.frequency[~curve.stable]
+        ends = np.concatenate([folds, unstable])
+        assert np.abs(ends / frequency - 1).min() < 0.03
+    assert {level for level, _ in exact.jumps} == {1, 2}
+    # All phases: the unstable middle part of both curves stays empty.
+    everywhere = run(appropriation=(0.0, 1.0))
+    for level, curve in enumerate(everywhere.curves, start=1):
+        chosen = np.asarray(everywhere.steady_states.level) == level
+        found = phases(everywhere.steady_states)[chosen]
+        frequency = np.asarray(everywhere.steady_states.frequency)[chosen]
+        phase = np.angle(curve.velocity[:, 1, 0])
+        for p, f in zip(found, frequency, strict=True):
+            # The two neighbours on the curve that enclose the state are both stable.
+            between = (phase[:-1] - p) * (phase[1:] - p) <= 1e-12
+            between &= (curve.frequency[:-1] - f) * (curve.frequency[1:] - f) <= 1e-6
+            assert np.any(between & curve.stable[:-1] & curve.stable[1:])
+
+
+# ------------------------------------------------------------------------------------- errors
+
+
+def test_without_errors_nothing_is_stated(exact):
+    states = exact.steady_states
+    assert np.all(np.isnan(states.velocity_std))
+    assert np.all(np.isnan(states.phase_std))
+    assert np.all(np.isnan(states.force_std))
+    assert np.all(np.isnan(states.harmonic_std))
+    assert np.all(states.measured)
+    assert states.harmonic_order == (2, 3)
+    assert states.sensors == ("midspan",)
+
+
+def test_errors_are_drawn_from_the_seed():
+    errors = MeasurementErrors(amplitude=0.01, phase=0.01, force=0.01, level_gain=0.01)
+    first, again, other = (run(errors=errors, seed=seed).steady_states for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first.velocity, again.velocity)
+    np.testing.assert_array_equal(first.force, again.force)
+    assert not np.any(first.velocity == other.velocity)
+    assert not np.any(first.force == other.force)
+    np.testing.assert_array_equal(first.frequency, other.frequency)  # known exactly
+
+
+def test_errors_have_the_stated_sizes():
+    many = {"points_per_level": 40, "keep_harmonics": (2, 3)}
+    errors = MeasurementErrors(amplitude=0.02, phase=0.03, force=0.015, harmonic=1e-4)
+    truth = run(TINY, **many).steady_states
+    tests = [run(TINY, errors=errors, seed=seed, **many).steady_states for seed in range(10)]
+    noisy = jax.tree.map(lambda *parts: np.concatenate(parts), *tests)
+    truth = jax.tree.map(lambda part: np.concatenate([part] * 10), truth)
+    ratio = (noisy.velocity / truth.velocity)[:, 0]
+    n = len(ratio)
+    assert n == 800
+    drawn = {
+        "amplitude": np.abs(ratio) - 1,
+        "phase": np.angle(ratio),
+        "force": noisy.force / truth.force - 1,
+    }
+    # 800 draws: the standard deviation is known to 1/√1600 = 2.5 %, the mean to σ/28; four of each.
+    for name, values in drawn.items():
+        sigma = getattr(errors, name)
+        assert np.std(values) == pytest.approx(sigma, rel=0.1), name
+        assert abs(np.mean(values)) < 4 * sigma / np.sqrt(n), name
+    # Independent of each other and from row to row: correlations below 4/√800.
+    table = np.stack([*drawn.values(), np.roll(drawn["amplitude"], 1)])
+    correlation = np.corrcoef(table) - np.eye(4)
+    assert np.abs(correlation).max() < 4 / np.sqrt(n)
+    # The harmonics of so small a motion vanish: what is recorded is the error, rms as stated.
+    harmonics = noisy.harmonics[:, 0]
+    assert np.abs(truth.harmonics).max() < 1e-6 * errors.harmonic
+    for part in harmonics.T:
+        assert np.sqrt(np.mean(np.abs(part) ** 2)) == pytest.approx(errors.harmonic, rel=0.1)
+        assert np.std(part.real) == pytest.approx(errors.harmonic / np.sqrt(2), rel=0.12)
+    # And the table says so.
+    np.testing.assert_allclose(noisy.velocity_std, 0.02 * np.abs(noisy.velocity), rtol=1e-14)
+    np.testing.assert_array_equal(noisy.phase_std, 0.03)
+    np.testing.assert_allclose(noisy.force_std, 0.015 * truth.force, rtol=1e-14)
+    np.testing.assert_array_equal(noisy.harmonic_std, 1e-4)
+
+
+def test_level_errors_are_shared_within_a_level():
+    forces = tuple(np.linspace(1e-9, 5e-9, 20))
+    errors = MeasurementErrors(level_gain=0.1, level_phase=0.2)
+    options = {"points_per_level": 4, "keep_harmonics": (2,)}
+    truth = run(forces, **options).steady_states
+    noisy = run(forces, errors=errors, seed=5, **options).steady_states
+    ratio = np.asarray(noisy.velocity / truth.velocity)[:, 0].reshape(20, 4)
+    np.testing.assert_allclose(ratio, ratio[:, :1] * np.ones(4), rtol=1e-12)  # rounding
+    assert len(np.unique(np.abs(ratio[:, 0]).round(9))) == 20
+    # 20 draws: 1/√40 = 16 % of the standard deviation, three of them.
+    assert np.std(np.abs(ratio[:, 0])) == pytest.approx(0.1, rel=0.5)
+    assert np.std(np.angle(ratio[:, 0])) == pytest.approx(0.2, rel=0.5)
+    # The same gain and turn for the harmonics of a state; nothing is stated for single rows.
+    own = np.asarray(noisy.harmonics / truth.harmonics)[:, 0, 0].reshape(20, 4)
+    np.testing.assert_allclose(own, ratio, rtol=1e-12)
+    assert np.all(np.isnan(noisy.velocity_std))
+    np.testing.assert_array_equal(noisy.force, truth.force)
+
+
+# ----------------------------------------------------------------------- the measurement chain
+
+
+def test_what_is_recorded_went_through_the_chain_in_order():
+    """Shape change, then far modes, then the instruments: by hand, harmonics included."""
+    parameters = {
+        "sensor_phase_error": {"phase_deg": 4.0},
+        "residual_mode": {"receptance": 2e-6},
+        "mode_shape_change": {"coefficient": 1e9},
+        "sensor_gain_error": {"gain": 0.03},
+        "force_gain_error": {"gain": 0.02},
+        "force_offset_error": {"offset": 1e-3},
+    }
+    effects = tuple(make_effect(kind, values) for kind, values in parameters.items())
+    modes = linear_modes([500.0], [0.01], [[2.0], [-1.0]], [3.0])
+    model = structure(modes, effects=effects)
+    omega, force = np.array([490.0, 505.0, 510.0]), np.array([0.1, 0.2, 0.2])
+    x = np.random.default_rng(3).normal(size=(3, 5, 1)) * 1e-5
+    states = VisitedStates(np.array([1, 2, 2]), np.array([0.0, 0.4, 1.0]), force, omega, x)
+    found = recorded_states(model, states, NO_ERRORS, 0, (2,))
+    one, two = (x[:, h, 0] - 1j * x[:, h + 1, 0] for h in (1, 3))
+    stretch = 1 + 1e9 * np.abs(one) ** 2
+    turn = np.exp(1j * np.deg2rad(4.0))
+    shape = np.array([2.0, -1.0])
+    first = (1j * omega * one * stretch)[:, None] * shape
+    first = (first + (1j * omega * 2e-6 * force)[:, None]) * 1.03 * turn
+    second = (2j * omega * two * stretch)[:, None] * shape * 1.03 * turn**2
+    np.testing.assert_allclose(found.velocity, first, rtol=1e-12)  # rounding
+    np.testing.assert_allclose(found.harmonics[:, :, 0], second, rtol=1e-12)
+    np.testing.assert_allclose(found.force, force / 1.02 - 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(found.order, [0.0, 0.4, 1.0])
+    np.testing.assert_array_equal(found.frequency, omega)
+
+
+def test_sensors_see_the_rigid_body_motion_too():
+    modes = linear_modes(
+        [500.0],
+        [0.02],
+        [[2.0]],
+        [3.0],
+        rigid_body_shape=np.array([[1.5]]),
+        rigid_body_participation=np.array([0.7]),
+    )
+    omega = np.array([480.0, 510.0])
+    receptance = 3.0 / (500.0**2 - omega**2 + 20j * omega)
+    x = np.stack([0 * omega, receptance.real, -receptance.imag], axis=1)[:, :, None]
+    states = VisitedStates(np.ones(2, dtype=int), np.zeros(2), np.ones(2), omega, x)
+    found = recorded_states(structure(modes), states, NO_ERRORS, 0)
+    wanted = linear_response(modes, omega, np.ones(2))
+    np.testing.assert_allclose(found.velocity, wanted, rtol=1e-12)  # rounding
+
+
+def drifting(drift):
+    modes = linear_modes([500.0], [0.02], [[2.0]], [3.0])
+    effect = make_effect("frequency_drift", {"relative_drift": drift})
+    return structure(modes, effects=(effect,))
+
+
+def response_of_drifting(drift, states):
+    own = 500.0 * (1 + drift * np.asarray(states.order))
+    omega = np.asarray(states.frequency)
+    dynamic = own**2 - omega**2 + 2j * 0.02 * own * omega
+    return 6j * omega * np.asarray(states.force) / dynamic
+
+
+@pytest.mark.long
+def test_a_drifting_structure_is_recorded_as_it_is_at_the_time():
+    # 3 % of drift are one and a half half-widths of the resonance.
+    test = phase_resonance_test(drifting(0.03), [1.0, 2.0, 2.0], 400.0, 600.0)
+    states = test.steady_states
+    np.testing.assert_allclose(states.order, np.linspace(0, 1, 15), atol=1e-15)
+    assert states.level.tolist() == [1] * 5 + [2] * 5 + [3] * 5
+    wanted = response_of_drifting(0.03, states)
+    np.testing.assert_allclose(
+        states.velocity[:, 0], wanted, rtol=1e-8
+    )  # Newton's method ends at an estimated 1e-10
+    indicator = np.cos(phases(states)) ** 2
+    assert np.all((indicator > 0.5) & (indicator < 0.7))
+
+
+# ----------------------------------------------------------------------------------- in time
+
+
+@pytest.mark.long
+def test_a_drifting_structure_is_stepped_through_in_time():
+    test = phase_resonance_test(
+        drifting(0.02),
+        [1.0, 2.0],
+        470.0,
+        540.0,
+        by="time_integration",
+        steps_per_sweep=71,
+    )
+    states = test.steady_states
+    assert test.jumps == ()
+    assert test.curves == ()
+    assert np.all(np.diff(states.order) > 0)
+    assert np.all(np.diff(states.level) >= 0)
+    # One step a rad/s, recorded at the time of the step.
+    assert np.all(np.asarray(states.frequency) % 1 < 1e-9)
+    np.testing.assert_allclose(
+        states.velocity[:, 0], response_of_drifting(0.02, states), rtol=3e-4
+    )  # `stepped_sine` settles to an estimated 1e-4
+    assert np.all(np.abs(np.cos(phases(states)) ** 2 - 0.6) < 0.1)
+
+
+@pytest.mark.long
+def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
+    options = {"by": "time_integration", "steps_per_sweep": 81, "appropriation": (0.4, 0.8)}
+    test = run(**options)
+    states = test.steady_states
+    assert 10 <= states.n_states <= 16
+    # Every state lies on the exact curve, on a stable part, by interpolation to about 1e-2.
+    for k in range(states.n_states):
+        curve = exact.curves[int(states.level[k]) - 1]
+        away = np.abs(curve.frequency / states.frequency[k] - 1) + np.abs(
+            curve.velocity[:, 1, 0] / states.velocity[k, 0] - 1
+        )
+        assert away.min() < 0.06
+        assert curve.stable[int(np.argmin(away))]
+    # Finite steps and transients: jumps are within two steps of the folds, or earlier.
+    step = 80 * HZ / 80
+    assert {level for level, _ in test.jumps} == {1, 2}
+    for level, frequency in test.jumps:
+        curve = exact.curves[level - 1]
+        left = np.concatenate(
+            [curve.frequency[curve.at_events("fold")], curve.frequency[~curve.stable]]
+        )
+        assert np.abs(left - frequency).min() < 2 * step
+
+
+# ---------------------------------------------------------------------------- under a controller
+
+
+def test_a_phase_locked_loop_on_a_linear_structure_is_the_closed_form():
+    wanted = np.array([0.6, 0.0, -0.6])
+    test = phase_controlled_test(curved_beam(), TINY, wanted)
+    states, modes = test.steady_states, curved_beam().modes
+    assert states.level.tolist() == [1] * 3 + [2] * 3
+    # The nonlinear terms are 1e-7 of it, as above.
+    np.testing.assert_allclose(phases(states), np.tile(wanted, 2), atol=1e-9)
+    np.testing.assert_array_equal(states.force, np.repeat(TINY, 3))
+    own, ratio = float(modes.natural_frequency[0]), float(modes.damping_ratio[0])
+    # tan φ = (ω² − Ω²)/(2ζωΩ)
+    slope = ratio * own * np.tan(wanted)
+    np.testing.assert_allclose(
+        states.frequency, np.tile(np.sqrt(own**2 + slope**2) - slope, 2), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        states.velocity, linear_response(modes, states.frequency, states.force), rtol=1e-5
+    )
+
+
+def test_a_phase_locked_loop_records_what_jumps_leave_out(exact):
+    test = phase_controlled_test(curved_beam(), FORCES, [0.5, 0.0, -0.5])
+    states = test.steady_states
+    # The curve at +0.5 rad turns back at 0.26 mN: a rising force does not get to the second level.
+    rising = test.curves[0].force
+    assert rising[np.argmax(np.diff(rising) < 0)] < FORCES[1]
+    np.testing.assert_allclose(phases(states), [0.5, 0.0, -0.5, 0.0, -0.5], atol=1e-9)
+    assert states.level.tolist() == [1, 1, 1, 2, 2]
+    unstable = 0
+    for k in range(5):
+        # On the forced response, where the phase passes the one asked for.
+        curve = exact.curves[int(states.level[k]) - 1]
+        phase, target = np.angle(curve.velocity[:, 1, 0]), phases(states)[k]
+        passed = np.flatnonzero((phase[:-1] - target) * (phase[1:] - target) <= 0)
+        share = (target - phase[passed]) / (phase[passed + 1] - phase[passed])
+        on = curve.frequency[passed] * (1 - share) + curve.frequency[passed + 1] * share
+        place = passed[np.argmin(np.abs(on - states.frequency[k]))]
+        # Linear interpolation over a step.
+        assert np.abs(on / states.frequency[k] - 1).min() < 2e-3
+        unstable += not curve.stable[place]
+    assert unstable >= 1
+    assert test.jumps == ()
+    assert len(test.curves) == 3
+
+
+NARROW = (55 * HZ, 80 * HZ)
+
+
+def test_response_control_holds_the_velocity():
+    test = response_controlled_test(curved_beam(), [1e-3, 0.1], *NARROW, keep_harmonics=(2,))
+    states, modes = test.steady_states, curved_beam().modes
+    assert states.level.tolist() == [1] * 5 + [2] * 5
+    np.testing.assert_allclose(
+        np.abs(states.velocity[:, 0]), np.repeat([1e-3, 0.1], 5), rtol=1e-8
+    )  # Newton's method ends at an estimated 1e-10
+    assert np.all(np.cos(phases(states)) ** 2 >= 0.5)
+    assert np.any(phases(states) > 0)
+    assert np.any(phases(states) < 0)
+    # A small motion needs the linear structure's force.
+    small = np.asarray(states.level) == 1
+    per_newton = linear_response(modes, states.frequency[small], np.ones(5))[:, 0]
+    np.testing.assert_allclose(1e-3 / np.abs(per_newton), states.force[small], rtol=1e-3)
+    # At the other one the forced response to each state's force passes through it.
+    own, strong = float(modes.natural_frequency[0]), ~small
+    assert np.all(np.asarray(states.frequency)[strong] < 1.01 * own)
+    assert np.all(np.abs(states.harmonics[strong, 0, 0]) > 1e-4)
+
+
+def test_errors_and_chain_are_the_same_for_every_test():
+    errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
+    options = {"errors": errors, "seed": 3}
+    exact_one = phase_controlled_test(curved_beam(), TINY, [0.0]).steady_states
+    drawn = phase_controlled_test(curved_beam(), TINY, [0.0], **options).steady_states
+    same = VisitedStates(np.array([1, 2]), np.zeros(2), np.ones(2), np.ones(2), np.ones((2, 3, 1)))
+    by_hand = recorded_states(curved_beam(), same, errors, 3)
+    plain = recorded_states(curved_beam(), same, NO_ERRORS, 3)
+    np.testing.assert_allclose(
+        drawn.velocity / exact_one.velocity, by_hand.velocity / plain.velocity, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        drawn.force / exact_one.force, by_hand.force / plain.force, rtol=1e-12
+    )
+    np.testing.assert_array_equal(drawn.phase_std, 0.02)
+
+
+# -------------------------------------------------------------------------------- failing well
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"appropriation": (0.7, 0.5)}, "`appropriation` must be a range inside 0…1"),
+        ({"appropriation": (0.5, 0.5)}, "`appropriation`"),
+        ({"appropriation": (-0.1, 0.5)}, "`appropriation`"),
+        ({"appropriation": (0.5, 1.1)}, "`appropriation`"),
+        ({"appropriation": (np.nan, 0.5)}, "`appropriation`"),
+        ({"points_per_level": 0}, "`points_per_level` must be 1 or more, but is 0"),
+        ({"keep_harmonics": (10,)}, "`keep_harmonics` must lie between 2 and `harmonic_order` = 9"),
+        ({"keep_harmonics": (1,)}, "`keep_harmonics`"),
+        ({"errors": MeasurementErrors(phase=-0.1)}, "the error `phase` must be zero or positive"),
+        ({"errors": MeasurementErrors(force=np.nan)}, "the error `force`"),
+        ({"forces": [0.0]}, "every force must be positive"),
+        ({"by": "magic"}, "`by` must be one of .*'time_integration'.*, but is 'magic'"),
+        ({"steps_per_sweep": 1}, "`steps_per_sweep` must be 2 or more, but is 1"),
+        ({"by": "time_integration", "cycles_per_step": 3}, "needs 8 cycles"),
+    ],
+)
+def test_wrong_settings_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        run(**options)
+
+
+@pytest.mark.parametrize(
+    ("forces", "phases", "message"),
+    [
+        ([0.0], [0.0], "every force must be positive, but one is 0.0 N"),
+        ([], [0.0], "a test needs at least one force"),
+        ([1e-9], [], "`phases` must name at least one phase"),
+        ([1e-9], [2.0], "`phase` must lie between"),
+    ],
+)
+def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message):
+    with pytest.raises(ValueError, match=message):
+        phase_controlled_test(curved_beam(), forces, phases)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"velocities": [-1.0]}, "every velocity must be positive, but one is -1.0 m/s"),
+        ({"appropriation": (1.0, 1.0)}, "`appropriation`"),
+        ({"points_per_level": 0}, "`points_per_level`"),
+        ({"keep_harmonics": (1,)}, "`keep_harmonics`"),
+        ({"from_frequency": 1e4}, "`from_frequency` must be positive and below"),
+    ],
+)
+def test_wrong_settings_of_response_control_are_named(options, message):
+    given = {"velocities": [1e-3], "from_frequency": RANGE[0], "to_frequency": RANGE[1]}
+    with pytest.raises(ValueError, match=message):
+        response_controlled_test(curved_beam(), **(given | options))
+
+
+def test_a_range_without_resonance_has_no_states():
+    with pytest.raises(ValueError, match="no stable state has an appropriation indicator"):
+        phase_resonance_test(curved_beam(), TINY, 30 * HZ, 40 * HZ)
+
+
+def test_one_state_and_odd_numbers_are_shared_among_the_sides():
+    forces = tuple(np.linspace(1e-9, 2e-9, 16))
+    states = run(forces, points_per_level=1).steady_states
+    assert states.level.tolist() == list(range(1, 17))
+    states = run(forces, points_per_level=5).steady_states
+    assert states.n_states == 80
+    assert int(jnp.sum(jnp.angle(states.velocity) > 0)) == 48
+
+
+def test_a_sweep_turns_round_where_it_lands():
+    # Along the curve: a low branch up to 10, back unstable, one from 2 to 8, back unstable, and one
+    # from 6.5 on. The sweep up jumps past the middle branch; the sweep down lands inside it, and
+    # finds its upper end only by turning round.
+    frequency = np.array([1.0, 5, 10, 6, 2, 2.5, 4, 5.5, 7, 8, 7.5, 6.5, 9, 12])
+    stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1], dtype=bool)
+    curve = SimpleNamespace(
+        frequency=frequency, stable=stable, at_events=lambda _: np.array([], dtype=int)
+    )
+    visited, jumps = _swept(curve)
+    np.testing.assert_array_equal(visited, stable)
+    assert jumps == [10.0, 6.5, 2.5]
