@@ -58,7 +58,9 @@ CASES = {
 }
 
 
-def exact_test(beam: sj.Structure, points: int, harmonics: tuple[int, ...]) -> sj.SteadyStates:
+def exact_test(
+    beam: sj.model.Structure, points: int, harmonics: tuple[int, ...]
+) -> sj.measure.SteadyStates:
     """The states as they are."""
     return sj.phase_resonance_test(
         beam, FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0),
@@ -66,7 +68,9 @@ def exact_test(beam: sj.Structure, points: int, harmonics: tuple[int, ...]) -> s
     ).steady_states  # fmt: skip
 
 
-def measured(exact: sj.SteadyStates, case: Case, random: np.random.Generator) -> sj.SteadyStates:
+def measured(
+    exact: sj.measure.SteadyStates, case: Case, random: np.random.Generator
+) -> sj.measure.SteadyStates:
     """The states as a test would record them."""
     velocity, force = np.asarray(exact.velocity), np.asarray(exact.force)
     level = np.unique(np.asarray(exact.level), return_inverse=True)[1]
@@ -81,7 +85,7 @@ def measured(exact: sj.SteadyStates, case: Case, random: np.random.Generator) ->
         "harmonic_order": case.harmonics,
         "harmonic_std": np.full(velocity.shape, HARMONIC),
     }
-    return sj.steady_states(
+    return sj.measure.steady_states(
         *(exact.level, exact.frequency, force * (1 + FORCE * random.normal(size=force.shape))),
         recorded,
         sensors=exact.sensors,
@@ -94,7 +98,7 @@ def measured(exact: sj.SteadyStates, case: Case, random: np.random.Generator) ->
 
 def run(name: str, case: Case, options: argparse.Namespace) -> dict:
     """All seeds of one case."""
-    beam = sj.flat_beam()
+    beam = sj.model.flat_beam()
     names = (*LINEAR, *(f"potential.{key}" for key in case.coefficients))
     truth = np.array([float(parameter_value(beam, name)) for name in names])
     exact = exact_test(beam, options.points, case.harmonics)

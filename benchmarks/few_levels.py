@@ -39,7 +39,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, differ: bool) -> Found:
     velocity = truth.velocity * np.exp(own + (shared if differ else 0.0))
     force = truth.force * np.exp(QUIET["force"] * rng.normal(size=n))
     fit = sj.fit_jointly(recorded(case, truth, force, velocity, QUIET), case.model.modes)
-    values = sj.fitted_values(fit, displacement=truth.at)
+    values = sj.identify.fitted_values(fit, displacement=truth.at)
     return Found(
         np.asarray(values.natural_frequency - truth.natural_frequency)
         / np.asarray(values.natural_frequency_std),

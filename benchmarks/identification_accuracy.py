@@ -27,10 +27,10 @@ def off_resonance(degrees_from: float, degrees_to: float) -> tuple[float, float]
     return np.cos(np.radians(degrees_to)) ** 2, np.cos(np.radians(degrees_from)) ** 2
 
 
-def flat_test() -> sj.SteadyStates:
+def flat_test() -> sj.measure.SteadyStates:
     """Twenty forces up to a little above the paper's largest, four states each."""
     return sj.phase_resonance_test(
-        sj.flat_beam(),
+        sj.model.flat_beam(),
         np.linspace(1.0e-3, 1.45e-2, 20).tolist(),
         55 * HERTZ,
         115 * HERTZ,
@@ -39,7 +39,7 @@ def flat_test() -> sj.SteadyStates:
     ).steady_states
 
 
-def curved_test() -> sj.SteadyStates:
+def curved_test() -> sj.measure.SteadyStates:
     """Forces from softening to stiffening, in finer steps and nearer to resonance at the minimum.
 
     The paper's test too went close to resonance where the stable side changes.
@@ -52,7 +52,7 @@ def curved_test() -> sj.SteadyStates:
     ]
     parts = [
         sj.phase_resonance_test(
-            sj.curved_beam(),
+            sj.model.curved_beam(),
             forces.tolist(),
             25 * HERTZ,
             140 * HERTZ,
@@ -63,7 +63,7 @@ def curved_test() -> sj.SteadyStates:
     ]
     offsets = np.cumsum([0] + [len(forces) for forces, _ in windows[:-1]])
     numbered = [part.renumbered(int(offset)) for part, offset in zip(parts, offsets, strict=True)]
-    return sj.join_steady_states(*numbered)
+    return sj.measure.join_steady_states(*numbered)
 
 
 def percent_errors(value: np.ndarray, truth: np.ndarray) -> dict[str, float]:
@@ -73,13 +73,13 @@ def percent_errors(value: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 
 
 def study(
-    model: sj.Structure,
-    data: sj.SteadyStates,
+    model: sj.model.Structure,
+    data: sj.measure.SteadyStates,
     argument: str,
-    branch: sj.NormalModeBranch,
-    responses: list[sj.ResponseCurve],
+    branch: sj.simulate.NormalModeBranch,
+    responses: list[sj.simulate.ResponseCurve],
     skip_hz: tuple[float, float],
-) -> tuple[dict, sj.Backbone]:
+) -> tuple[dict, sj.identify.Backbone]:
     """Errors of points, curve, resonances and force balance against harmonic balance."""
     found = sj.identify_backbone(data, model.modes, amplitude=argument)
     points, backbone = found.points, found.fit.backbone
@@ -113,7 +113,7 @@ def study(
         exact = curve.at_events("phase_resonance")
         k = max(exact, key=lambda k: abs(curve.velocity[k, 1, 0]))
         predicted = max(
-            sj.resonances(backbone, model.modes, curve.force),
+            sj.identify.resonances(backbone, model.modes, curve.force),
             key=lambda r: -abs(r.frequency - curve.frequency[k]),
             default=None,
         )
@@ -137,7 +137,7 @@ def study(
     return result, backbone
 
 
-def force_error(backbone: sj.Backbone, curve: sj.ResponseCurve) -> np.ndarray:
+def force_error(backbone: sj.identify.Backbone, curve: sj.simulate.ResponseCurve) -> np.ndarray:
     """Relative error of the force that the backbone needs for the exact response."""
     velocity, frequency = np.abs(curve.velocity[:, 1, 0]), curve.frequency
     argument = velocity / frequency if backbone.argument == "displacement" else velocity
@@ -151,7 +151,7 @@ def force_error(backbone: sj.Backbone, curve: sj.ResponseCurve) -> np.ndarray:
 
 def main() -> None:
     """Run both beams and print."""
-    flat, curved = sj.flat_beam(), sj.curved_beam()
+    flat, curved = sj.model.flat_beam(), sj.model.curved_beam()
     data = flat_test()
     branch = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
     responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 55 * HERTZ, 115 * HERTZ)
@@ -171,11 +171,15 @@ def main() -> None:
             [
                 part
                 for force in CURVED_BEAM_FORCES
-                for part in sj.predict_response(
+                for part in sj.identify.predict_response(
                     backbone, curved.modes, force, from_frequency=25 * HERTZ
                 )
             ],
-            [r for f in CURVED_BEAM_FORCES for r in sj.resonances(backbone, curved.modes, f)],
+            [
+                r
+                for f in CURVED_BEAM_FORCES
+                for r in sj.identify.resonances(backbone, curved.modes, f)
+            ],
             simulated=responses,
         )
         plot.save_figure(figure, folder / "curved_responses.png")

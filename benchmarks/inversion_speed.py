@@ -64,8 +64,8 @@ def closed_form_with_roots(
     half = jnp.cos(phase) * w.real + jnp.sin(phase) * w.imag
     root = jnp.sqrt(half**2 - jnp.abs(w) ** 2 + amplitude**2)
     direction = jnp.exp(1j * phase)
-    far = sj.closed_form(constant, frequency, (-half + root) * direction)
-    near = sj.closed_form(constant, frequency, (-half - root) * direction)
+    far = sj.identify.closed_form(constant, frequency, (-half + root) * direction)
+    near = sj.identify.closed_form(constant, frequency, (-half - root) * direction)
     return (*far, *near)
 
 
@@ -80,7 +80,9 @@ def median_time(function, *args: jax.Array) -> float:
     return float(np.median(times))
 
 
-def worst_residuals(points: sj.SnrmPoints, sample: dict[str, np.ndarray]) -> tuple[float, float]:
+def worst_residuals(
+    points: sj.identify.SnrmPoints, sample: dict[str, np.ndarray]
+) -> tuple[float, float]:
     """Largest relative errors of Eq. (12) and of Eq. (17) among the answers, in NumPy."""
     good = np.isfinite(np.asarray(points.natural_frequency))
     omega, zeta = (np.asarray(p)[good] for p in (points.natural_frequency, points.damping_ratio))
@@ -109,20 +111,26 @@ def main() -> None:
     velocity, phase = mode + residual, jnp.angle(mode)
     phasor = (constant, frequency, velocity, residual)
     triple = (constant, frequency, jnp.abs(velocity), phase, residual)
-    points = sj.invert_phasor(*phasor)
+    points = sj.identify.invert_phasor(*phasor)
     names, counts = np.unique(np.asarray(points.status), return_counts=True)
     amplitude, natural = worst_residuals(points, sample)
     solved = np.isfinite(points.natural_frequency) & np.isfinite(points.damping_ratio)
     answered = np.isin(
         points.status,
-        [sj.PointStatus.OK, sj.PointStatus.TWO_ROOTS, sj.PointStatus.NEGATIVE_DAMPING],
+        [
+            sj.identify.PointStatus.OK,
+            sj.identify.PointStatus.TWO_ROOTS,
+            sj.identify.PointStatus.NEGATIVE_DAMPING,
+        ],
     )
     error = np.abs(np.asarray(points.natural_frequency) / sample["natural"] - 1)
     seconds = {
         "closed_form_triple_s": median_time(jax.jit(closed_form_with_roots), *triple),
-        "newton_triple_s": median_time(sj.invert_amplitude_phase, *triple),
-        "newton_phasor_s": median_time(sj.invert_phasor, *phasor),
-        "closed_form_one_root_s": median_time(jax.jit(sj.closed_form), constant, frequency, mode),
+        "newton_triple_s": median_time(sj.identify.invert_amplitude_phase, *triple),
+        "newton_phasor_s": median_time(sj.identify.invert_phasor, *phasor),
+        "closed_form_one_root_s": median_time(
+            jax.jit(sj.identify.closed_form), constant, frequency, mode
+        ),
     }
     print(
         json.dumps(
@@ -131,7 +139,8 @@ def main() -> None:
                 "measurements": n,
                 "device": jax.devices()[0].device_kind,
                 "status": {
-                    sj.PointStatus(int(k)).name: int(c) for k, c in zip(names, counts, strict=True)
+                    sj.identify.PointStatus(int(k)).name: int(c)
+                    for k, c in zip(names, counts, strict=True)
                 },
                 "worst_relative_error_eq12": amplitude,
                 "worst_relative_error_eq17": natural,

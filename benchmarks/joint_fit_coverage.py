@@ -37,7 +37,7 @@ FAMILY: dict[str, str] = {}
 class Case(NamedTuple):
     """A beam, the forces of its test and the force whose response is foretold."""
 
-    model: sj.Structure
+    model: sj.model.Structure
     forces: tuple[float, ...]  # N
     from_hz: float
     to_hz: float
@@ -47,13 +47,15 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "flat": Case(sj.flat_beam(), (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2), 60, 120, 1.1e-2, ()),
+    "flat": Case(
+        sj.model.flat_beam(), (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2), 60, 120, 1.1e-2, ()
+    ),
     # Far into softening and stiffening the method wants states near resonance: harmonics are large.
     # Around the softest amplitude a stepped sine jumps, in force as in frequency, and velocity has
     # a maximum: only a loop locked to the phase gets there. Levels lie closer, for the curve is
     # steep.
     "curved": Case(
-        sj.curved_beam("monostable"),
+        sj.model.curved_beam("monostable"),
         tuple(
             np.concatenate(
                 [
@@ -87,7 +89,7 @@ def truth_of(case: Case) -> Truth:
     """Exact states and values."""
     ends = (case.from_hz * HERTZ, case.to_hz * HERTZ)
     if case.phases:
-        test = sj.phase_controlled_test(
+        test = sj.simulate.phase_controlled_test(
             case.model, case.forces, np.radians(case.phases), harmonic_order=HARMONICS
         ).steady_states
     else:
@@ -97,8 +99,8 @@ def truth_of(case: Case) -> Truth:
         ).steady_states  # fmt: skip
     modes = case.model.modes
     constant = float(modes.mode_shape[0, 0] * modes.participation[0])
-    fine = sj.StepControl(largest=0.01, angle=0.02)
-    locked = sj.phase_controlled(
+    fine = sj.simulate.StepControl(largest=0.01, angle=0.02)
+    locked = sj.simulate.phase_controlled(
         case.model, 1.05 * case.forces[-1], harmonic_order=HARMONICS, steps=fine
     )
     # The nonlinear mode is what the sensor sees beside the other modes' linear response.
@@ -132,9 +134,9 @@ def truth_of(case: Case) -> Truth:
 
 def recorded(
     case: Case, truth: Truth, force: np.ndarray, velocity: np.ndarray, errors: dict[str, float]
-) -> sj.SteadyStates:
+) -> sj.measure.SteadyStates:
     """States with their errors, whose random part is stated."""
-    return sj.steady_states(
+    return sj.measure.steady_states(
         truth.level,
         truth.frequency,
         force,

@@ -47,22 +47,24 @@ def _plain(value: object) -> object:
     return [float(f"{x:.4g}") for x in array.reshape(-1)] if array.ndim else float(f"{array:.4g}")
 
 
-def load(folder: Path) -> tuple[sj.SteadyStates, sj.Structure]:
+def load(folder: Path) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
     """Data and model of one beam."""
     model = read_model(folder / "model.toml")
     (table,) = folder.glob("*.csv")
     return read_steady_states(table, sensors=model.modes.sensors).steady_states, model
 
 
-def only(data: sj.SteadyStates, rows: np.ndarray) -> sj.SteadyStates:
+def only(data: sj.measure.SteadyStates, rows: np.ndarray) -> sj.measure.SteadyStates:
     """Some of the states."""
     index = np.flatnonzero(rows)
     plain = {"harmonic_order", "sensors"}
     parts = {k: v if k in plain else np.asarray(v)[index] for k, v in vars(data).items()}
-    return sj.SteadyStates(**{k: v if k in plain else jnp.asarray(v) for k, v in parts.items()})
+    return sj.measure.SteadyStates(
+        **{k: v if k in plain else jnp.asarray(v) for k, v in parts.items()}
+    )
 
 
-def at_resonance(data: sj.SteadyStates, level: int) -> tuple[float, float, float]:
+def at_resonance(data: sj.measure.SteadyStates, level: int) -> tuple[float, float, float]:
     """Frequency, velocity and force of a level where the phase passes zero, by interpolation."""
     mine = np.asarray(data.level) == level
     velocity = np.asarray(data.velocity)[mine, 0]
@@ -71,7 +73,7 @@ def at_resonance(data: sj.SteadyStates, level: int) -> tuple[float, float, float
     return tuple(float(np.interp(0.0, -phase[order], c[order])) for c in columns)
 
 
-def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
+def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
     """Every pair of levels foretold by the other six."""
     levels = np.unique(np.asarray(data.level)).tolist()
     rows, times = [], []
@@ -83,7 +85,7 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
         inside = set(levels[1:-1])
         for level in pair:
             frequency, velocity, force = at_resonance(data, level)
-            found = [p for c in sj.fitted_response(fit, force) for p in c.resonances]
+            found = [p for c in sj.identify.fitted_response(fit, force) for p in c.resonances]
             if not found:
                 rows.append((level, level in inside, np.nan, np.nan, np.nan, np.nan))
                 continue
@@ -120,7 +122,7 @@ def held_out(data: sj.SteadyStates, model: sj.Structure) -> None:
 def describe(name: str, fit: JointFit, seconds: float) -> None:
     """What a fit of all levels says."""
     at = np.linspace(0.0, fit.largest[1], 6)
-    values = sj.fitted_values(fit, at)
+    values = sj.identify.fitted_values(fit, at)
     tell(
         measurement="fit",
         beam=name,
@@ -138,7 +140,7 @@ def describe(name: str, fit: JointFit, seconds: float) -> None:
     )
 
 
-def halves(data: sj.SteadyStates, model: sj.Structure, free: tuple[str, ...]) -> None:
+def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple[str, ...]) -> None:
     """Odd and even levels fitted apart, where both have amplitudes."""
     fits, ends = [], []
     for odd in (True, False):
@@ -147,7 +149,7 @@ def halves(data: sj.SteadyStates, model: sj.Structure, free: tuple[str, ...]) ->
         fits.append(fit)
         ends.append((np.abs(np.asarray(fit.motion().velocity)).min(), fit.largest[1]))
     at = np.linspace(max(e[0] for e in ends), min(e[1] for e in ends), 12)
-    one, two = (sj.fitted_values(fit, at) for fit in fits)
+    one, two = (sj.identify.fitted_values(fit, at) for fit in fits)
     gaps = {
         "frequency": (one.natural_frequency - two.natural_frequency)
         / np.hypot(one.natural_frequency_std, two.natural_frequency_std),
@@ -171,7 +173,7 @@ def _residuals(vector, restore, data, modes, spread, weighing):
     return all_residuals(vector, restore, data, modes, spread, weighing)
 
 
-def speed(data: sj.SteadyStates, model: sj.Structure) -> None:
+def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
     """A fit with given families, SciPy on the same residuals, and all derivatives."""
     settings = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
 

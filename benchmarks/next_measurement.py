@@ -22,7 +22,7 @@ OMEGA, CONSTANT = 500.0, 6.0
 NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003, "gain": 0.01}
 FAMILIES = {"backbone": "polynomial:2@displacement", "damping": "viscous_quadratic@velocity"}
 FORCES = (0.3, 0.8, 1.6, 2.6)
-MODES = sj.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
+MODES = sj.model.linear_modes([OMEGA], [0.012], [[2.0]], [3.0])
 
 
 def squared(x: np.ndarray) -> np.ndarray:
@@ -66,7 +66,9 @@ def at_frequency(force: float, omega: float, expected: float) -> complex:
 Row = tuple[int, float, float, complex]  # level, force, frequency, velocity
 
 
-def measured(rows: list[Row], rng: np.random.Generator, gains: dict[int, float]) -> sj.SteadyStates:
+def measured(
+    rows: list[Row], rng: np.random.Generator, gains: dict[int, float]
+) -> sj.measure.SteadyStates:
     """Rows with noise; every level has its own gain."""
     level, force, omega, velocity = (np.array(column) for column in zip(*rows, strict=True))
     for number in level:
@@ -75,7 +77,7 @@ def measured(rows: list[Row], rng: np.random.Generator, gains: dict[int, float])
     own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
     velocity = velocity * np.exp(shared + own)
     force = force * np.exp(NOISE["force"] * rng.normal(size=n))
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level,
         omega,
         force,
@@ -86,21 +88,21 @@ def measured(rows: list[Row], rng: np.random.Generator, gains: dict[int, float])
     )
 
 
-def fitted(data: sj.SteadyStates) -> sj.JointFit:
+def fitted(data: sj.measure.SteadyStates) -> sj.identify.JointFit:
     """The joint fit of all these tests."""
     return sj.fit_jointly(data, MODES, level_gain_std=NOISE["gain"], **FAMILIES)
 
 
-def band(fit: sj.JointFit, at: np.ndarray) -> float:
+def band(fit: sj.identify.JointFit, at: np.ndarray) -> float:
     """Mean relative 1σ of both curves."""
-    values = sj.fitted_values(fit, at)
+    values = sj.identify.fitted_values(fit, at)
     return float(
         np.mean(values.natural_frequency_std / values.natural_frequency)
         + np.mean(values.modal_damping_std / values.modal_damping)
     )
 
 
-def advised(fit: sj.JointFit) -> list[Row]:
+def advised(fit: sj.identify.JointFit) -> list[Row]:
     """Ten states where the fit wants them; equal forces are one level."""
     advice = sj.next_measurements(fit, 10)
     level = {force: 10 + k for k, force in enumerate(dict.fromkeys(one.force for one in advice))}
@@ -165,7 +167,7 @@ def one_test(seed: int) -> list[float]:
     at = np.linspace(speed.min(), speed.max(), 25)
     before, ratios = band(fit, at), []
     for more in (advised(fit), *map(even, WAYS)):
-        joined = sj.join_steady_states(data, measured(more, rng, dict(gains)))
+        joined = sj.measure.join_steady_states(data, measured(more, rng, dict(gains)))
         ratios.append(band(fitted(joined), at) / before)
     return ratios
 

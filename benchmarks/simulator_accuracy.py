@@ -33,8 +33,8 @@ from conftest import NumpyBalance, TimeDomain, initial_state, spectrum_distance
 HERTZ = 2 * np.pi
 KINDS = ("fold", "peak", "phase_resonance")
 CURVES = {
-    "flat": (sj.flat_beam(), FLAT_BEAM_FORCES, (60 * HERTZ, 120 * HERTZ)),
-    "curved": (sj.curved_beam("monostable"), CURVED_BEAM_FORCES, (20 * HERTZ, 150 * HERTZ)),
+    "flat": (sj.model.flat_beam(), FLAT_BEAM_FORCES, (60 * HERTZ, 120 * HERTZ)),
+    "curved": (sj.model.curved_beam("monostable"), CURVED_BEAM_FORCES, (20 * HERTZ, 150 * HERTZ)),
 }
 BAR = 1e-7  # of the closure
 
@@ -45,7 +45,7 @@ def tell(**fields: object) -> None:
     print(json.dumps({"benchmark": "simulator_accuracy", **rounded}), flush=True)
 
 
-def responses(beam: str, **settings: object) -> list[sj.ResponseCurve]:
+def responses(beam: str, **settings: object) -> list[sj.simulate.ResponseCurve]:
     """The curves of one beam at the paper's forces."""
     model, forces, ends = CURVES[beam]
     return sj.forced_response(model, forces, *ends, **settings)
@@ -83,7 +83,7 @@ def events() -> None:
     for beam, (model, _, _) in CURVES.items():
         known: dict[float, dict[str, int]] = {}
         for step in (0.003, 0.01, 0.03, 0.05, 0.1, 0.3):
-            control = sj.StepControl(first=step, largest=step)
+            control = sj.simulate.StepControl(first=step, largest=step)
             for curve in responses(beam, steps=control, stability=False, max_points=8000):
                 counts = {kind: int(curve.at_events(kind).size) for kind in KINDS}
                 known.setdefault(curve.force, counts)
@@ -116,7 +116,7 @@ def events() -> None:
 
 def stability(n_each: int) -> None:
     """Verdicts against multipliers of the map over one period."""
-    settings = {"harmonic_order": 31, "steps": sj.StepControl(largest=0.01, angle=0.02)}
+    settings = {"harmonic_order": 31, "steps": sj.simulate.StepControl(largest=0.01, angle=0.02)}
     chosen = []
     for beam, (model, _, _) in CURVES.items():
         for curve in responses(beam, max_points=8000, **settings):

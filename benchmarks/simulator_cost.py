@@ -28,17 +28,17 @@ MODES = (1, 2, 4, 8, 16)
 HZ = 2 * np.pi
 
 
-def chain(n_modes: int) -> sj.Structure:
+def chain(n_modes: int) -> sj.model.Structure:
     """A structure of `n_modes` modes whose first one stiffens by a fifth under 1 N."""
     frequency = HZ * (80.0 + 96.0 * np.arange(n_modes))
     quartic = {(k, k, k, k): 2e11 * (k + 1) ** 2 for k in range(n_modes)}
     quartic |= {(k, k, k, k + 1): 1e11 for k in range(n_modes - 1)}
     quartic |= {(k, k, k + 1, k + 1): 3e11 for k in range(n_modes - 1)}
     shape = 2.0 * (-1.0) ** np.arange(n_modes)
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         frequency, np.full(n_modes, 0.01), shape[None], 3.0 / (1.0 + np.arange(n_modes))
     )
-    return sj.structure(modes, sj.polynomial_potential(quartic, n_modes))
+    return sj.model.structure(modes, sj.model.polynomial_potential(quartic, n_modes))
 
 
 def peak_memory() -> float:
@@ -83,7 +83,7 @@ def one_size(harmonics: int, n_modes: int) -> dict:
     def follow() -> list:
         return follow_from_rest(balances, np.arange(1), ends, steps, 4000, downward=False)
 
-    def respond() -> sj.ResponseCurve:
+    def respond() -> sj.simulate.ResponseCurve:
         return sj.forced_response(
             model, [force], 60 * HZ, 110 * HZ, harmonic_order=harmonics, stability=False
         )[0]
@@ -119,23 +119,23 @@ def many_curves(members: int) -> dict:
     model = chain(1)
     coefficient = np.asarray(model.potential.coefficient)[0] * rng.uniform(0.5, 2.0, members)
 
-    def with_coefficient(value: float) -> sj.Structure:
-        potential = sj.polynomial_potential({"1111": float(value)}, 1)
-        return sj.structure(model.modes, potential)
+    def with_coefficient(value: float) -> sj.model.Structure:
+        potential = sj.model.polynomial_potential({"1111": float(value)}, 1)
+        return sj.model.structure(model.modes, potential)
 
     models = [with_coefficient(value) for value in coefficient]
     forces = rng.uniform(0.2, 2.0, members)
     settings = {"stability": False, "keep_curves": False, "harmonic_order": 5}
-    sj.forced_response_batch(models[:64], forces[:64], 60 * HZ, 140 * HZ, **settings)
+    sj.simulate.forced_response_batch(models[:64], forces[:64], 60 * HZ, 140 * HZ, **settings)
     before, begin = peak_memory(), time.perf_counter()
-    batch = sj.forced_response_batch(models, forces, 60 * HZ, 140 * HZ, **settings)
+    batch = sj.simulate.forced_response_batch(models, forces, 60 * HZ, 140 * HZ, **settings)
     seconds = time.perf_counter() - begin
     return {
         "benchmark": "many single-mode curves",
         "members": members,
         "harmonics": 5,
         "points": int(batch.n_points.sum()),
-        "failed": int(np.sum(batch.status != int(sj.CurveStatus.UPPER_END))),
+        "failed": int(np.sum(batch.status != int(sj.simulate.CurveStatus.UPPER_END))),
         "seconds": round(seconds, 2),
         "ms_per_curve": round(1e3 * seconds / members, 3),
         "memory_MiB": round(peak_memory()),

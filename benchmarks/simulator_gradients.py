@@ -24,7 +24,7 @@ import snrmjax as sj
 from snrmjax.model.beams import FLAT_BEAM_FORCES
 
 HERTZ = 2 * np.pi
-MODEL, FORCE, ENDS = sj.flat_beam(), FLAT_BEAM_FORCES[-1], (60 * HERTZ, 120 * HERTZ)
+MODEL, FORCE, ENDS = sj.model.flat_beam(), FLAT_BEAM_FORCES[-1], (60 * HERTZ, 120 * HERTZ)
 SETTINGS = {"stability": False}
 STEPS = (3e-3, 1e-3, 3e-4, 1e-4, 3e-5)
 
@@ -35,7 +35,7 @@ def tell(**fields: object) -> None:
     print(json.dumps({"benchmark": "simulator_gradients", **rounded}), flush=True)
 
 
-def numbers(model: sj.Structure) -> tuple:
+def numbers(model: sj.model.Structure) -> tuple:
     """What the derivatives are taken by."""
     modes = model.modes
     return model.potential.coefficient, modes.natural_frequency, modes.damping_ratio
@@ -45,7 +45,7 @@ COUNTS = [int(values.size) for values in numbers(MODEL)]
 ZERO = np.zeros(sum(COUNTS))
 
 
-def changed(shifts: jax.Array) -> sj.Structure:
+def changed(shifts: jax.Array) -> sj.model.Structure:
     """The beam with every number times 1 + its shift."""
     parts = jnp.split(shifts, np.cumsum(COUNTS)[:-1])
     new = tuple(v * (1 + p) for v, p in zip(numbers(MODEL), parts, strict=True))
@@ -124,16 +124,18 @@ def main() -> None:
         start = curve.point(curve.at_events(kind)[number])
 
         def quantity(shifts: jax.Array, kind: str = kind, start: tuple = start) -> jax.Array:
-            found = sj.periodic_motion(changed(shifts), FORCE, start, condition=kind)
+            found = sj.simulate.periodic_motion(changed(shifts), FORCE, start, condition=kind)
             return found.amplitude if kind == "peak" else found.frequency
 
         measure(name, quantity, forward_solve)
     heights = np.linspace(0.15, 0.95, 20) * np.abs(curve.velocity[:, 1, 0]).max()
-    found, which = sj.response_at_velocities(MODEL, curve, heights)
+    found, which = sj.simulate.response_at_velocities(MODEL, curve, heights)
     starts = (found.coefficients, found.frequency)
 
     def frequencies(shifts: jax.Array) -> jax.Array:
-        return sj.motions_at_velocities(changed(shifts), FORCE, starts, heights[which]).frequency
+        return sj.simulate.motions_at_velocities(
+            changed(shifts), FORCE, starts, heights[which]
+        ).frequency
 
     measure(f"frequencies at {len(which)} motions", frequencies, forward_solve)
 

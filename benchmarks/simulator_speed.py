@@ -54,7 +54,7 @@ class Case(NamedTuple):
     """One curve to follow."""
 
     beam: str
-    model: sj.Structure
+    model: sj.model.Structure
     force: float  # N
     from_hz: float
     to_hz: float
@@ -67,8 +67,8 @@ class Case(NamedTuple):
 
 
 CASES = (
-    Case("flat", sj.flat_beam(), 1.334e-2, 60.0, 120.0, downward=False),
-    Case("curved", sj.curved_beam("monostable"), 1.779e-3, 25.0, 140.0, downward=True),
+    Case("flat", sj.model.flat_beam(), 1.334e-2, 60.0, 120.0, downward=False),
+    Case("curved", sj.model.curved_beam("monostable"), 1.779e-3, 25.0, 140.0, downward=True),
 )
 
 
@@ -82,8 +82,8 @@ def tell(**fields: object) -> None:
 
 
 def respond(
-    case: Case, model: sj.Structure | None = None, **settings: object
-) -> list[sj.ResponseCurve]:
+    case: Case, model: sj.model.Structure | None = None, **settings: object
+) -> list[sj.simulate.ResponseCurve]:
     """The public verb for one case; two parts where neither end is reached from the other."""
     return sj.forced_response(
         model or case.model,
@@ -94,7 +94,7 @@ def respond(
     )
 
 
-def without_stability(case: Case) -> list[sj.ResponseCurve]:
+def without_stability(case: Case) -> list[sj.simulate.ResponseCurve]:
     """The same without stability, which the peers do not judge either."""
     return respond(case, stability=False)
 
@@ -102,7 +102,7 @@ def without_stability(case: Case) -> list[sj.ResponseCurve]:
 METHODS = {"snrmjax": respond, "snrmjax, no stability": without_stability}
 
 
-def midspan(curves: list[sj.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
+def midspan(curves: list[sj.simulate.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
     """Frequency (Hz) and velocity amplitude of the fundamental (m/s) along the curve."""
     frequency = np.concatenate([np.asarray(c.frequency) for c in curves]) / HERTZ
     return frequency, np.concatenate([np.abs(np.asarray(c.velocity)[:, 1, 0]) for c in curves])
@@ -110,7 +110,7 @@ def midspan(curves: list[sj.ResponseCurve]) -> tuple[np.ndarray, np.ndarray]:
 
 def reference(case: Case, harmonics: int) -> tuple[np.ndarray, np.ndarray]:
     """The curve in fine steps, and between them by a spline: its chords do not matter."""
-    fine = sj.StepControl(largest=0.01, angle=0.02, tolerance=1e-10)
+    fine = sj.simulate.StepControl(largest=0.01, angle=0.02, tolerance=1e-10)
     curves = respond(case, harmonic_order=harmonics, steps=fine, max_points=8000)
     frequency, velocity = midspan(curves)
     # The spline runs along the arc of all unknowns: in the plane alone the curve may have cusps.
@@ -153,7 +153,7 @@ def write_problem(case: Case, scale: float, target: Path) -> None:
             rest.remove(mode)
             entry = force.setdefault(tuple(rest), np.zeros(case.model.n_modes))
             entry[mode] += monomial.count(mode) * value
-    steps = sj.StepControl()
+    steps = sj.simulate.StepControl()
     ends = (case.to_hz, case.from_hz) if case.downward else (case.from_hz, case.to_hz)
     problem = {
         "natural_frequency": modes.natural_frequency.tolist(),
@@ -342,7 +342,7 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
             seconds=warm,
             version=f"snrmjax {version('snrmjax')}, jax {jax.__version__}",
             settings="events and stability" if name == "snrmjax" else "events",
-            status=" + ".join(sj.CurveStatus(int(c.status)).name for c in curves[name]),
+            status=" + ".join(sj.simulate.CurveStatus(int(c.status)).name for c in curves[name]),
             reached_hz=float(curve[0][-1]),
             n_solves=sum(int(c.n_solves) for c in curves[name]),
         )
@@ -393,7 +393,7 @@ import json, time
 begin = time.perf_counter()
 import snrmjax as sj
 imported = time.perf_counter()
-model = sj.flat_beam()
+model = sj.model.flat_beam()
 sj.forced_response(model, [{force}], {lower}, {upper}, harmonic_order={harmonics})
 done = time.perf_counter()
 sj.forced_response(model, [{force}], {lower}, {upper}, harmonic_order={harmonics})
@@ -457,7 +457,7 @@ def second_model() -> None:
         respond(case)
         warm = float(np.median([timed(lambda case=case: respond(case))[0] for _ in range(3)]))
         potential = case.model.potential
-        changed = sj.polynomial_potential(
+        changed = sj.model.polynomial_potential(
             dict(zip(potential.monomials, 1.02 * np.asarray(potential.coefficient), strict=True)),
             case.model.n_modes,
         )
@@ -491,7 +491,7 @@ def batch(n_forces: int = 64) -> None:
         def together(
             case: Case = case, forces: list = forces, ends: tuple = ends, settings: dict = settings
         ) -> object:
-            return sj.forced_response_batch(case.model, forces, *ends, **settings)
+            return sj.simulate.forced_response_batch(case.model, forces, *ends, **settings)
 
         first = {f.__name__: timed(f)[0] for f in (one_by_one, together)}
         runs = [(timed(one_by_one)[0], timed(together)[0]) for _ in range(3)]

@@ -56,7 +56,7 @@ def show(figure, name):
 # can see that, and errors below are counted outside it.
 
 # %%
-flat = sj.flat_beam()
+flat = sj.model.flat_beam()
 flat_mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
 flat_responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
 show(plot.normal_mode_figure(flat_mode), "flat_mode")
@@ -103,7 +103,7 @@ def errors_percent(points, branch, skip_hz):
 
 TONGUE = (87.3, 90.4)
 by_displacement = errors_percent(found.points, flat_mode, TONGUE)
-as_in_paper = sj.identify_points(flat_test.steady_states, flat.modes, amplitude="velocity")
+as_in_paper = sj.identify.identify_points(flat_test.steady_states, flat.modes, amplitude="velocity")
 by_velocity = errors_percent(as_in_paper, flat_mode, TONGUE)
 print(
     f"displacement: median {np.median(by_displacement):.4f} %, worst {by_displacement.max():.4f} %"
@@ -118,11 +118,13 @@ print(f"velocity:     median {np.median(by_velocity):.4f} %, worst {by_velocity.
 
 # %%
 backbone = found.fit.backbone
-resonances = [r for force in FLAT_BEAM_FORCES for r in sj.resonances(backbone, flat.modes, force)]
+resonances = [
+    r for force in FLAT_BEAM_FORCES for r in sj.identify.resonances(backbone, flat.modes, force)
+]
 predicted = [
     response
     for force in FLAT_BEAM_FORCES
-    for response in sj.predict_response(backbone, flat.modes, force)
+    for response in sj.identify.predict_response(backbone, flat.modes, force)
 ]
 show(
     plot.response_figure(
@@ -155,11 +157,11 @@ for resonance, exact in zip(resonances, flat_responses, strict=True):
 # shipped; the model is asked for its equilibria.
 
 # %%
-curved = sj.curved_beam()
-printed = sj.curved_beam("as_printed")
+curved = sj.model.curved_beam()
+printed = sj.model.curved_beam("as_printed")
 for model in (curved, printed):
     print(model.name)
-    for e in sj.equilibria(model):
+    for e in sj.model.equilibria(model):
         print(f"   q = {e.displacement[0]:.3g} kg^1/2 m, {'stable' if e.stable else 'unstable'}")
 
 # %% [markdown]
@@ -186,7 +188,7 @@ for forces, (nearest, farthest) in WINDOWS:
     )
     parts.append(part.steady_states.renumbered(len(recorded)))
     recorded += list(forces)
-curved_data = sj.join_steady_states(*parts)
+curved_data = sj.measure.join_steady_states(*parts)
 curved_mode = sj.nonlinear_normal_mode(curved, 125 * HERTZ)
 curved_found = sj.identify_backbone(curved_data, curved.modes)
 show(
@@ -209,14 +211,14 @@ show(
         [
             response
             for force in CURVED_BEAM_FORCES
-            for response in sj.predict_response(
+            for response in sj.identify.predict_response(
                 curved_backbone, curved.modes, force, from_frequency=25 * HERTZ
             )
         ],
         [
             r
             for force in CURVED_BEAM_FORCES
-            for r in sj.resonances(curved_backbone, curved.modes, force)
+            for r in sj.identify.resonances(curved_backbone, curved.modes, force)
         ],
         simulated=curved_responses,
     ),
@@ -254,7 +256,7 @@ print(
 )
 
 # %%
-with_peak = sj.identify_points(curved_data, curved.modes, measure="peak")
+with_peak = sj.identify.identify_points(curved_data, curved.modes, measure="peak")
 show(
     plot.modal_damping_figure(
         [
@@ -282,15 +284,17 @@ size = np.abs(large.velocity[:, 1, 0])
 near = np.flatnonzero(large.stable & (size > 0.6 * size.max()) & (size < 0.95 * size.max()))[::3]
 frequency, orbits = jnp.asarray(large.frequency[near]), jnp.asarray(large.coefficients[near])
 for factor in np.geomspace(3, 1, 13)[1:]:
-    between = sj.structure(
+    between = sj.model.structure(
         printed.modes,
-        sj.polynomial_potential({"111": -3.4380e9 / 3, "1111": factor * 6.2183e12 / 4}, 1),
+        sj.model.polynomial_potential({"111": -3.4380e9 / 3, "1111": factor * 6.2183e12 / 4}, 1),
     )
     force = np.sqrt(3 / factor) * large.force * np.ones(len(near))
-    orbits, solved = sj.solve_at_frequency(between, jnp.asarray(force), frequency, orbits)
+    orbits, solved = sj.simulate.solve_at_frequency(between, jnp.asarray(force), frequency, orbits)
 print(f"{int(solved.sum())} of {len(near)} large orbits reached the printed coefficient")
-velocity = np.asarray(sj.velocity_phasors(orbits, frequency, printed.modes.mode_shape))[solved]
-printed_data = sj.steady_states(
+velocity = np.asarray(sj.simulate.velocity_phasors(orbits, frequency, printed.modes.mode_shape))[
+    solved
+]
+printed_data = sj.measure.steady_states(
     np.ones(len(velocity), dtype=int),
     np.asarray(frequency)[solved],
     force[solved],
@@ -303,7 +307,9 @@ printed_damping = {
     measure: float(
         np.median(
             np.asarray(
-                sj.identify_points(printed_data, printed.modes, measure=measure).modal_damping
+                sj.identify.identify_points(
+                    printed_data, printed.modes, measure=measure
+                ).modal_damping
             )
         )
     )

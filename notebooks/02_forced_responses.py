@@ -88,7 +88,7 @@ def draw(axes, curve, colour, name, events=tuple(EVENTS)):
 # `forced_response` follows each curve around its folds and locates what happens on the way.
 
 # %%
-flat, curved = sj.flat_beam(), sj.curved_beam()
+flat, curved = sj.model.flat_beam(), sj.model.curved_beam()
 flat_responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ)
 curved_responses = sj.forced_response(curved, CURVED_BEAM_FORCES, 20 * HERTZ, 150 * HERTZ)
 for curve in (*flat_responses, *curved_responses):
@@ -139,10 +139,13 @@ show(figure, "forced_responses")
 mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
 spine = sj.nonlinear_normal_mode(flat, 105 * HERTZ, tongues="skip")
 (tongue,) = mode.tongues
-fine = sj.StepControl(largest=0.01)
-damped = sj.damped_normal_mode(flat, 0.7, steps=fine)
-locked = sj.phase_controlled(flat, FLAT_BEAM_FORCES[-1], steps=fine)
-held = [sj.response_controlled(flat, v, 70 * HERTZ, 110 * HERTZ) for v in (0.15, 0.3, 0.45, 0.6)]
+fine = sj.simulate.StepControl(largest=0.01)
+damped = sj.simulate.damped_normal_mode(flat, 0.7, steps=fine)
+locked = sj.simulate.phase_controlled(flat, FLAT_BEAM_FORCES[-1], steps=fine)
+held = [
+    sj.simulate.response_controlled(flat, v, 70 * HERTZ, 110 * HERTZ)
+    for v in (0.15, 0.3, 0.45, 0.6)
+]
 print(
     f"tongue: harmonic {tongue.harmonic} meets mode {tongue.mode + 1} from "
     f"{tongue.from_frequency / HERTZ:.2f} to {tongue.to_frequency / HERTZ:.2f} Hz, "
@@ -241,11 +244,11 @@ show(figure, "three_backbones")
 
 # %%
 weakest = CURVED_BEAM_FORCES[0]
-coefficients = sj.curved_beam("as_printed").potential.coefficient
+coefficients = sj.model.curved_beam("as_printed").potential.coefficient
 bistable = eqx.tree_at(lambda beam: beam.potential.coefficient, curved, coefficients)
-wells = [e for e in sj.equilibria(bistable) if e.stable]
+wells = [e for e in sj.model.equilibria(bistable) if e.stable]
 first_well = sj.forced_response(bistable, [weakest], 20 * HERTZ, 150 * HERTZ)[0]
-(second_well,) = sj.isolated_responses(
+(second_well,) = sj.simulate.isolated_responses(
     bistable, weakest, 20 * HERTZ, 150 * HERTZ, known=[first_well]
 )
 for name, well, curve in (("first", wells[0], first_well), ("second", wells[1], second_well)):
@@ -263,7 +266,9 @@ for name, well, curve in (("first", wells[0], first_well), ("second", wells[1], 
 
 # %%
 middle = curved_responses[1]
-(cut_off,) = sj.isolated_responses(curved, middle.force, 20 * HERTZ, 150 * HERTZ, known=[middle])
+(cut_off,) = sj.simulate.isolated_responses(
+    curved, middle.force, 20 * HERTZ, 150 * HERTZ, known=[middle]
+)
 from_lower = sj.forced_response(curved, [middle.force], 10 * HERTZ, 150 * HERTZ)[0]
 turn = cut_off.frequency[cut_off.at_events("fold")].max()
 same_fold = np.min(np.abs(from_lower.frequency[from_lower.at_events("fold")] / turn - 1))
@@ -286,18 +291,18 @@ print(
 viscous, unit = 2 * 0.05 * 79.02 * HERTZ, 0.6 / 11.84338  # 1/s; modal velocity at 0.6 m/s
 falling = {"coefficient": -1.9 * 3 * np.pi / 8 * viscous / unit}
 rising = {"coefficient": 4 / 3 * viscous / unit**2}
-looped = sj.structure(
-    sj.linear_modes([79.02 * HERTZ], [0.05], [[11.84338]], [247.841], sensors=("midspan",)),
-    sj.polynomial_potential({"1111": 1e12}, 1),
+looped = sj.model.structure(
+    sj.model.linear_modes([79.02 * HERTZ], [0.05], [[11.84338]], [247.841], sensors=("midspan",)),
+    sj.model.polynomial_potential({"1111": 1e12}, 1),
     effects=(
-        sj.make_effect("quadratic_damping", falling),
-        sj.make_effect("cubic_damping", rising),
+        sj.model.make_effect("quadratic_damping", falling),
+        sj.model.make_effect("cubic_damping", rising),
     ),
 )
-looped_locked = sj.phase_controlled(looped, 3e-3)
-apart = sj.isolated_responses(looped, 1.5e-3, 65 * HERTZ, 100 * HERTZ, known=[])
-(below,) = (curve for curve in apart if curve.status == sj.CurveStatus.UPPER_END)
-(loop,) = (curve for curve in apart if curve.status == sj.CurveStatus.CLOSED)
+looped_locked = sj.simulate.phase_controlled(looped, 3e-3)
+apart = sj.simulate.isolated_responses(looped, 1.5e-3, 65 * HERTZ, 100 * HERTZ, known=[])
+(below,) = (curve for curve in apart if curve.status == sj.simulate.CurveStatus.UPPER_END)
+(loop,) = (curve for curve in apart if curve.status == sj.simulate.CurveStatus.CLOSED)
 print(
     f"main curve up to {level(below).max():.3f} m/s; closed loop from {level(loop).min():.3f} to "
     f"{level(loop).max():.3f} m/s"
@@ -333,7 +338,7 @@ def with_harmonics(model, curve, order):
     missing = max(0, 2 * order + 1 - curve.coefficients.shape[1])
     start = np.pad(curve.coefficients, ((0, 0), (0, missing), (0, 0)))[:, : 2 * order + 1]
     force, omega = jnp.full(len(start), curve.force), jnp.asarray(curve.frequency)
-    return np.asarray(sj.solve_at_frequency(model, force, omega, jnp.asarray(start))[0])
+    return np.asarray(sj.simulate.solve_at_frequency(model, force, omega, jnp.asarray(start))[0])
 
 
 def distance(motions, exact):
@@ -368,7 +373,7 @@ print(f"estimate over truth at nine of ten motions: {believed[0]:.2f} to {believ
 coefficients, omega = strongest.point(tip)
 for order in (1, 3):
     start = jnp.asarray(coefficients[: 2 * order + 1]), omega
-    found = sj.periodic_motion(flat, strongest.force, start, condition="phase_resonance")
+    found = sj.simulate.periodic_motion(flat, strongest.force, start, condition="phase_resonance")
     print(
         f"flat beam with {order}: {100 * (found.frequency / omega - 1):+.4f} % in frequency, "
         f"{100 * (found.amplitude / level(strongest)[tip] - 1):+.4f} % in velocity"
@@ -378,7 +383,7 @@ for order in (1, 3):
 figure, ((a, b),) = drawing.panels(12.5, 5.4, 1, 2)
 for curve, colour in ((crude, BLUE), (middle, "black")):
     a.plot(curve.frequency / HERTZ, level(curve), color=colour, linewidth=1.5)
-phasors = sj.velocity_phasors(
+phasors = sj.simulate.velocity_phasors(
     jnp.asarray(truth), jnp.asarray(middle.frequency), curved.modes.mode_shape
 )
 x = middle.frequency / HERTZ
@@ -433,8 +438,8 @@ def changed(percent):
 def peak_and_jump(percent):
     """Peak velocity (m/s) and frequency of the upper fold (rad/s)."""
     beam = changed(percent)
-    peak = sj.periodic_motion(beam, strongest.force, summit, condition="peak")
-    fold = sj.periodic_motion(beam, strongest.force, cliff, condition="fold")
+    peak = sj.simulate.periodic_motion(beam, strongest.force, summit, condition="peak")
+    fold = sj.simulate.periodic_motion(beam, strongest.force, cliff, condition="fold")
     return jnp.stack([peak.amplitude, fold.frequency])
 
 
@@ -470,7 +475,7 @@ show(figure, "sensitivity")
 rng = np.random.default_rng(7)
 scatter = 3.0 * rng.normal(size=(200, len(names)))  # %
 scatter[:, len(keys) : len(keys) + 4] = 0.0  # the frequencies are known well
-batch = sj.forced_response_batch(
+batch = sj.simulate.forced_response_batch(
     *([changed(row) for row in scatter], strongest.force, 60 * HERTZ, 120 * HERTZ), stability=False
 )
 jumps = np.array([c[0].frequency[c[0].at_events("fold")].max() for c in batch.curves])
@@ -524,7 +529,9 @@ headline = {
     "closed loop four times above the main curve": level(loop).max() > 4 * level(below).max(),
     "estimated error within 10 % of the true one": 0.9 < believed[0] <= believed[1] < 1.1,
     "peak falls by 0.99 % per % of damping": abs(sensitivity[0, len(keys) + 4] + 0.99) < 5e-3,
-    "200 beams foretold within 0.1 % of scatter": np.all(batch.status == sj.CurveStatus.UPPER_END)
+    "200 beams foretold within 0.1 % of scatter": np.all(
+        batch.status == sj.simulate.CurveStatus.UPPER_END
+    )
     and np.allclose(computed.std(axis=0), foretold.std(axis=0), atol=0.1),
 }
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -83,9 +83,9 @@ def remarks(fit):
 # to the largest force, from 82° off resonance to as near as a stepped sine gets before it jumps.
 
 # %%
-flat = sj.flat_beam()
-truth = sj.damped_normal_mode(flat, 0.85, steps=sj.StepControl(largest=0.02))
-errors = sj.MeasurementErrors(amplitude=0.01, phase=np.radians(0.7), force=0.003)
+flat = sj.model.flat_beam()
+truth = sj.simulate.damped_normal_mode(flat, 0.85, steps=sj.simulate.StepControl(largest=0.02))
+errors = sj.simulate.MeasurementErrors(amplitude=0.01, phase=np.radians(0.7), force=0.003)
 ends = (60 * HERTZ, 120 * HERTZ)
 forces = np.geomspace(6e-4, 1.334e-2, 8).tolist()
 near = sj.phase_resonance_test(flat, forces, *ends, points_per_level=4, errors=errors, seed=3)
@@ -119,7 +119,7 @@ show(
 # %%
 def at_velocities(fit, velocity):
     """Curves in Hz and %, with half the width of their 95 % bands."""
-    values = sj.fitted_values(fit, velocity)
+    values = sj.identify.fitted_values(fit, velocity)
     frequency, damping = values.natural_frequency / HERTZ, 100 * values.damping_ratio
     bands = values.natural_frequency_std / HERTZ, 100 * values.damping_ratio_std
     return np.array([frequency, damping]), 1.96 * np.array(bands)
@@ -177,7 +177,7 @@ for exact in sj.forced_response(flat, [2.669e-3, 1.334e-2], *ends):
         f"{abs(exact.velocity[tip, 1, 0]):.4f} m/s"
     )
     for name, fit in fits.items():
-        point = sj.fitted_response(fit, exact.force)[0].resonances[0]
+        point = sj.identify.fitted_response(fit, exact.force)[0].resonances[0]
         print(
             f"   {name}: {point.frequency / HERTZ:.2f} ± "
             f"{1.96 * point.frequency_std / HERTZ:.2f} Hz, {point.velocity:.4f} ± "
@@ -221,7 +221,7 @@ for name, fit in fits.items():
 # squares, times the variances, add up to the band's: the shares below.
 
 # %%
-shares = sj.contributions(with_levels)
+shares = sj.identify.contributions(with_levels)
 for row in contributions_by_kind(shares):
     print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
 show(joint_plot.contributions_figure(shares), "contributions")
@@ -233,7 +233,7 @@ show(joint_plot.contributions_figure(shares), "contributions")
 # of two. (`posterior=True` adds a fourth way, sampling by NUTS.)
 
 # %%
-ways = sj.compare_bands(few, np.array([0.1, 0.35, 0.6]), n_samples=100)
+ways = sj.identify.compare_bands(few, np.array([0.1, 0.35, 0.6]), n_samples=100)
 for one in ways:
     print(
         f"{one.velocity:.2f} m/s, {one.quantity.replace('_', ' ')}: covariance "
@@ -251,7 +251,9 @@ for one in advice:
         f"{one.rank}. {1e3 * one.force:.2f} mN at {one.frequency / HERTZ:.2f} Hz, bands at "
         f"{100 * one.expected_band_ratio:.1f} %: {one.reason}"
     )
-responses = [sj.fitted_response(with_levels, f)[0] for f in sorted({a.force for a in advice})]
+responses = [
+    sj.identify.fitted_response(with_levels, f)[0] for f in sorted({a.force for a in advice})
+]
 show(joint_plot.advice_figure(responses, advice, "midspan"), "next_measurements")
 
 # %%
@@ -299,7 +301,7 @@ else:
     gain = np.exp(float(hung.unknowns.log_force_gain))
     print(f"{' and '.join(taken(hung))}; gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
     remarks(hung)
-    points = sj.identify_points(corrected(data, hung), model.modes)
+    points = sj.identify.identify_points(corrected(data, hung), model.modes)
     series = [joint_plot.FitSeries("fit", hung, points)]
     show(joint_plot.fitted_curves_figure(series), "suspended_beam")
     show(joint_plot.residuals_figure(hung), "suspended_residuals")
@@ -321,7 +323,7 @@ else:
     bolted = sj.fit_jointly(data, model.modes)
     print(" and ".join(taken(bolted)))
     remarks(bolted)
-    points = sj.identify_points(data, model.modes)
+    points = sj.identify.identify_points(data, model.modes)
     series = [joint_plot.FitSeries("fit", bolted, points)]
     show(joint_plot.fitted_curves_figure(series), "brake_reuss_beam")
     show(joint_plot.residuals_figure(bolted), "brake_reuss_residuals")
@@ -345,8 +347,8 @@ else:
     show(joint_plot.fitted_curves_figure(series), "levels_held_out")
     close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
     at = np.asarray(unseen.backbone_velocity)
-    foretold = sj.fitted_values(six, at)
-    yardstick = sj.fitted_values(bolted, at, of_a_new_level=True)
+    foretold = sj.identify.fitted_values(six, at)
+    yardstick = sj.identify.fitted_values(bolted, at, of_a_new_level=True)
     remarks(six)
     for level in (4, 7):
         rows = close & (np.asarray(unseen.level) == level)

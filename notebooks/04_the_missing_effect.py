@@ -85,7 +85,7 @@ def report(found):
 
 # %%
 OMEGA, ZETA, SHAPE = 79.0 * HERTZ, 0.005, 2.0
-modes = sj.linear_modes(
+modes = sj.model.linear_modes(
     [1.0005 * OMEGA],
     [0.97 * ZETA],
     [[SHAPE]],
@@ -93,11 +93,15 @@ modes = sj.linear_modes(
     natural_frequency_std=[0.001 * OMEGA],
     damping_ratio_std=[0.05 * ZETA],
 )
-model = sj.structure(modes)
+model = sj.model.structure(modes)
 hidden = make_effect("one_sided_stop", {"stiffness": 0.12 * OMEGA**2, "gap": 3e-4 / SHAPE})
-truth = sj.structure(sj.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE]), effects=(hidden,))
+truth = sj.model.structure(
+    sj.model.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE]), effects=(hidden,)
+)
 largest = 2 * ZETA * OMEGA**2 * 6e-4 / SHAPE**2  # N, for twice the gap
-errors = sj.MeasurementErrors(amplitude=0.01, phase=np.radians(0.7), force=0.003, harmonic=2e-4)
+errors = sj.simulate.MeasurementErrors(
+    amplitude=0.01, phase=np.radians(0.7), force=0.003, harmonic=2e-4
+)
 test = sj.phase_resonance_test(
     truth,
     (largest * np.geomspace(0.3, 1.0, 5)).tolist(),
@@ -169,7 +173,7 @@ headline["the completed model's peak within 0.1 Hz and 2 %"] = (
 
 # %%
 states = test.steady_states
-bare = sj.steady_states(
+bare = sj.measure.steady_states(
     *(np.asarray(states.level), np.asarray(states.frequency), np.asarray(states.force)),
     np.asarray(states.velocity),
     sensors=states.sensors,

@@ -165,8 +165,8 @@ headline["both beyond 95 % of their own error"] = all(c > half for c, half in in
 # phases, 1 % of noise in amplitude, 0.7° in phase, 0.3 % in force, and what the force lacks.
 
 # %%
-flat = sj.flat_beam().modes
-first = sj.linear_modes(
+flat = sj.model.flat_beam().modes
+first = sj.model.linear_modes(
     flat.natural_frequency[:1],
     flat.damping_ratio[:1],
     flat.mode_shape[:, :1],
@@ -174,14 +174,14 @@ first = sj.linear_modes(
     sensors=flat.sensors,
 )
 CUBIC = 3.4375e12  # of q⁴ in the potential, Tab. A.1
-truth = sj.structure(first, sj.polynomial_potential({"1111": CUBIC}, 1))
+truth = sj.model.structure(first, sj.model.polynomial_potential({"1111": CUBIC}, 1))
 model = stated(
-    truth, sj.polynomial_potential({"1111": CUBIC}, 1, coefficient_std={"1111": 0.02 * CUBIC})
+    truth, sj.model.polynomial_potential({"1111": CUBIC}, 1, coefficient_std={"1111": 0.02 * CUBIC})
 )
 forces = np.geomspace(FLAT_BEAM_FORCES[0], FLAT_BEAM_FORCES[-1], 6)
 friction = 0.1 * forces[0] * float(first.participation[0]) * np.pi / 4
 rubbing = dataclasses.replace(
-    truth, effects=(sj.make_effect("coulomb_friction", {"force": friction}),)
+    truth, effects=(sj.model.make_effect("coulomb_friction", {"force": friction}),)
 )
 motions = {
     name: sj.phase_resonance_test(
@@ -220,7 +220,7 @@ def recorded(states, nearest, farthest, *, missing=0.0, seed=1, per_level=6, sid
     velocity = np.asarray(states.velocity)[rows, 0]
     velocity = velocity * (1 + AMPLITUDE * noise[0]) * np.exp(1j * PHASE * noise[1])
     force = np.asarray(states.force)[rows] + missing
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level[rows],
         np.asarray(states.frequency)[rows],
         force * (1 + FORCE * noise[2]),
@@ -242,7 +242,7 @@ linear = float(2 * first.damping_ratio[0] * first.natural_frequency[0])
 series, rise = [], {}
 for share in (0.0, 0.06, 0.10, 0.15, -0.15):
     data = recorded(motions["beam"], 18, 34, missing=share * forces[0])
-    points = sj.identify_points(data, first)
+    points = sj.identify.identify_points(data, first)
     lowest = np.asarray(data.level) == 1
     rise[share] = float(np.mean(np.asarray(points.modal_damping)[lowest])) / linear
     label = f"{100 * share:.0f} % left out" if share > 0 else "force as it is"
@@ -451,7 +451,7 @@ headline["the test's states would find the offset to 1 % of the lowest force"] =
 # apart, 3° to 34° off resonance; the model has the true stiffness and the linear damping.
 
 # %%
-curved = sj.curved_beam()
+curved = sj.model.curved_beam()
 right = stated(curved, curved.potential)
 HARMONICS = tuple(range(2, 10))
 LEVELS = {"softening": np.geomspace(3e-5, 1.6e-4, 5), "stiffening": np.geomspace(8e-4, 3e-3, 5)}
@@ -463,7 +463,7 @@ full = {
         160 * HERTZ,
         appropriation=(np.cos(np.radians(34)) ** 2, np.cos(np.radians(3)) ** 2),
         points_per_level=5,
-        errors=sj.MeasurementErrors(amplitude=AMPLITUDE, phase=PHASE, force=FORCE),
+        errors=sj.simulate.MeasurementErrors(amplitude=AMPLITUDE, phase=PHASE, force=FORCE),
         keep_harmonics=HARMONICS,
         seed=3,
     ).steady_states
@@ -491,7 +491,7 @@ linear = float(2 * curved.modes.damping_ratio[0] * curved.modes.natural_frequenc
 series, apparent, ratios = [], {}, {}
 for name, states in full.items():
     for quantity in ("fundamental", "peak"):
-        points = sj.identify_points(read(states, quantity), curved.modes)
+        points = sj.identify.identify_points(read(states, quantity), curved.modes)
         top = np.asarray(states.level) == 5
         apparent[name, quantity] = float(np.median(np.asarray(points.modal_damping)[top]))
         series.append(plot.DampingSeries(f"{name}, {quantity}", points=points))
@@ -553,7 +553,8 @@ show(figures["residuals"], "peak_residuals")
 square, cube = (float(value) for value in curved.potential.coefficient)
 free_std = {"111": 0.3 * abs(square), "1111": 0.3 * abs(cube)}
 free = stated(
-    curved, sj.polynomial_potential({"111": square, "1111": cube}, 1, coefficient_std=free_std)
+    curved,
+    sj.model.polynomial_potential({"111": square, "1111": cube}, 1, coefficient_std=free_std),
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
 report(misled)

@@ -82,7 +82,7 @@ def demo(out: Out) -> None:
     from snrmjax.report.workflow import present_identification, write_identification
 
     with _staged(out) as folder:
-        model = sj.flat_beam()
+        model = sj.model.flat_beam()
         write_model(folder / "model.toml", model)
         _say("simulating the forced responses of the flat beam")
         curves = sj.forced_response(model, FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
@@ -96,7 +96,9 @@ def demo(out: Out) -> None:
             np.linspace(1.0e-3, 1.45e-2, 12).tolist(),
             60 * HERTZ,
             110 * HERTZ,
-            errors=sj.MeasurementErrors(amplitude=0.005, phase=np.radians(0.3), force=0.002),
+            errors=sj.simulate.MeasurementErrors(
+                amplitude=0.005, phase=np.radians(0.3), force=0.002
+            ),
             seed=1,
             keep_harmonics=(3, 5),
         )
@@ -140,13 +142,13 @@ def simulate(
             main_curves = sj.forced_response(structure, [one], *ends, harmonic_order=harmonics)
             curves += main_curves
             if isolated:
-                further = sj.isolated_responses(
+                further = sj.simulate.isolated_responses(
                     structure, one, *ends, known=main_curves, harmonic_order=harmonics
                 )
                 _say(f"  {len(further)} further branches found")
                 curves += further
         for curve in curves:
-            if curve.branch == "main" and curve.status != sj.CurveStatus.UPPER_END:
+            if curve.branch == "main" and curve.status != sj.simulate.CurveStatus.UPPER_END:
                 _warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
         _report_truncation(curves, harmonics)
         if not any(len(curve.frequency) for curve in curves):
@@ -185,7 +187,10 @@ def nnm(
                 f"internal resonance: harmonic {tongue.harmonic} drives mode {tongue.mode + 1} "
                 f"from {tongue.from_frequency / HERTZ:.2f} to {tongue.to_frequency / HERTZ:.2f} Hz"
             )
-        if branch.status not in (sj.CurveStatus.UPPER_END, sj.CurveStatus.LOWER_END):
+        if branch.status not in (
+            sj.simulate.CurveStatus.UPPER_END,
+            sj.simulate.CurveStatus.LOWER_END,
+        ):
             _warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
         results.write_normal_mode(folder / "nnm.csv", structure, branch)
         save_figure(normal_mode_figure(branch, sensor=_sensor(structure)), folder / "nnm.png")
@@ -290,7 +295,9 @@ def identify(
         if joint is not None:
             pair = (joint.unknowns.squared_frequency, joint.unknowns.modal_damping)
             done["curves"] = " and ".join(joint_results.described(curve) for curve in pair)
-            responses = [r for f in predict_force or [] for r in sj.fitted_response(joint, f)]
+            responses = [
+                r for f in predict_force or [] for r in sj.identify.fitted_response(joint, f)
+            ]
             shares = told.fitted.shares if told.fitted else ()
             further["joint_fit"] = joint_results.summarise_fit(joint, responses, shares)
             joint_results.write_joint_fit(folder / "fit.json", joint)
@@ -373,11 +380,11 @@ def main() -> None:
         sys.exit(2)
 
 
-def _sensor(structure: sj.Structure) -> str:
-    return structure.modes.sensors[sj.reference_sensor(structure.modes)]
+def _sensor(structure: sj.model.Structure) -> str:
+    return structure.modes.sensors[sj.identify.reference_sensor(structure.modes)]
 
 
-def _report_truncation(curves: list[sj.ResponseCurve], harmonics: int) -> None:
+def _report_truncation(curves: list[sj.simulate.ResponseCurve], harmonics: int) -> None:
     """Say where the harmonics that are left out would matter."""
     worst = max(
         (float(np.max(c.truncation, initial=0.0)) for c in curves if c.truncation is not None),
@@ -390,7 +397,7 @@ def _report_truncation(curves: list[sj.ResponseCurve], harmonics: int) -> None:
         )
 
 
-def _report_equilibria(structure: sj.Structure) -> None:
+def _report_equilibria(structure: sj.model.Structure) -> None:
     from snrmjax.report.workflow import equilibria_notes
 
     for note in equilibria_notes(structure):

@@ -34,10 +34,10 @@ from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.search.locating import Located, located, own_power
 from snrmjax.diagnose.search.model_search import DETECTED, Named, Row, named
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import with_parameters
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
 
 _LOOSE = 0.1  # relative 1σ of a force's gain

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose.misfit.predictions import without_strength
-from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves

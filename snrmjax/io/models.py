@@ -29,8 +29,8 @@ from snrmjax.model.potential import (
     parse_monomial,
     polynomial_potential,
 )
-from snrmjax.model.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
-from snrmjax.model.structure import Structure, structure
+from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 
 _MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
 _MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std")

@@ -15,7 +15,7 @@ from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from snrmjax.io.columns import Header
 from snrmjax.io.files import shown
-from snrmjax.model.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
+from snrmjax.numerics.rules import FRACTION, IN_RANGE_HZ, NOT_NEGATIVE, POSITIVE, SHORT, WHOLE, Rule
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _LIKE_GROUPED_NUMBER = re.compile(r"[+-]?[0-9][0-9.,'_\s]*(?:[eE][+-]?[0-9]+)?")

@@ -21,7 +21,7 @@ from snrmjax.io.columns import (
 from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
 from snrmjax.io.rows import Cells, split_rows
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.measure.steady_states import NO_PHASE, SteadyStates, steady_states
+from snrmjax.measure.states import NO_PHASE, SteadyStates, steady_states
 
 
 class TableReading(NamedTuple):

@@ -1,1 +1,6 @@
-"""measure"""
+"""What a test gives: steady states, records, harmonics, indicators, force calibration."""
+
+import lazy_loader
+
+# The public names are in `__init__.pyi`; each module is imported with its first name.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes, linear_response
 
 
@@ -407,7 +407,7 @@ def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> Stea
     positive (NaN when traced): such a drive lies below the range that the line can be used in.
     Reference: Kwarta & Allen, section 4.1.
 
-    >>> from snrmjax.measure.steady_states import steady_states
+    >>> from snrmjax.measure.states import steady_states
     >>> line = calibrate_force([0.01, 0.02, 0.03], [1.0, 2.0, 3.0])
     >>> data = steady_states([1], [500.0], [np.nan], [0.1 + 0j], drive=[0.05])
     >>> apply_calibration(data, line).force.round(9)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.measure.signals import require_orders
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 
 
 def nnm_appropriation(
@@ -83,7 +83,7 @@ def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[
     Returns one number per state; NaN for a state that no sensor measured.
     Reference: Kwarta & Allen, Eq. (20).
 
-    >>> from snrmjax.measure.steady_states import steady_states
+    >>> from snrmjax.measure.states import steady_states
     >>> data = steady_states([1, 1], [500.0, 510.0], [1.0, 1.0], [0.6 + 0.0j, 0.5 - 0.5j])
     >>> appropriation_of(data).round(12)
     Array([1. , 0.5], dtype=float64)

@@ -17,7 +17,7 @@ from snrmjax.measure.harmonic_fit import (
     orders_with_mean,
     phasor_relative_to_force,
 )
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.states import SteadyStates, steady_states
 
 
 class RecordFit(eqx.Module):

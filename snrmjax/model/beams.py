@@ -12,7 +12,7 @@ import numpy as np
 
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import Structure, structure
+from snrmjax.model.structures import Structure, structure
 
 FLAT_BEAM_FORCES = (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2)
 """Forces in N of the flat beam's response functions in the paper (Fig. 8)."""

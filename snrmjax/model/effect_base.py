@@ -16,7 +16,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import PolynomialPotential
-from snrmjax.model.rules import Rule
+from snrmjax.numerics.rules import Rule
 
 Scalar = Float[Array, ""]
 

@@ -41,7 +41,7 @@ from snrmjax.model.measurement_chain import (
     SensorPhaseError,
 )
 from snrmjax.model.mode_coupling import InternalResonanceOneToThree, InternalResonanceOneToTwo
-from snrmjax.model.rules import NOT_NEGATIVE, Rule
+from snrmjax.numerics.rules import NOT_NEGATIVE, Rule
 
 
 class CubicStiffness(AbstractMemoryless):

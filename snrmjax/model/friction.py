@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from snrmjax.model.effect_base import AbstractHysteresis, Scalar
-from snrmjax.model.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, Rule
 
 SMOOTHING = 0.05  # width of the smoothed jump of Coulomb's force over the rms velocity
 # In w = u^(p−1) on (0, 1), where the thresholds of an Iwan element are evenly dense.

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar
-from snrmjax.model.rules import ABOVE_MINUS_ONE, Rule
+from snrmjax.numerics.rules import ABOVE_MINUS_ONE, Rule
 
 
 def _shifted(

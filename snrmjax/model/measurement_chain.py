@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
-from snrmjax.model.rules import ABOVE_MINUS_ONE, OF_A_MODE, Rule
+from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_MODE, Rule
 
 Amplitude = Float[Array, " state"]
 Velocity = Complex[Array, "state harmonic sensor"]

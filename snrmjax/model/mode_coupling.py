@@ -11,7 +11,7 @@ from jaxtyping import Array
 from snrmjax.model.effect_base import AbstractAddedMode, Scalar
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
-from snrmjax.model.rules import OF_A_MODE, Rule
+from snrmjax.numerics.rules import OF_A_MODE, Rule
 
 
 class AbstractInternalResonance(AbstractAddedMode):

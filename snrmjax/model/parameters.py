@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.effects import effect_parameters
 from snrmjax.model.potential import monomial_key
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 
 _MODE_FIELDS = ("natural_frequency", "damping_ratio", "participation")
 
@@ -24,7 +24,7 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
     kind the second is "quadratic_damping_2". Parameters of effects that are no single numbers
     have no name.
 
-    >>> from snrmjax import curved_beam
+    >>> from snrmjax.model import curved_beam
     >>> parameter_names(curved_beam())[:3]
     ('potential.111', 'potential.1111', 'mode_1.natural_frequency')
     """

@@ -20,8 +20,8 @@ from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
 from snrmjax.report.style import (
     IDENTIFIED,

@@ -20,7 +20,7 @@ from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import force_velocity_loop, peak_amplitude
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.report.sampling import (
     BAND,

@@ -10,7 +10,7 @@ from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
 from snrmjax.identify.pointwise.prediction import CONTINUED, PredictedResponse, Resonance
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.report.figures import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Rows, Section, minus, with_error

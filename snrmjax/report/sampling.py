@@ -13,7 +13,7 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.identify.pointwise.prediction import PredictedResponse
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch

@@ -24,8 +24,8 @@ from snrmjax.identify.pointwise.prediction import (
 )
 from snrmjax.io import results
 from snrmjax.io.files import write_summary
-from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.structure import Structure, equilibria
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
 from snrmjax.report.identification_report import identification_report

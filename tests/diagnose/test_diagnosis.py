@@ -276,7 +276,7 @@ def test_what_is_located_is_what_was_changed():
     assert "quadratic_damping" in found.candidates[0]
 
 
-class RootDamping(sj.AbstractMemoryless):
+class RootDamping(sj.model.AbstractMemoryless):
     """f = c √|q̇| sgn q̇ (rounded at rest), which the library does not have."""
 
     kind: ClassVar[str] = "root_damping"
@@ -292,7 +292,7 @@ def test_an_effect_of_the_users_own_takes_part():
     # over √(modal velocity).
     size = 3.0
     data = balanced(lambda v: 1.1128 * size / np.sqrt(v / SHAPE))
-    sj.register_effect(RootDamping)
+    sj.model.register_effect(RootDamping)
     try:
         found = sj.diagnose_model(linear_model(), data)
         assert found.effects == ("root_damping",)
@@ -302,7 +302,9 @@ def test_an_effect_of_the_users_own_takes_part():
     finally:
         del EFFECTS["root_damping"]
     with pytest.raises(ValueError, match="already"):
-        sj.register_effect(type(sj.make_effect("cubic_stiffness", {"coefficient": 1.0})))
+        sj.model.register_effect(
+            type(sj.model.make_effect("cubic_stiffness", {"coefficient": 1.0}))
+        )
 
 
 def test_too_few_states_and_a_model_of_something_else_are_said():

@@ -25,8 +25,8 @@ FEW = ("one_sided_stop", "quadratic_damping", "force_gain_error", "residual_mode
 
 def linear():
     """One mode, driven and seen at the same place."""
-    modes = sj.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE])
-    return sj.structure(modes)
+    modes = sj.model.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE])
+    return sj.model.structure(modes)
 
 
 def states(model, phases=(-40.0, -15.0, 20.0, 45.0)):
@@ -39,7 +39,7 @@ def states(model, phases=(-40.0, -15.0, 20.0, 45.0)):
             frequency = -b + np.sqrt(b**2 + OMEGA**2)
             stiffness = OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency
             rows.append((level, frequency, force, 1j * frequency * SHAPE**2 * force / stiffness))
-    return sj.steady_states(*(np.array(column) for column in zip(*rows, strict=True)))
+    return sj.measure.steady_states(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def test_resonances_of_a_linear_mode_are_its_own():

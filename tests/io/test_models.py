@@ -17,7 +17,7 @@ from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import Structure, structure
+from snrmjax.model.structures import Structure, structure
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.io.tables import group_states, read_steady_states, write_steady_states, write_table
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.states import SteadyStates, steady_states
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -16,7 +16,7 @@ from snrmjax.measure.force_calibration import (
     calibrate_force,
     equivalent_force,
 )
-from snrmjax.measure.steady_states import steady_states
+from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_modes
 
 # The paper's section 4.1: drives in V, forces in N, gain in N/V, offset in N.

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import snrmjax  # noqa: F401
 from snrmjax.measure.harmonic_fit import fit_harmonics, phasor_relative_to_force
 from snrmjax.measure.indicators import appropriation_of, mode_indicator, nnm_appropriation
-from snrmjax.measure.steady_states import steady_states
+from snrmjax.measure.states import steady_states
 
 OMEGA = 500.0
 ORDERS = (1, 2, 3, 4, 5)

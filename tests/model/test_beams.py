@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from snrmjax.model.modes import linear_response
-from snrmjax.model.structure import equilibria
+from snrmjax.model.structures import equilibria
 
 HZ = 2 * np.pi
 

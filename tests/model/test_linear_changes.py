@@ -7,7 +7,7 @@ import pytest
 
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 
 FREQUENCY, RATIO = np.array([300.0, 500.0]), np.array([0.02, 0.01])
 

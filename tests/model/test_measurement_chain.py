@@ -9,7 +9,7 @@ import pytest
 
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 
 RANDOM = np.random.default_rng(3)
 FREQUENCY = np.array([450.0, 500.0, 510.0])

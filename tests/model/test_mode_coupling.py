@@ -9,7 +9,7 @@ import pytest
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import displacement_scale, simulated_structure, structure
+from snrmjax.model.structures import displacement_scale, simulated_structure, structure
 
 THIRD = {"coefficient": 7.0, "frequency_hz": 30.0, "damping_ratio": 0.04}
 SECOND = {"coefficient": -3.0, "frequency_hz": 20.0, "damping_ratio": 0.0}

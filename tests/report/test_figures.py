@@ -22,12 +22,12 @@ FORCES = (4.0e-5, 8.0e-5, 1.334e-4)
 
 @pytest.fixture(scope="module")
 def model():
-    return sj.curved_beam()
+    return sj.model.curved_beam()
 
 
 @pytest.fixture(scope="module")
 def virtual(model):
-    errors = sj.MeasurementErrors(amplitude=0.005, phase=0.01)
+    errors = sj.simulate.MeasurementErrors(amplitude=0.005, phase=0.01)
     return sj.phase_resonance_test(
         model,
         FORCES,
@@ -57,12 +57,12 @@ def mode(model):
 
 @pytest.fixture(scope="module")
 def predicted(model, backbone):
-    return sj.predict_response(backbone, model.modes, FORCES[2], points_per_side=60)
+    return sj.identify.predict_response(backbone, model.modes, FORCES[2], points_per_side=60)
 
 
 @pytest.fixture(scope="module")
 def resonance(model, backbone):
-    return sj.resonances(backbone, model.modes, FORCES[2])
+    return sj.identify.resonances(backbone, model.modes, FORCES[2])
 
 
 def named(axes, label):
@@ -164,8 +164,8 @@ def test_error_bars_are_95_per_cent(identification, backbone):
 
 def test_points_out_of_the_curves_are_grey_crosses(identification, backbone):
     points = identification.points
-    status = points.status.at[1].set(int(sj.PointStatus.NEGATIVE_DAMPING))
-    status = status.at[3].set(int(sj.PointStatus.NO_ROOT))
+    status = points.status.at[1].set(int(sj.identify.PointStatus.NEGATIVE_DAMPING))
+    status = status.at[3].set(int(sj.identify.PointStatus.NO_ROOT))
     natural = points.natural_frequency.at[3].set(jnp.nan)
     doubted = eqx.tree_at(lambda p: (p.status, p.natural_frequency), points, (status, natural))
     figure = plot.backbone_figure(doubted, backbone)
@@ -247,7 +247,7 @@ def test_many_points_are_drawn_small(identification, backbone):
 
 ARRAYS = [
     field.name
-    for field in dataclasses.fields(sj.BackbonePoints)
+    for field in dataclasses.fields(sj.identify.BackbonePoints)
     if field.name not in ("sensor", "argument")
 ]
 

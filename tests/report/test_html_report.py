@@ -12,8 +12,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import snrmjax as sj
-from snrmjax import report as reports
 from snrmjax.io.units import HERTZ
+from snrmjax.report import html as reports
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
 from snrmjax.report.identification_report import (
     identification_report,
@@ -28,7 +28,7 @@ LINEAR_DAMPING = 2 * DAMPING * LINEAR_HZ * HERTZ  # 1/s
 
 @pytest.fixture(scope="module")
 def modes():
-    return sj.linear_modes(
+    return sj.model.linear_modes(
         [LINEAR_HZ * HERTZ], [DAMPING], [[2.0]], [3.0], sensors=(f"tip {NASTY}",)
     )
 
@@ -45,7 +45,7 @@ def data(modes):
     force = displacement * np.hypot(natural**2 - omega**2, LINEAR_DAMPING * omega) / 6.0
     level = np.repeat(np.arange(1, 9), 4)
     velocity = displacement * omega * np.exp(1j * phase)
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level,
         omega,
         force,
@@ -66,7 +66,7 @@ def identification(data, modes):
 
 
 def resonance(force, velocity, frequency_hz, *, continued=False):
-    return sj.Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
+    return sj.identify.Resonance(force, 1e-3, frequency_hz * HERTZ, 0.019, velocity, continued)
 
 
 def simulated(force, velocities, frequencies_hz, events):
@@ -74,14 +74,14 @@ def simulated(force, velocities, frequencies_hz, events):
     n = len(velocities)
     velocity = np.zeros((n, 2, 1), dtype=complex)
     velocity[:, 1, 0] = velocities
-    return sj.ResponseCurve(
+    return sj.simulate.ResponseCurve(
         force=force,
         frequency=HERTZ * np.asarray(frequencies_hz),
         coefficients=np.zeros((n, 3, 1)),
         velocity=velocity,
         stable=np.ones(n, dtype=bool),
         event=tuple(events),
-        status=sj.CurveStatus.UPPER_END,
+        status=sj.simulate.CurveStatus.UPPER_END,
         sensors=(f"tip {NASTY}",),
     )
 
@@ -225,9 +225,9 @@ def test_points_left_out_are_counted_with_the_reason(identification, modes):
     points = identification.points
     status = (
         points.status.at[0]
-        .set(int(sj.PointStatus.NO_ROOT))
+        .set(int(sj.identify.PointStatus.NO_ROOT))
         .at[1:3]
-        .set(int(sj.PointStatus.NEGATIVE_DAMPING))
+        .set(int(sj.identify.PointStatus.NEGATIVE_DAMPING))
     )
     doubted = identification._replace(points=eqx.tree_at(lambda p: p.status, points, status))
     rows = dict(identification_summary(doubted, modes))

@@ -32,7 +32,7 @@ def told(fit):
 
 @pytest.fixture(scope="module")
 def figures(told):
-    points = sj.identify_points(noisy(1, gain=0.01), modes())
+    points = sj.identify.identify_points(noisy(1, gain=0.01), modes())
     return joint_report.joint_figures(told, points)
 
 
@@ -126,7 +126,7 @@ def test_lines_are_the_known_curves():
 
 def test_bands_are_ninety_five_per_cent(fit, figures):
     natural, ratio = figures["joint_fit"].axes
-    values = sj.fitted_values(fit, np.array([0.0, fit.largest[1]]))
+    values = sj.identify.fitted_values(fit, np.array([0.0, fit.largest[1]]))
     for axes, value, std, unit in (
         (natural, values.natural_frequency, values.natural_frequency_std, 1 / HERTZ),
         (ratio, values.damping_ratio, values.damping_ratio_std, 100.0),

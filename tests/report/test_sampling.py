@@ -17,7 +17,9 @@ FREQUENCY = np.array([10.0, 20.0, 30.0, 40.0, 50.0])
 @pytest.fixture
 def predicted():
     at = np.zeros(5, dtype=bool)
-    return sj.PredictedResponse(2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False)
+    return sj.identify.PredictedResponse(
+        2.0, FREQUENCY, 1j * SHAPE, SHAPE, ~at, ("lead",) * 5, at, False
+    )
 
 
 @pytest.fixture
@@ -25,14 +27,14 @@ def simulated():
     # Harmonics 0 to 2 of two sensors: only the fundamental counts.
     velocity = np.full((5, 3, 2), 100.0 + 0j)
     velocity[:, 1] = SHAPE[:, None] * [1.0, -0.5j]
-    return sj.ResponseCurve(
+    return sj.simulate.ResponseCurve(
         force=2.0,
         frequency=FREQUENCY,
         coefficients=np.zeros((5, 5, 1)),
         velocity=velocity,
         stable=np.ones(5, dtype=bool),
         event=("",) * 5,
-        status=sj.CurveStatus.UPPER_END,
+        status=sj.simulate.CurveStatus.UPPER_END,
         sensors=("tip", "root"),
     )
 
@@ -67,7 +69,7 @@ def test_damping_of_the_points_that_curves_use():
 
 
 def test_measured_states_under_about_a_force():
-    data = sj.steady_states(
+    data = sj.measure.steady_states(
         np.array([1, 1, 2, 2]),
         HERTZ * np.array([10.0, 11.0, 12.0, 13.0]),
         np.array([2.0, 2.05, 2.2, 2.0]),

@@ -51,7 +51,7 @@ def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
     own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
     velocity = velocity * np.exp(own)
     force = force * np.exp(NOISE["force"] * rng.normal(size=n))
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level,
         omega.real,
         force.real,
@@ -63,7 +63,7 @@ def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):
 
 
 def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         [frequency],
         [damping],
         [[SHAPE]],
@@ -71,7 +71,7 @@ def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
         natural_frequency_std=[1e-4 * OMEGA],
         damping_ratio_std=[damping_std * ZETA],
     )
-    return sj.structure(modes, **settings)
+    return sj.model.structure(modes, **settings)
 
 
 def beside(frequency, damping, constant, stiffening=0.0, seed=0):
@@ -93,7 +93,7 @@ def beside(frequency, damping, constant, stiffening=0.0, seed=0):
     velocity = velocity * np.exp(-1j * np.angle(force))
     n = len(level)
     own = NOISE["velocity"] * rng.normal(size=n) + 1j * NOISE["phase"] * rng.normal(size=n)
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level.real.astype(int),
         omega.real,
         np.abs(force) * np.exp(NOISE["force"] * rng.normal(size=n)),

@@ -32,7 +32,7 @@ def truth_at(speeds):
 
 def modes():
     """The one mode."""
-    return sj.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION])
+    return sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION])
 
 
 def exact(per_level=9, widest=60):
@@ -74,7 +74,7 @@ def noisy(seed=None, gain=0.0, scale=1.0, per_level=9, widest=60):
 
 def stated(level, omega, force, velocity, **others):
     """`SteadyStates` with the noise stated."""
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level,
         omega,
         force,

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
 
 _MOST = 0.2  # 1σ of a deviation, beyond which smooth curves were not those of the structure
 

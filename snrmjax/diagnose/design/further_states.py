@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
 from snrmjax.diagnose.misfit.programs import COMPARED
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.states import SteadyStates, steady_states
 
 HARMONICS = COMPARED
 """That are foretold of further states."""

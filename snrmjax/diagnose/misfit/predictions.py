@@ -24,11 +24,11 @@ from snrmjax.identify.calibrate.calibration_states import (
     calibration_states,
     state_whitener,
 )
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import parameter_values, stated_stds
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each

@@ -27,7 +27,7 @@ from snrmjax.model.effect_base import (
 from snrmjax.model.friction import IwanMicroslip, JenkinsSlider
 from snrmjax.model.mode_coupling import AbstractInternalResonance
 from snrmjax.model.parameters import with_parameters
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance

@@ -25,7 +25,7 @@ from snrmjax.identify.calibrate.calibration_states import (
     whitened,
 )
 from snrmjax.identify.calibrate.inverse_force import Erring, held_state, missed_columns
-from snrmjax.measure.steady_states import SteadyStates, check_phases
+from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
     parameter_value,
@@ -33,7 +33,7 @@ from snrmjax.model.parameters import (
     with_parameters,
     with_stated_std,
 )
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates, relative_errors
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates, calibration_states
-from snrmjax.measure.steady_states import SteadyStates, check_phases
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates, check_phases
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.prescribed_motion import HeldMotion, held_motion
@@ -37,8 +37,8 @@ def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 
     Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj
-    >>> linear = sj.structure(sj.linear_modes([500.0], [0.01], [[2.0]], [3.0]))
-    >>> data = sj.steady_states([1], [500.0], [1.0], [0.9 + 0.0j])
+    >>> linear = sj.model.structure(sj.model.linear_modes([500.0], [0.01], [[2.0]], [3.0]))
+    >>> data = sj.measure.steady_states([1], [500.0], [1.0], [0.9 + 0.0j])
     >>> needed_force(linear, data).force.round(6)
     Array([1.5+0.j], dtype=complex128)
     """

@@ -17,7 +17,7 @@ from jaxtyping import Array, Complex, Float, Int
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import mistrust, modal_filter
 from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.measure.steady_states import SteadyStates, check_phases, relative_errors
+from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled

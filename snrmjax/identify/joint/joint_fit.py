@@ -46,7 +46,7 @@ from snrmjax.identify.joint.selection import (
     select_families,
 )
 from snrmjax.identify.joint.variance_components import Scatter, few_levels_factor
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled

@@ -16,12 +16,7 @@ from snrmjax.identify.curves.families import (
 )
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
-    BalanceData,
-    Spread,
-    Unknowns,
-)
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.joint.initial_guess import levels_apart, most_parameters
 from snrmjax.identify.joint.linearisation import BalanceSlopes, balance_slopes
 from snrmjax.identify.joint.smoothness import (

@@ -12,7 +12,7 @@ from snrmjax.identify.pointwise.inversion import PointStatus, SnrmPoints, invert
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.measure.steady_states import SteadyStates, check_phases, relative_errors
+from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 AmplitudeArgument = Literal["displacement", "velocity"]

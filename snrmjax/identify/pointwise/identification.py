@@ -15,7 +15,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     mistrust,
 )
 from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
-from snrmjax.measure.steady_states import SteadyStates
+from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 
 

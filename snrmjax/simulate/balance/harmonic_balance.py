@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.averaging import AveragedForce, averaged_effect
 from snrmjax.model.effect_base import AbstractForce, AbstractKinked
-from snrmjax.model.structure import LinearTerms, Structure
+from snrmjax.model.structures import LinearTerms, Structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonics import (
     alias_free_samples,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 

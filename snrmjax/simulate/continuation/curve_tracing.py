@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped, over_cores, stacked, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import (

@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import (
@@ -63,7 +63,7 @@ def forced_response(
     Raises `ValueError` for a force that is not positive and for an empty or endless frequency
     range.
 
-    >>> from snrmjax import flat_beam
+    >>> from snrmjax.model import flat_beam
     >>> curve = forced_response(flat_beam(), [2e-4], 480.0, 520.0, harmonic_order=1)[0]
     >>> curve.status.name, curve.at_events("phase_resonance").size
     ('UPPER_END', 1)

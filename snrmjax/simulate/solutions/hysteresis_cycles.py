@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.friction import AbstractSliders
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 
 Memory = tuple[Float[Array, " state"], ...]
 

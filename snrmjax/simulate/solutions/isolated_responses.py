@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.structure import Structure, equilibria, simulated_structure
+from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, padded, taken
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
 from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, traced

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
-from snrmjax.model.structure import Structure, displacement_scale, simulated_structure
+from snrmjax.model.structures import Structure, displacement_scale, simulated_structure
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance

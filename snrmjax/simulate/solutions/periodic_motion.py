@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
@@ -57,7 +57,8 @@ def periodic_motion(
     Returns a `PeriodicMotion` whose values are NaN where Newton's method did not converge: start
     nearer. Raises `ValueError` for an unknown condition and for a missing or needless `value`.
 
-    >>> from snrmjax import flat_beam, forced_response
+    >>> from snrmjax import forced_response
+    >>> from snrmjax.model import flat_beam
     >>> beam = flat_beam()
     >>> curve = forced_response(beam, [2e-4], 480.0, 520.0, harmonic_order=1)[0]
     >>> start = curve.point(curve.at_events("peak")[0])

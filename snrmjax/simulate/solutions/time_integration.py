@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     CyclePoint,
@@ -99,7 +99,7 @@ def settled_motion(
     brings to a stop creep at its smoothing velocity.
     Reference: Tsitouras, Comput. Math. Appl. 62 (2011) 770, doi:10.1016/j.camwa.2011.06.002.
 
-    >>> from snrmjax import flat_beam, linear_response
+    >>> from snrmjax.model import flat_beam, linear_response
     >>> motion = settled_motion(flat_beam(), 1e-6, 500.0, harmonic_order=1)
     >>> exact = linear_response(flat_beam().modes, 500.0, 1e-6)
     >>> bool(motion.converged), bool(abs(motion.velocity[1] / exact - 1).max() < 1e-4)

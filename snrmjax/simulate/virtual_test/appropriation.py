@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import harmonic_balance

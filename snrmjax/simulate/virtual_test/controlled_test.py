@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.simulate.solutions.controlled import (
     ControlledCurve,
     phase_controlled,

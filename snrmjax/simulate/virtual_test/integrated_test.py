@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from snrmjax.model.structure import Structure
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.simulate.solutions.time_integration import IntegratedMotion, stepped_sine
 from snrmjax.simulate.virtual_test.appropriation import around, mode_phase

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple, get_args
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.measure.steady_states import SteadyStates
-from snrmjax.model.structure import Structure
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve
 from snrmjax.simulate.solutions.forced_response import forced_response_batch

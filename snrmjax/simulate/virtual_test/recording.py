@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from snrmjax.measure.steady_states import SteadyStates, steady_states
-from snrmjax.model.structure import Structure, simulated_structure
+from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.simulate.balance.harmonics import displacement_phasors, velocity_phasors
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 

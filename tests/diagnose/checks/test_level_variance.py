@@ -99,14 +99,14 @@ def test_errors_of_levels_need_the_phases_of_every_sensor(monkeypatch, data):
 
     monkeypatch.setattr(diagnosis, "Bench", stop)
     velocity = np.asarray(data.velocity)
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         *([OMEGA], [ZETA], [[SHAPE], [0.5 * SHAPE]], [PARTICIPATION]), sensors=("one", "other")
     )
-    two = sj.steady_states(
+    two = sj.measure.steady_states(
         *(np.asarray(data.level), np.asarray(data.frequency), np.asarray(data.force)),
         np.concatenate([velocity, 0.5 * velocity], axis=1),
         phase_std=np.tile([np.nan, np.pi], (data.n_states, 1)),
         sensors=("one", "other"),
     )
     with pytest.raises(Reached):
-        sj.diagnose_model(sj.structure(modes), two)
+        sj.diagnose_model(sj.model.structure(modes), two)

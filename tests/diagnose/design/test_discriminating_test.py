@@ -27,7 +27,7 @@ TIPS = np.geomspace(1e-4, 1e-3, 5)  # Q at resonance
 
 
 def linear_model():
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         [OMEGA],
         [ZETA],
         [[SHAPE]],
@@ -35,7 +35,7 @@ def linear_model():
         natural_frequency_std=[1e-4 * OMEGA],
         damping_ratio_std=[0.01 * ZETA],
     )
-    return sj.structure(modes)
+    return sj.model.structure(modes)
 
 
 def measured(kind=None, harmonic_std=np.nan, harmonics_at=(), seed=0):
@@ -58,7 +58,7 @@ def measured(kind=None, harmonic_std=np.nan, harmonics_at=(), seed=0):
         third = third + harmonic_std / np.sqrt(2) * (rng.normal(size=n) + 1j * rng.normal(size=n))
     seen = np.isin(level, harmonics_at)
     second = harmonic_std / np.sqrt(2) * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    return sj.steady_states(
+    return sj.measure.steady_states(
         level,
         omega,
         force * np.exp(NOISE["force"] * rng.normal(size=n)),

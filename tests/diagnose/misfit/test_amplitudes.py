@@ -250,7 +250,7 @@ def test_amplitudes_count_once():
 @pytest.mark.parametrize(
     "verb",
     [
-        lambda model, data: sj.identify_points(data, model.modes),
+        lambda model, data: sj.identify.identify_points(data, model.modes),
         lambda model, data: sj.fit_jointly(data, model.modes),
         lambda model, data: calibrate_model(model, data, ["mode_1.damping_ratio"]),
         needed_force,

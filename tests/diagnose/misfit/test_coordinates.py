@@ -53,15 +53,15 @@ def joint_states():
         "phase_std": np.full((len(x), 1), NOISE),
         "force_std": NOISE * np.abs(needed) * x,
     }
-    return sj.steady_states(level, omega, np.abs(needed) * x, velocity, **errors)
+    return sj.measure.steady_states(level, omega, np.abs(needed) * x, velocity, **errors)
 
 
 def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         [OMEGA], [ZETA], [[1.0]], [1.0],
         natural_frequency_std=[1e-4 * OMEGA], damping_ratio_std=[0.01 * ZETA],
     )  # fmt: skip
-    predictions = Predictions(sj.structure(modes), joint_states(), 1.0)
+    predictions = Predictions(sj.model.structure(modes), joint_states(), 1.0)
     bench, kind = Bench(predictions), "iwan_microslip"
     one = candidate(kind, scales_of(predictions))
     one = one._replace(starts=one.starts[:1])  # p = 1.2, a hundred of its 1σ away

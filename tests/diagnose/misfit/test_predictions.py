@@ -23,17 +23,17 @@ EVERY = [k if k in QUICK else pytest.param(k, marks=pytest.mark.long) for k in E
 @pytest.fixture(scope="module")
 def predictions():
     """States that a linear model needs two per cent more force for."""
-    modes = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
-    model = dataclasses.replace(sj.structure(modes), name="")
+    modes = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    model = dataclasses.replace(sj.model.structure(modes), name="")
     frequency = OMEGA * np.tile(np.linspace(0.98, 1.02, 4), 2)
     q = np.repeat([1e-3, 3e-3], 4) * np.exp(1j * np.tile([-0.5, -1.2, -2.0, -2.6], 2))
     needed = np.abs((OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency) * q) / 3.0
     level = np.repeat([1, 2], 4)
-    data = sj.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
+    data = sj.measure.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
     return Predictions(model, data), data
 
 
-class SmoothFriction(sj.AbstractMemoryless):
+class SmoothFriction(sj.model.AbstractMemoryless):
     """f = c tanh(q̇/knee): an effect of a user, who says nothing of what is typical."""
 
     kind: ClassVar[str] = "smooth_friction"
@@ -49,7 +49,7 @@ class SmoothFriction(sj.AbstractMemoryless):
 def own_friction(predictions):
     """Predictions with an effect of one's own, its structure and its parameters."""
     ours, data = predictions
-    sj.register_effect(SmoothFriction)
+    sj.model.register_effect(SmoothFriction)
     own = Predictions(ours.model, data)
     yield own, own.group("smooth_friction"), parameter_labels("smooth_friction")
     del EFFECTS["smooth_friction"]
@@ -130,9 +130,9 @@ def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions
 def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions):
     """A coefficient is 1e-3 of its own 1σ: the slope is that of the force of a cubic spring."""
     _, data = predictions
-    linear = sj.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
-    potential = sj.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
-    ours = Predictions(dataclasses.replace(sj.structure(linear, potential), name=""), data)
+    linear = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
+    potential = sj.model.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
+    ours = Predictions(dataclasses.replace(sj.model.structure(linear, potential), name=""), data)
     group = ours.group("cubic_stiffness")
     slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
     frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]

@@ -25,7 +25,7 @@ DRAG = "quadratic_damping.coefficient"
 
 
 def curved(*effects, **changes):
-    model = sj.curved_beam()
+    model = sj.model.curved_beam()
     modes = dataclasses.replace(model.modes, **changes)
     return dataclasses.replace(model, modes=modes, effects=tuple(effects))
 
@@ -76,14 +76,14 @@ def rows(data, index):
 
 
 def test_a_linear_structure_needs_the_force_of_its_closed_form():
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         [500.0, 1300.0], [0.01, 0.02], [[2.0, 1.0], [0.5, -1.0]], [3.0, 1.0],
         rigid_body_shape=[[1.0], [0.7]], rigid_body_participation=[2.0],
     )  # fmt: skip
     omega = np.array([470.0, 500.0, 510.0])
     velocity = np.outer([0.3, 0.5j, 0.2 - 0.1j], [1.0, 1.0])
-    data = sj.steady_states([1] * 3, omega, [0.4] * 3, velocity, sensors=modes.sensors)
-    found = needed_force(sj.structure(modes), data, harmonic_order=2)
+    data = sj.measure.steady_states([1] * 3, omega, [0.4] * 3, velocity, sensors=modes.sensors)
+    found = needed_force(sj.model.structure(modes), data, harmonic_order=2)
     response = np.asarray(linear_response(modes, jnp.asarray(omega), jnp.ones(3)))
     # 1e-10: rounding of a system whose condition number is about 1e4.
     np.testing.assert_allclose(found.force, velocity[:, 0] / response[:, 0], rtol=1e-10)
@@ -130,12 +130,12 @@ def test_derivatives_of_the_needed_force_are_those_of_central_differences(exact)
 
 
 def test_the_needed_force_has_slopes_by_the_mode_shape():
-    modes = sj.linear_modes([300.0], [0.01], [[2.0]], [3.0])
-    data = sj.steady_states([1, 1], [295.0, 305.0], [1.0, 1.0], [0.1 + 0.05j, 0.1 - 0.05j])
+    modes = sj.model.linear_modes([300.0], [0.01], [[2.0]], [3.0])
+    data = sj.measure.steady_states([1, 1], [295.0, 305.0], [1.0, 1.0], [0.1 + 0.05j, 0.1 - 0.05j])
 
     def force(shape):
         changed = dataclasses.replace(modes, mode_shape=shape)
-        return jnp.sum(needed_force(sj.structure(changed), data).force.real)
+        return jnp.sum(needed_force(sj.model.structure(changed), data).force.real)
 
     # A linear mode of half the shape has to move twice as far.
     slope = jax.grad(force)(modes.mode_shape)
@@ -146,7 +146,7 @@ def test_the_needed_force_has_slopes_by_the_mode_shape():
 
 
 def test_exact_data_of_the_flat_beam_give_its_dominant_coefficients():
-    beam, forces = sj.flat_beam(), (4.448e-3, 1.334e-2)
+    beam, forces = sj.model.flat_beam(), (4.448e-3, 1.334e-2)
     data = sj.phase_resonance_test(
         beam, forces, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0), points_per_level=6,
         harmonic_order=ORDER,
@@ -244,10 +244,12 @@ def test_a_prior_weighs_as_much_as_its_std_says(exact):
 
 @pytest.mark.long
 def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
-    modes = sj.linear_modes([400.0, 2500.0], [0.03, 0.01], [[2.0, 1.0], [5.0, -3.0]], [100.0, 20.0])
-    potential = sj.polynomial_potential({"1111": 5e9, "1112": 4e9, "111": 1e6}, 2)
-    model = sj.structure(modes, potential)
-    errors = sj.MeasurementErrors(amplitude=0.01, phase=0.01, force=0.003, harmonic=2e-4)
+    modes = sj.model.linear_modes(
+        [400.0, 2500.0], [0.03, 0.01], [[2.0, 1.0], [5.0, -3.0]], [100.0, 20.0]
+    )
+    potential = sj.model.polynomial_potential({"1111": 5e9, "1112": 4e9, "111": 1e6}, 2)
+    model = sj.model.structure(modes, potential)
+    errors = sj.simulate.MeasurementErrors(amplitude=0.01, phase=0.01, force=0.003, harmonic=2e-4)
     names = ("potential.1111", "potential.111")
     chi, distance, freedom = 0.0, 0.0, 0
     for seed in range(4):
@@ -312,7 +314,7 @@ def test_data_that_do_not_do_are_told(exact):
     with pytest.raises(ValueError, match="2 parameters need more than 2 data"):
         calibrate_model(curved(), rows(exact, [0]), NAMES)
     with pytest.raises(ValueError, match="sensors"):
-        calibrate_model(sj.flat_beam(), dataclasses.replace(exact, sensors=("a",)), NAMES)
+        calibrate_model(sj.model.flat_beam(), dataclasses.replace(exact, sensors=("a",)), NAMES)
     unknown = dataclasses.replace(exact, force=jnp.full(exact.n_states, jnp.nan))
     with pytest.raises(ValueError, match="calibrate_force"):
         calibrate_model(curved(), unknown, NAMES)

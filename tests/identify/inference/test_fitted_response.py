@@ -43,7 +43,7 @@ def moved(fit, vector):
 
 
 def test_resonance_of_known_curves(exact_fit):
-    found = sj.fitted_response(exact_fit, FORCE)[0].resonances[0]
+    found = sj.identify.fitted_response(exact_fit, FORCE)[0].resonances[0]
     low, high = 1e-5, 1e-2
     for _ in range(200):  # X with X ω̃ δ(X ω̃) = A F, by bisection
         middle = 0.5 * (low + high)
@@ -63,14 +63,14 @@ def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
     speed = x * np.sqrt(vector[0] * (1 - 0.4 * 0.25))
     force = speed * float(falling.unknowns.modal_damping(speed)) / CONSTANT
     # Beyond that turn the velocity falls, and the force has a second resonance there.
-    tips = sj.fitted_response(falling, force)[0].resonances
+    tips = sj.identify.fitted_response(falling, force)[0].resonances
     (found,) = (point for point in tips if not point.continued)
     assert found.frequency == pytest.approx(speed / x, rel=1e-9)
     assert found.velocity == pytest.approx(speed, rel=1e-9)
 
 
 def test_every_point_obeys_the_known_curves(exact_fit):
-    curve = sj.fitted_response(exact_fit, FORCE)[0]
+    curve = sj.identify.fitted_response(exact_fit, FORCE)[0]
     speed = np.abs(curve.velocity)
     x = speed / curve.frequency
     needed = squared(x) - curve.frequency**2 + 1j * curve.frequency * damping(speed)
@@ -80,7 +80,7 @@ def test_every_point_obeys_the_known_curves(exact_fit):
 
 
 def test_folds_are_where_the_frequency_turns(exact_fit):
-    found = sj.fitted_response(exact_fit, FORCE)[0].folds
+    found = sj.identify.fitted_response(exact_fit, FORCE)[0].folds
     assert len(found) == 2
     # Ω against X at fixed force, scanned: |(ω̃² − Ω²) + iΩδ| X = A F by bisection above ω̃.
     x = np.linspace(4e-4, 2.2e-3, 4001)
@@ -102,7 +102,7 @@ def test_folds_are_where_the_frequency_turns(exact_fit):
 
 @pytest.mark.parametrize("kind", ["resonance", "fold"])
 def test_slopes_of_points_are_central_differences(fit, kind):
-    curve = sj.fitted_response(fit, FORCE)[0]
+    curve = sj.identify.fitted_response(fit, FORCE)[0]
     best = max(curve.resonances if kind == "resonance" else curve.folds, key=lambda p: p.velocity)
     slopes = point_slopes(fit, FORCE, kind, best)
     vector = np.asarray(fit.vector()[0])
@@ -111,7 +111,7 @@ def test_slopes_of_points_are_central_differences(fit, kind):
         values = []
         for sign in (1, -1):
             there = moved(fit, vector + sign * step * np.eye(len(vector))[k])
-            one = sj.fitted_response(there, FORCE)[0]
+            one = sj.identify.fitted_response(there, FORCE)[0]
             points = one.resonances if kind == "resonance" else one.folds
             near = max(points, key=lambda p: p.velocity)
             values.append([near.frequency, near.velocity])
@@ -129,13 +129,13 @@ def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
     speeds = np.array([0.3, 0.6, 0.85])
     drawn = [
         np.asarray(
-            sj.fitted_values(
+            sj.identify.fitted_values(
                 moved(fit, vector + root @ rng.normal(size=len(vector))), speeds
             ).modal_damping
         )
         for _ in range(150)
     ]
-    values = sj.fitted_values(fit, speeds)
+    values = sj.identify.fitted_values(fit, speeds)
     # 150 draws know a spread to 1/sqrt(300).
     np.testing.assert_allclose(np.std(drawn, axis=0), values.modal_damping_std, rtol=3 * 0.058)
 
@@ -144,8 +144,8 @@ def test_a_new_level_has_a_wider_band(fit):
     spread = dataclasses.replace(fit.spread, level=np.array([0.01, 0.0, 0.004, 0.05]))
     scattering = dataclasses.replace(fit, spread=spread)
     speeds = np.array([0.3, 0.8])
-    plain = sj.fitted_values(scattering, speeds)
-    wide = sj.fitted_values(scattering, speeds, of_a_new_level=True)
+    plain = sj.identify.fitted_values(scattering, speeds)
+    wide = sj.identify.fitted_values(scattering, speeds, of_a_new_level=True)
     extra = np.sqrt(wide.modal_damping_std**2 - plain.modal_damping_std**2)
     np.testing.assert_allclose(extra, 0.05 * np.asarray(plain.modal_damping), rtol=1e-9)
 
@@ -154,7 +154,7 @@ def test_the_backbone_for_other_tools_is_the_same_curve(fit):
     backbone = as_backbone(fit)
     amplitude = np.linspace(2e-4, 1.9e-3, 9)
     speed = np.asarray(backbone.velocity(amplitude))
-    values = sj.fitted_values(fit, speed)
+    values = sj.identify.fitted_values(fit, speed)
     # 120 knots of a shape-preserving cubic.
     np.testing.assert_allclose(
         backbone.natural_frequency(amplitude), values.natural_frequency, rtol=1e-5
@@ -168,7 +168,7 @@ def test_advice_narrows_the_band_and_avoids_what_cannot_be_measured(fit):
     assert all(np.diff(ratios) < 0)
     assert 0 < ratios[-1] < ratios[0] < 1
     for one in advice:
-        curve = sj.fitted_response(fit, one.force)[0]
+        curve = sj.identify.fitted_response(fit, one.force)[0]
         near = np.argmin(np.abs(curve.velocity - one.velocity * np.exp(1j * one.phase)))
         assert curve.stable[near]
         assert not curve.continued[near]
@@ -185,7 +185,7 @@ def test_advice_holds_what_it_promises():
     level = np.asarray(fit.data.level)
     one = sj.next_measurements(fit, 1, target="damping")[0]
     velocity = one.velocity * np.exp(1j * one.phase)
-    more = sj.steady_states(
+    more = sj.measure.steady_states(
         [level.max() + 1],
         [one.frequency],
         [one.force],
@@ -194,14 +194,14 @@ def test_advice_holds_what_it_promises():
         phase_std=np.array([0.012]),
         force_std=np.array([0.003 * one.force]),
     )
-    again = sj.fit_jointly(sj.join_steady_states(data, more), modes(), **settings)
+    again = sj.fit_jointly(sj.measure.join_steady_states(data, more), modes(), **settings)
     assert not fit.level_std[1:].any()  # scatter that one fit finds and the other does not
     assert not again.level_std[1:].any()  # would move the bands too
     speeds = np.abs(np.asarray(fit.motion().velocity))
     at = np.linspace(speeds.min(), speeds.max(), 25)
     bands = [
         np.mean(np.asarray(v.modal_damping_std / v.modal_damping))
-        for v in (sj.fitted_values(f, at) for f in (again, fit))
+        for v in (sj.identify.fitted_values(f, at) for f in (again, fit))
     ]
     # The state said nothing new (it lies on the fit's curve): only the bands move.
     assert bands[0] / bands[1] == pytest.approx(one.expected_band_ratio, abs=0.01)

@@ -45,7 +45,7 @@ def fit():
 
 def test_exact_states_give_back_the_curves():
     found = fit_jointly(noisy(), modes(), **TRUE)
-    values = sj.fitted_values(found, SPEEDS)
+    values = sj.identify.fitted_values(found, SPEEDS)
     want = truth_at(SPEEDS)
     # The solver stops at 1e-10 of the whitened residuals, whose unit is a per cent.
     np.testing.assert_allclose(values.natural_frequency**2, want[0], rtol=1e-9)
@@ -89,7 +89,7 @@ def test_gain_offset_and_phase_of_the_instruments_are_found():
     level, omega, force, velocity = exact()
     gain, offset, phase = 0.4, 0.02, np.radians(5.0)
     volts = (force - offset) / gain
-    data = sj.steady_states(
+    data = sj.measure.steady_states(
         level,
         omega,
         np.full(len(level), np.nan),
@@ -106,7 +106,7 @@ def test_gain_offset_and_phase_of_the_instruments_are_found():
     assert float(unknowns.instrument_phase) == pytest.approx(phase, rel=1e-6)
     assert found.drive_known_only
     want = truth_at(SPEEDS)
-    values = sj.fitted_values(found, SPEEDS)
+    values = sj.identify.fitted_values(found, SPEEDS)
     np.testing.assert_allclose(values.modal_damping, want[1], rtol=1e-6)
 
 
@@ -115,7 +115,7 @@ def test_bands_are_as_wide_as_the_scatter_of_repeated_tests():
     z = []
     for seed in range(40):
         found = fit_jointly(noisy(seed, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
-        values = sj.fitted_values(found, SPEEDS)
+        values = sj.identify.fitted_values(found, SPEEDS)
         first = (values.natural_frequency**2 - want[0]) / (
             2 * values.natural_frequency * values.natural_frequency_std
         )
@@ -132,7 +132,7 @@ def test_bands_are_as_wide_as_the_scatter_of_repeated_tests():
 
 def test_without_the_levels_error_bands_are_too_narrow(fit):
     blind = fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=1e-9, **TRUE)
-    narrow, wide = (sj.fitted_values(f, SPEEDS).modal_damping_std for f in (blind, fit))
+    narrow, wide = (sj.identify.fitted_values(f, SPEEDS).modal_damping_std for f in (blind, fit))
     assert np.all(np.asarray(narrow) < 0.8 * np.asarray(wide))
 
 
@@ -170,15 +170,15 @@ def test_order_of_rows_and_units_do_not_matter(fit):
     order = np.random.default_rng(0).permutation(len(level))
     mixed = stated(level[order], omega[order], force[order], velocity[order])
     again = fit_jointly(mixed, modes(), level_gain_std=0.01, **TRUE)
-    values, others = (sj.fitted_values(f, SPEEDS) for f in (fit, again))
+    values, others = (sj.identify.fitted_values(f, SPEEDS) for f in (fit, again))
     # The stated noise is that of the exact magnitudes in one and of the noisy in the other: the
     # same numbers here, so only rounding and the solver's end remain.
     np.testing.assert_allclose(others.natural_frequency, values.natural_frequency, rtol=1e-8)
     np.testing.assert_allclose(others.modal_damping_std, values.modal_damping_std, rtol=1e-5)
-    in_mm = sj.linear_modes([500.0], [0.012], [[2000.0]], [3.0])
+    in_mm = sj.model.linear_modes([500.0], [0.012], [[2000.0]], [3.0])
     thousand = stated(level, omega, force, 1e3 * velocity)
     scaled = fit_jointly(thousand, in_mm, level_gain_std=0.01, **TRUE)
-    others = sj.fitted_values(scaled, 1e3 * SPEEDS)
+    others = sj.identify.fitted_values(scaled, 1e3 * SPEEDS)
     np.testing.assert_allclose(others.natural_frequency, values.natural_frequency, rtol=1e-8)
 
 
@@ -193,8 +193,8 @@ def test_noise_that_residuals_contradict_is_said_and_widens_the_bands():
     assert not any("stated noise" in note for note in quiet.notes)
     assert abs(loud.noise_scale - 3) < 3 * loud.noise_scale_std
     assert any("understated" in note for note in loud.notes)
-    ratio = sj.fitted_values(loud, SPEEDS).modal_damping_std / (
-        sj.fitted_values(quiet, SPEEDS).modal_damping_std
+    ratio = sj.identify.fitted_values(loud, SPEEDS).modal_damping_std / (
+        sj.identify.fitted_values(quiet, SPEEDS).modal_damping_std
     )
     np.testing.assert_allclose(ratio, 3.0, rtol=0.25)  # the noise is known to a tenth
     silent = fit_jointly(noisy(2, scale=0.3), modes(), **TRUE)
@@ -203,7 +203,7 @@ def test_noise_that_residuals_contradict_is_said_and_widens_the_bands():
 
 def test_noise_that_nobody_states_is_found():
     level, omega, force, velocity = (np.asarray(part) for part in _columns(noisy(4)))
-    found = fit_jointly(sj.steady_states(level, omega, force, velocity), modes(), **TRUE)
+    found = fit_jointly(sj.measure.steady_states(level, omega, force, velocity), modes(), **TRUE)
     # One relative error stands for those of velocity, phase and force, larger off resonance.
     assert 0.3 * NOISE["velocity"] < found.noise_scale < 1.5 * NOISE["velocity"]
     assert not found.noise_stated
@@ -235,7 +235,9 @@ def test_levels_that_scatter_are_found_and_enter_the_bands():
     assert any("levels differ" in note for note in found.notes)
     steady = fit_jointly(noisy(8), modes(), **TRUE)
     assert steady.level_std[2] == 0
-    wide, narrow = (sj.fitted_values(f, SPEEDS).natural_frequency_std for f in (found, steady))
+    wide, narrow = (
+        sj.identify.fitted_values(f, SPEEDS).natural_frequency_std for f in (found, steady)
+    )
     assert np.all(np.asarray(wide) > np.asarray(narrow))
 
 
@@ -252,7 +254,7 @@ def test_two_levels_whose_gains_differ_are_found_to():
         return fit_jointly(data, modes(), **TRUE)
 
     def largest_error(fit):
-        values = sj.fitted_values(fit, SPEEDS[3:])
+        values = sj.identify.fitted_values(fit, SPEEDS[3:])
         off = np.asarray(values.natural_frequency**2 - truth_at(SPEEDS[3:])[0])
         return np.max(np.abs(off / (2 * values.natural_frequency * values.natural_frequency_std)))
 
@@ -271,7 +273,7 @@ def test_auto_finds_the_families_that_made_the_data():
     found = fit_jointly(noisy(3, gain=0.002, per_level=15), modes(), level_gain_std=0.002)
     chosen = {c.curve: c for c in found.candidates if c.chosen}
     assert chosen["backbone"].argument == "displacement"
-    values, want = sj.fitted_values(found, SPEEDS), truth_at(SPEEDS)
+    values, want = sj.identify.fitted_values(found, SPEEDS), truth_at(SPEEDS)
     z = (values.modal_damping - want[1]) / values.modal_damping_std
     assert np.all(np.abs(z) < 4)
     scores = [c.score for c in found.candidates if c.curve == "damping"]
@@ -287,7 +289,7 @@ def test_an_exponent_at_the_end_of_its_range_leaves_the_bands_alone():
         for damping in ("viscous_microslip@velocity", "viscous_quadratic@velocity")
     )
     at = np.linspace(0.1, 1.0, 5) * fixed.largest[1]
-    wide, narrow = (sj.fitted_values(fit, at) for fit in (free, fixed))
+    wide, narrow = (sj.identify.fitted_values(fit, at) for fit in (free, fixed))
     ratio = np.asarray(wide.natural_frequency_std / narrow.natural_frequency_std)
     assert np.all((ratio > 0.99) & (ratio < 1.1))
     ratio = np.asarray(wide.modal_damping_std / narrow.modal_damping_std)
@@ -303,7 +305,10 @@ def test_a_robust_loss_shrugs_off_an_outlier():
     data = stated(level, omega, force, velocity)
     plain, robust = (fit_jointly(data, modes(), robust=r, **TRUE) for r in (False, True))
     clean = fit_jointly(noisy(5), modes(), **TRUE)
-    curves = [np.asarray(sj.fitted_values(f, SPEEDS).modal_damping) for f in (plain, robust, clean)]
+    curves = [
+        np.asarray(sj.identify.fitted_values(f, SPEEDS).modal_damping)
+        for f in (plain, robust, clean)
+    ]
     gaps = [np.max(np.abs(curve - curves[2])) for curve in curves]
     assert gaps[1] < 0.5 * gaps[0]
     assert robust.data.weight[13] < 0.3
@@ -371,7 +376,7 @@ def test_a_fit_comes_back_from_its_file(fit, tmp_path):
     assert again.names() == fit.names()
     assert again.notes == fit.notes
     np.testing.assert_array_equal(again.covariance, fit.covariance)
-    one, other = (sj.fitted_values(f, SPEEDS) for f in (fit, again))
+    one, other = (sj.identify.fitted_values(f, SPEEDS) for f in (fit, again))
     for first, second in zip(one, other, strict=True):
         np.testing.assert_array_equal(first, second)
     (tmp_path / "no.json").write_text('{"format": 0}')
@@ -393,7 +398,7 @@ def test_tables_and_summary(fit, tmp_path):
     header, *lines = (tmp_path / "next.csv").read_text().splitlines()
     assert header == "rank,force_n,frequency_hz,expected_band_ratio,reason"
     assert len(lines) == 2
-    summary = summarise_fit(fit, sj.fitted_response(fit, 1.0))
+    summary = summarise_fit(fit, sj.identify.fitted_response(fit, 1.0))
     named = summary["parameters"]["damping.viscous"]
     assert named["unit"] == "1/s"
     assert abs(named["value"] - 12) < 4 * named["std"]

@@ -19,7 +19,7 @@ from snrmjax.identify.joint.residuals import all_residuals
 
 def drawn(free, *, room=False):
     """Residuals of drawn states, the unknowns near their smallest, and their order."""
-    modes = sj.linear_modes(
+    modes = sj.model.linear_modes(
         *([OMEGA, 3 * OMEGA], [0.012, 0.01], [[SHAPE, 1.5]], [PARTICIPATION, 2.0]),
         natural_frequency_std=[1.0, 5.0],
         damping_ratio_std=[1e-3, 2e-3],

@@ -91,7 +91,7 @@ def test_bands_hold_curves_under_misfits_that_neighbours_share():
         error = drawn(rng, 0.9, 2, LEVELS, 25).reshape(2, -1)
         own = np.exp(NOISE["velocity"] * error[0] + 1j * NOISE["phase"] * error[1])
         fit = fit_jointly(stated(level, omega, force, velocity * own), modes(), **TRUE)
-        values = sj.fitted_values(fit, speeds)
+        values = sj.identify.fitted_values(fit, speeds)
         found = np.stack([values.natural_frequency, values.modal_damping])
         std = np.stack([values.natural_frequency_std, values.modal_damping_std])
         scores.append(np.abs(found - want) / std)

@@ -85,9 +85,11 @@ def test_bands_of_curves_hold_what_rivals_say(fit, argument):
     at = {
         argument: np.linspace(0.1, 1.3, 7) * {"displacement": displacement}.get(argument, velocity)
     }
-    found = sj.fitted_values(fit, **at)
+    found = sj.identify.fitted_values(fit, **at)
     alone = by_estimation_alone(fit)
-    answers = [sj.fitted_values(one, **at) for one in (alone, *(r.fit for r in fit.rivals))]
+    answers = [
+        sj.identify.fitted_values(one, **at) for one in (alone, *(r.fit for r in fit.rivals))
+    ]
     weights = [one.weight for one in fit.rivals]
     for name in ("natural_frequency", "modal_damping"):
         pairs = [
@@ -99,9 +101,9 @@ def test_bands_of_curves_hold_what_rivals_say(fit, argument):
 
 
 def test_bands_of_a_resonance_and_a_fold_hold_what_rivals_say(fit):
-    found = sj.fitted_response(fit, FORCE)[0]
+    found = sj.identify.fitted_response(fit, FORCE)[0]
     answers = [
-        sj.fitted_response(one, FORCE)[0]
+        sj.identify.fitted_response(one, FORCE)[0]
         for one in (by_estimation_alone(fit), *(r.fit for r in fit.rivals))
     ]
     weights = [one.weight for one in fit.rivals]
@@ -115,13 +117,15 @@ def test_bands_of_a_resonance_and_a_fold_hold_what_rivals_say(fit):
 
 def test_bands_along_a_response_hold_what_rivals_say(fit):
     """On a flank, where the velocity at one frequency is one and can be looked up."""
-    ours, alone = (sj.fitted_response(f, FORCE)[0] for f in (fit, by_estimation_alone(fit)))
+    ours, alone = (
+        sj.identify.fitted_response(f, FORCE)[0] for f in (fit, by_estimation_alone(fit))
+    )
     tip = np.argmax(np.abs(ours.velocity))
     place = tip // 2  # on the way up
     omega = ours.frequency[place]
     pairs = [(abs(alone.velocity[place]), alone.velocity_std[place])]
     for one in fit.rivals:
-        theirs = sj.fitted_response(one.fit, FORCE, points_per_side=2000)[0]
+        theirs = sj.identify.fitted_response(one.fit, FORCE, points_per_side=2000)[0]
         rising = slice(0, np.argmax(np.abs(theirs.velocity)))
         size, at = np.abs(theirs.velocity[rising]), theirs.frequency[rising]
         std = np.interp(omega, at, theirs.velocity_std[rising])
@@ -145,8 +149,11 @@ def test_rivals_add_up_in_any_order(fit):
     """Along a response, on whose upper flank all of them differ."""
 
     def added(*factors):
-        wide = sj.fitted_response(against(fit, *factors), FORCE)[0].velocity_std
-        return wide**2 - sj.fitted_response(by_estimation_alone(fit), FORCE)[0].velocity_std ** 2
+        wide = sj.identify.fitted_response(against(fit, *factors), FORCE)[0].velocity_std
+        return (
+            wide**2
+            - sj.identify.fitted_response(by_estimation_alone(fit), FORCE)[0].velocity_std ** 2
+        )
 
     one, other, both, turned = added(1.1), added(1.3), added(1.1, 1.3), added(1.3, 1.1)
     tip = np.argmax(one)
@@ -157,10 +164,10 @@ def test_rivals_add_up_in_any_order(fit):
 
 @pytest.mark.parametrize("factor", [1.05, 1.3, 1.6])
 def test_a_resonance_is_as_uncertain_as_its_rival_is_far(fit, factor):
-    mine = sj.fitted_response(by_estimation_alone(fit), FORCE)[0].resonances[0]
-    wide = sj.fitted_response(against(fit, factor), FORCE)[0].resonances[0]
+    mine = sj.identify.fitted_response(by_estimation_alone(fit), FORCE)[0].resonances[0]
+    wide = sj.identify.fitted_response(against(fit, factor), FORCE)[0].resonances[0]
     rival = against(fit, factor).rivals[0].fit
-    theirs = sj.fitted_response(rival, FORCE)[0].resonances[0]
+    theirs = sj.identify.fitted_response(rival, FORCE)[0].resonances[0]
     apart = (theirs.velocity - mine.velocity) ** 2
     excess = apart - abs(theirs.velocity_std**2 - mine.velocity_std**2)
     expected = np.sqrt(mine.velocity_std**2 + 0.25 * excess)
@@ -184,7 +191,9 @@ def test_a_band_at_one_velocity_does_not_hang_on_what_else_is_asked(fit):
 def test_at_rest_dry_friction_leaves_damping_as_open_as_just_beside(fit):
     given = {"backbone": "polynomial:1@displacement", "damping": "viscous_coulomb@displacement"}
     dry = sj.fit_jointly(noisy(4, gain=0.01), modes(), level_gain_std=0.01, **given)
-    assert np.isinf(np.asarray(sj.fitted_values(dry, displacement=np.zeros(1)).modal_damping))
+    assert np.isinf(
+        np.asarray(sj.identify.fitted_values(dry, displacement=np.zeros(1)).modal_damping)
+    )
     parameters = dry.unknowns.modal_damping.parameters.at[1].set(2.0)
     dry = eqx.tree_at(lambda f: f.unknowns.modal_damping.parameters, dry, parameters)
     either = dataclasses.replace(by_estimation_alone(fit), rivals=(Rival("damping", 0.5, dry),))
@@ -204,9 +213,9 @@ def test_the_choice_is_a_contribution(fit):
     assert sum(one.damping_share for one in shares.values()) == pytest.approx(1.0, rel=1e-6)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), 25)
-    with_choice = np.asarray(sj.fitted_values(fit, displacement=at).modal_damping_std)
+    with_choice = np.asarray(sj.identify.fitted_values(fit, displacement=at).modal_damping_std)
     without = np.asarray(
-        sj.fitted_values(by_estimation_alone(fit), displacement=at).modal_damping_std
+        sj.identify.fitted_values(by_estimation_alone(fit), displacement=at).modal_damping_std
     )
     expected = np.mean(1 - (without / with_choice) ** 2)
     assert shares["choice of the families"].damping_share == pytest.approx(expected, rel=0.02)
@@ -216,7 +225,7 @@ def test_knots_for_classical_predictions_have_the_same_band(fit):
     backbone = as_backbone(fit)
     at = np.asarray(backbone.modal_damping.knots)[5::20]
     std = np.sqrt(np.diag(np.asarray(backbone.modal_damping_covariance)))[5::20]
-    expected = np.asarray(sj.fitted_values(fit, displacement=at).modal_damping_std)
+    expected = np.asarray(sj.identify.fitted_values(fit, displacement=at).modal_damping_std)
     np.testing.assert_allclose(std, expected, rtol=1e-9)
 
 

@@ -8,7 +8,7 @@ import pytest
 from snrmjax.identify.pointwise.backbone import Backbone, fit_backbone
 from snrmjax.identify.pointwise.backbone_points import identify_points
 from snrmjax.identify.pointwise.curve_fit import ShapePreservingSpline, _linearised
-from snrmjax.measure.steady_states import steady_states
+from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_modes
 
 W0, RATE = 500.0, 10.0  # ω0 and 2ζ̃ω̃, constant: ζ = 1 %

@@ -9,7 +9,7 @@ import pytest
 
 from snrmjax.identify.pointwise.backbone_points import identify_points
 from snrmjax.identify.pointwise.inversion import PointStatus
-from snrmjax.measure.steady_states import SteadyStates, steady_states
+from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.modes import linear_modes
 
 SENSORS = ("tip", "middle", "root")

@@ -13,7 +13,7 @@ HERTZ = 2 * np.pi
 MEASURED = Path(__file__).resolve().parents[4] / "shared" / "data" / "brake_reuss_beam"
 
 W0, ZETA, SHAPE, PARTICIPATION = 500.0, 0.01, 2.0, 1.5
-MODES = sj.linear_modes([W0], [ZETA], [[SHAPE]], [PARTICIPATION])
+MODES = sj.model.linear_modes([W0], [ZETA], [[SHAPE]], [PARTICIPATION])
 
 
 def linear_test(seed, noise, *, stated=False, more_off_it=0.0, levels=6):
@@ -31,7 +31,7 @@ def linear_test(seed, noise, *, stated=False, more_off_it=0.0, levels=6):
     error *= np.sqrt(1 + (more_off_it * np.sin(np.angle(exact))) ** 2)
     velocity = exact * (1 + error)
     spread = {"velocity_std": noise * np.abs(velocity), "phase_std": np.full(level.size, noise)}
-    return sj.steady_states(level, frequency, force, velocity, **(spread if stated else {}))
+    return sj.measure.steady_states(level, frequency, force, velocity, **(spread if stated else {}))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ class TestMeasuredBeam:
         families = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
         fit = sj.fit_jointly(data, model.modes, **families)
         frequency, speed, damping = crossings
-        values = sj.fitted_values(fit, speed)
+        values = sj.identify.fitted_values(fit, speed)
         assert fit.converged
         # Levels cross within 0.05 Hz of a curve; an error of phase of 7°, which the fit finds at
         # the highest, is worth tan(7°)·0.7 % of 80 Hz there.
@@ -141,7 +141,7 @@ class TestLinearMode:
     def test_stated_errors_are_left_as_stated(self):
         data = linear_test(0, 0.01, stated=True)
         found = sj.identify_backbone(data, MODES)
-        points = sj.identify_points(data, MODES)
+        points = sj.identify.identify_points(data, MODES)
         np.testing.assert_array_equal(
             found.points.natural_frequency_std, points.natural_frequency_std
         )
@@ -150,7 +150,7 @@ class TestLinearMode:
     def test_noise_larger_than_stated_is_noted(self):
         data = linear_test(0, 0.03)
         little = np.full(data.force.shape[0], 0.01)
-        stated = sj.steady_states(
+        stated = sj.measure.steady_states(
             data.level,
             data.frequency,
             data.force,
@@ -165,7 +165,7 @@ class TestLinearMode:
     def test_a_phase_that_is_off_shows_in_the_damping(self, turn, told):
         data = linear_test(0, 0.003)
         velocity = data.velocity[:, 0] * np.exp(1j * turn)
-        turned = sj.steady_states(data.level, data.frequency, data.force, velocity)
+        turned = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
         notes = [n for n in sj.identify_backbone(turned, MODES).notes if "inside the levels" in n]
         # 2ζ̃ω̃ is |A|F cos φ/v: a phase that reads too high makes it fall towards the lead side.
         assert len(notes) == (told is not None)
@@ -175,7 +175,7 @@ class TestLinearMode:
         data = linear_test(0, 0.0)
         velocity = np.asarray(data.velocity[:, 0]).copy()
         velocity[3] = np.nan
-        spoilt = sj.steady_states(data.level, data.frequency, data.force, velocity)
+        spoilt = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
         found = sj.identify_backbone(spoilt, MODES)
         assert any(note.startswith("1 of 30 points are left out") for note in found.notes)
 

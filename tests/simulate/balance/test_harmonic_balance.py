@@ -12,7 +12,7 @@ from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import simulated_structure, structure
+from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,

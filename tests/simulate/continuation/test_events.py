@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import StepControl
 from snrmjax.simulate.continuation.events import BIFURCATIONS, EVENT_KINDS
 from snrmjax.simulate.solutions.forced_response import forced_response

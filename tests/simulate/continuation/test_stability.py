@@ -9,7 +9,7 @@ from scipy.special import mathieu_a, mathieu_b
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.stability import (
     StabilityLoss,
     floquet_multipliers,

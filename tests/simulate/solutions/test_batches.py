@@ -9,7 +9,7 @@ import pytest
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded, stacked, taken
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.forced_response import forced_response, forced_response_batch

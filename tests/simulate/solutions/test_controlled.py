@@ -8,7 +8,7 @@ from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.controlled import (
     damped_normal_mode,

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.structure import simulated_structure, structure
+from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.continuation.stability import floquet_multipliers, is_stable
 from snrmjax.simulate.solutions.forced_response import solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import settled_motion

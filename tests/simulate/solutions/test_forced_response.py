@@ -11,7 +11,7 @@ from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.periodic_motion import periodic_motion

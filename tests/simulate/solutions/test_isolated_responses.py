@@ -7,7 +7,7 @@ from snrmjax.model.beams import curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.forced_response import forced_response
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses

@@ -12,7 +12,7 @@ from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.solutions.normal_modes import DEFAULT_STEPS, nonlinear_normal_mode
 

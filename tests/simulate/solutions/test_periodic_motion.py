@@ -9,7 +9,7 @@ import pytest
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.solutions.forced_response import forced_response
 from snrmjax.simulate.solutions.periodic_motion import (
     motions_at_velocities,

@@ -11,7 +11,7 @@ from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import simulated_structure, structure
+from snrmjax.model.structures import simulated_structure, structure
 from snrmjax.simulate.solutions import time_integration
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import (

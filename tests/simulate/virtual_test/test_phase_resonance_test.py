@@ -10,7 +10,7 @@ import pytest
 from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
-from snrmjax.model.structure import structure
+from snrmjax.model.structures import structure
 from snrmjax.simulate.virtual_test.controlled_test import (
     phase_controlled_test,
     response_controlled_test,

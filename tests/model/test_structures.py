@@ -12,7 +12,7 @@ from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structure import displacement_scale, equilibria, structure
+from snrmjax.model.structures import displacement_scale, equilibria, structure
 
 ALL_EFFECTS = {
     "cubic_stiffness": {"coefficient": 1.3},

@@ -1,0 +1,3 @@
+from .diagnosis import Diagnosis, diagnose_model
+
+__all__ = ["Diagnosis", "diagnose_model"]

@@ -1,0 +1,72 @@
+from .calibrate.calibration import CalibratedModel, calibrate_model
+from .curves.families import FAMILIES
+from .inference.fitted_curves import fitted_values
+from .inference.fitted_response import FittedPoint, FittedResponse, fitted_response
+from .inference.optimal_design import NextMeasurement, next_measurements
+from .inference.uncertainty import (
+    bootstrap,
+    compare_bands,
+    contributions,
+    profile,
+    sample_posterior,
+    sensitivity,
+)
+from .joint.joint_fit import JointFit, fit_jointly
+from .pointwise.backbone import Backbone, BackboneFit, fit_backbone
+from .pointwise.backbone_points import BackbonePoints, identify_points
+from .pointwise.identification import Identification, identify_backbone
+from .pointwise.inversion import (
+    PointStatus,
+    SnrmPoints,
+    closed_form,
+    invert_amplitude_phase,
+    invert_phasor,
+)
+from .pointwise.prediction import (
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonance_by_fixed_point,
+    resonances,
+)
+from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+
+__all__ = [
+    "FAMILIES",
+    "Backbone",
+    "BackboneFit",
+    "BackbonePoints",
+    "CalibratedModel",
+    "FittedPoint",
+    "FittedResponse",
+    "Identification",
+    "JointFit",
+    "NextMeasurement",
+    "PointStatus",
+    "PredictedResponse",
+    "Resonance",
+    "SnrmPoints",
+    "bootstrap",
+    "calibrate_model",
+    "closed_form",
+    "compare_bands",
+    "contributions",
+    "fit_backbone",
+    "fit_jointly",
+    "fitted_response",
+    "fitted_values",
+    "identify_backbone",
+    "identify_points",
+    "invert_amplitude_phase",
+    "invert_phasor",
+    "next_measurements",
+    "nonlinear_mode_velocity",
+    "predict_response",
+    "profile",
+    "reference_sensor",
+    "resonance_by_fixed_point",
+    "resonances",
+    "sample_posterior",
+    "sensitivity",
+    "snrm_velocity",
+]

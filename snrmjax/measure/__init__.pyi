@@ -1,0 +1,39 @@
+from .force_calibration import (
+    EquivalentForce,
+    ForceCalibration,
+    ForceStatus,
+    apply_calibration,
+    calibrate_force,
+    equivalent_force,
+)
+from .harmonic_fit import FitStatus, HarmonicFit, fit_harmonics, phasor_relative_to_force
+from .indicators import appropriation_of, mode_indicator, nnm_appropriation
+from .records import RecordFit, fit_records, steady_state_from_records
+from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
+from .states import SteadyStates, join_steady_states, steady_states
+
+__all__ = [
+    "EquivalentForce",
+    "FitStatus",
+    "ForceCalibration",
+    "ForceStatus",
+    "ForceVelocityLoop",
+    "HarmonicFit",
+    "RecordFit",
+    "SteadyStates",
+    "apply_calibration",
+    "appropriation_of",
+    "calibrate_force",
+    "equivalent_force",
+    "fit_harmonics",
+    "fit_records",
+    "force_velocity_loop",
+    "join_steady_states",
+    "mode_indicator",
+    "nnm_appropriation",
+    "peak_amplitude",
+    "phasor_relative_to_force",
+    "steady_state_from_records",
+    "steady_states",
+    "synthesise",
+]

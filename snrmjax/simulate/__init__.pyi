@@ -1,0 +1,63 @@
+from .balance.harmonics import velocity_phasors
+from .continuation.continuation import CurveStatus, StepControl
+from .continuation.response_curve import ResponseCurve
+from .continuation.stability import StabilityLoss, floquet_multipliers
+from .solutions.controlled import (
+    ControlledCurve,
+    DampedModeBranch,
+    damped_normal_mode,
+    phase_controlled,
+    response_controlled,
+)
+from .solutions.forced_response import (
+    ResponseBatch,
+    forced_response,
+    forced_response_batch,
+    solve_at_frequency,
+)
+from .solutions.isolated_responses import isolated_responses
+from .solutions.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
+from .solutions.periodic_motion import (
+    PeriodicMotion,
+    motions_at_velocities,
+    periodic_motion,
+    response_at_velocities,
+)
+from .solutions.time_integration import IntegratedMotion, MotionStatus, settled_motion, stepped_sine
+from .virtual_test.controlled_test import phase_controlled_test, response_controlled_test
+from .virtual_test.phase_resonance_test import MeasurementErrors, VirtualTest, phase_resonance_test
+
+__all__ = [
+    "ControlledCurve",
+    "CurveStatus",
+    "DampedModeBranch",
+    "IntegratedMotion",
+    "MeasurementErrors",
+    "MotionStatus",
+    "NormalModeBranch",
+    "PeriodicMotion",
+    "ResponseBatch",
+    "ResponseCurve",
+    "StabilityLoss",
+    "StepControl",
+    "Tongue",
+    "VirtualTest",
+    "damped_normal_mode",
+    "floquet_multipliers",
+    "forced_response",
+    "forced_response_batch",
+    "isolated_responses",
+    "motions_at_velocities",
+    "nonlinear_normal_mode",
+    "periodic_motion",
+    "phase_controlled",
+    "phase_controlled_test",
+    "phase_resonance_test",
+    "response_at_velocities",
+    "response_controlled",
+    "response_controlled_test",
+    "settled_motion",
+    "solve_at_frequency",
+    "stepped_sine",
+    "velocity_phasors",
+]
