@@ -51,7 +51,7 @@ def load(folder: Path) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
     """Data and model of one beam."""
     model = read_model(folder / "model.toml")
     (table,) = folder.glob("*.csv")
-    return read_steady_states(table, sensors=model.modes.sensors).steady_states, model
+    return read_steady_states(table, model), model
 
 
 def only(data: sj.measure.SteadyStates, rows: np.ndarray) -> sj.measure.SteadyStates:

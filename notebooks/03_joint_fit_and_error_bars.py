@@ -287,7 +287,7 @@ def measured(name):
     """Data and model of a measured beam."""
     model = read_model(MEASURED / name / "model.toml")
     (table,) = (MEASURED / name).glob("*.csv")
-    return read_steady_states(table, sensors=model.modes.sensors).steady_states, model
+    return read_steady_states(table, model), model
 
 
 if MEASURED is None:

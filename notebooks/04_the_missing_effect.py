@@ -206,7 +206,7 @@ if MEASURED is None:
 else:
     linear = read_model(MEASURED / "brake_reuss_beam" / "model.toml")
     table = MEASURED / "brake_reuss_beam" / "response_controlled.csv"
-    data = read_steady_states(table, sensors=linear.modes.sensors).steady_states
+    data = read_steady_states(table, linear)
     joint = sj.diagnose_model(linear, data)
     report(joint)
     figures = diagnosis_report.diagnosis_figures(joint, data)

@@ -263,10 +263,11 @@ def identify(
 
     with _staged(out) as folder:
         structure = read_model(model)
-        reading = read_steady_states(data, sensors=structure.modes.sensors)
-        for note in reading.notes:
+        measured = read_steady_states(data, structure)
+        notes = measured.notes
+        for note in notes:
             _warn(note)
-        measured, joint, advice = reading.steady_states, None, []
+        joint, advice = None, []
         if fit is not None or free or advise:
             joint = fit_as_asked(measured, structure, fit or "auto", free or [], robust=robust)
             measured = corrected(measured, joint)
@@ -306,9 +307,7 @@ def identify(
             for one in advice:
                 hertz = f"{one.frequency / HERTZ:.6g} Hz"
                 _say(f"{one.rank}. {one.force:.4g} N at {hertz}: {one.reason}")
-        write_identification(
-            *(folder, told, data.stem.replace("_", " "), done, reading.notes), further
-        )
+        write_identification(*(folder, told, data.stem.replace("_", " "), done, notes), further)
         if joint is not None:
             joint_results.write_fitted_backbone(folder / "backbone.csv", joint)
 
@@ -347,13 +346,12 @@ def diagnose(
         own = beside if several and beside.exists() else model
         try:
             with _staged(out / path.stem if several else out) as folder:
-                reading = read_steady_states(path, sensors=read_model(own).modes.sensors)
-                for note in reading.notes:
+                structure = read_model(own)
+                measured = read_steady_states(path, structure)
+                for note in measured.notes:
                     _warn(note)
                 simulate = not several if responses is None else responses
-                found = write_diagnosis(
-                    folder, path.stem, read_model(own), reading.steady_states, simulate=simulate
-                )
+                found = write_diagnosis(folder, path.stem, structure, measured, simulate=simulate)
         except ValueError as error:
             if not several:
                 raise

@@ -1,10 +1,11 @@
 """Tables: steady states in and out, and results out, as CSV."""
 
 import csv
+import dataclasses
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
-from typing import NamedTuple, SupportsFloat
+from typing import SupportsFloat
 
 import jax
 import numpy as np
@@ -22,16 +23,16 @@ from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, 
 from snrmjax.io.rows import Cells, split_rows
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.measure.states import NO_PHASE, SteadyStates, steady_states
+from snrmjax.model.modes import LinearModes
+from snrmjax.model.structures import Structure, modes_of
 
 
-class TableReading(NamedTuple):
-    """Steady states as a file gave them, and notes about what the reader did not use."""
-
-    steady_states: SteadyStates
-    notes: tuple[str, ...]
-
-
-def read_steady_states(path: FilePath, *, sensors: tuple[str, ...] | None = None) -> TableReading:
+def read_steady_states(
+    path: FilePath,
+    model: Structure | LinearModes | None = None,
+    *,
+    sensors: tuple[str, ...] | None = None,
+) -> SteadyStates:
     """Read measured steady states from a CSV, one row a steady state and sensor.
 
     Rows of the same level, frequency, force (or drive voltage) and test order are one state seen
@@ -40,15 +41,20 @@ def read_steady_states(path: FilePath, *, sensors: tuple[str, ...] | None = None
     of the two parts of the velocity's phasor a table may have `velocity_m_s`, the amplitude of its
     fundamental: the phases are then unknown (`SteadyStates.phase_unknown`).
 
-    Arguments: `sensors` are the model's; without them the sensors are those of the table, in the
-    order in which they appear. Returns the steady states, at `sensors` in their order, and one
-    note for each thing in the file that was not used or not stated.
+    Arguments: `model` is the structure that was measured, whose sensors the table must have; in
+    its place `sensors` may name them. Without either the sensors are those of the table, in the
+    order in which they appear. Returns the steady states with the sensors in the model's order;
+    their `notes` say what of the file was not used or not stated.
     Raises `ValueError` that names file, row, column, value and what was expected.
+
+    Typical use: `data = read_steady_states("measured.csv", read_model("model.toml"))`.
     """
+    if model is not None:
+        sensors = modes_of(model).sensors
     return _read(read_text(path), file_name(path), sensors)
 
 
-def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> TableReading:
+def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> SteadyStates:
     rows = split_rows(text, file)
     header = read_header(rows[0].fields, file)
     for row in rows[1:]:
@@ -68,7 +74,7 @@ def _read(text: str, file: str, sensors: tuple[str, ...] | None) -> TableReading
     return _assemble(cells, sensors)
 
 
-def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
+def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> SteadyStates:
     header, file = cells.header, cells.file
     notes = list(header.notes)
     columns = {name: cells.numbers(name) for name in REQUIRED if name in header.position}
@@ -130,7 +136,7 @@ def _assemble(cells: Cells, sensors: tuple[str, ...] | None) -> TableReading:
         harmonic_std=per_sensor(columns.get("harmonic_std_m_s", not_stated)),
         harmonic_order=header.harmonic_order,
     )
-    return TableReading(data, tuple(notes))
+    return dataclasses.replace(data, notes=tuple(notes))
 
 
 def _without_phases(cells: Cells, columns: dict[str, np.ndarray]) -> list[str]:
@@ -285,7 +291,7 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
         for name, part in zip(harmonic_columns(order), ("real", "imag"), strict=False):
             columns[name] = _texts(getattr(harmonic, part))
     text = _table_text(columns)
-    back = _read(text, file, host.sensors).steady_states
+    back = _read(text, file, host.sensors)
     if back.n_states != data.n_states or not np.array_equal(back.measured, host.measured):
         raise ValueError(
             f"{file} could not tell some steady states apart that have the same level, "

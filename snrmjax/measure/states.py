@@ -1,5 +1,6 @@
 """A table of measured steady states: the input of every identification."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +27,8 @@ class SteadyStates(eqx.Module):
     A sensor that did not measure a state has `measured` False and velocity 0. A standard
     deviation that nobody stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
     of such a velocity and of its harmonics the amplitudes alone count. A force known only as a
-    drive voltage is in `drive` and `force` is NaN.
+    drive voltage is in `drive` and `force` is NaN. `notes` say what a reader of files did not use
+    or did not find stated.
     """
 
     level: Int[Array, " state"]
@@ -43,6 +45,7 @@ class SteadyStates(eqx.Module):
     harmonic_std: Float[Array, "state sensor"]  # m/s, rms of the complex error, NaN = not stated
     harmonic_order: tuple[int, ...] = eqx.field(static=True)
     sensors: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def n_states(self) -> int:
@@ -169,7 +172,9 @@ def join_steady_states(*parts: SteadyStates) -> SteadyStates:
                 f"{list(part.sensors)} and {list(part.harmonic_order)}, the first "
                 f"{list(parts[0].sensors)} and {list(parts[0].harmonic_order)}."
             )
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    alike = [dataclasses.replace(part, notes=notes) for part in parts]
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
 
 
 def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:

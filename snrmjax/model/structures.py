@@ -189,6 +189,11 @@ class Structure(eqx.Module):
         return tangent
 
 
+def modes_of(model: Structure | LinearModes) -> LinearModes:
+    """The linear modes of a structure; linear modes themselves as they are."""
+    return model.modes if isinstance(model, Structure) else model
+
+
 def structure(
     modes: LinearModes,
     potential: PolynomialPotential | None = None,

@@ -249,12 +249,10 @@ def fit_as_asked(
         raise ValueError(f"--fit takes one or two families, but {fit!r} names {len(names)}.")
     return fit_jointly(
         data,
-        structure.modes,
+        structure,
         backbone=names[0],
         damping=names[1] if len(names) == 2 else "auto",
         free=[name for names in free for name in names.split(",")],
-        level_gain_std=float(structure.level_gain_std),
-        level_phase_std=float(structure.level_phase_std),
         robust=robust,
     )
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.io.tables import group_states, read_steady_states, write_steady_states, write_table
-from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.measure.states import SteadyStates, join_steady_states, steady_states
+from snrmjax.model.beams import flat_beam
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -35,6 +36,8 @@ def same(one: SteadyStates, other: SteadyStates) -> bool:
     """Equal to the last bit, but for what passes through Hz or degrees: there one rounding."""
     for name in SteadyStates.__dataclass_fields__:
         a, b = getattr(one, name), getattr(other, name)
+        if name == "notes":
+            continue  # about the file, not of the states
         if name in ("sensors", "harmonic_order"):
             equal = a == b
         elif name in ("frequency", "phase_std"):
@@ -57,8 +60,8 @@ def with_column(name, values, table=TABLE):
 
 
 def test_reads_units_and_order(tmp_path):
-    data, notes = read(tmp_path, TABLE)
-    assert notes == ()
+    data = read(tmp_path, TABLE)
+    assert data.notes == ()
     np.testing.assert_array_equal(data.level, [1, 1, 2])
     np.testing.assert_array_equal(data.frequency, np.array([79.0, 80.0, 80.5]) * 2 * np.pi)
     np.testing.assert_array_equal(data.force, [0.1, 0.1, 0.2])
@@ -79,8 +82,8 @@ def test_reads_every_optional_column(tmp_path):
         "drive_v,frequency_hz,level"
     )
     row = "1e-5,2.,+1.5,-.5,7,8,0.25,0.01,90,1E-3,tip,0,.5,3,50,-2"
-    data, notes = read(tmp_path, f"{header}\n{row}\n", ("tip",))
-    assert notes == ()
+    data = read(tmp_path, f"{header}\n{row}\n", ("tip",))
+    assert data.notes == ()
     assert data.harmonic_order == (0, 3, 12)
     np.testing.assert_array_equal(data.harmonics[0, 0], [-0.5 + 0j, 1.5 + 2j, 7 + 8j])
     np.testing.assert_array_equal(data.harmonic_std, [[1e-5]])
@@ -118,7 +121,7 @@ ODDITIES = {
 def test_accepts(tmp_path, oddity):
     reading = read(tmp_path, ODDITIES[oddity])
     assert reading.notes == ()
-    assert same(reading.steady_states, read(tmp_path, TABLE).steady_states)
+    assert same(reading, read(tmp_path, TABLE))
 
 
 @pytest.mark.parametrize(
@@ -143,18 +146,34 @@ def test_accepts(tmp_path, oddity):
 )
 def test_accepts_with_a_note(tmp_path, content, note):
     reading = read(tmp_path, content)
-    plain = read(tmp_path, TABLE).steady_states
-    np.testing.assert_array_equal(reading.steady_states.velocity, plain.velocity)
+    plain = read(tmp_path, TABLE)
+    np.testing.assert_array_equal(reading.velocity, plain.velocity)
     assert any(re.search(note, text) for text in reading.notes)
     assert all("\n" not in text and text.endswith(".") for text in reading.notes)
+
+
+def test_a_model_gives_the_sensors_and_is_all_that_an_identification_needs(tmp_path):
+    beam = flat_beam()
+    content = f"{COLUMNS},sensor,comment\n1,79.0,0.1,0.01,0.002,midspan,a\n"
+    (tmp_path / "beam.csv").write_text(content)
+    for model in (beam, beam.modes):
+        assert read_steady_states(tmp_path / "beam.csv", model).sensors == beam.modes.sensors
+    with pytest.raises(ValueError, match="must be one of the model's"):
+        read(tmp_path, content, ("tip",))
+
+
+def test_joined_states_keep_each_note_once(tmp_path):
+    one = read(tmp_path, with_column("comment", ["a", "b", "c"]))
+    two = read(tmp_path, TABLE)
+    assert join_steady_states(one, two, one).notes == one.notes != ()
 
 
 def test_an_empty_harmonic_is_not_measured(tmp_path):
     table = with_column("velocity_h2_re_m_s", [1, "", 3])
     table = with_column("velocity_h2_im_m_s", [4, "", 6], table)
     table = with_column("velocity_h0_m_s", ["", 8, 9], table)
-    data, notes = read(tmp_path, table)
-    assert len(notes) == 3
+    data = read(tmp_path, table)
+    assert len(data.notes) == 3
     np.testing.assert_array_equal(
         data.harmonics[:, 0, 1], [1 + 4j, complex(np.nan, np.nan), 3 + 6j]
     )
@@ -179,23 +198,23 @@ def test_an_amplitude_alone_has_no_phase(tmp_path):
     header = "level,frequency_hz,force_n,velocity_m_s,phase_std_deg"
     table = f"{header}\n1,79,0.1,0.2,1\n1,80,0.1,0.3,1\n"
     reading = read(tmp_path, table)
-    states = reading.steady_states
+    states = reading
     np.testing.assert_array_equal(states.velocity[:, 0], [0.2, 0.3])
     assert np.all(states.phase_unknown)
     assert any("amplitude of the velocity alone" in note for note in reading.notes)
     assert any("`phase_std_deg`" in note for note in reading.notes)
     # What is written is read as the same.
     write_steady_states(tmp_path / "again.csv", states)
-    assert np.all(read_steady_states(tmp_path / "again.csv").steady_states.phase_unknown)
+    assert np.all(read_steady_states(tmp_path / "again.csv").phase_unknown)
 
 
 def test_phases_that_are_hardly_known_are_unknown(tmp_path):
-    states = read(tmp_path, with_column("phase_std_deg", [59.9, 60, ""])).steady_states
+    states = read(tmp_path, with_column("phase_std_deg", [59.9, 60, ""]))
     np.testing.assert_array_equal(states.phase_unknown[:, 0], [False, True, False])
 
 
 def test_sensors_of_one_state_share_it(tmp_path):
-    data = read(tmp_path, SENSORS).steady_states
+    data = read(tmp_path, SENSORS)
     assert data.sensors == ("a", "b")
     np.testing.assert_array_equal(data.velocity.real, GROUPED)
     np.testing.assert_array_equal(data.measured, np.array(GROUPED) != 0)
@@ -206,14 +225,14 @@ def test_sensors_of_one_state_share_it(tmp_path):
 def test_rows_may_be_sorted_by_sensor(tmp_path):
     header, *rows = SENSORS.splitlines()
     by_sensor = sorted(rows, key=lambda row: row[-1])
-    data = read(tmp_path, "\n".join([header, *by_sensor])).steady_states
+    data = read(tmp_path, "\n".join([header, *by_sensor]))
     order = np.argsort(np.asarray(data.velocity.real[:, 0]) + np.asarray(data.velocity.real[:, 1]))
     expected = np.array(GROUPED)[np.argsort(np.sum(GROUPED, axis=1))]
     np.testing.assert_array_equal(np.asarray(data.velocity.real)[order], expected)
 
 
 def test_sensors_come_in_the_order_of_the_model(tmp_path):
-    data = read(tmp_path, SENSORS, ("b", "unused", "a")).steady_states
+    data = read(tmp_path, SENSORS, ("b", "unused", "a"))
     assert data.sensors == ("b", "unused", "a")
     np.testing.assert_array_equal(data.velocity.real, np.array([[b, 0.0, a] for a, b in GROUPED]))
     assert not np.any(data.measured[:, 1])
@@ -221,18 +240,18 @@ def test_sensors_come_in_the_order_of_the_model(tmp_path):
 
 def test_test_order_tells_repeats_apart(tmp_path):
     table = with_column("order", [0, 0.5, 0.1, 0.5, 0, ""], SENSORS)
-    data = read(tmp_path, table).steady_states
+    data = read(tmp_path, table)
     expected = [[0.01, 0.05], [0.04, 0.02], [0.0, 0.03], [0.06, 0.0]]
     np.testing.assert_array_equal(data.velocity.real, expected)
 
 
 def test_one_sensor_takes_the_name_of_the_model(tmp_path):
-    assert read(tmp_path, TABLE, ("tip",)).steady_states.sensors == ("tip",)
+    assert read(tmp_path, TABLE, ("tip",)).sensors == ("tip",)
 
 
 def test_force_std_belongs_to_the_state(tmp_path):
     table = with_column("force_std_n", [0.01, "", 0.02, "", 0.03, 0.04], SENSORS)
-    data = read(tmp_path, table).steady_states
+    data = read(tmp_path, table)
     np.testing.assert_array_equal(data.force_std, [0.01, 0.02, 0.03, 0.04])
 
 
@@ -530,7 +549,7 @@ def test_reads_or_refuses_a_damaged_table(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("damaged") / "beam.csv"
     path.write_bytes(content.encode())
     try:
-        states = read_steady_states(path).steady_states
+        states = read_steady_states(path)
     except ValueError as error:
         message = str(error)
         assert "beam.csv" in message
@@ -602,7 +621,7 @@ def measured_states(draw):
 def test_round_trip(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("round") / "beam.csv"
     write_steady_states(path, data)
-    back = read_steady_states(path, sensors=data.sensors).steady_states
+    back = read_steady_states(path, sensors=data.sensors)
     assert same(back, data)
     # What came from a file returns to the last bit.
     content = path.read_bytes()
@@ -614,7 +633,7 @@ def test_numbers_of_a_file_stay_as_they_are(tmp_path):
     path = tmp_path / "copy.csv"
     frequencies = [f"{f:.2f}".rstrip("0") + "1" for f in np.linspace(10, 200, 300)]
     rows = [f"1,{f},0.1,0.01,0.02,0.7" for f in frequencies]
-    data = read(tmp_path, "\n".join([COLUMNS + ",phase_std_deg", *rows])).steady_states
+    data = read(tmp_path, "\n".join([COLUMNS + ",phase_std_deg", *rows]))
     write_steady_states(path, data)
     lines = path.read_text().splitlines()[1:]
     assert [line.split(",")[2] for line in lines] == [repr(float(f)) for f in frequencies]
@@ -770,8 +789,8 @@ def measured(name):
 
 
 def test_measured_brake_reuss_beam():
-    data, notes = read_steady_states(measured("brake_reuss_beam/response_controlled.csv"))
-    assert notes == ()
+    data = read_steady_states(measured("brake_reuss_beam/response_controlled.csv"))
+    assert data.notes == ()
     assert data.velocity.shape == (8 * 41, 1)
     np.testing.assert_array_equal(np.unique(data.level, return_counts=True)[1], [41] * 8)
     assert float(data.force[0]) == 0.36465208
@@ -781,8 +800,8 @@ def test_measured_brake_reuss_beam():
 
 def test_measured_suspended_beam():
     path = measured("suspended_beam/lock_in_stepped_sine.csv")
-    data, notes = read_steady_states(path, sensors=("laser",))
-    assert notes == ()
+    data = read_steady_states(path, sensors=("laser",))
+    assert data.notes == ()
     assert data.velocity.shape == (4 * 40, 1)
     np.testing.assert_array_equal(np.unique(data.level, return_counts=True)[1], [40] * 4)
     assert np.all(np.isnan(data.force))

@@ -24,8 +24,7 @@ NOISE = {"velocity": 0.01, "phase": 0.012, "force": 0.003}
 def files(name, folder="blind"):
     """Model and data of a set."""
     model = read_model(HERE / folder / f"{name}.toml")
-    data = read_steady_states(HERE / folder / f"{name}.csv", sensors=model.modes.sensors)
-    return model, data.steady_states
+    return model, read_steady_states(HERE / folder / f"{name}.csv", model)
 
 
 def balanced(change_of_damping, seed=0, levels=5, per_level=9, shift=0.0):

@@ -48,6 +48,7 @@ from snrmjax.identify.joint.selection import (
 from snrmjax.identify.joint.variance_components import Scatter, few_levels_factor
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
@@ -144,13 +145,13 @@ class JointFit(eqx.Module):
 @on_one_core
 def fit_jointly(
     data: SteadyStates,
-    modes: LinearModes,
+    modes: LinearModes | Structure,
     *,
     backbone: str = "auto",
     damping: str = "auto",
     free: Sequence[str] = (),
-    level_gain_std: float = 0.0,
-    level_phase_std: float = 0.0,
+    level_gain_std: float | None = None,
+    level_phase_std: float | None = None,
     robust: bool = False,
 ) -> JointFit:
     """Fit both curves to the complex force balance of all states at once.
@@ -168,11 +169,16 @@ def fit_jointly(
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
     chosen by predicting left-out levels, and so is the family itself for "auto". `free` may name
     "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only the
-    drive is known. `level_gain_std` relative, `level_phase_std` in rad.
+    drive is known. `level_gain_std` relative, `level_phase_std` in rad; what is not given is what
+    the structure states where `modes` is one, and nothing where it is not.
     Returns a `JointFit`. Raises `ValueError` for too few states, an unknown family or name, and a
     family with more parameters than there are data.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     """
+    gain, phase = (0.0, 0.0) if isinstance(modes, LinearModes) else modes.level_stds[:2]
+    level_gain_std = gain if level_gain_std is None else level_gain_std
+    level_phase_std = phase if level_phase_std is None else level_phase_std
+    modes = modes_of(modes)
     unknown = [name for name in free if name not in FREE]
     if unknown:
         raise ValueError(f"`free` knows {', '.join(FREE)}, not {unknown[0]!r}.")

@@ -17,6 +17,7 @@ from snrmjax.identify.pointwise.backbone_points import (
 from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
+from snrmjax.model.structures import Structure, modes_of
 
 
 class Identification(NamedTuple):
@@ -29,7 +30,7 @@ class Identification(NamedTuple):
 
 def identify_backbone(
     data: SteadyStates,
-    modes: LinearModes,
+    modes: LinearModes | Structure,
     *,
     amplitude: AmplitudeArgument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
@@ -39,12 +40,14 @@ def identify_backbone(
 ) -> Identification:
     """Backbone and damping of the mode of interest from near-resonant steady states.
 
-    `identify_points`, then `fit_backbone`; their arguments are described there. Where no noise
+    `identify_points`, then `fit_backbone`; their arguments are described there. `modes` may also be
+    the structure that has them. Where no noise
     is stated, the standard deviations of the points come from the scatter about the curves.
     Returns an `Identification` whose `notes` say in words what was left out, what the noise
     turned out to be and how far an anchor moved the curves.
     Reference: Kwarta & Allen, section 2.2.
     """
+    modes = modes_of(modes)
     points = identify_points(data, modes, amplitude=amplitude, measure=measure)
     fit = fit_backbone(points, modes, family=family, n_knots=n_knots, anchor=anchor)
     if not fit.noise_stated:

@@ -43,6 +43,12 @@ def fit():
     return fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
 
 
+def test_a_structure_states_the_errors_of_its_levels(fit):
+    stated = sj.model.structure(modes(), level_gain_std=0.01)
+    found = fit_jointly(noisy(1, gain=0.01), stated, **TRUE)
+    np.testing.assert_array_equal(found.covariance, fit.covariance)
+
+
 def test_exact_states_give_back_the_curves():
     found = fit_jointly(noisy(), modes(), **TRUE)
     values = sj.identify.fitted_values(found, SPEEDS)

@@ -37,7 +37,7 @@ def linear_test(seed, noise, *, stated=False, more_off_it=0.0, levels=6):
 @pytest.fixture(scope="module")
 def data(model):
     table = MEASURED / "response_controlled.csv"
-    return read_steady_states(table, sensors=model.modes.sensors).steady_states
+    return read_steady_states(table, model)
 
 
 @pytest.fixture(scope="module")
