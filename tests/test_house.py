@@ -21,8 +21,11 @@ ROOMS = {
     "report": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io"},
 }
 # Within a room: what each sub-room may import beside itself. A module beside the sub-rooms may
-# import all of them, and none of them imports it.
+# import all of them; none of them imports it, unless it is named here.
 SUB_ROOMS = {
+    "model.library": {
+        *("model.effect_base", "model.effect_metadata", "model.modes", "model.potential"),
+    },
     "simulate.balance": set(),
     "simulate.continuation": {"simulate.balance"},
     "simulate.solutions": {"simulate.balance", "simulate.continuation"},
@@ -81,7 +84,7 @@ def sub_room_of(module):
 
 def climbs(module, name):
     """Whether a module imports what stands above it in its own room."""
-    own, target = sub_room_of(module), sub_room_of(name)
+    own, target = sub_room_of(module), ".".join(name.split(".")[1:3])
     if own is None or room_of(name) != room_of(module) or target == own:
         return False
     return target not in SUB_ROOMS[own]
@@ -154,7 +157,7 @@ def test_the_rooms_are_there_and_all_files_are_seen():
     for room, below in ROOMS.items():  # downwards only: nobody is below itself
         assert room not in set(itertools.chain(below, *(ROOMS[b] for b in below)))
     for room, below in SUB_ROOMS.items():
-        assert room not in set(itertools.chain(below, *(SUB_ROOMS[b] for b in below)))
+        assert room not in set(itertools.chain(below, *(SUB_ROOMS.get(b, ()) for b in below)))
 
 
 BROKEN = {
@@ -176,6 +179,10 @@ BROKEN = {
         ("assert True", "an assert statement"),
         ("try:\n    pass\nexcept:\n    pass", "a bare except"),
         ("\n" * (LONGEST + 1), "more than 450"),
+    ],
+    "snrmjax.model.library.friction": [
+        ("from snrmjax.model.effects import EFFECTS", "model.library imports"),
+        ("from snrmjax.model.effect_base import AbstractForce", ""),
     ],
     "snrmjax.measure.signals": [("from snrmjax.simulate import harmonics", "measure imports")],
     "snrmjax.simulate": [("from .identify import inversion", "")],  # inside the room: allowed

@@ -1,36 +1,27 @@
-"""Physical effects that a model may lack, each defined once: the forces without memory, and all.
-
-Friction is in `friction`, changes of the linear terms in `linear_changes`, internal resonances in
-`mode_coupling`, errors of force and instruments in `measurement_chain`. A memoryless effect acts
-on the mode of interest: f(q, q̇) is added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with q in
-kg^1/2 m. Its describing function (`averaging`), its harmonic-balance residual and its Jacobian
-all follow from that one definition.
-"""
+"""All effects by their kind: the library's and those that a user registers."""
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import (
-    AbstractEffect,
-    AbstractKinked,
-    AbstractMemoryless,
-    Scalar,
-    ramp,
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
+from snrmjax.model.library.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
+from snrmjax.model.library.internal_resonances import (
+    InternalResonanceOneToThree,
+    InternalResonanceOneToTwo,
 )
-from snrmjax.model.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
-from snrmjax.model.linear_changes import (
+from snrmjax.model.library.linear_changes import (
     AddedMass,
     FrequencyDrift,
     LinearDampingChange,
     LinearFrequencyShift,
 )
-from snrmjax.model.measurement_chain import (
+from snrmjax.model.library.measurement_chain import (
     CloseMode,
     ForceGainError,
     ForceHarmonics,
@@ -40,123 +31,15 @@ from snrmjax.model.measurement_chain import (
     SensorGainError,
     SensorPhaseError,
 )
-from snrmjax.model.mode_coupling import InternalResonanceOneToThree, InternalResonanceOneToTwo
-from snrmjax.numerics.rules import NOT_NEGATIVE, Rule
-
-
-class CubicStiffness(AbstractMemoryless):
-    """f = a q³; raises ω̃² by ¾aQ²."""
-
-    kind: ClassVar[str] = "cubic_stiffness"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**3
-
-
-class QuadraticStiffness(AbstractMemoryless):
-    """f = a q²; a mean displacement and a second harmonic, softening in second order."""
-
-    kind: ClassVar[str] = "quadratic_stiffness"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**2
-
-
-class QuinticStiffness(AbstractMemoryless):
-    """f = a q⁵; raises ω̃² by ⅝aQ⁴."""
-
-    kind: ClassVar[str] = "quintic_stiffness"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**5
-
-
-class BilinearStiffness(AbstractKinked):
-    """f = k|q|/2: stiffness differs by k between the two sides; even harmonics ∝ Q."""
-
-    kind: ClassVar[str] = "bilinear_stiffness"
-    stiffness: Scalar
-
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
-        return 0.5 * self.stiffness * (ramp(displacement, width) + ramp(-displacement, width))
-
-
-class GapStiffness(AbstractKinked):
-    """A spring k that engages beyond ±gap; threshold and odd harmonics."""
-
-    kind: ClassVar[str] = "gap_stiffness"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"gap": (NOT_NEGATIVE,)}
-    stiffness: Scalar
-    gap: Scalar
-
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
-        above = ramp(displacement - self.gap, width)
-        return self.stiffness * (above - ramp(-displacement - self.gap, width))
-
-
-class OneSidedStop(AbstractKinked):
-    """A spring k that engages beyond +gap; threshold and even harmonics."""
-
-    kind: ClassVar[str] = "one_sided_stop"
-    stiffness: Scalar
-    gap: Scalar
-
-    def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
-        """See `AbstractKinked.rounded_force`."""
-        return self.stiffness * ramp(displacement - self.gap, width)
-
-
-class QuadraticDamping(AbstractMemoryless):
-    """f = c|q̇|q̇ (fluid drag); 2ζ̃ω̃ rises by 8cΩQ/3π."""
-
-    kind: ClassVar[str] = "quadratic_damping"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * jnp.abs(velocity) * velocity
-
-
-class CubicDamping(AbstractMemoryless):
-    """f = c q̇³; 2ζ̃ω̃ rises by ¾cΩ²Q²."""
-
-    kind: ClassVar[str] = "cubic_damping"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * velocity**3
-
-
-class VanDerPolDamping(AbstractMemoryless):
-    """f = c q²q̇; 2ζ̃ω̃ rises by cQ²/4."""
-
-    kind: ClassVar[str] = "van_der_pol_damping"
-    coefficient: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return self.coefficient * displacement**2 * velocity
-
-
-class StaticPreload(AbstractMemoryless):
-    """A constant force; with a cubic stiffness it shifts ω₀ and brings a second harmonic."""
-
-    kind: ClassVar[str] = "static_preload"
-    constant_force: Scalar
-
-    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
-        """See `AbstractMemoryless.force`."""
-        return jnp.broadcast_to(self.constant_force, jnp.shape(displacement))
-
+from snrmjax.model.library.stiffness import (
+    BilinearStiffness,
+    CubicStiffness,
+    GapStiffness,
+    OneSidedStop,
+    QuadraticStiffness,
+    QuinticStiffness,
+    StaticPreload,
+)
 
 EFFECTS: dict[str, type[AbstractEffect]] = {
     effect.kind: effect

@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.model import (
-    effect_base,
-    effects,
-    friction,
-    linear_changes,
-    measurement_chain,
-    mode_coupling,
-)
+from snrmjax.model import effect_base
 from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.library import (
+    damping,
+    friction,
+    internal_resonances,
+    linear_changes,
+    measurement_chain,
+    stiffness,
+)
 
 # kind: parameters, force by hand, and whether it is odd in (q, q̇), even, or neither.
 FAMILY = {
@@ -64,7 +65,10 @@ OTHER_KINDS = {
     "mode_shape_change": ("coefficient",),
     "force_harmonics": ("second", "third"),
 }
-MODULES = (effect_base, effects, friction, linear_changes, measurement_chain, mode_coupling)
+MODULES = (
+    *(effect_base, stiffness, damping, friction),
+    *(linear_changes, internal_resonances, measurement_chain),
+)
 
 
 def test_the_family_is_complete():

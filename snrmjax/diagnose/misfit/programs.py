@@ -24,8 +24,8 @@ from snrmjax.model.effect_base import (
     AbstractKinked,
     AbstractMemoryless,
 )
-from snrmjax.model.friction import IwanMicroslip, JenkinsSlider
-from snrmjax.model.mode_coupling import AbstractInternalResonance
+from snrmjax.model.library.friction import IwanMicroslip, JenkinsSlider
+from snrmjax.model.library.internal_resonances import AbstractInternalResonance
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped

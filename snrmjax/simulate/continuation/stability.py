@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.model.effect_base import AbstractHysteresis
-from snrmjax.model.friction import AbstractSliders
+from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import over_cores, padded
 from snrmjax.numerics.compiled import compiled

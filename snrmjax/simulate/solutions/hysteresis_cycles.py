@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from snrmjax.model.effect_base import AbstractHysteresis
-from snrmjax.model.friction import AbstractSliders
+from snrmjax.model.library.friction import AbstractSliders
 from snrmjax.model.structures import Structure
 
 Memory = tuple[Float[Array, " state"], ...]
