@@ -1,6 +1,7 @@
 """A table of measured steady states: the input of every identification."""
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -154,27 +155,58 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
         )
 
 
-def join_steady_states(*parts: SteadyStates) -> SteadyStates:
-    """All states of several tests of the same structure, in order.
+def check_force(data: SteadyStates, purpose: str) -> None:
+    """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
+    if np.any(np.isfinite(np.asarray(data.force))):
+        return
+    if not np.any(np.isfinite(np.asarray(data.drive))):
+        raise ValueError(f"{purpose} needs the force, but no steady state has one.")
+    raise ValueError(
+        f"{purpose} needs the force in newtons, but only a drive voltage (`drive_v`) is given. Let "
+        "a joint fit find the force per volt together with the curves: `--fit auto --free "
+        'force_gain`, in Python `fit_jointly(data, modes, free=["force_gain"])`. Or calibrate the '
+        "force with low-level responses first: `sj.measure.equivalent_force`, `calibrate_force` "
+        "and `apply_calibration`."
+    )
 
-    Levels are kept as they are: give different tests different levels beforehand, since a level
-    stands for what its states share. Raises `ValueError` when sensors or recorded harmonics
-    differ.
+
+def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyStates:
+    """All steady states of several tests of the same structure, in order.
+
+    Arguments: the tests, as separate arguments or as one list. Levels are kept as they are: states
+    of one level are taken to share their errors of gain and phase, so give different tests
+    different levels beforehand (`SteadyStates.renumbered`).
+    Returns `SteadyStates`. Raises `ValueError` when there is nothing to join, when something is
+    not `SteadyStates`, or when sensors or recorded harmonics differ.
 
     >>> one = steady_states([1], [500.0], [1.0], [0.6 + 0.0j])
-    >>> join_steady_states(one, one).n_states
-    2
+    >>> join_steady_states([one, one.renumbered(1)]).level
+    Array([1, 2], dtype=int64)
     """
-    for part in parts[1:]:
-        if part.sensors != parts[0].sensors or part.harmonic_order != parts[0].harmonic_order:
+    tests: list[SteadyStates] = []
+    for part in parts:
+        tests += [part] if isinstance(part, SteadyStates) else _listed(part)
+    if not tests:
+        raise ValueError("there is nothing to join: give one `SteadyStates` at least.")
+    for test in tests:
+        if not isinstance(test, SteadyStates):
+            raise ValueError(
+                f"`join_steady_states` joins `SteadyStates`, but got a `{type(test).__name__}`."
+            )
+        if test.sensors != tests[0].sensors or test.harmonic_order != tests[0].harmonic_order:
             raise ValueError(
                 "tests can be joined when they have the same sensors and harmonics, but one has "
-                f"{list(part.sensors)} and {list(part.harmonic_order)}, the first "
-                f"{list(parts[0].sensors)} and {list(parts[0].harmonic_order)}."
+                f"{list(test.sensors)} and {list(test.harmonic_order)}, the first "
+                f"{list(tests[0].sensors)} and {list(tests[0].harmonic_order)}."
             )
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
-    alike = [dataclasses.replace(part, notes=notes) for part in parts]
+    notes = tuple(dict.fromkeys(note for test in tests for note in test.notes))
+    alike = [dataclasses.replace(test, notes=notes) for test in tests]
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
+
+
+def _listed(part: Any) -> list[SteadyStates]:
+    """The members of a list; what is no list is its only member, to be refused by its type."""
+    return [part] if isinstance(part, str | Mapping) or not np.iterable(part) else list(part)
 
 
 def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:

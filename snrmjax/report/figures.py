@@ -15,7 +15,11 @@ from matplotlib.figure import Figure
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
-from snrmjax.identify.pointwise.prediction import CONTINUED, PredictedResponse, Resonance
+from snrmjax.identify.pointwise.prediction import (
+    LARGEST_AMPLITUDE_RATIO,
+    PredictedResponse,
+    Resonance,
+)
 from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
@@ -182,7 +186,7 @@ def response_figure(
         [frequency_range] if frequency_range else [span_of(c, sensor) for c in predicted or exact]
     )
     low, high = min(s[0] for s in spans) / HERTZ, max(s[1] for s in spans) / HERTZ
-    spine = sample_backbone(backbone, reach=CONTINUED)
+    spine = sample_backbone(backbone, reach=LARGEST_AMPLITUDE_RATIO)
     figure, rows = panels(10.5, 0.8 + 3.1 * len(forces), len(forces), 2)
     for force, (speeds, phases) in zip(forces, rows, strict=True):
         omega, states = measured_near(measured, sensor, force, force_tolerance)

@@ -8,7 +8,11 @@ import numpy as np
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
-from snrmjax.identify.pointwise.prediction import CONTINUED, PredictedResponse, Resonance
+from snrmjax.identify.pointwise.prediction import (
+    LARGEST_AMPLITUDE_RATIO,
+    PredictedResponse,
+    Resonance,
+)
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -183,7 +187,7 @@ def resonance_table(
         rows.append(row + (_beside(one, simulated, backbone.sensor, unit) if simulated else []))
     caption = (
         "Phase resonances: here the mode moves in phase with the force. Resonances are looked for "
-        f"up to {CONTINUED:g} times the largest measured amplitude."
+        f"up to {LARGEST_AMPLITUDE_RATIO:g} times the largest measured amplitude."
     )
     if simulated:
         caption += " Differences are the prediction minus the nearest one of harmonic balance."

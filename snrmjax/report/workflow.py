@@ -16,7 +16,7 @@ from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.pointwise.backbone import BackboneFit
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.prediction import (
-    CONTINUED,
+    LARGEST_AMPLITUDE_RATIO,
     PredictedResponse,
     Resonance,
     predict_response,
@@ -81,8 +81,8 @@ def present_identification(
         responses = predict_response(backbone, model.modes, force)
         if not found:
             notes.append(
-                f"no resonance at {force:g} N up to {CONTINUED:g} times the largest measured "
-                "amplitude."
+                f"no resonance at {force:g} N up to {LARGEST_AMPLITUDE_RATIO:g} times the largest "
+                "measured amplitude."
             )
         elif any(one.continued for one in found):
             notes.append(f"the resonance at {force:g} N lies beyond the measured amplitudes.")

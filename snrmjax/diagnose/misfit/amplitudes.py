@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 from scipy.special import ive
 
-from snrmjax.identify.calibrate.calibration_states import CalibrationStates, Selection
+from snrmjax.identify.calibrate.calibration_states import CalibrationStates, ComparedColumns
 
 _OFF = np.radians(30.0)  # beyond which a state is off resonance, and within which it is at it
 
@@ -100,7 +100,7 @@ class Sizes(NamedTuple):
         return np.where(noise > 0, mean, size), np.where(noise > 0, slope, 1 / exact)
 
 
-def sizes_of(chosen: Selection) -> Sizes:
+def sizes_of(chosen: ComparedColumns) -> Sizes:
     """What the states' columns compare."""
     states: CalibrationStates = chosen.states
     velocity = np.asarray(states.velocity)
@@ -119,7 +119,7 @@ def sizes_of(chosen: Selection) -> Sizes:
 
 
 def what_is_lost(
-    chosen: Selection, phase: Float[np.ndarray, " state"], levels: np.ndarray
+    chosen: ComparedColumns, phase: Float[np.ndarray, " state"], levels: np.ndarray
 ) -> list[str]:
     """What a diagnosis without phases cannot say, in words.
 

@@ -19,7 +19,7 @@ from snrmjax.diagnose.misfit.predictions import (
     Predictions,
     scales_of,
 )
-from snrmjax.identify.calibrate.calibration_states import Selection, whitened
+from snrmjax.identify.calibrate.calibration_states import ComparedColumns, whitened_columns
 from snrmjax.numerics.blocks import over_cores
 
 _STEPS = 9  # of a fit
@@ -104,7 +104,7 @@ def weighing(
         if std > 0
     ]
     every = np.concatenate([baseline, *parts], axis=2)
-    own = np.asarray(whitened(measured.whiten, every))[known]
+    own = np.asarray(whitened_columns(measured.whiten, every))[known]
     state, column = np.nonzero(known)
     lower = np.linalg.cholesky(np.eye(len(own)) + own @ own.T)
     return Weighing(measured.whiten, known, own, lower, state, column)
@@ -228,7 +228,7 @@ class Bench:
             left = [kind for kind in left if kind not in inside]
             yield group, values
 
-    def with_errors(self, chosen: Selection) -> "Bench":
+    def with_errors(self, chosen: ComparedColumns) -> "Bench":
         """The same with the same states under other errors."""
         other, predictions = copy.copy(self), copy.copy(self.predictions)
         predictions.chosen = chosen

@@ -20,7 +20,7 @@ from snrmjax.diagnose.misfit.amplitudes import sizes_of
 from snrmjax.diagnose.misfit.candidates import Scales, candidate, parameter_labels
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
-    Selection,
+    ComparedColumns,
     calibration_states,
     state_whitener,
 )
@@ -81,7 +81,7 @@ class Predicted(NamedTuple):
 class Measured(NamedTuple):
     """The states, their whitening and what of them was measured."""
 
-    chosen: Selection
+    chosen: ComparedColumns
     by_error: Float[np.ndarray, "state column input"]
     whiten: Float[np.ndarray, "state column column"]
     known: Bool[np.ndarray, "state column"]
@@ -269,7 +269,7 @@ class Predictions:
         return columns, slopes
 
 
-def _widened(chosen: Selection) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
+def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
     """The states as the programs take them, their harmonics, and which columns are the states' own.
 
     Harmonics that the states lack have room: further states that are asked for have them, and one
@@ -299,7 +299,7 @@ def _filled(directions: np.ndarray) -> np.ndarray:
 
 
 def whitened_states(
-    chosen: Selection, by_error: Float[np.ndarray, "state column input"]
+    chosen: ComparedColumns, by_error: Float[np.ndarray, "state column input"]
 ) -> Measured:
     """The states with the whitening that follows from their errors."""
     parts = [padded(np.asarray(part)) for part in (*chosen.states, by_error)]

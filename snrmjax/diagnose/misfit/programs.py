@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates
-from snrmjax.identify.calibrate.inverse_force import Erring, held_state, missed_columns
+from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns, state_motion
 from snrmjax.model.effect_base import (
     AbstractEffect,
     AbstractForce,
@@ -57,7 +57,7 @@ def grown(
 
     def one(*row: Array) -> tuple[Array, Array]:
         state = CalibrationStates(*row)
-        motion = held_state(model, state, state.velocity[0], held[0][0], held[2])
+        motion = state_motion(model, state, state.velocity[0], held[0][0], held[2])
         point, jacobian = motion.grown_with_jacobian()
         return point, jnp.linalg.inv(jacobian)
 
@@ -120,7 +120,7 @@ def missed(
             forces = [_quick(added[k], swings=swings) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
-            erring = Erring(measured, 1.0, trials.by_error @ along)
+            erring = StateWithErrors(measured, 1.0, trials.by_error @ along)
             motion = erring.motion(changed, held[0][0], held[2])
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
             balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
@@ -130,7 +130,7 @@ def missed(
             # Where the second motion is not found, the first step towards it is its slope.
             lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
             point = jnp.where(lost, start.point + end.moves[0], end.point)
-            own_columns = missed_columns(erring, motion, point, *held[:2])
+            own_columns = residual_columns(erring, motion, point, *held[:2])
             start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
             place = jnp.arange(n_directions + 1) == number
             return start, jnp.where(place, own_columns[:, None], columns)

@@ -19,12 +19,12 @@ from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
-    Selection,
+    ComparedColumns,
     calibration_states,
     state_whitener,
-    whitened,
+    whitened_columns,
 )
-from snrmjax.identify.calibrate.inverse_force import Erring, held_state, missed_columns
+from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns, state_motion
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.parameters import (
     checked_names,
@@ -132,7 +132,7 @@ def calibrate_model(
     """Fit parameters of a model to measured steady states of all levels at once.
 
     Minimises the whitened sum of squares of (F_needed − F)/F over the states, F_needed being the
-    complex force that the measured frequency and fundamental velocity need (`needed_force`), and
+    complex force that the measured frequency and fundamental velocity need (`inverse_force`), and
     of what is missed of other sensors and of harmonics with a stated error. The covariance of a
     state's residuals follows from the stated errors of force, velocity and phase; it is taken anew
     where a fit ended. Levenberg–Marquardt, with the balance's exact derivatives.
@@ -189,7 +189,7 @@ def _grown(
 
     def one(*row: Array) -> Array:
         state = CalibrationStates(*row)
-        return held_state(model, state, state.velocity[0], *settings.held).grown()
+        return state_motion(model, state, state.velocity[0], *settings.held).grown()
 
     return mapped(one, *states)
 
@@ -212,10 +212,10 @@ def _columns(
     level = unknowns[p:].reshape(settings.n_levels, len(settings.shared))[state.level]
     shared = dict(zip(settings.shared, level * aim.level_std, strict=True))
     factor = jnp.exp(-shared.get("gain", 0.0) - 1j * shared.get("phase", 0.0))
-    erring = Erring(state, factor, error)
+    erring = StateWithErrors(state, factor, error)
     motion = erring.motion(model, settings.sensors[0], settings.harmonic_order)
     point = motion.solved(near)
-    return missed_columns(erring, motion, point, settings.sensors, settings.orders), point
+    return residual_columns(erring, motion, point, settings.sensors, settings.orders), point
 
 
 @compiled
@@ -268,7 +268,7 @@ def _fit(
             return _columns(model, state, settings, aim, unknowns, none, begin)[0]
 
         # A state that is lost on the way is NaN: the solver then takes a smaller step.
-        of_states = whitened(whiten, mapped(one, *states, near(y * unit)))
+        of_states = whitened_columns(whiten, mapped(one, *states, near(y * unit)))
         rest = jnp.append(aim.misses(unknowns), hold * y * unit)
         return jnp.append(of_states.reshape(-1), rest)
 
@@ -316,7 +316,7 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
         slopes, good = _slopes(*subject, aim, unknowns, near), bool(ended)
     return _Fitted(
         unknowns=np.asarray(unknowns),
-        residuals=whitened(*map(np.asarray, (whiten, slopes.columns))),
+        residuals=whitened_columns(*map(np.asarray, (whiten, slopes.columns))),
         jacobian=_jacobian(whiten, slopes, aim, unknowns),
         usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
         good=good,
@@ -325,7 +325,7 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
 
 def _jacobian(whiten: Array, slopes: _Slopes, aim: _Aim, unknowns: Array) -> np.ndarray:
     own, by_unknown = np.asarray(whiten), np.asarray(slopes.by_unknown)
-    of_states = whitened(own, by_unknown).reshape(-1, unknowns.shape[0])
+    of_states = whitened_columns(own, by_unknown).reshape(-1, unknowns.shape[0])
     return np.concatenate([of_states, np.asarray(_own_slopes(aim, unknowns))])
 
 
@@ -335,7 +335,7 @@ def _own_slopes(aim: _Aim, unknowns: Array) -> Float[Array, "unknown unknown"]:
 
 
 def _result(
-    model: Structure, n_states: int, chosen: Selection, settings: _Settings, aim: _Aim
+    model: Structure, n_states: int, chosen: ComparedColumns, settings: _Settings, aim: _Aim
 ) -> CalibratedModel:
     found = _fitted(model, chosen.states, settings, aim)
     names, p, usable = settings.names, len(settings.names), found.usable
@@ -379,7 +379,7 @@ def _result(
 
 
 def _notes(
-    chosen: Selection, names: tuple[str, ...], found: _Fitted, reduced: float, doubt: float
+    chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, doubt: float
 ) -> list[str]:
     notes = []
     if not found.good:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.measure.states import SteadyStates, relative_errors
+from snrmjax.measure.states import SteadyStates, check_force, relative_errors
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.compiled import compiled
@@ -37,7 +37,7 @@ class CalibrationStates(NamedTuple):
     known: Bool[Array, "state column"]  # what was measured
 
 
-class Selection(NamedTuple):
+class ComparedColumns(NamedTuple):
     """What of the data is used."""
 
     states: CalibrationStates
@@ -50,7 +50,9 @@ class Selection(NamedTuple):
     notes: tuple[str, ...]
 
 
-def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int) -> Selection:
+def calibration_states(
+    model: Structure, data: SteadyStates, harmonic_order: int
+) -> ComparedColumns:
     """The states that the reference sensor measured under a known force.
 
     Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
@@ -65,11 +67,7 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
             f"`data` has the sensors {list(data.sensors)}, but `model` has "
             f"{list(model.modes.sensors)}."
         )
-    if not np.any(np.isfinite(np.asarray(data.force))):
-        raise ValueError(
-            "the force is unknown (only a drive voltage is given): calibrate it first, with "
-            "`calibrate_force` and `apply_calibration`."
-        )
+    check_force(data, "a comparison with a model")
     notes: list[str] = []
     # Operations of JAX compile for every number of states.
     told: Any = jax.tree.map(np.asarray, data)
@@ -127,7 +125,7 @@ def calibration_states(model: Structure, data: SteadyStates, harmonic_order: int
     parts = jax.device_put(CalibrationStates(*columns), may_alias=False)
     orders = tuple(told.harmonic_order[k] for k in places)
     own_places = (tuple(sensors), orders, unknown)
-    return Selection(parts, rows, len(levels), *own_places, stated, tuple(notes))
+    return ComparedColumns(parts, rows, len(levels), *own_places, stated, tuple(notes))
 
 
 @compiled
@@ -157,7 +155,7 @@ def state_whitener(
     return jnp.where(good, inverse, 0.0)
 
 
-def whitened(
+def whitened_columns(
     whitener: Float[OneKind, "state column column"], columns: Float[OneKind, "state column *entry"]
 ) -> Float[OneKind, "state column *entry"]:
     """Columns of all states, or their derivatives, made independent; zero without weight.

@@ -16,7 +16,7 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.prescribed_motion import HeldMotion, held_motion
 
 
-class NeededForce(eqx.Module):
+class InverseForce(eqx.Module):
     """Motions with a given fundamental and the forces they need; NaN where none was found."""
 
     force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
@@ -24,7 +24,7 @@ class NeededForce(eqx.Module):
     converged: Bool[Array, " state"]
 
 
-def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 9) -> NeededForce:
+def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 9) -> InverseForce:
     """The complex force that measured frequencies and fundamental velocities need.
 
     Solves the harmonic balance for all coefficients and the force, with the velocity's fundamental
@@ -32,14 +32,14 @@ def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 
     motion is grown from small amplitudes by Newton's method. A differentiable function of the
     model, by the implicit function theorem: in forward and in reverse mode, once.
 
-    Returns a `NeededForce`, NaN where no motion was found and for states that the reference sensor
+    Returns a `InverseForce`, NaN where no motion was found and for states that the reference sensor
     did not measure. It is the measured force where model and measurement are right.
     Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj
     >>> linear = sj.model.structure(sj.model.linear_modes([500.0], [0.01], [[2.0]], [3.0]))
     >>> data = sj.measure.steady_states([1], [500.0], [1.0], [0.9 + 0.0j])
-    >>> needed_force(linear, data).force.round(6)
+    >>> inverse_force(linear, data).force.round(6)
     Array([1.5+0.j], dtype=complex128)
     """
     check_phases(data, "a needed force")
@@ -47,14 +47,14 @@ def needed_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 
     found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
     n, rows = data.n_states, chosen.rows
     nothing = jnp.full((n, *found.velocity.shape[1:]), jnp.nan, dtype=jnp.complex128)
-    return NeededForce(
+    return InverseForce(
         force=nothing[:, 0, 0].at[rows].set(found.force),
         velocity=nothing.at[rows].set(found.velocity),
         converged=jnp.zeros(n, dtype=bool).at[rows].set(found.converged),
     )
 
 
-def held_state(
+def state_motion(
     model: Structure,
     state: CalibrationStates,
     velocity: Complex[Array, ""],
@@ -71,7 +71,7 @@ def held_state(
     )
 
 
-class Erring(NamedTuple):
+class StateWithErrors(NamedTuple):
     """A state whose record is taken to err."""
 
     state: CalibrationStates
@@ -86,11 +86,11 @@ class Erring(NamedTuple):
 
     def motion(self, model: Structure, sensor: int, harmonic_order: int) -> HeldMotion:
         """The equations of its motion."""
-        return held_state(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
+        return state_motion(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
 
 
-def missed_columns(
-    erring: Erring,
+def residual_columns(
+    erring: StateWithErrors,
     motion: HeldMotion,
     point: Float[Array, " entry"],
     sensors: tuple[int, ...],
@@ -118,12 +118,12 @@ def missed_columns(
 @compiled
 def _needed(
     model: Structure, states: CalibrationStates, sensor: int, harmonic_order: int
-) -> NeededForce:
-    def one(*row: Array) -> NeededForce:
+) -> InverseForce:
+    def one(*row: Array) -> InverseForce:
         state = CalibrationStates(*row)
-        held = held_state(model, state, state.velocity[0], sensor, harmonic_order)
+        held = state_motion(model, state, state.velocity[0], sensor, harmonic_order)
         point = held.solved(held.grown())
         force, velocity = held.recorded(point)
-        return NeededForce(force, velocity, jnp.isfinite(jax.lax.stop_gradient(point[-1])))
+        return InverseForce(force, velocity, jnp.isfinite(jax.lax.stop_gradient(point[-1])))
 
     return mapped(one, *states)

@@ -16,8 +16,12 @@ from snrmjax.identify.joint.force_balance import BalanceData, Spread, Unknowns, 
 from snrmjax.identify.joint.free_unknowns import Restore
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.curve_fit import ShapePreservingSpline
-from snrmjax.identify.pointwise.prediction import CONTINUED, predict_response, resonances
+from snrmjax.identify.pointwise.curve_fit import PchipCurve
+from snrmjax.identify.pointwise.prediction import (
+    LARGEST_AMPLITUDE_RATIO,
+    predict_response,
+    resonances,
+)
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.compiled import compiled
 
@@ -49,14 +53,18 @@ class FittedResponse(NamedTuple):
     continued: Bool[np.ndarray, " point"]
     resonances: tuple[FittedPoint, ...]
     folds: tuple[FittedPoint, ...]
+    note: str  # where the curve extrapolates the fit; empty where it nowhere does
 
 
-def as_backbone(fit: JointFit) -> Backbone:
+def as_backbone(
+    fit: JointFit, *, largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+) -> Backbone:
     """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
 
-    Damping that belongs to the velocity is taken where it lies on the backbone.
+    Damping that belongs to the velocity is taken where it lies on the backbone. The knots reach up
+    to `largest_amplitude_ratio` times the largest measured amplitude.
     """
-    displacement = CONTINUED * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+    displacement = largest_amplitude_ratio * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
     sampled = values_at_displacement(fit, displacement)
     # A polynomial may fall below zero beyond the data: there is no motion there.
     sound = np.append(sampled[0][:, 0] > 0, False).argmin()
@@ -76,8 +84,8 @@ def as_backbone(fit: JointFit) -> Backbone:
         values[:, 1].at[0].set(jnp.where(jnp.isfinite(values[0, 1]), values[0, 1], values[1, 1]))
     )
     return Backbone(
-        squared_frequency=ShapePreservingSpline(jnp.asarray(displacement), values[:, 0]),
-        modal_damping=ShapePreservingSpline(jnp.asarray(displacement), damping),
+        squared_frequency=PchipCurve(jnp.asarray(displacement), values[:, 0]),
+        modal_damping=PchipCurve(jnp.asarray(displacement), damping),
         squared_frequency_covariance=covariance[0],
         modal_damping_covariance=jnp.nan_to_num(covariance[1]),
         modal_constant=fit.modes.mode_shape[r, j] * fit.modes.participation[j],
@@ -95,6 +103,7 @@ def fitted_response(
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
     points_per_side: int = 200,
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> list[FittedResponse]:
     """Response curves under a force with bands, and its resonances and folds with theirs.
 
@@ -103,26 +112,30 @@ def fitted_response(
     velocity, along both equations of a resonance and of a fold. They include what the choice among
     families leaves open: what rivals say of the same points.
 
-    Arguments: `force` in N, frequencies in rad/s. Returns the connected curves, the main one
-    first; resonances and folds with the first curve that has them.
-    Raises `ValueError` for a force that is not positive.
+    Arguments: `force` in N, frequencies in rad/s; curves end at `largest_amplitude_ratio` times
+    the largest measured amplitude, beyond which the fitted curves are extrapolated.
+    Returns the connected curves, the main one first; resonances and folds with the first curve
+    that has them; the `note` of each says where it extrapolates.
+    Raises `ValueError` for a force or a ratio that is not positive.
     """
-    rough = as_backbone(fit)
+    ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
+    rough = as_backbone(fit, **ratio)
     load = abs(float(rough.modal_constant)) * force
-    settings = {"from_frequency": from_frequency, "to_frequency": to_frequency}
+    settings = {"from_frequency": from_frequency, "to_frequency": to_frequency, **ratio}
     curves = predict_response(rough, fit.modes, force, points_per_side=points_per_side, **settings)
-    largest = fit.largest[0] * (1 + 1e-9)
     tips = [
         (r.amplitude, r.frequency)
-        for r in resonances(rough, fit.modes, force)
+        for r in resonances(rough, fit.modes, force, **ratio)
         if from_frequency <= r.frequency <= to_frequency
     ]
-    found = [_located(fit, force, load, "resonance", *tip, largest) for tip in tips]
+    found = [_located(fit, force, load, "resonance", *tip, largest_amplitude_ratio) for tip in tips]
     answer = []
     for number, curve in enumerate(curves):
         moved = _banded(fit, force, load, curve.amplitude, curve.frequency)
         turns = _turns(curve.frequency, curve.amplitude)
-        folds = [_located(fit, force, load, "fold", *turn, largest) for turn in turns]
+        folds = [
+            _located(fit, force, load, "fold", *turn, largest_amplitude_ratio) for turn in turns
+        ]
         answer.append(
             FittedResponse(
                 force=force,
@@ -134,6 +147,7 @@ def fitted_response(
                 continued=curve.continued,
                 resonances=tuple(p for p in found if p is not None) if number == 0 else (),
                 folds=tuple(p for p in folds if p is not None),
+                note=curve.note,
             )
         )
     return answer
@@ -275,7 +289,7 @@ def _located(
     kind: str,
     amplitude: float,
     frequency: float,
-    largest: float,
+    ratio: float,
 ) -> FittedPoint | None:
     """A resonance or a fold near a point, or None where Newton's method finds none."""
     found = _values_and_slopes(fit, force, load, kind, amplitude, frequency)
@@ -285,7 +299,9 @@ def _located(
     variance = np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes)
     widened = variance
     for rival in fit.rivals:
-        answer = _of_a_rival(rival.fit, force, load, kind, float(values[2]), float(values[0]))
+        answer = _of_a_rival(
+            rival.fit, force, load, kind, float(values[2]), float(values[0]), ratio
+        )
         if answer is None:
             continue  # a fold that the rival does not have moves no band
         own = np.einsum("op,pq,oq->o", answer[1], rival.fit.covariance, answer[1])
@@ -293,22 +309,30 @@ def _located(
         widened = widened + shift**2
     (omega, speed, x), std = values, np.sqrt(widened)
     return FittedPoint(
-        *(force, float(omega), float(std[0]), float(speed), float(std[1])), bool(x > largest)
+        *(force, float(omega), float(std[0]), float(speed), float(std[1])),
+        bool(x > fit.largest[0] * (1 + 1e-9)),
     )
 
 
 def _of_a_rival(
-    rival: JointFit, force: float, load: float, kind: str, amplitude: float, frequency: float
+    rival: JointFit,
+    force: float,
+    load: float,
+    kind: str,
+    amplitude: float,
+    frequency: float,
+    ratio: float,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """A rival's resonance or fold that corresponds to one of the fit, and its slopes."""
     near = _values_and_slopes(rival, force, load, kind, amplitude, frequency)
     if near is not None:
         return near
-    rough = as_backbone(rival)
+    rough = as_backbone(rival, largest_amplitude_ratio=ratio)
     if kind == "resonance":
-        starts = [(r.amplitude, r.frequency) for r in resonances(rough, rival.modes, force)]
+        tips = resonances(rough, rival.modes, force, largest_amplitude_ratio=ratio)
+        starts = [(tip.amplitude, tip.frequency) for tip in tips]
     else:
-        curves = predict_response(rough, rival.modes, force)
+        curves = predict_response(rough, rival.modes, force, largest_amplitude_ratio=ratio)
         starts = [turn for c in curves for turn in _turns(c.frequency, c.amplitude)]
     for start in sorted(starts, key=lambda one: abs(np.log(one[0] / amplitude))):
         found = _values_and_slopes(rival, force, load, kind, *start)

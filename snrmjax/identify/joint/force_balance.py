@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
-from snrmjax.identify.pointwise.backbone_points import mistrust, modal_filter
+from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -74,9 +74,10 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     """The states with a measured velocity, and whether their noise is stated.
 
     Where nobody stated any noise, force, amplitude and phase get the same relative error, larger
-    off resonance (`mistrust`); the fit then finds its size. Without an error of the force a state
-    near a fold would be exact in one direction, since amplitude and phase there move the balance
-    in the other: a force of which no error is stated gets a tenth of the velocity's.
+    off resonance (`off_resonance_error_factor`); the fit then finds its size. Without an error of
+    the force a state near a fold would be exact in one direction, since amplitude and phase there
+    move the balance in the other: a force of which no error is stated gets a tenth of the
+    velocity's.
     Raises `ValueError` where phases are unknown.
     """
     check_phases(data, "a joint fit")
@@ -89,7 +90,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
-        far = mistrust(velocity)
+        far = off_resonance_error_factor(velocity)
         errors = np.stack([far, far, far], axis=1)
     of_force = np.where(errors[:, 0] > 0, errors[:, 0], _UNSTATED_FORCE * errors[:, 1])
     errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet

@@ -7,10 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, BackbonePoints, mistrust
+from snrmjax.identify.pointwise.backbone_points import (
+    AmplitudeArgument,
+    BackbonePoints,
+    off_resonance_error_factor,
+)
 from snrmjax.identify.pointwise.curve_fit import (
     AS_STATED,
-    AbstractCurve,
+    AbstractPointwiseCurve,
     CurveFit,
     LeftOut,
     fit_curve,
@@ -58,8 +62,8 @@ class Backbone(eqx.Module):
     belong to the values at the knots.
     """
 
-    squared_frequency: AbstractCurve
-    modal_damping: AbstractCurve
+    squared_frequency: AbstractPointwiseCurve
+    modal_damping: AbstractPointwiseCurve
     squared_frequency_covariance: Float[Array, "knot knot"]
     modal_damping_covariance: Float[Array, "damping_knot damping_knot"]
     modal_constant: Float[Array, ""]  # Φ_r Φᵀb, 1/kg: acceleration per newton at resonance
@@ -210,7 +214,7 @@ def _fit_pair(
     linear = np.asarray(points.linear_variance)[use]
     # Nothing stated: one relative error for amplitude and phase alike, none for the force.
     errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
-    far = 1.0 if stated else mistrust(np.asarray(points.mode_velocity))[use]
+    far = 1.0 if stated else off_resonance_error_factor(np.asarray(points.mode_velocity))[use]
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]

@@ -12,7 +12,7 @@ from snrmjax.identify.pointwise.inversion import PointStatus, SnrmPoints, invert
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
+from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 AmplitudeArgument = Literal["displacement", "velocity"]
@@ -22,7 +22,7 @@ INPUTS = ("log_force", "log_velocity", "phase")
 """The measured quantities whose errors are carried to the points."""
 
 OFF_RESONANCE = 4.0
-"""How much more a point 90° off resonance is mistrusted than one at it, when no noise is stated."""
+"""Error of a point 90° off resonance over that of one at resonance, where no noise is stated."""
 
 OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
 """The quantities whose derivatives `BackbonePoints.sensitivity` holds."""
@@ -102,11 +102,7 @@ def identify_points(
     if data.n_states == 0:
         raise ValueError("`data` has no steady states.")
     check_phases(data, "an identification")
-    if not bool(jnp.any(jnp.isfinite(data.force))):
-        raise ValueError(
-            "the force is unknown (only a drive voltage is given): calibrate it first, with "
-            "`calibrate_force` and `apply_calibration`."
-        )
+    check_force(data, "an identification point by point")
     if measure == "peak" and not set(data.harmonic_order) - {1}:
         raise ValueError(
             '`measure="peak"` needs harmonics, but the steady states have the fundamental only.'
@@ -286,9 +282,12 @@ def _solve(
     return points, own, argument_of(own, frequency), by_input, variance
 
 
-def mistrust(mode_velocity: Complex[np.ndarray, " state"]) -> Float[np.ndarray, " state"]:
-    """Errors of points relative to one at resonance, where no noise is stated.
+def off_resonance_error_factor(
+    mode_velocity: Complex[np.ndarray, " state"],
+) -> Float[np.ndarray, " state"]:
+    """Error of each point relative to that of a point at resonance, where no noise is stated.
 
-    The method is exact at resonance and errs with the correction it makes from there.
+    √(1 + (4 sin φ)²), φ the phase of the mode's velocity: at resonance a point needs no correction
+    for the distance from resonance, and away from it the correction brings its own errors.
     """
     return np.sqrt(1.0 + (OFF_RESONANCE * np.sin(np.angle(mode_velocity))) ** 2)

@@ -18,7 +18,7 @@ from scipy.linalg import lstsq
 from snrmjax.numerics.least_squares import ErrorSizes, error_sizes, penalised_least_squares
 
 
-class AbstractCurve(eqx.Module):
+class AbstractPointwiseCurve(eqx.Module):
     """A function of amplitude through values at knots; continued linearly beyond them."""
 
     kind: ClassVar[str]
@@ -48,24 +48,24 @@ class AbstractCurve(eqx.Module):
         return value + below + jnp.maximum(x - last, 0.0) * slopes[1]
 
 
-class PiecewiseLinear(AbstractCurve):
+class PiecewiseLinear(AbstractPointwiseCurve):
     """Straight lines between the knots, in the amplitude itself: the paper's choice."""
 
     kind: ClassVar[str] = "piecewise_linear"
 
     @staticmethod
     def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """See `AbstractCurve.abscissa`."""
+        """See `AbstractPointwiseCurve.abscissa`."""
         return amplitude
 
     def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
-        """See `AbstractCurve.within`."""
+        """See `AbstractPointwiseCurve.within`."""
         if self.knots.shape[0] < 2:
             return jnp.broadcast_to(self.values[0], abscissa.shape)
         return interpax.interp1d(abscissa, self.knots, self.values, method="linear", extrap=True)
 
 
-class ShapePreservingSpline(AbstractCurve):
+class PchipCurve(AbstractPointwiseCurve):
     """A monotonicity-preserving cubic (PCHIP) in the squared amplitude.
 
     The square makes the curve an even, smooth function of amplitude: ω̃² of a smooth restoring
@@ -76,11 +76,11 @@ class ShapePreservingSpline(AbstractCurve):
 
     @staticmethod
     def abscissa(amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """See `AbstractCurve.abscissa`."""
+        """See `AbstractPointwiseCurve.abscissa`."""
         return amplitude**2
 
     def within(self, abscissa: Float[Array, " point"]) -> Float[Array, " point"]:
-        """See `AbstractCurve.within`."""
+        """See `AbstractPointwiseCurve.within`."""
         if self.knots.shape[0] < 2:
             return jnp.broadcast_to(self.values[0], abscissa.shape)
         knots = self.abscissa(self.knots)
@@ -88,8 +88,8 @@ class ShapePreservingSpline(AbstractCurve):
         return interpax.interp1d(abscissa, knots, self.values, method=method, extrap=True)
 
 
-CURVES: dict[str, type[AbstractCurve]] = {
-    curve.kind: curve for curve in (PiecewiseLinear, ShapePreservingSpline)
+CURVES: dict[str, type[AbstractPointwiseCurve]] = {
+    curve.kind: curve for curve in (PiecewiseLinear, PchipCurve)
 }
 """Families of curves by name."""
 
@@ -100,7 +100,7 @@ AS_STATED = ErrorSizes(1.0, 0.0)
 class CurveFit(NamedTuple):
     """A curve fitted to points, with the uncertainty of its values at the knots."""
 
-    curve: AbstractCurve
+    curve: AbstractPointwiseCurve
     covariance: Float[Array, "knot knot"]
 
     def std(self, amplitude: Float[Array, " point"]) -> Float[Array, " point"]:
@@ -110,7 +110,7 @@ class CurveFit(NamedTuple):
 
 
 @eqx.filter_jit
-def _slopes(curve: AbstractCurve, amplitude: Array) -> Float[Array, "point knot"]:
+def _slopes(curve: AbstractPointwiseCurve, amplitude: Array) -> Float[Array, "point knot"]:
     """Derivatives of the curve with respect to its values."""
 
     def at(values: Array) -> Array:
@@ -310,7 +310,7 @@ def predict_left_out(
     return LeftOut(score, error_sizes(errors, spreads), squares)
 
 
-def log_slope(curve: AbstractCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
+def log_slope(curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
     """dg/d log a of a curve at amplitudes between its knots, to the accuracy weights need."""
     knots, values = np.asarray(curve.knots), np.asarray(curve.values)
     low = np.clip(amplitude * (1 - 1e-4), knots[0], knots[-1])

@@ -12,7 +12,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     AmplitudeMeasure,
     BackbonePoints,
     identify_points,
-    mistrust,
+    off_resonance_error_factor,
 )
 from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.states import SteadyStates
@@ -58,7 +58,9 @@ def identify_backbone(
 def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not."""
     sensitivity = np.asarray(points.sensitivity)
-    scale = mistrust(np.asarray(points.mode_velocity))[:, None] * np.array(fit.noise_scale)
+    scale = off_resonance_error_factor(np.asarray(points.mode_velocity))[:, None] * np.array(
+        fit.noise_scale
+    )
     spread = scale[:, :, None] * np.array([0.0, 1.0, 1.0])
     own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)

@@ -51,13 +51,13 @@ class SnrmPoints(NamedTuple):
     status: Int[Array, "*batch"]  # `PointStatus`
 
 
-class TwoByTwo(lx.AbstractLinearSolver[Any]):
+class CramersRule(lx.AbstractLinearSolver[Any]):
     """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step."""
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Array:
         """See `lineax.AbstractLinearSolver.init`."""
         if operator.in_size() != 2 or operator.out_size() != 2:
-            raise ValueError("`TwoByTwo` solves systems of two equations for two unknowns only.")
+            raise ValueError("`CramersRule` solves systems of two equations for two unknowns only.")
         return operator.as_matrix()
 
     def compute(
@@ -83,10 +83,10 @@ class TwoByTwo(lx.AbstractLinearSolver[Any]):
         return True
 
 
-_NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=TwoByTwo())
+_NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=CramersRule())
 _STEPS = 8  # from the closed form one step is enough, two where the two roots nearly meet
 _CHUNK = 1 << 14  # members that are solved at a time on a CPU: they stay in its cache
-_ADJOINT = optx.ImplicitAdjoint(linear_solver=TwoByTwo())
+_ADJOINT = optx.ImplicitAdjoint(linear_solver=CramersRule())
 
 
 def closed_form(

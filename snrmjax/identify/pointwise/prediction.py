@@ -14,8 +14,8 @@ from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
 
-CONTINUED = 1.5
-"""Curves are continued up to this multiple of the largest measured amplitude."""
+LARGEST_AMPLITUDE_RATIO = 1.5
+"""Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
 
 _SCAN = 4096
 
@@ -42,22 +42,32 @@ class PredictedResponse(NamedTuple):
     branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
     continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
     isolated: bool  # a closed curve, apart from the main one
+    note: str  # where the curve extrapolates the backbone; empty where it nowhere does
 
 
-def resonances(backbone: Backbone, modes: LinearModes, force: float) -> list[Resonance]:
+def resonances(
+    backbone: Backbone,
+    modes: LinearModes,
+    force: float,
+    *,
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
+) -> list[Resonance]:
     """All phase resonances under a force, by Newton's method from every sign change.
 
     At resonance Ω = ω̃ and the velocity amplitude of the mode is v = |A|F/(2ζ̃ω̃), both functions
     of amplitude; the total adds the residual modes. Damping that falls with amplitude can give
     several solutions.
 
-    Arguments: `force` in N. Returns the solutions in order of amplitude, up to `CONTINUED` times
-    the largest measured amplitude; an empty list when none lies there.
-    Raises `ValueError` for a force that is not positive.
+    Arguments: `force` in N; solutions are looked for up to `largest_amplitude_ratio` times the
+    largest measured amplitude. Beyond the measured amplitudes the backbone is extrapolated along
+    its end slopes, which no measurement supports: see `Resonance.continued`.
+    Returns the solutions in order of amplitude; an empty list when none lies there.
+    Raises `ValueError` for a force or a ratio that is not positive.
+    Not differentiable: differentiate `Backbone` itself, or `snrm_velocity`.
     Reference: Kwarta & Allen, Eq. (19).
     """
     _require_force(force)
-    amplitude = _scan(backbone)
+    amplitude = _scan(backbone, largest_amplitude_ratio)
     load = abs(float(backbone.modal_constant)) * force
     excess = _on_backbone(backbone, amplitude).excess(load)
     at = np.flatnonzero(np.signbit(excess[:-1]) != np.signbit(excess[1:]))
@@ -80,18 +90,20 @@ def resonance_by_fixed_point(
     *,
     start: float | None = None,
     max_steps: int = 256,
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> Resonance | None:
     """One phase resonance by the paper's fixed-point iteration v ← |A|F/(2ζ̃ω̃)(v).
 
     Arguments: `force` in N; `start` the first amplitude (of the backbone's argument), by default
     the largest measured one. Returns None when the iteration does not converge, which happens
-    where damping changes fast with amplitude: use `resonances`.
+    where damping changes fast with amplitude (use `resonances`), or ends beyond
+    `largest_amplitude_ratio` times the largest measured amplitude. Not differentiable.
     Reference: Kwarta & Allen, Eq. (19).
     """
     _require_force(force)
     first = jnp.asarray(float(backbone.largest) if start is None else start)
     root, good = _picard(backbone, jnp.asarray(force), first, max_steps)
-    largest = CONTINUED * float(backbone.largest)
+    largest = float(_scan(backbone, largest_amplitude_ratio)[-1])
     if not bool(good) or not 0 < float(root) <= largest:
         return None
     return _resonance(backbone, modes, force, float(root))
@@ -106,6 +118,7 @@ def predict_response(
     to_frequency: float = np.inf,
     points_per_side: int = 200,
     smallest_fraction: float = 0.02,
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
 ) -> list[PredictedResponse]:
     """The whole response to a force, both sides of resonance and the unstable part included.
 
@@ -115,12 +128,17 @@ def predict_response(
     damping of small changes of amplitude is negative: both follow from the averaged equations.
 
     Arguments: `force` in N, frequencies in rad/s; `points_per_side` on either side of every
-    resonance; the main curve starts at `smallest_fraction` of its largest amplitude.
-    Returns the connected curves, the main one first, isolated ones after it.
+    resonance; the main curve starts at `smallest_fraction` of its largest amplitude, and all end
+    at `largest_amplitude_ratio` times the largest measured amplitude. Beyond the measured
+    amplitudes the backbone is extrapolated along its end slopes, which no measurement supports.
+    Returns the connected curves, the main one first, isolated ones after it; the `note` of each
+    says where it extrapolates.
+    Raises `ValueError` for a force or a ratio that is not positive.
+    Not differentiable: its points move with the curve's ends. Differentiate `Backbone` itself.
     Reference: Kwarta & Allen, section 2.2 and Eq. (10).
     """
     _require_force(force)
-    scan = _scan(backbone)
+    scan = _scan(backbone, largest_amplitude_ratio)
     load = abs(float(backbone.modal_constant)) * force
     inside = _on_backbone(backbone, scan).frequencies(load)[2] >= 0
     starts = [scan[0]] if inside[0] else []
@@ -145,7 +163,7 @@ def predict_response(
         keep = (curve.frequency >= from_frequency) & (curve.frequency <= to_frequency)
         # A range that cuts the peak off leaves two pieces, which no line may join.
         runs = np.split(np.arange(len(keep)), np.flatnonzero(np.diff(keep.astype(int))) + 1)
-        curves += [_subset(curve, run) for run in runs if run.size and keep[run[0]]]
+        curves += [_part(curve, run, backbone) for run in runs if run.size and keep[run[0]]]
     return curves
 
 
@@ -154,9 +172,12 @@ def _require_force(force: float) -> None:
         raise ValueError(f"`force` must be positive, but is {force!r} N.")
 
 
-def _scan(backbone: Backbone) -> Float[np.ndarray, " point"]:
-    """Amplitudes from zero to the end of the continued curve."""
-    return CONTINUED * float(backbone.largest) * np.linspace(0.0, 1.0, _SCAN + 1)
+def _scan(backbone: Backbone, ratio: float) -> Float[np.ndarray, " point"]:
+    """Amplitudes from zero to `ratio` times the largest measured one."""
+    if not ratio > 0 or not np.isfinite(ratio):
+        raise ValueError(f"`largest_amplitude_ratio` must be positive, but is {ratio!r}.")
+    n = int(np.ceil(_SCAN * max(ratio / LARGEST_AMPLITUDE_RATIO, 1.0)))
+    return ratio * float(backbone.largest) * np.linspace(0.0, 1.0, n + 1)
 
 
 class _OnBackbone(NamedTuple):
@@ -351,16 +372,27 @@ def _one_curve(
         branch=tuple(np.where(frequency <= natural, "lead", "lag").tolist()),
         continued=both.amplitude > float(backbone.largest) * (1 + 1e-9),
         isolated=closed,
+        note="",
     )
-    return _subset(curve, keep)
+    return _part(curve, keep, backbone)
 
 
-def _subset(curve: PredictedResponse, keep: np.ndarray) -> PredictedResponse:
+def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> PredictedResponse:
+    """Some points of a curve, and the note on those that extrapolate the backbone."""
+    amplitude, continued = curve.amplitude[keep], curve.continued[keep]
+    note = ""
+    if continued.any():
+        note = (
+            f"{int(continued.sum())} of {len(continued)} points lie beyond the largest measured "
+            f"amplitude, up to {amplitude.max() / float(backbone.largest):.3g} times it: there the "
+            "backbone is extrapolated, which no measurement supports."
+        )
     return curve._replace(
         frequency=curve.frequency[keep],
         velocity=curve.velocity[keep],
-        amplitude=curve.amplitude[keep],
+        amplitude=amplitude,
         stable=curve.stable[keep],
         branch=tuple(np.asarray(curve.branch)[keep].tolist()),
-        continued=curve.continued[keep],
+        continued=continued,
+        note=note,
     )

@@ -17,7 +17,7 @@ from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import Bench
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.identify.calibrate.calibration import calibrate_model
-from snrmjax.identify.calibrate.inverse_force import needed_force
+from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import EFFECTS
 
 
@@ -253,7 +253,7 @@ def test_amplitudes_count_once():
         lambda model, data: sj.identify.identify_points(data, model.modes),
         lambda model, data: sj.fit_jointly(data, model.modes),
         lambda model, data: calibrate_model(model, data, ["mode_1.damping_ratio"]),
-        needed_force,
+        inverse_force,
     ],
 )
 def test_what_needs_phases_says_so(verb):

@@ -12,7 +12,7 @@ import snrmjax as sj
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
 from snrmjax.diagnose.misfit.programs import HARMONICS
-from snrmjax.identify.calibrate.inverse_force import needed_force
+from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 
 OMEGA, ZETA = 300.0, 0.01
@@ -69,7 +69,7 @@ def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
     found = asked(ours, kind, values[None])[0]
     effect = make_effect(kind, dict(zip(effect_parameters(kind), values, strict=True)))
     model = dataclasses.replace(ours.model, effects=(effect,))
-    needed = needed_force(model, data, harmonic_order=HARMONICS)
+    needed = inverse_force(model, data, harmonic_order=HARMONICS)
     assert needed.converged.all()
     missed = np.asarray(needed.force) / np.asarray(data.force) - 1
     # Masing's formula stands for sliders, of which a rule of 48 points makes an error of 1e-4.

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import snrmjax as sj
 from snrmjax.identify.calibrate.calibration import calibrate_model
-from snrmjax.identify.calibrate.inverse_force import needed_force
+from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_response
 from snrmjax.model.parameters import (
@@ -83,7 +83,7 @@ def test_a_linear_structure_needs_the_force_of_its_closed_form():
     omega = np.array([470.0, 500.0, 510.0])
     velocity = np.outer([0.3, 0.5j, 0.2 - 0.1j], [1.0, 1.0])
     data = sj.measure.steady_states([1] * 3, omega, [0.4] * 3, velocity, sensors=modes.sensors)
-    found = needed_force(sj.model.structure(modes), data, harmonic_order=2)
+    found = inverse_force(sj.model.structure(modes), data, harmonic_order=2)
     response = np.asarray(linear_response(modes, jnp.asarray(omega), jnp.ones(3)))
     # 1e-10: rounding of a system whose condition number is about 1e4.
     np.testing.assert_allclose(found.force, velocity[:, 0] / response[:, 0], rtol=1e-10)
@@ -103,7 +103,7 @@ def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
         rigid_body_participation=jnp.array([30.0]),
     )
     data = curved_test(model, keep_harmonics=(2, 3))
-    found = needed_force(model, data, harmonic_order=ORDER)
+    found = inverse_force(model, data, harmonic_order=ORDER)
     assert bool(found.converged.all())
     # 1e-7: the tests' states are solved to 1e-10 of the displacement, of which the force at
     # resonance is a tenth or less.
@@ -118,7 +118,7 @@ def test_derivatives_of_the_needed_force_are_those_of_central_differences(exact)
 
     def parts(relative):
         changed = with_parameters(model, names, jnp.asarray(start) * (1 + relative))
-        force = needed_force(changed, exact, harmonic_order=ORDER).force / exact.force
+        force = inverse_force(changed, exact, harmonic_order=ORDER).force / exact.force
         return jnp.stack([force.real, force.imag])
 
     zero, step = jnp.zeros(len(names)), 3e-5
@@ -135,7 +135,7 @@ def test_the_needed_force_has_slopes_by_the_mode_shape():
 
     def force(shape):
         changed = dataclasses.replace(modes, mode_shape=shape)
-        return jnp.sum(needed_force(sj.model.structure(changed), data).force.real)
+        return jnp.sum(inverse_force(sj.model.structure(changed), data).force.real)
 
     # A linear mode of half the shape has to move twice as far.
     slope = jax.grad(force)(modes.mode_shape)

@@ -54,6 +54,19 @@ def test_resonance_of_known_curves(exact_fit):
     assert not found.continued
 
 
+def test_a_larger_ratio_looks_further(exact_fit):
+    largest = exact_fit.largest[0]
+    x = 2.5 * largest
+    speed = x * np.sqrt(squared(x))
+    force = speed * damping(speed) / CONSTANT
+    (near,) = sj.identify.fitted_response(exact_fit, force)
+    (far,) = sj.identify.fitted_response(exact_fit, force, largest_amplitude_ratio=3.0)
+    assert near.resonances == ()
+    assert far.resonances[0].frequency == pytest.approx(speed / x, rel=1e-6)
+    assert far.resonances[0].continued
+    assert "beyond the largest measured amplitude, up to 2.5 times it" in far.note
+
+
 def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
     # ω̃² = a(1 − 0.4 u): X ω̃ has its largest value at u = 1.25, short of 1.5² times the data.
     vector = np.array(exact_fit.vector()[0])

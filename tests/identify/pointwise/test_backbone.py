@@ -7,7 +7,7 @@ import pytest
 
 from snrmjax.identify.pointwise.backbone import Backbone, fit_backbone
 from snrmjax.identify.pointwise.backbone_points import identify_points
-from snrmjax.identify.pointwise.curve_fit import ShapePreservingSpline, _linearised
+from snrmjax.identify.pointwise.curve_fit import PchipCurve, _linearised
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_modes
 
@@ -213,8 +213,8 @@ class TestStd:
         values = squared(knots), np.array([10.0, 11.0, 14.0])
         roots = 20.0 * rng.normal(size=(3, 3)), 0.1 * rng.normal(size=(3, 3))
         backbone = Backbone(
-            squared_frequency=ShapePreservingSpline(jnp.asarray(knots), jnp.asarray(values[0])),
-            modal_damping=ShapePreservingSpline(jnp.asarray(knots), jnp.asarray(values[1])),
+            squared_frequency=PchipCurve(jnp.asarray(knots), jnp.asarray(values[0])),
+            modal_damping=PchipCurve(jnp.asarray(knots), jnp.asarray(values[1])),
             squared_frequency_covariance=jnp.asarray(roots[0] @ roots[0].T),
             modal_damping_covariance=jnp.asarray(roots[1] @ roots[1].T),
             modal_constant=jnp.asarray(CONSTANT),
@@ -239,7 +239,7 @@ class TestStd:
         np.testing.assert_allclose(zeta_std, np.std(zeta, axis=0), rtol=0.07)
 
     def test_a_squared_frequency_below_zero_has_no_frequency(self):
-        line = ShapePreservingSpline(jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0]))
+        line = PchipCurve(jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0]))
         fit = fitted(duffing_test(0, stated=False), n_knots=5)
         broken = eqx.tree_at(lambda b: b.squared_frequency, fit.backbone, line)
         at = jnp.array([0.5, 0.9])

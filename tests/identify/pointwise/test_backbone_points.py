@@ -405,7 +405,10 @@ class TestRefusals:
             sensors=("tip",),
             drive=np.ones(n),
         )
-        with pytest.raises(ValueError, match=r"force is unknown .* calibrate it first"):
+        with pytest.raises(
+            ValueError,
+            match=r"only a drive voltage .* `--fit auto --free force_gain`.*calibrate_force",
+        ):
             identify_points(data, three_modes((0,)))
 
     def test_states_without_an_answer_leave_the_others_alone(self):

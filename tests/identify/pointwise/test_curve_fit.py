@@ -13,8 +13,8 @@ from snrmjax.identify.pointwise.curve_fit import (
     AS_STATED,
     CURVES,
     CurveFit,
+    PchipCurve,
     PiecewiseLinear,
-    ShapePreservingSpline,
     _linearised,
     _slopes,
     fit_curve,
@@ -57,7 +57,7 @@ both_kinds = pytest.mark.parametrize("kind", list(CURVES))
 class TestCurves:
     def test_the_families(self):
         assert CURVES["piecewise_linear"] is PiecewiseLinear
-        assert CURVES["spline"] is ShapePreservingSpline
+        assert CURVES["spline"] is PchipCurve
         assert len(CURVES) == 2
 
     @both_kinds

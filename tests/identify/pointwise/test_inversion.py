@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from snrmjax.identify.pointwise.inversion import (
     STATUS_MESSAGE,
+    CramersRule,
     PointStatus,
     SnrmPoints,
-    TwoByTwo,
     closed_form,
     invert_amplitude_phase,
     invert_one,
@@ -634,18 +634,18 @@ class TestDerivatives:
         np.testing.assert_allclose(found, found.transpose(0, 2, 1), rtol=1e-9, atol=1e-12)
 
 
-class TestTwoByTwo:
+class TestCramersRule:
     def test_against_numpy(self):
         rng = np.random.default_rng(5)
         matrices = rng.normal(size=(200, 2, 2)) * 10.0 ** rng.uniform(-6, 6, (200, 1, 1))
         vectors = rng.normal(size=(200, 2))
 
         def solve(matrix, vector):
-            return lx.linear_solve(lx.MatrixLinearOperator(matrix), vector, TwoByTwo()).value
+            return lx.linear_solve(lx.MatrixLinearOperator(matrix), vector, CramersRule()).value
 
         def transposed(matrix, vector):
             operator = lx.MatrixLinearOperator(matrix).transpose()
-            return lx.linear_solve(operator, vector, TwoByTwo()).value
+            return lx.linear_solve(operator, vector, CramersRule()).value
 
         def both(matrix, vector):
             return (
@@ -669,7 +669,7 @@ class TestTwoByTwo:
     def test_another_size_is_refused(self):
         operator = lx.MatrixLinearOperator(jnp.eye(3))
         with pytest.raises(ValueError, match="two equations for two unknowns"):
-            lx.linear_solve(operator, jnp.ones(3), TwoByTwo())
+            lx.linear_solve(operator, jnp.ones(3), CramersRule())
 
 
 invert_compiled = eqx.filter_jit(invert_phasor)

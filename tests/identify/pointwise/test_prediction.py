@@ -10,9 +10,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.curve_fit import ShapePreservingSpline
+from snrmjax.identify.pointwise.curve_fit import PchipCurve
 from snrmjax.identify.pointwise.prediction import (
-    CONTINUED,
+    LARGEST_AMPLITUDE_RATIO,
     predict_response,
     resonance_by_fixed_point,
     resonances,
@@ -42,8 +42,8 @@ def backbone(squared, damping, argument="displacement", knots=(0.0, 0.3, 0.45, 0
     knots = UNIT[argument] * LARGEST * jnp.asarray(knots)
     none = jnp.zeros((knots.size, knots.size))
     return Backbone(
-        squared_frequency=ShapePreservingSpline(knots, jnp.asarray(squared)),
-        modal_damping=ShapePreservingSpline(knots, jnp.asarray(damping)),
+        squared_frequency=PchipCurve(knots, jnp.asarray(squared)),
+        modal_damping=PchipCurve(knots, jnp.asarray(damping)),
         squared_frequency_covariance=none,
         modal_damping_covariance=none,
         modal_constant=jnp.asarray(CONSTANT),
@@ -94,7 +94,7 @@ def all_resonances(which, force):
         omega = np.sqrt(squared(a))
         return velocity_amplitude(which, a, omega) * damping(a) - abs(CONSTANT) * force
 
-    grid = CONTINUED * float(which.largest) * np.linspace(1e-9, 1, 20001)
+    grid = LARGEST_AMPLITUDE_RATIO * float(which.largest) * np.linspace(1e-9, 1, 20001)
     signs = np.sign(excess(grid))
     brackets = [(grid[k], grid[k + 1]) for k in np.flatnonzero(signs[1:] != signs[:-1])]
     return [brentq(excess, a, b, xtol=1e-18, rtol=1e-14) for a, b in brackets]
@@ -163,10 +163,43 @@ class TestResonances:
             np.testing.assert_allclose(found.amplitude, part * LARGEST, rtol=1e-10)
 
     def test_a_force_beyond_the_continued_curve_has_none(self):
-        force = force_for(DUFFING, 1.01 * CONTINUED)
+        force = force_for(DUFFING, 1.01 * LARGEST_AMPLITUDE_RATIO)
         assert resonances(DUFFING, MODES, force) == []
         assert resonance_by_fixed_point(DUFFING, MODES, force) is None
-        assert len(resonances(DUFFING, MODES, force_for(DUFFING, 0.99 * CONTINUED))) == 1
+        assert (
+            len(resonances(DUFFING, MODES, force_for(DUFFING, 0.99 * LARGEST_AMPLITUDE_RATIO))) == 1
+        )
+
+    def test_a_larger_ratio_looks_further(self):
+        # Beyond the knots ω̃² continues along a², in which the Duffing backbone is a line already,
+        # and the damping is constant: the extrapolation is exact.
+        force = force_for(DUFFING, 3.7)
+        (found,) = resonances(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
+        np.testing.assert_allclose(found.amplitude, 3.7 * LARGEST, rtol=1e-10)
+        assert found.continued
+        again = resonance_by_fixed_point(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
+        np.testing.assert_allclose(again.amplitude, found.amplitude, rtol=1e-8)
+        assert not resonances(DUFFING, MODES, force, largest_amplitude_ratio=3.6)
+
+    def test_a_curve_reaches_as_far_as_asked_and_says_where_it_extrapolates(self):
+        force = force_for(DUFFING, 3.0)
+        (short,) = predict_response(DUFFING, MODES, force)
+        (long,) = predict_response(DUFFING, MODES, force, largest_amplitude_ratio=4.0)
+        assert short.amplitude.max() <= LARGEST_AMPLITUDE_RATIO * LARGEST
+        # The largest displacement lies beyond the phase resonance by ζ²/2 of it, here 3e-5.
+        np.testing.assert_allclose(long.amplitude.max(), 3.0 * LARGEST, rtol=1e-4)
+        n = int(long.continued.sum())
+        assert 0 < n < len(long.continued)
+        assert long.note.startswith(f"{n} of {len(long.continued)} points lie beyond the largest")
+        assert "up to 3 times it" in long.note
+        (small,) = predict_response(DUFFING, MODES, force_for(DUFFING, 0.5))
+        assert small.note == ""
+
+    @pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan, np.inf])
+    @pytest.mark.parametrize("verb", [resonances, resonance_by_fixed_point, predict_response])
+    def test_the_ratio_must_be_positive(self, verb, ratio):
+        with pytest.raises(ValueError, match="`largest_amplitude_ratio` must be positive"):
+            verb(DUFFING, MODES, force_for(DUFFING, 0.5), largest_amplitude_ratio=ratio)
 
     @pytest.mark.parametrize("force", [0.0, -1.0, np.nan, np.inf])
     @pytest.mark.parametrize("verb", [resonances, resonance_by_fixed_point, predict_response])
@@ -308,10 +341,10 @@ class TestResponse:
         (plain,) = predict(DUFFING, MODES, force)
         # Time in another unit: frequencies times 4, displacements at the same forces over 16.
         fast = Backbone(
-            squared_frequency=ShapePreservingSpline(
+            squared_frequency=PchipCurve(
                 DUFFING.squared_frequency.knots / 16, 16 * DUFFING.squared_frequency.values
             ),
-            modal_damping=ShapePreservingSpline(
+            modal_damping=PchipCurve(
                 DUFFING.modal_damping.knots / 16, 4 * DUFFING.modal_damping.values
             ),
             squared_frequency_covariance=DUFFING.squared_frequency_covariance,
