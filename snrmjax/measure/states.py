@@ -204,9 +204,10 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
 
 
-def _listed(part: Any) -> list[SteadyStates]:
+def _listed(part: Any) -> list[Any]:
     """The members of a list; what is no list is its only member, to be refused by its type."""
-    return [part] if isinstance(part, str | Mapping) or not np.iterable(part) else list(part)
+    alone = isinstance(part, str | Mapping) or not np.iterable(part)
+    return [part] if alone else list(part)
 
 
 def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
