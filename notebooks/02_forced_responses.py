@@ -45,13 +45,13 @@ from snrmjax.report import style as drawing
 HERTZ = 2 * np.pi
 BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
-CIRCLE = {**drawing.HOLLOW, "marker": "o", "markersize": 6.0, "clip_on": True}
-DOTS = {"linestyle": "none", "marker": ".", "markersize": 5.0}
+CIRCLE = {**drawing.HOLLOW, "marker": "o", "markersize": 4.5, "clip_on": True}
+DOTS = {"linestyle": "none", "marker": ".", "markersize": 3.5}
 EVENTS = {
     "fold": {**CIRCLE, "marker": "s"},
-    "peak": {**CIRCLE, "marker": "^", "markersize": 8.0},
-    "phase_resonance": {**CIRCLE, "color": "black", "markersize": 3.0},
-    "period_doubling": {**CIRCLE, "marker": "D", "markersize": 5.0, "color": ORANGE},
+    "peak": {**CIRCLE, "marker": "^", "markersize": 5.5},
+    "phase_resonance": {**CIRCLE, "color": "black", "markersize": 2.0},
+    "period_doubling": {**CIRCLE, "marker": "D", "markersize": 3.5, "color": ORANGE},
 }
 HZ, VELOCITY = "Frequency (Hz)", "Velocity amplitude (m/s)"
 
@@ -61,7 +61,7 @@ def show(figure, name):
     drawing.legend(figure)
     if FIGURES is not None:
         FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=85)
+        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=150)
     return figure
 
 
@@ -97,7 +97,7 @@ for curve in (*flat_responses, *curved_responses):
         print(f"   {curve.frequency[k] / HERTZ:8.3f} Hz {level(curve)[k]:.4f} m/s {curve.event[k]}")
 
 # %%
-figure, ((left, right),) = drawing.panels(12.5, 5.6, 1, 2)
+figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.6, 1, 2)
 for axes, curves in ((left, flat_responses), (right, curved_responses)):
     shades = ("0.72", "0.58", "0.38", "black")[-len(curves) :]
     for curve, shade in zip(curves, shades, strict=True):
@@ -105,7 +105,7 @@ for axes, curves in ((left, flat_responses), (right, curved_responses)):
     lines = [axes.plot([], [], color=shade)[0] for shade in shades]
     names = [drawing.with_unit(curve.force, "N") for curve in curves]
     corner = "upper left" if axes is left else "lower center"
-    axes.legend(lines, names, loc=corner, frameon=False, fontsize=10.5)
+    axes.legend(lines, names, loc=corner, frameon=False, fontsize=drawing.SMALL)
 left.set_ylim(0.0, 0.86)
 right.set_yscale("log")
 right.set_ylim(0.004, 3.5)
@@ -181,10 +181,10 @@ lock_error = max(
 print(f"last point of the phase-locked curve against the phase resonance: {lock_error:.0e}")
 
 # %%
-figure, ((a, b), (c, d)) = drawing.panels(11.5, 8.6, 2, 2)
+figure, ((a, b), (c, d)) = drawing.panels(drawing.PAGE, 5.8, 2, 2)
 for curve, k in tips:
     x, y = curve.frequency / HERTZ, level(curve)
-    a.plot(x, y, color="0.75", linewidth=1.2, label="responses")
+    a.plot(x, y, color="0.75", linewidth=0.9, label="responses")
     drawing.marks(a, x[k], y[k], CIRCLE, "phase resonance")
 lines = (
     (mode, "-", "black", "undamped mode"),
@@ -193,18 +193,18 @@ lines = (
 )
 for branch, style, colour, name in lines:
     x, fifth = branch.frequency / HERTZ, np.abs(branch.velocity[:, 5, 0])
-    a.plot(x, level(branch), style, color=colour, linewidth=1.5, label=name)
-    b.semilogy(x, fifth, style, color=colour, linewidth=1.5)
+    a.plot(x, level(branch), style, color=colour, linewidth=drawing.LINE, label=name)
+    b.semilogy(x, fifth, style, color=colour, linewidth=drawing.LINE)
 a.set(xlim=(70, 105), ylim=(0, 0.9))
 b.set(xlim=(84, 93), ylim=(1e-4, 3))
 c.semilogx(mode.energy, mode.frequency / HERTZ, color="black")
 c.semilogx(
     *(spine.energy, spine.frequency / HERTZ, ":"),
     color=GREEN,
-    linewidth=3.0,
+    linewidth=2.0,
     label="tongue skipped",
 )
-note = {"textcoords": "offset points", "fontsize": 10.5}
+note = {"textcoords": "offset points", "fontsize": drawing.SMALL}
 place = (mode.energy.max(), tongue.to_frequency / HERTZ)
 c.annotate(
     f"tongue: harmonic {tongue.harmonic}\nmeets mode {tongue.mode + 1}",
@@ -214,7 +214,7 @@ c.annotate(
 c.set(xlim=(1e-6, 2e-1))
 for curve in held:
     x, y = curve.frequency / HERTZ, curve.force * 1e3
-    d.plot(x, y, color="0.4", linewidth=1.5)
+    d.plot(x, y, color="0.4", linewidth=drawing.LINE)
     low = np.flatnonzero(y < 37)[0]
     d.annotate(f"{level(curve)[0]:.2f} m/s", (x[low], y[low]), (9, 0), **note)
 d.plot(locked.frequency / HERTZ, locked.force * 1e3, "--", color=ORANGE)
@@ -309,7 +309,7 @@ print(
 )
 
 # %%
-figure, ((a, b, c),) = drawing.panels(14.0, 5.2, 1, 3)
+figure, ((a, b, c),) = drawing.panels(drawing.PAGE, 3.0, 1, 3)
 for axes, main, other in ((a, first_well, second_well), (b, middle, cut_off), (c, below, loop)):
     draw(axes, main, "black", "main curve", ("fold",))
     draw(axes, other, ORANGE, "found apart from it", ("fold",))
@@ -380,9 +380,9 @@ for order in (1, 3):
     )
 
 # %%
-figure, ((a, b),) = drawing.panels(12.5, 5.4, 1, 2)
+figure, ((a, b),) = drawing.panels(drawing.PAGE, 3.4, 1, 2)
 for curve, colour in ((crude, BLUE), (middle, "black")):
-    a.plot(curve.frequency / HERTZ, level(curve), color=colour, linewidth=1.5)
+    a.plot(curve.frequency / HERTZ, level(curve), color=colour, linewidth=drawing.LINE)
 phasors = sj.simulate.velocity_phasors(
     jnp.asarray(truth), jnp.asarray(middle.frequency), curved.modes.mode_shape
 )
@@ -391,7 +391,7 @@ a.plot(x[::3], np.abs(phasors[::3, 1, 0]), **DOTS, color=ORANGE, label="31 harmo
 for order, colour in ((1, BLUE), (3, GREEN), (9, "black"), (15, drawing.SERIES[3])):
     name = "1 harmonic" if order == 1 else f"{order} harmonics"
     b.semilogy(x, errors[order], **DOTS, color=colour, label=name)
-pale = {**CIRCLE, "markersize": 5.5, "markeredgecolor": "0.6", "zorder": 1}
+pale = {**CIRCLE, "markersize": 4.0, "markeredgecolor": "0.6", "zorder": 1}
 b.semilogy(x, middle.truncation, **pale, label="estimate, 9 harmonics")
 a.set(xlim=(20, 80), ylim=(0, 0.75))
 b.set(xlim=(20, 150), ylim=(2e-8, 10))
@@ -448,14 +448,14 @@ derivative = jax.jit(jax.jacrev(peak_and_jump))(jnp.zeros(len(names)))
 sensitivity = 100 * np.asarray(derivative) / nominal[:, None]  # % per %
 
 # %%
-figure, (both,) = drawing.panels(12.5, 4.2, 1, 2)
+figure, (both,) = drawing.panels(drawing.PAGE, 2.8, 1, 2)
 titles = "(a) peak velocity", "(b) frequency of the upper fold"
 for axes, row, title in zip(both, sensitivity, titles, strict=True):
     largest = np.argsort(-np.abs(row))[:6][::-1]
     label, size = [names[i] for i in largest], row[largest]
     bars = axes.barh(label, size, color=np.where(size > 0, BLUE, ORANGE))
-    axes.bar_label(bars, [f"{s:+.3f}" for s in size], padding=4, fontsize=10)
-    axes.axvline(0.0, color="0.4", linewidth=1.0)
+    axes.bar_label(bars, [f"{s:+.3f}" for s in size], padding=4, fontsize=drawing.SMALL)
+    axes.axvline(0.0, color="0.4", linewidth=0.7)
     axes.margins(x=0.16)
     drawing.name_axes(axes, title, "Sensitivity (% per %)", "")
 show(figure, "sensitivity")
@@ -489,14 +489,14 @@ for what, value, guess in zip(quantities, computed.T, foretold.T, strict=True):
     )
 
 # %%
-figure, ((a, b),) = drawing.panels(12.5, 5.2, 1, 2)
+figure, ((a, b),) = drawing.panels(drawing.PAGE, 3.2, 1, 2)
 a.plot(batch.peak_frequency / HERTZ, batch.peak_velocity, **DOTS, color=BLUE)
 a.plot(summit[1] / HERTZ, nominal[0], **CIRCLE, label="the beam without scatter")
 for what, colour, value, guess in zip(
     quantities, (BLUE, ORANGE), computed.T, foretold.T, strict=True
 ):
     b.plot(guess, value, **DOTS, color=colour, label=what)
-b.plot([-10, 12], [-10, 12], color="0.5", linewidth=1.0, zorder=1)
+b.plot([-10, 12], [-10, 12], color="0.5", linewidth=0.7, zorder=1)
 b.set(xlim=(-10, 12), ylim=(-10, 12))
 drawing.name_axes(a, "(a) peaks of 200 beams", HZ, VELOCITY)
 drawing.name_axes(b, "(b) foretold by derivatives", "Foretold change (%)", "Computed change (%)")

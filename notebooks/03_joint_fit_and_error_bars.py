@@ -58,7 +58,7 @@ def show(figure, name):
     """Return the figure to the notebook; as a script, write it into the folder given."""
     if FIGURES is not None:
         FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=85)
+        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=150)
     return figure
 
 
@@ -153,7 +153,7 @@ for name, (values, bands) in rows.items():
 # The curves are too good for the figure. Less the truth, they show who knows what.
 
 # %%
-figure, ((left, right),) = drawing.panels(11.0, 4.8, 1, 2)
+figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.2, 1, 2)
 colours = drawing.SERIES[:2]
 for (name, (values, bands)), colour in zip(rows.items(), colours, strict=True):
     for axes, value, band, exact in zip((left, right), values, bands, true, strict=True):

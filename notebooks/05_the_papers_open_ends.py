@@ -49,7 +49,7 @@ def show(figure, name):
     """Return the figure to the notebook; as a script, write it into the folder given."""
     if FIGURES is not None:
         FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=85)
+        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=150)
     return figure
 
 
@@ -110,7 +110,7 @@ PRINTED = {  # drive in V and force in N of section 4.1, forces of the validatio
     ),
 }
 lines, intercepts, shares = {}, {}, {}
-figure, grid = drawing.panels(10.0, 4.6, 1, 2)
+figure, grid = drawing.panels(drawing.PAGE, 3.4, 1, 2)
 for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=True):
     newtons = 1e-4 * np.array(tenths)
     line = calibrate_force(volts, newtons)
@@ -144,7 +144,7 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
     axes.set_xticks([0.2, 0.5, 1, 2, 5], ["0.2", "0.5", "1", "2", "5"], minor=False)
     axes.minorticks_off()
     drawing.name_axes(axes, f"printed {name} beam", "force by the line (mN)", "damping over linear")
-grid[0, 1].legend(fontsize=8.5, loc="upper right")
+grid[0, 1].legend(fontsize=drawing.SMALL, loc="upper right")
 show(figure, "force_lines")
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
     abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
@@ -324,7 +324,7 @@ headline["a right force: nothing is missing"] = nothing.verdict == "none"
 # resonance are fewer: the frequency steps leave no more of them.)
 
 # %%
-figure, grid = drawing.panels(7.0, 4.4, 1, 1)
+figure, grid = drawing.panels(drawing.COLUMN, 3.4, 1, 1)
 axes = grid[0, 0]
 BINS = ((0, 4), (6, 14), (18, 34), (30, 60))
 PARTED = (("10 % left out", "beam", 0.1), ("friction of that size", "beam with friction", 0.0))
@@ -353,7 +353,7 @@ axes.axhspan(-6, 6, color="0.88", zorder=0, label="not decided")
 axes.set_yscale("symlog", linthresh=10)
 axes.set_yticks([-100, -10, 0, 10, 100], ["−100", "−10", "0", "10", "100"])
 axes.set_xticks(range(len(BINS)), [f"{a}° to {b}°" for a, b in BINS])
-axes.legend(fontsize=9)
+axes.legend(fontsize=drawing.SMALL)
 drawing.name_axes(axes, "", "states, degrees off resonance", "gain: offset less friction")
 show(figure, "offset_or_friction")
 

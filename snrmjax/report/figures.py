@@ -1,8 +1,9 @@
 """Figures in the manner of the method paper: measured, identified, predicted and simulated.
 
-Blue is measured, vermilion identified or predicted, black simulated; dashed thin lines are
-unstable and pale ones lie beyond the measured amplitudes. Axes are in Hz, degrees and per cent of
-critical damping. Figures need no display and change none of matplotlib's settings.
+Blue is measured, vermilion identified or predicted, black simulated (broad and grey behind a
+prediction); dashed thin lines are unstable and pale ones lie beyond the measured amplitudes. Axes
+are in Hz, degrees and per cent of critical damping. Figures need no display and change none of
+matplotlib's settings.
 """
 
 from collections.abc import Sequence
@@ -37,15 +38,21 @@ from snrmjax.report.sampling import (
     velocity_of,
 )
 from snrmjax.report.style import (
+    BACKGROUND,
+    COLUMN,
     CROSS,
+    CURVE,
     DOT,
     FILL,
     HOLLOW,
     IDENTIFIED,
+    LINE,
     MEASURED,
+    PAGE,
     SERIES,
     SIMULATED,
     STAR,
+    dress,
     explain_lines,
     fit_axis,
     legend,
@@ -56,6 +63,7 @@ from snrmjax.report.style import (
     plain,
     png_bytes,
     response_line,
+    share_frequencies,
     stars,
     unit_for,
     with_unit,
@@ -72,7 +80,7 @@ class DampingSeries(NamedTuple):
     backbone: Backbone | None = None
 
 
-def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 200.0) -> None:
+def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 220.0) -> None:
     """Write a figure as a PNG, whole or not at all.
 
     Raises `ValueError` when `path` does not end in .png or cannot be written.
@@ -91,10 +99,10 @@ def backbone_figure(
 ) -> Figure:
     """Measured steady states, the points identified from them, and the curves through these.
 
-    Three panels: velocity amplitude and phase against frequency (0° at resonance), and damping
-    ratio against velocity amplitude. Error bars and bands are 95 %; axes fit the points, so that
-    a wide band may leave them. Steady states that have no place in the curves, as their status
-    says, are grey crosses.
+    Three panels: velocity amplitude over velocity phase against frequency (0° at resonance), and
+    damping ratio against velocity amplitude. Error bars and bands are 95 %; axes fit the points, so
+    that a wide band may leave them. Steady states that have no place in the curves, as their
+    status says, are grey crosses.
 
     Arguments: `truth` a nonlinear mode to compare with; `modes` the linear modes, of which the
     mode of interest is marked at zero amplitude.
@@ -112,7 +120,11 @@ def backbone_figure(
     curve = sample_backbone(backbone)
     velocity = curve.velocity / unit.size
 
-    figure, ((speeds, phases, dampings),) = panels(13.0, 4.7, 1, 3)
+    figure = Figure(figsize=(PAGE, 4.4), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.8, 1.0))
+    speeds, phases, dampings = map(figure.add_subplot, (grid[0, 0], grid[1, 0], grid[:, 1]))
+    for axes in figure.axes:
+        dress(axes)
     for axes, y in ((speeds, measured), (phases, phase_of(points.mode_velocity, backbone))):
         marks(axes, omega[use], y[use], DOT, "measured")
         marks(axes, omega[~use], y[~use], CROSS, "measured, left out")
@@ -122,8 +134,9 @@ def backbone_figure(
     stars(speeds, natural[use], own[use], "identified, 95 % bars", xerr=bars)
     stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
     stars(dampings, own[use], damping[use], yerr=damping_bars)
-    speeds.plot(curve.frequency, velocity, color=IDENTIFIED, zorder=4, label="identified curve")
-    dampings.plot(velocity, curve.damping, color=IDENTIFIED, zorder=4)
+    above = {**CURVE, "zorder": 4}
+    speeds.plot(curve.frequency, velocity, color=IDENTIFIED, **above, label="identified curve")
+    dampings.plot(velocity, curve.damping, color=IDENTIFIED, **above)
     sides = curve.frequency - curve.frequency_error, curve.frequency + curve.frequency_error
     speeds.fill_betweenx(velocity, *sides, color=IDENTIFIED, **FILL, label="95 % band")
     sides = curve.damping - curve.damping_error, curve.damping + curve.damping_error
@@ -132,7 +145,7 @@ def backbone_figure(
     if truth is not None:
         true_velocity = np.abs(velocity_of(truth, backbone.sensor)) / unit.size
         inside = np.where(true_velocity <= top, truth.frequency / HERTZ, np.nan)
-        speeds.plot(inside, true_velocity, "--", color=SIMULATED, zorder=4, label="true mode")
+        speeds.plot(inside, true_velocity, "--", color=SIMULATED, **above, label="true mode")
         seen += [*inside]
     if modes is not None:
         j = modes.mode_of_interest
@@ -141,15 +154,15 @@ def backbone_figure(
         marks(speeds, linear[0], 0.0, diamond, "linear mode")
         marks(dampings, 0.0, linear[1], diamond)
         seen, seen_damping = [*seen, linear[0]], [*seen_damping, linear[1]]
-    phases.sharex(speeds)
+    share_frequencies(speeds, phases)
     speeds.set_ylim(0.0, top)
     dampings.set_xlim(0.0, top)
     fit_axis(speeds, "x", natural[use], seen, bars)
     fit_axis(dampings, "y", damping[use], seen_damping, damping_bars)
     phase_axis(phases)
     at, level = plain(backbone.sensor), f"Velocity amplitude ({unit.name})"
-    name_axes(speeds, f"(a) amplitude at {at}", "Frequency (Hz)", level)
-    name_axes(phases, "(b) phase", "Frequency (Hz)", "Phase of the mode's velocity (°)")
+    name_axes(speeds, f"(a) amplitude at {at}", "", level)
+    name_axes(phases, "(b) phase of the mode", "Frequency (Hz)", "Velocity phase (°)")
     name_axes(dampings, "(c) damping", level, "Damping ratio (% of critical)")
     legend(figure)
     return figure
@@ -187,7 +200,7 @@ def response_figure(
     )
     low, high = min(s[0] for s in spans) / HERTZ, max(s[1] for s in spans) / HERTZ
     spine = sample_backbone(backbone, reach=LARGEST_AMPLITUDE_RATIO)
-    figure, rows = panels(10.5, 0.8 + 3.1 * len(forces), len(forces), 2)
+    figure, rows = panels(PAGE, 0.6 + 1.9 * len(forces), len(forces), 2)
     for force, (speeds, phases) in zip(forces, rows, strict=True):
         omega, states = measured_near(measured, sensor, force, force_tolerance)
         curves = [c for c in every if c.force == force]
@@ -196,26 +209,29 @@ def response_figure(
         unit = unit_for(largest, "m/s")
         for part, style in ((~spine.beyond, {"label": "backbone"}), (spine.beyond, {"alpha": 0.4})):
             x, y = spine.frequency[part], spine.velocity[part] / unit.size
-            speeds.plot(x, y, ":", color=IDENTIFIED, **style)
-        phases.axhline(0.0, color="0.6", linewidth=1.0, zorder=1)
+            speeds.plot(x, y, ":", color=IDENTIFIED, **CURVE, **style)
+        phases.axhline(0.0, color="0.6", linewidth=0.6, zorder=1)
         for curve, v in zip(curves, velocities, strict=True):
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, phase_of(v, backbone))):
                 x = curve.frequency / HERTZ
                 if isinstance(curve, PredictedResponse):
-                    name, colour, width, beyond = "predicted", IDENTIFIED, 1.5, curve.continued
+                    name, colour, width, beyond = "predicted", IDENTIFIED, LINE, curve.continued
                 else:
-                    name, colour, width, beyond = "harmonic balance", SIMULATED, 3.0, None
+                    name, colour, width, beyond = "harmonic balance", BACKGROUND, 3.5 * LINE, None
                 response_line(axes, x, y, curve.stable, name, colour, width, beyond)
         for axes, y in ((speeds, np.abs(states) / unit.size), (phases, phase_of(states, backbone))):
             marks(axes, omega, y, DOT, "measured")
         found = [(one.frequency / HERTZ, one.velocity) for one in resonances if one.force == force]
-        star = {**STAR, "markersize": 15.0, "zorder": 5}
+        star = {**STAR, "markersize": 10.0, "zorder": 5}
         marks(speeds, [f for f, _ in found], [v / unit.size for _, v in found], star, "resonance")
         marks(phases, [f for f, _ in found], np.zeros(len(found)), star)
         speeds.set(xlim=(low, high), ylim=(0.0, 1.12 * largest / unit.size))
         phases.sharex(speeds)
         phase_axis(phases)
-        bottom = "Frequency (Hz)" if force == forces[-1] else ""
+        last = force == forces[-1]
+        for axes in (speeds, phases):
+            axes.tick_params(labelbottom=last)
+        bottom = "Frequency (Hz)" if last else ""
         title, level = f"force {with_unit(force, 'N')}: ", f"Velocity amplitude ({unit.name})"
         name_axes(speeds, f"{title}amplitude at {plain(sensor)}", bottom, level)
         name_axes(phases, f"{title}phase", bottom, "Velocity phase (°)")
@@ -242,7 +258,7 @@ def simulated_response_figure(
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
     colours = dict(zip(forces, shades, strict=True))
     unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
-    figure, ((speeds,), (phases,)) = panels(9.0, 7.5, 2, 1)
+    figure, ((speeds,), (phases,)) = panels(PAGE, 5.4, 2, 1)
     markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
     for event in (None, *markers):
         for curve in drawn:
@@ -250,14 +266,14 @@ def simulated_response_figure(
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
                 if event is None:
                     label, colour = with_unit(curve.force, "N"), colours[curve.force]
-                    response_line(axes, x, y, curve.stable, label, colour, 1.8)
+                    response_line(axes, x, y, curve.stable, label, colour, LINE)
                     continue
                 at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
                 if event == "phase_resonance":
-                    style |= {"color": "black", "markersize": 3.0}
+                    style |= {"color": "black", "markersize": 2.0}
                 marks(axes, x[at], y[at], style, event.replace("_", " "))
     speeds.set_ylim(bottom=0.0)
-    phases.sharex(speeds)
+    share_frequencies(speeds, phases)
     phase_axis(phases)
     name_axes(speeds, f"(a) amplitude at {plain(name)}", "", f"Velocity amplitude ({unit.name})")
     name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
@@ -285,10 +301,10 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
     signal = branch.velocity[:, 1:, branch.sensors.index(name)]
     peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
     unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
-    figure, ((speeds, energies),) = panels(11.0, 4.7, 1, 2)
-    speeds.plot(omega, peak / unit.size, color=SERIES[5], label="peak of the signal")
-    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, label="fundamental")
-    energies.semilogx(branch.energy, omega, color=SIMULATED)
+    figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
+    speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")
+    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, **CURVE, label="fundamental")
+    energies.semilogx(branch.energy, omega, color=SIMULATED, **CURVE)
     energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
     speeds.set_ylim(bottom=0.0)
     title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
@@ -330,14 +346,14 @@ def force_velocity_figure(
     frequency, indicator = np.asarray(data.frequency) / HERTZ, np.asarray(appropriation_of(data))
     columns = min(3, len(states))
     height = -(-len(states) // columns)
-    figure, grid = panels(3.9 * columns, 0.3 + 3.7 * height, height, columns)
+    figure, grid = panels(PAGE / 3 * columns, 0.2 + 2.4 * height, height, columns)
     for number, (axes, k) in enumerate(zip(grid.flat, states, strict=False)):
         force, velocity = np.asarray(loops.force[number]), np.asarray(loops.velocity[number])
         force_unit, unit = unit_for(force, "N"), unit_for(velocity, "m/s")
         ends, phasor = np.array([-1.0, 1.0]), phasors[number, 0]
         in_phase = ends * forces[number] / force_unit.size, ends * phasor.real / unit.size
-        axes.plot(*in_phase, "--", color=SIMULATED, linewidth=1.1)
-        axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED)
+        axes.plot(*in_phase, "--", color=SIMULATED, linewidth=0.8)
+        axes.plot(force / force_unit.size, velocity / unit.size, color=MEASURED, **CURVE)
         turn = f"{np.angle(phasor) / DEGREE:+.0f}°".replace("-", "−")
         title = f"level {int(data.level[k])}, {frequency[k]:.4g} Hz\n"
         title += f"phase {turn}, indicator {indicator[k]:.2f}"
@@ -359,7 +375,7 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
     shown = [s for s in series if s.points is not None or s.backbone is not None]
     if not shown:
         raise ValueError("there is no damping to show: no series has points or a backbone.")
-    figure, ((axes,),) = panels(7.5, 5.2, 1, 1)
+    figure, ((axes,),) = panels(COLUMN, 3.5, 1, 1)
     curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in shown]
     largest = [c.velocity for c in curves if c]
     largest += [usable_damping(s.points)[0] for s in shown if s.points]
@@ -377,10 +393,10 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
             velocity, damping = curve.velocity / unit.size, curve.modal_damping
             sides = damping - curve.modal_damping_error, damping + curve.modal_damping_error
             axes.fill_between(velocity, *sides, color=colour, **FILL)
-            axes.plot(velocity, damping, color=colour, label=name)
+            axes.plot(velocity, damping, color=colour, **CURVE, label=name)
             lines += [*damping]
     if linear is not None:
-        axes.axhline(linear, color=SIMULATED, linestyle=":", label="linear mode")
+        axes.axhline(linear, color=SIMULATED, linestyle=":", linewidth=LINE, label="linear mode")
     axes.set_xlim(left=0.0)
     fit_axis(axes, "y", dots, lines)
     name_axes(axes, "", f"Velocity amplitude ({unit.name})", "Modal damping 2ζω (1/s)")

@@ -13,7 +13,7 @@ from snrmjax.report.style import png_bytes
 
 Rows = Sequence[tuple[str, str]]
 
-_REM_PER_INCH = 5.0  # of figures on the page: their letters are then about as large as the text's
+_REM_PER_INCH = 8.0  # of figures on the page: their letters are then as large as the text's
 
 
 class ReportFigure(NamedTuple):
@@ -78,7 +78,7 @@ def report_html(report: Report) -> str:
 
 
 def _embedded(one: ReportFigure) -> dict[str, str]:
-    drawn = one.png or png_bytes(one.figure, dots_per_inch=130.0)
+    drawn = one.png or png_bytes(one.figure)
     png = base64.b64encode(drawn).decode("ascii")
     width = f"{_REM_PER_INCH * one.figure.get_figwidth():g}"
     return {"png": png, "width": width, "alt": one.caption.split(". ")[0], "caption": one.caption}

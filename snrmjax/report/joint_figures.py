@@ -23,13 +23,19 @@ from snrmjax.report.sampling import (
     velocity_of,
 )
 from snrmjax.report.style import (
+    COLUMN,
+    CURVE,
     DOT,
     FILL,
     HOLLOW,
     IDENTIFIED,
+    LINE,
     MEASURED,
+    PAGE,
     SERIES,
     SIMULATED,
+    SMALL,
+    TEXT,
     Unit,
     explain_lines,
     fit_axis,
@@ -40,6 +46,7 @@ from snrmjax.report.style import (
     phase_axis,
     plain,
     response_line,
+    share_frequencies,
     unit_for,
     with_unit,
 )
@@ -77,7 +84,7 @@ def fitted_curves_figure(
         if one.points is not None:
             reach += [*np.asarray(one.points.backbone_velocity)[np.asarray(one.points.usable)]]
     top = 1.04 * max(reach) / unit.size
-    figure, ((natural, damping),) = panels(11.0, 5.2, 1, 2)
+    figure, ((natural, damping),) = panels(PAGE, 3.4, 1, 2)
     seen: tuple[list[float], list[float]] = ([], [])
     dots: tuple[list[float], list[float]] = ([], [])
     for number, (one, curve) in enumerate(zip(series, curves, strict=True)):
@@ -89,7 +96,7 @@ def fitted_curves_figure(
                 np.asarray(one.points.natural_frequency)[use] / HERTZ,
                 100 * np.asarray(one.points.damping_ratio)[use],
             )
-            style = {**DOT, "markersize": 4.0, "alpha": 0.55, "color": MEASURED}
+            style = {**DOT, "markersize": 2.8, "alpha": 0.6, "color": MEASURED}
             if len(series) > 1:
                 style["color"] = colour
             for axes, y, kept in zip((natural, damping), each, dots, strict=True):
@@ -100,7 +107,7 @@ def fitted_curves_figure(
             _bands(natural, damping, wide, unit, colour, "95 % band of a further level", 0.5)
         _bands(natural, damping, curve, unit, colour, "95 % band")
         for axes, y in ((natural, curve.frequency), (damping, curve.damping)):
-            axes.plot(curve.velocity / unit.size, y, color=colour, zorder=4, label=name)
+            axes.plot(curve.velocity / unit.size, y, color=colour, zorder=4, **CURVE, label=name)
         for kept, y, error in (
             (seen[0], curve.frequency, curve.frequency_error),
             (seen[1], curve.damping, curve.damping_error),
@@ -109,7 +116,7 @@ def fitted_curves_figure(
     if truth is not None:
         x = np.abs(velocity_of(truth, series[0].fit.modes.sensors[series[0].fit.data.sensor]))
         inside = x / unit.size <= top
-        style = {"color": SIMULATED, "linestyle": "--", "linewidth": 1.2, "zorder": 5}
+        style = {"color": SIMULATED, "linestyle": "--", "linewidth": LINE, "zorder": 5}
         natural.plot(x[inside] / unit.size, truth.frequency[inside] / HERTZ, **style, label="true")
         if isinstance(truth, DampedModeBranch):
             damping.plot(x[inside] / unit.size, 100 * truth.damping_ratio[inside], **style)
@@ -150,28 +157,28 @@ def residuals_figure(fit: JointFit) -> Figure:
     """
     left = fit_residuals(fit)
     unit = unit_for(left.velocity, "m/s")
-    figure, ((speeds, phases, spread),) = panels(13.0, 4.7, 1, 3)
+    figure, ((speeds, phases, spread),) = panels(PAGE, 2.9, 1, 3)
     for part, (colour, name) in enumerate(((MEASURED, "first part"), (IDENTIFIED, "second part"))):
-        style = {**DOT, "color": colour, "markersize": 4.0, "alpha": 0.7}
+        style = {**DOT, "color": colour, "markersize": 2.8, "alpha": 0.7}
         marks(speeds, left.velocity / unit.size, left.parts[:, part], style, name)
         marks(phases, left.phase, left.parts[:, part], style)
     reach = max(3.5, 1.08 * float(np.max(np.abs(left.parts))))
     for axes in (speeds, phases):
         for y, line in ((0.0, "-"), (-BAND, "--"), (BAND, "--")):
-            axes.axhline(y, color="0.4", linewidth=0.9, linestyle=line, zorder=1)
+            axes.axhline(y, color="0.4", linewidth=0.6, linestyle=line, zorder=1)
         axes.set_ylim(-reach, reach)
     speeds.set_xlim(left=0.0)
     edges = np.linspace(-reach, reach, 2 * int(np.clip(np.sqrt(left.parts.size), 8, 20)) + 1)
     spread.hist(left.parts.reshape(-1), edges, density=True, color="0.75", label="residuals")
     x = np.linspace(-reach, reach, 201)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    spread.plot(x, normal, color=SIMULATED, label="normal distribution, variance one")
+    spread.plot(x, normal, color=SIMULATED, **CURVE, label="standard normal distribution")
     outside = 100 * float(np.mean(np.abs(left.parts) > BAND))
-    ylabel = "Whitened residual (1)"
+    ylabel = "Whitened residual (σ)"
     name_axes(speeds, "(a) against amplitude", f"Velocity amplitude ({unit.name})", ylabel)
-    name_axes(phases, "(b) against phase", "Velocity phase (°), 0° at resonance", ylabel)
-    title = f"(c) rms {left.rms:.2f}, {outside:.1f} % outside ±1.96"
-    name_axes(spread, title, ylabel, "Density (1)")
+    name_axes(phases, "(b) against phase", "Velocity phase (°)", ylabel)
+    title = f"(c) rms {left.rms:.2f} σ,\n{outside:.1f} % outside ±1.96 σ"
+    name_axes(spread, title, ylabel, "Density (1/σ)")
     legend(figure)
     return figure
 
@@ -195,17 +202,17 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
         names.append(small[0].source if len(small) == 1 else f"{len(small)} smaller ones together")
         shares.append((sum(r.frequency_share for r in small), sum(r.damping_share for r in small)))
     place = np.arange(len(names))
-    figure, ((axes,),) = panels(9.0, 1.6 + 0.62 * len(names), 1, 1)
+    figure, ((axes,),) = panels(COLUMN, 1.0 + 0.36 * len(names), 1, 1)
     for k, (what, colour) in enumerate((("natural frequency", MEASURED), ("damping", IDENTIFIED))):
         widths = [100 * share[k] for share in shares]
         bars = axes.barh(place + (k - 0.5) * 0.38, widths, 0.36, color=colour, label=what)
-        axes.bar_label(bars, [f"{w:.1f} %" for w in widths], padding=3, fontsize=9.5)
+        axes.bar_label(bars, [f"{w:.1f} %" for w in widths], padding=2, fontsize=SMALL)
     axes.set_yticks(place, [plain(name) for name in names])
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.set_xlim(0.0, 1.12 * 100 * max(max(share) for share in shares))
+    axes.set_xlim(0.0, 1.22 * 100 * max(max(share) for share in shares))
     axes.xaxis.set_major_formatter(PercentFormatter(decimals=0))
-    name_axes(axes, "", "Share of the band's variance, mean over the amplitudes", "")
+    name_axes(axes, "", "Share of the band's variance", "")
     legend(figure)
     return figure
 
@@ -222,7 +229,7 @@ def advice_figure(
     if not responses:
         raise ValueError("there is no response to show: `responses` is empty.")
     forces = sorted({one.force for one in responses})
-    figure, ((speeds,), (phases,)) = panels(9.0, 7.5, 2, 1)
+    figure, ((speeds,), (phases,)) = panels(PAGE, 5.0, 2, 1)
     largest = max(float(np.max(np.abs(one.velocity))) for one in responses)
     unit = unit_for(largest, "m/s")
     resonant = np.concatenate(
@@ -237,7 +244,7 @@ def advice_figure(
         x, name = curve.frequency[near] / HERTZ, with_unit(curve.force, "N")
         turn = np.angle(sign * curve.velocity[near]) / DEGREE
         for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
-            pieces = (curve.stable[near], name, colour, 1.5, curve.continued[near])
+            pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])
             response_line(axes, x, y, *pieces)
     for one in advice:
         marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
@@ -246,14 +253,14 @@ def advice_figure(
     for ranks, first in _together(advice):
         at = (first.frequency / HERTZ, first.velocity / unit.size)
         text = ", ".join(map(str, ranks))
-        offset: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+        offset: dict[str, Any] = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
         box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
-        speeds.annotate(text, at, **offset, fontsize=10.5, zorder=6, bbox=box)
+        speeds.annotate(text, at, **offset, fontsize=TEXT, zorder=6, bbox=box)
     if forces[-1] > 8 * forces[0]:
         speeds.set_yscale("log")
     else:
         speeds.set_ylim(0.0, 1.12 * largest / unit.size)
-    phases.sharex(speeds)
+    share_frequencies(speeds, phases)
     phase_axis(phases)
     name_axes(speeds, f"(a) amplitude at {plain(sensor)}", "", f"Velocity amplitude ({unit.name})")
     name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")

@@ -1,6 +1,8 @@
 """The marks, colours, panels and legends that all figures share.
 
-Everything is set on the figures themselves: matplotlib's settings stay as they are.
+Sizes are those of a printed page: a figure of `PAGE` inches fills its width, and no letter is
+smaller than 8 pt there. Everything is set on the figures themselves: matplotlib's settings stay
+as they are.
 """
 
 import io
@@ -11,7 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+PAGE, COLUMN = 7.2, 4.8  # inches: a figure of several panels, and of one
+TEXT, SMALL = 9.0, 8.5  # points: of titles and labels, and of ticks, legends and notes
+
 MEASURED, IDENTIFIED, SIMULATED, EXCLUDED = "#0072B2", "#D55E00", "black", "0.55"
+BACKGROUND = "0.72"  # of a curve to compare with, broad behind another one
 SERIES = (IDENTIFIED, MEASURED, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours that colour-blind readers can tell apart (Okabe & Ito)."""
 
@@ -19,12 +25,14 @@ CROWD = 120
 """From this number of points on they are drawn small."""
 
 Style = dict[str, Any]
-DOT: Style = {"linestyle": "none", "marker": "o", "markersize": 5.5, "color": MEASURED}
-DOT |= {"markeredgecolor": "white", "markeredgewidth": 0.5}
-STAR: Style = {**DOT, "marker": "*", "markersize": 11.0, "color": IDENTIFIED}
-CROSS: Style = {**DOT, "marker": "x", "markeredgecolor": EXCLUDED, "markeredgewidth": 1.5}
-HOLLOW: Style = {**DOT, "color": "white", "markeredgecolor": "black", "markersize": 7.0}
-HOLLOW |= {"markeredgewidth": 1.2, "zorder": 5, "clip_on": False}
+DOT: Style = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": MEASURED}
+DOT |= {"markeredgecolor": "white", "markeredgewidth": 0.3}
+STAR: Style = {**DOT, "marker": "*", "markersize": 7.5, "color": IDENTIFIED}
+CROSS: Style = {**DOT, "marker": "x", "markeredgecolor": EXCLUDED, "markeredgewidth": 1.1}
+HOLLOW: Style = {**DOT, "color": "white", "markeredgecolor": "black", "markersize": 5.0}
+HOLLOW |= {"markeredgewidth": 0.9, "zorder": 5, "clip_on": False}
+LINE = 1.3  # points: the width of a curve
+CURVE: Style = {"linewidth": LINE}
 FILL: Style = {"alpha": 0.22, "linewidth": 0}
 
 
@@ -63,7 +71,7 @@ def plain(text: str) -> str:
     return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
-def png_bytes(figure: Figure, *, dots_per_inch: float = 200.0) -> bytes:
+def png_bytes(figure: Figure, *, dots_per_inch: float = 220.0) -> bytes:
     """A figure as the content of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dots_per_inch)
@@ -75,19 +83,25 @@ def panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure
     figure = Figure(figsize=(width, height), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat:
-        axes.tick_params(labelsize=10.5)
-        axes.grid(color="0.9", linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+        dress(axes)
     return figure, grid
+
+
+def dress(axes: Axes) -> None:
+    """The ticks, grid and spines that all panels have."""
+    axes.tick_params(labelsize=SMALL, width=0.6, length=3.0)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["bottom", "left"]].set_linewidth(0.6)
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
 
 
 def name_axes(axes: Axes, title: str, x: str, y: str) -> None:
     """Title and axis labels."""
-    axes.set_title(title, loc="left", fontsize=11.5)
-    axes.set_xlabel(x, fontsize=11.5)
-    axes.set_ylabel(y, fontsize=11.5)
+    axes.set_title(title, loc="left", fontsize=TEXT)
+    axes.set_xlabel(x, fontsize=TEXT)
+    axes.set_ylabel(y, fontsize=TEXT)
 
 
 def fit_axis(axes: Axes, direction: str, points: Any, others: Any = (), bars: Any = (0.0,)) -> None:
@@ -110,8 +124,8 @@ def fit_axis(axes: Axes, direction: str, points: Any, others: Any = (), bars: An
     axes.set(**{f"{direction}lim": ends})
     outside = int(np.sum((value < ends[0]) | (value > ends[1])))
     if outside:
-        note = f"{outside} point{'s' if outside > 1 else ''} off the {direction} axis"
-        place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": 9.5}
+        note = f"{outside} point{'s' if outside > 1 else ''} outside the {direction} range"
+        place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top", "fontsize": SMALL}
         axes.text(0.99, 0.99 if direction == "y" else 0.93, note, color="0.3", **place)
 
 
@@ -122,6 +136,12 @@ def phase_axis(axes: Axes) -> None:
     axes.yaxis.set_major_locator(MultipleLocator(45.0))
 
 
+def share_frequencies(upper: Axes, lower: Axes) -> None:
+    """Two panels above one another on one frequency axis, with its numbers below both."""
+    lower.sharex(upper)
+    upper.tick_params(labelbottom=False)
+
+
 def marks(axes: Axes, x: Any, y: Any, style: Style, name: str | None = None) -> None:
     """Markers, if there are any; without a point nothing enters the legend."""
     if np.size(x):
@@ -130,8 +150,8 @@ def marks(axes: Axes, x: Any, y: Any, style: Style, name: str | None = None) -> 
 
 def stars(axes: Axes, x: Any, y: Any, name: str | None = None, **bars: Any) -> None:
     """Identified points with their error bars, small and without edges when they are many."""
-    crowded = {"markersize": 5.0, "markeredgewidth": 0.0} if len(x) > CROWD else {}
-    axes.errorbar(x, y, **bars, fmt="none", ecolor=IDENTIFIED, elinewidth=0.9, alpha=0.4)
+    crowded = {"markersize": 3.5, "markeredgewidth": 0.0} if len(x) > CROWD else {}
+    axes.errorbar(x, y, **bars, fmt="none", ecolor=IDENTIFIED, elinewidth=0.6, alpha=0.4)
     marks(axes, x, y, {**STAR, **crowded, "zorder": 3}, name)
 
 
@@ -164,7 +184,7 @@ def response_line(
 def explain_lines(figure: Figure) -> None:
     """Name dashed and pale lines in the legend to come, if there are any."""
     lines = [line for axes in figure.axes for line in axes.lines]
-    style: Style = {"color": "0.3", "linewidth": 1.1}
+    style: Style = {"color": "0.3", "linewidth": 0.8}
     if any(line.get_linestyle() == "--" for line in lines):
         figure.axes[-1].plot([], [], "--", **style, label="unstable")
     if any((line.get_alpha() or 1.0) < 1.0 for line in lines):
@@ -177,7 +197,7 @@ def legend(figure: Figure) -> None:
     for axes in figure.axes:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             found.setdefault(name, handle)
-    columns = max(1, min(len(found), int(figure.get_figwidth() / 1.9)))
+    columns = _columns(list(found), figure.get_figwidth())
     order = [k for first in range(columns) for k in range(first, len(found), columns)]
     names = [list(found)[k] for k in order]
     figure.legend(
@@ -185,6 +205,17 @@ def legend(figure: Figure) -> None:
         names,
         loc="outside lower center",
         ncols=columns,
-        fontsize=10.5,
+        fontsize=SMALL,
         frameon=False,
+        handlelength=1.8,
+        columnspacing=1.6,
     )
+
+
+def _columns(names: list[str], width: float) -> int:
+    """The most columns of names that fit a width in inches, when they are read row by row."""
+    for columns in range(len(names), 1, -1):
+        longest = [max(map(len, names[first::columns])) for first in range(columns)]
+        if sum(0.065 * letters + 0.55 for letters in longest) < width:
+            return columns
+    return 1

@@ -116,12 +116,12 @@ def test_backbone_points_are_drawn_in_hertz_and_per_cent(identification, backbon
     )
     (ratios,) = [line for line in dampings.lines if line.get_marker() == "*"]
     np.testing.assert_array_equal(ratios.get_ydata(), 100 * np.asarray(points.damping_ratio))
+    # Amplitude and phase share the frequencies below both.
     assert [axes.get_xlabel() for axes in figure.axes] == [
-        "Frequency (Hz)",
-        "Frequency (Hz)",
-        "Velocity amplitude (m/s)",
+        *("", "Frequency (Hz)", "Velocity amplitude (m/s)"),
     ]
-    assert phases.get_ylabel() == "Phase of the mode's velocity (°)"
+    assert phases.get_xlim() == speeds.get_xlim()
+    assert phases.get_ylabel() == "Velocity phase (°)"
     assert dampings.get_ylabel() == "Damping ratio (% of critical)"
     assert {-90.0, -45.0, 0.0, 45.0, 90.0} <= set(phases.get_yticks())
     assert phases.get_ylim() == (-100.0, 100.0)
@@ -226,7 +226,7 @@ def test_far_outliers_leave_the_axis_and_are_counted(identification, backbone):
     wild = eqx.tree_at(lambda p: p.damping_ratio, points, points.damping_ratio.at[2].set(3.0))
     dampings = plot.backbone_figure(wild, backbone).axes[2]
     assert dampings.get_ylim()[1] < 100.0
-    assert [text.get_text() for text in dampings.texts] == ["1 point off the y axis"]
+    assert [text.get_text() for text in dampings.texts] == ["1 point outside the y range"]
     assert not plot.backbone_figure(points, backbone).axes[2].texts
 
 
@@ -310,13 +310,13 @@ def test_parts_beyond_the_data_are_pale(backbone, predicted):
     assert "beyond the data" in legend_names(figure)
 
 
-def test_responses_have_a_row_a_force_and_simulation_in_black(backbone, predicted, virtual):
+def test_responses_have_a_row_a_force_and_simulation_behind(backbone, predicted, virtual):
     figure = plot.response_figure(backbone, predicted, simulated=virtual.curves)
     assert len(figure.axes) == 2 * len(FORCES)
     for force, axes in zip(FORCES, figure.axes[::2], strict=True):
         assert axes.get_title(loc="left").startswith(f"force {drawing.with_unit(force, 'N')}:")
         (curve,) = [c for c in virtual.curves if c.force == force]
-        lines = pieces(axes, "black")
+        lines = pieces(axes, drawing.BACKGROUND)
         x = np.concatenate([line.get_xdata()[:-1] for line in lines])
         np.testing.assert_array_equal(x, curve.frequency[:-1] / HERTZ)
     assert not curve.stable.all()
@@ -458,7 +458,7 @@ def test_saved_figures_are_png_files(tmp_path, mode):
     figure = plot.normal_mode_figure(mode)
     plot.save_figure(figure, tmp_path / "mode.png", dots_per_inch=50)
     image = mpl.image.imread(tmp_path / "mode.png")
-    assert image.shape[:2] == (235, 550)
+    assert image.shape[:2] == (160, 360)
     assert np.ptp(image[..., :3]) == 1.0
     assert [file.name for file in tmp_path.iterdir()] == ["mode.png"]
 

@@ -147,7 +147,7 @@ def test_residuals_are_drawn_and_counted(fit, figures):
     angles = np.concatenate([one.get_xdata() for one in phases.lines if one.get_marker() == "o"])
     assert 55 < np.abs(angles).max() < 64
     outside = 100 * np.mean(np.abs(fit.residuals) > 1.96)
-    assert f"{outside:.1f} % outside ±1.96" in spread.get_title(loc="left")
+    assert f"{outside:.1f} % outside ±1.96 σ" in spread.get_title(loc="left")
     assert f"rms {np.sqrt(np.mean(fit.residuals**2)):.2f}" in spread.get_title(loc="left")
     assert plot_data.fit_residuals(fit).level.min() == 1
 
