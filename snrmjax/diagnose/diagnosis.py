@@ -18,21 +18,22 @@ from snrmjax.diagnose.checks.verdict import (
     tolerated,
     unproved,
 )
-from snrmjax.diagnose.design.discriminating_test import Request, requested
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, requested
 from snrmjax.diagnose.misfit.amplitudes import UNSEEN, what_is_lost
 from snrmjax.diagnose.misfit.candidates import (
     CLOSE,
     SECOND_ORDER,
-    Candidate,
+    EffectCandidate,
     Scales,
     candidate,
     decide_by,
     only_by_calibration,
 )
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit, unfitted
+from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.locating import Located, located, own_power
-from snrmjax.diagnose.search.model_search import DETECTED, Named, Row, named
+from snrmjax.diagnose.search.model_search import DETECTED, FoundEffects, Row, named
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
@@ -74,7 +75,7 @@ class Diagnosis:
     notes: tuple[str, ...]
     table: tuple[tuple[Row, ...], ...]
     completed: Structure
-    request: Request | None  # the measurement of `decide_by`, where one was weighed
+    request: DiscriminatingTest | None  # the measurement of `decide_by`, where one was weighed
     blind: dict[int, Structure]  # completed without having seen a level
     force_gain: float  # acting force over recorded one, where a gain was free; else 1
     rows: Int[np.ndarray, " state"]  # of the data, that were used
@@ -105,7 +106,7 @@ def diagnose_model(
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
     """
-    predictions = Predictions(model, data, force_gain_std)
+    predictions = predictions_of(model, data, force_gain_std)
     n_states = len(predictions.chosen.rows)
     unknown = predictions.chosen.phase_unknown[:, 0]
     if 2 * n_states - unknown.sum() < 2 * _LEAST_STATES:
@@ -122,9 +123,9 @@ def diagnose_model(
         model, note = with_levels_as_found(model, data)
         if note:
             notes.append(note)
-            predictions = Predictions(model, data, force_gain_std)
-    bench = Bench(predictions)
-    if not np.isfinite(bench.base).all():
+            predictions = predictions_of(model, data, force_gain_std)
+    misfit = weighted_misfit(predictions)
+    if not np.isfinite(misfit.base).all():
         raise ValueError(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
@@ -139,22 +140,22 @@ def diagnose_model(
         present |= set(UNSEEN)
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
     if predictions.chosen.noise_stated:
-        found = named(bench, scales, kinds)
+        found = named(misfit, scales, kinds)
     else:
-        found, size = _named_and_noise(predictions, bench, scales, kinds)
+        found, size = _named_and_noise(predictions, misfit, scales, kinds)
         notes.append(
             f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
             "radian are taken, which is what the answer leaves; how well it fits is no proof then."
         )
-    bench, fit = found.bench.turned(found.fit), found.fit
-    free = located(bench, found.nothing)
-    noise, noise_std = neighbour_noise(bench, fit)
+    misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
+    free = located(misfit, found.nothing)
+    noise, noise_std = neighbour_noise(misfit, fit)
     verdict, reasons = judged(found, noise, noise_std)
     open_ends: list[Doubt] = []
     if verdict in ("named", "ambiguous"):
-        both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(bench, fit, kind))
+        both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind))
         part = part_of(fit.kinds)
-        power = own_power(bench, found.nothing, fit, part) if part else None
+        power = own_power(misfit, found.nothing, fit, part) if part else None
         feeding = frozenset(k for k in fit.kinds if k in GROWING and fit.of_kind(k)[0] < 0)
         orders = predictions.chosen.orders
         stepped = np.asarray(predictions.chosen.states.frequency)
@@ -163,15 +164,15 @@ def diagnose_model(
     if open_ends:
         verdict = "unknown" if any(doubt.refutes for doubt in open_ends) else "ambiguous"
         reasons = [doubt.reason for doubt in open_ends]
-    values, own = _values(bench, fit), bench.baseline(fit)
+    values, own = _values(misfit, fit), misfit.baseline_parameters(fit.rows)
     n_levels = predictions.chosen.n_levels
     inner = outer = None
     blind = {}
     if n_levels > 2:
-        order = _by_amplitude(bench)
+        order = _by_amplitude(misfit)
         places = (order[n_levels // 2], order[-1])
         inner, outer = (
-            held_out(bench, found.nothing, fit, place, tolerated(noise)) for place in places
+            held_out(misfit, found.nothing, fit, place, tolerated(noise)) for place in places
         )
         missed = not_foretold(
             inner,
@@ -187,7 +188,7 @@ def diagnose_model(
             verdict, reasons = "ambiguous", [*reasons, open_end.reason]
             open_ends.append(open_end)
         for place in places if fit.kinds else ():
-            unseen = without_level(bench, fit, place)
+            unseen = without_level(misfit, fit, place)
             mine = dict(zip(fit.labels, unseen.values.tolist(), strict=True))
             blind[unseen.level] = _completed(model, unseen.baseline, fit.kinds, mine)
     elif n_levels < 3:
@@ -195,9 +196,9 @@ def diagnose_model(
             f"{n_levels} level{'s' if n_levels > 1 else ''} only: nothing can be held out to prove "
             "the answer."
         )
-    chosen = bench.predictions.chosen
+    chosen = misfit.predictions.chosen
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
-    lost = what_is_lost(chosen, phase, bench.level_numbers)
+    lost = what_is_lost(chosen, phase, misfit.level_numbers)
     notes = [*reasons, *notes, *lost, *predictions.chosen.notes]
     shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
     if abs(shift) > _ANOTHER:
@@ -207,7 +208,7 @@ def diagnose_model(
         )
     # Without phases the first thing to measure is these.
     request = _request(found) if verdict == "ambiguous" and not unknown.any() else None
-    force = bench.weighing.column < 2
+    force = misfit.noise.column < 2
     best = {name: value for name, (value, _) in values.items()}
     return Diagnosis(
         verdict=verdict,
@@ -216,8 +217,8 @@ def diagnose_model(
         decide_by=_decide_by(found, request, open_ends, phases=not unknown.any()),
         located=free.parts,
         parameters=values,
-        gap=Gap(gap(bench, found.nothing), gap(bench, fit), inner, outer),
-        detection_limits=_limits(bench, fit, scales, present),
+        gap=Gap(gap(misfit, found.nothing), gap(misfit, fit), inner, outer),
+        detection_limits=_limits(misfit, fit, scales, present),
         p_value=found.p_value,
         noise_scale=float(np.sqrt(noise)),
         notes=tuple(notes),
@@ -225,40 +226,40 @@ def diagnose_model(
         completed=_completed(model if fit.kinds else given, own, fit.kinds, best),
         request=request,
         blind=blind,
-        force_gain=_force_gain(bench, fit),
-        rows=predictions.chosen.rows[np.unique(bench.weighing.state[force])],
+        force_gain=_force_gain(misfit, fit),
+        rows=predictions.chosen.rows[np.unique(misfit.noise.state[force])],
         sensor=predictions.chosen.sensors[0],
-        before=_of_force(bench, found.nothing),
-        after=_of_force(bench, fit),
+        before=_of_force(misfit, found.nothing),
+        after=_of_force(misfit, fit),
     )
 
 
 def _named_and_noise(
-    predictions: Predictions, bench: Bench, scales: Scales, kinds: tuple[str, ...]
-) -> tuple[Named, float]:
+    predictions: Predictions, misfit: WeightedMisfit, scales: Scales, kinds: tuple[str, ...]
+) -> tuple[FoundEffects, float]:
     """What is missing, with noise as large as what is left; its size over the assumed one.
 
     It begins with what no free curves of amplitude explain, and is never below what neighbouring
     states show.
     """
-    nothing = bench.nothing()
-    least = max(float(np.sqrt(neighbour_noise(bench.turned(nothing), nothing)[0])), _FINEST)
-    predictions.scale_errors(least)
-    bench = Bench(predictions)
-    free = located(bench, bench.nothing())
+    nothing = baseline_fit(misfit)
+    least = max(float(np.sqrt(neighbour_noise(at_phases_of(misfit, nothing), nothing)[0])), _FINEST)
+    predictions = predictions.with_errors_scaled(least)
+    misfit = weighted_misfit(predictions)
+    free = located(misfit, baseline_fit(misfit))
     factor = float(np.sqrt(max(free.chi_square / max(free.freedom, 1), 1.0)))
     size = least
     for _ in range(_TURNS):
-        predictions.scale_errors(factor)
+        predictions = predictions.with_errors_scaled(factor)
         size *= factor
-        found = named(Bench(predictions), scales, kinds)
-        factor = max(gap(found.bench, found.fit), least / size)
+        found = named(weighted_misfit(predictions), scales, kinds)
+        factor = max(gap(found.misfit, found.fit), least / size)
         if factor > _NEAR:
             break
     return found, size
 
 
-def _request(found: Named) -> Request | None:
+def _request(found: FoundEffects) -> DiscriminatingTest | None:
     """The measurement that would settle the classes of several effects."""
     open_places = [k for k, group in enumerate(found.classes) if len(group) > 1]
     places = tuple(
@@ -271,15 +272,15 @@ def _request(found: Named) -> Request | None:
     request = requested(found, places) if places else None
     if request is not None:
         return request._replace(calibration_too=too)
-    return Request("calibration", decide_by(unclear, harmonics=True)) if too else None
+    return DiscriminatingTest("calibration", decide_by(unclear, harmonics=True)) if too else None
 
 
 def _decide_by(
-    found: Named, request: Request | None, open_ends: list[Doubt], *, phases: bool
+    found: FoundEffects, request: DiscriminatingTest | None, open_ends: list[Doubt], *, phases: bool
 ) -> str | None:
     """What would settle it, in words: of the classes, and of the doubts."""
     groups = [set(group) for group in found.classes if len(group) > 1]
-    harmonics = bool(found.bench.predictions.chosen.orders)
+    harmonics = bool(found.misfit.predictions.chosen.orders)
     sentences = []
     if groups and not phases:
         sentences.append("Record the phase of the velocity relative to the force.")
@@ -298,33 +299,33 @@ def _decide_by(
     return " ".join(sentences) or None
 
 
-def _by_amplitude(bench: Bench) -> list[int]:
+def _by_amplitude(misfit: WeightedMisfit) -> list[int]:
     """Levels from the smallest to the largest velocity."""
-    level = np.asarray(bench.predictions.chosen.states.level)
-    speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
-    peak = [speed[level == k].max() for k in range(bench.predictions.chosen.n_levels)]
+    level = np.asarray(misfit.predictions.chosen.states.level)
+    speed = np.abs(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
+    peak = [speed[level == k].max() for k in range(misfit.predictions.chosen.n_levels)]
     return [int(k) for k in np.argsort(peak)]
 
 
-def _of_force(bench: Bench, fit: Fit) -> Float[np.ndarray, "state part"]:
+def _of_force(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, "state part"]:
     """What is left of the force, in its two parts or one."""
-    weighing, chosen = bench.weighing, bench.predictions.chosen
-    mine = weighing.column < 2
+    noise, chosen = misfit.noise, misfit.predictions.chosen
+    mine = noise.column < 2
     left = np.full((len(chosen.rows), 2), np.nan)
-    left[weighing.state[mine], weighing.column[mine]] = weighing.without_shared(fit.rows)[mine]
-    return left[np.unique(weighing.state[mine])]
+    left[noise.state[mine], noise.column[mine]] = noise.without_shared(fit.rows)[mine]
+    return left[np.unique(noise.state[mine])]
 
 
-def _force_gain(bench: Bench, fit: Fit) -> float:
+def _force_gain(misfit: WeightedMisfit, fit: EffectFit) -> float:
     """Acting force over recorded one, as the data put it where it is unknown."""
-    std, place = bench.predictions.force_gain_std, len(bench.predictions.stated)
-    return 1 + std * float(bench.weighing.likeliest(fit.rows)[place]) if std > 0 else 1.0
+    std, place = misfit.predictions.force_gain_std, len(misfit.predictions.stated)
+    return 1 + std * float(misfit.noise.shared_errors(fit.rows)[place]) if std > 0 else 1.0
 
 
-def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:
+def _values(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, tuple[float, float]]:
     if not fit.labels:
         return {}
-    arms = bench.weighing.decorrelated(fit.slopes.T).T
+    arms = misfit.noise.decorrelated(fit.slopes.T).T
     size = np.linalg.norm(arms, axis=0)
     size = np.where(size > 0, size, 1.0)
     inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-12, hermitian=True)
@@ -335,34 +336,36 @@ def _values(bench: Bench, fit: Fit) -> dict[str, tuple[float, float]]:
     }
 
 
-def _limits(bench: Bench, fit: Fit, scales: Scales, present: set[str]) -> dict[str, float]:
+def _limits(
+    misfit: WeightedMisfit, fit: EffectFit, scales: Scales, present: set[str]
+) -> dict[str, float]:
     """The size of every effect that would have been seen beside what was found."""
     limits = {}
     for kind in EFFECTS:
         if kind in present or kind in fit.kinds or kind == CLOSE:
             continue
         tried = candidate(kind, scales)
-        change = bench.change(tried)
-        square = bench.chi_square(change)
+        change = misfit.first_change(tried)
+        square = misfit.chi_square(change)
         if not square > 0:
             continue
-        need = DETECTED + len(tried.unit) * np.log(bench.n_rows)
-        power = 4 if kind in SECOND_ORDER and not bench.predictions.chosen.orders else 2
+        need = DETECTED + len(tried.unit) * np.log(misfit.n_rows)
+        power = 4 if kind in SECOND_ORDER and not misfit.predictions.chosen.orders else 2
         name = f"{kind}.{effect_parameters(kind)[0]}"
         limit = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
-        limits[name] = _tried(bench, tried, limit, need)
+        limits[name] = _tried(misfit, tried, limit, need)
     return limits
 
 
-def _tried(bench: Bench, one: Candidate, limit: float, need: float) -> float:
+def _tried(misfit: WeightedMisfit, one: EffectCandidate, limit: float, need: float) -> float:
     """A limit as trials at it correct it where sizes are compared: they are not linear in it."""
-    if not bench.predictions.sizes.alone.any():
+    if not misfit.predictions.sizes.alone.any():
         return limit
     first, *shape = one.starts[0]
     for _ in range(_TRIALS):
         start = (float(np.copysign(limit, first)), *shape)
-        rows = bench.at_start(one._replace(starts=(start,))).rows
-        square = bench.chi_square(rows - bench.base)
+        rows = unfitted(misfit, one._replace(starts=(start,))).rows
+        square = misfit.chi_square(rows - misfit.base)
         if not 0 < square < np.inf:
             break
         # χ² grows with a power between the second and the fourth.

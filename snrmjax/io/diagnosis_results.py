@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from snrmjax.diagnose.design.discriminating_test import Request
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis import Diagnosis
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
@@ -81,7 +81,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
     }
 
 
-def _request(request: Request | None) -> dict | None:
+def _request(request: DiscriminatingTest | None) -> dict | None:
     if request is None:
         return None
     return {

@@ -24,8 +24,14 @@ import snrmjax as sj
 from snrmjax.diagnose.checks.cross_validation import held_out
 from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways, even_share
 from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.effect_fit import Bench
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.effect_fit import (
+    baseline_fit,
+    fit_effect,
+    unfitted,
+    with_errors_passed_on,
+)
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.response_prediction import (
     level_forces,
     measured_resonance,
@@ -154,10 +160,10 @@ def test_an_imitation_that_misses_the_level_left_out_is_no_answer():
 
 
 def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(monkeypatch):
-    predictions = Predictions(linear_model(), balanced(quadratic))
+    predictions = predictions_of(linear_model(), balanced(quadratic))
     one = candidate("cubic_damping", scales_of(predictions))
-    usual = Bench(predictions).change(one)
-    whole = Bench._predicted
+    usual = weighted_misfit(predictions).change(one)
+    whole = WeightedMisfit.predicted
 
     def only_weak(self, group, labels, values, *, slopes):
         found = whole(self, group, labels, values, slopes=slopes)
@@ -165,46 +171,51 @@ def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(mo
             columns=np.where(values[0, 0] > 0.5 * one.unit[0], np.nan, 1) * found[0]
         )
 
-    bench = Bench(predictions)
-    monkeypatch.setattr(Bench, "_predicted", only_weak)
+    misfit = weighted_misfit(predictions)
+    monkeypatch.setattr(WeightedMisfit, "predicted", only_weak)
     # A force of first order: what is left is what its harmonics do to each other.
-    np.testing.assert_allclose(bench.change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max())
+    np.testing.assert_allclose(
+        misfit.first_change(one), usual, rtol=0, atol=5e-3 * np.abs(usual).max()
+    )
 
 
 def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
-    predictions = Predictions(linear_model(), balanced(quadratic))
-    one, bench = candidate("quadratic_damping", scales_of(predictions)), Bench(predictions)
-    best = bench.fitted(one)
-    std = 1 / np.linalg.norm(bench.weighing.decorrelated(best.slopes[:, 0]))
+    predictions = predictions_of(linear_model(), balanced(quadratic))
+    one, misfit = (
+        candidate("quadratic_damping", scales_of(predictions)),
+        weighted_misfit(predictions),
+    )
+    best = fit_effect(misfit, one)
+    std = 1 / np.linalg.norm(misfit.noise.decorrelated(best.slopes[:, 0]))
     looked = []
-    whole = Bench._evaluated
+    whole = WeightedMisfit.evaluated
 
     def counted(self, group, labels, values):
         looked.append(len(values))
         return whole(self, group, labels, values)
 
-    monkeypatch.setattr(Bench, "_evaluated", counted)
+    monkeypatch.setattr(WeightedMisfit, "evaluated", counted)
     # 0.1σ off, χ² is 0.01 above its least: less than what ends a fit.
-    again = bench.fitted(one._replace(starts=((best.values[0] + 0.1 * std,),)))
+    again = fit_effect(misfit, one._replace(starts=((best.values[0] + 0.1 * std,),)))
     assert looked == [1]
     # Of the step Marquardt's damping leaves a hundredth: 1e-3σ, and 1e-4 of what χ² was above.
     assert again.values[0] == pytest.approx(best.values[0], abs=5e-3 * std)
     assert again.chi_square == pytest.approx(best.chi_square, abs=1e-4)
     # 1σ off it is looked at.
-    bench.fitted(one._replace(starts=((best.values[0] + std,),)))
+    fit_effect(misfit, one._replace(starts=((best.values[0] + std,),)))
     assert len(looked) > 2
 
 
 def test_damping_of_one_direction_shows_in_harmonic_2():
     model, data = files("blind_15")
-    scales = scales_of(Predictions(model, data))
-    found = named(Bench(Predictions(model, data)), scales, ("quadratic_damping",))
+    scales = scales_of(predictions_of(model, data))
+    found = named(weighted_misfit(predictions_of(model, data)), scales, ("quadratic_damping",))
     assert KEYS["blind_15"]["outside"] == "asymmetric_damping"
     # It acts in one direction only: even and odd part are equal.
-    share, std = even_share(found.bench, found.fit, "quadratic_damping")
+    share, std = even_share(found.misfit, found.fit, "quadratic_damping")
     assert share == pytest.approx(1.0, abs=3 * std)
     assert std < 0.3
-    assert not acts_both_ways(found.bench, found.fit, "quadratic_damping")
+    assert not acts_both_ways(found.misfit, found.fit, "quadratic_damping")
 
 
 CLOSE = {"modal_constant": 0.3, "frequency_hz": 1.03 * OMEGA / (2 * np.pi), "damping_ratio": 0.01}
@@ -252,7 +263,7 @@ def test_what_is_kept_beside_a_mode_close_by_is_chosen_anew():
 
 
 def test_a_model_without_damping_may_have_a_mode_close_by():
-    scales = scales_of(Predictions(linear_model(damping=0.0), balanced(quadratic)))
+    scales = scales_of(predictions_of(linear_model(damping=0.0), balanced(quadratic)))
     one = candidate("close_mode", scales)
     values = np.array(one.starts)
     assert np.all(np.isfinite(values))
@@ -314,11 +325,11 @@ def test_too_few_states_and_a_model_of_something_else_are_said():
 
 
 def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
-    predictions = Predictions(linear_model(), balanced(lambda v: 0.0 * v))
-    bench = Bench(predictions)
+    predictions = predictions_of(linear_model(), balanced(lambda v: 0.0 * v))
+    misfit = weighted_misfit(predictions)
     turned = candidate("sensor_phase_error", scales_of(predictions))
-    fit = bench.at_start(turned._replace(starts=((10.0,),)))
-    own, other = bench._slopes, bench.reweighed(fit)._slopes
+    fit = unfitted(misfit, turned._replace(starts=((10.0,),)))
+    own, other = misfit._slopes, with_errors_passed_on(misfit, fit)._slopes
     before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
     # The motion is the recorded one turned back by 10°, and so is the force that it needs. Slopes
     # are differences over 2.5e-6 of a parameter: 1e-5 of each is 2.5e-11 of the force.
@@ -375,7 +386,7 @@ def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, 
     """It could be all that is seen: the measured suspended beam then had a gain of 5e-6 N/V."""
     kinds = []
 
-    def noted(bench, scales, some):
+    def noted(misfit, scales, some):
         kinds.extend(some)
         raise InterruptedError
 
@@ -391,17 +402,17 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
     data = balanced(quadratic)
     precise = {name: 1e-3 * getattr(data, name) for name in ("velocity_std", "force_std")}
     data = dataclasses.replace(data, phase_std=1e-3 * data.phase_std, **precise)
-    bench = Bench(Predictions(linear_model(), data, 1.0))
-    nothing, shared = bench.nothing(), bench.weighing.shared
-    out = np.asarray(data.level)[bench.weighing.state] == 2
+    misfit = weighted_misfit(predictions_of(linear_model(), data, 1.0))
+    nothing, shared = baseline_fit(misfit), misfit.noise.shared
+    out = np.asarray(data.level)[misfit.noise.state] == 2
     system = np.vstack([shared[~out], np.eye(shared.shape[1])])
     told, triangle = np.linalg.qr(system)
-    common = np.linalg.solve(triangle, told[: (~out).sum()].T @ bench.base[~out])
-    left = bench.base[out] - shared[out] @ common
+    common = np.linalg.solve(triangle, told[: (~out).sum()].T @ misfit.base[~out])
+    left = misfit.base[out] - shared[out] @ common
     spread = np.linalg.solve(triangle.T, shared[out].T).T
     inner = np.linalg.qr(np.vstack([spread.T, np.eye(len(left))]), mode="r")
     expected = np.linalg.norm(np.linalg.solve(inner.T, left)) / np.sqrt(len(left))
-    found = held_out(bench, nothing, nothing, 2)
+    found = held_out(misfit, nothing, nothing, 2)
     assert found.after == found.before == pytest.approx(expected, rel=1e-4)
 
 

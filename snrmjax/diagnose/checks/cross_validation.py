@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import solve_triangular
 
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit, unlikely
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 
 class HeldOut(NamedTuple):
@@ -19,23 +21,25 @@ class HeldOut(NamedTuple):
     uncertain_p_value: float  # by noise and what the other levels leave open of the parameters
 
 
-def held_out(bench: Bench, nothing: Fit, fit: Fit, level: int, noise: float = 1.0) -> HeldOut:
+def held_out(
+    misfit: WeightedMisfit, nothing: EffectFit, fit: EffectFit, level: int, noise: float = 1.0
+) -> HeldOut:
     """Fit to the other levels alone, and compare with the one left out.
 
     The misfit is that of the level given the others: what it shares with them through the
     baseline's stated errors is foretold too; its own gain and phase are not. `noise` is the
     variance over the stated one for which probabilities are given.
     """
-    out = _rows_of(bench, level)
+    out = _rows_of(misfit, level)
     n_out = int(out.sum())
-    before, _ = _foretold(bench, nothing, out)
-    after, open_too = _foretold(bench, fit, out)
+    before, _ = _foretold(misfit, nothing, out)
+    after, open_too = _foretold(misfit, fit, out)
     return HeldOut(
-        int(bench.level_numbers[level]),
+        int(misfit.level_numbers[level]),
         float(np.sqrt(before / n_out)),
         float(np.sqrt(after / n_out)),
-        unlikely(after / noise, n_out),
-        unlikely(open_too / noise, n_out),
+        chi_square_p_value(after / noise, n_out),
+        chi_square_p_value(open_too / noise, n_out),
     )
 
 
@@ -47,27 +51,27 @@ class Unseen(NamedTuple):
     baseline: dict[str, float]
 
 
-def without_level(bench: Bench, fit: Fit, level: int) -> Unseen:
+def without_level(misfit: WeightedMisfit, fit: EffectFit, level: int) -> Unseen:
     """One step from the whole fit to the best one without a level's rows."""
-    kept = ~_rows_of(bench, level)
-    change, rows, _ = _refitted(bench, fit, kept)
+    kept = ~_rows_of(misfit, level)
+    change, rows, _ = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
-    number = int(bench.level_numbers[level])
-    return Unseen(number, values, bench.baseline(fit._replace(rows=rows), kept))
+    number = int(misfit.level_numbers[level])
+    return Unseen(number, values, misfit.baseline_parameters(rows, kept))
 
 
-def gap(bench: Bench, fit: Fit) -> float:
+def gap(misfit: WeightedMisfit, fit: EffectFit) -> float:
     """Root-mean-square misfit of all rows in units of noise."""
-    return float(np.sqrt(bench.chi_square(fit.rows) / bench.n_rows))
+    return float(np.sqrt(misfit.chi_square(fit.rows) / misfit.n_rows))
 
 
-def _rows_of(bench: Bench, level: int) -> Bool[np.ndarray, " row"]:
-    levels = np.asarray(bench.predictions.chosen.states.level)
-    return np.asarray(levels[bench.weighing.state] == level)
+def _rows_of(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"]:
+    levels = np.asarray(misfit.predictions.chosen.states.level)
+    return np.asarray(levels[misfit.noise.state] == level)
 
 
 def _refitted(
-    bench: Bench, fit: Fit, kept: Bool[np.ndarray, " row"]
+    misfit: WeightedMisfit, fit: EffectFit, kept: Bool[np.ndarray, " row"]
 ) -> tuple[
     Float[np.ndarray, " parameter"], Float[np.ndarray, " row"], Float[np.ndarray, "row any"]
 ]:
@@ -78,7 +82,7 @@ def _refitted(
     slopes = fit.slopes
     if not slopes.shape[1]:
         return np.zeros(0), fit.rows, slopes
-    lower = bench.weighing.of_rows(kept)
+    lower = misfit.noise.of_rows(kept)
     size = np.linalg.norm(slopes, axis=0)
     size = np.where(size > 0, size, 1.0)
     scaled = slopes / size
@@ -92,13 +96,15 @@ def _refitted(
     return change / size, fit.rows + scaled @ change, scaled @ root
 
 
-def _foretold(bench: Bench, fit: Fit, out: Bool[np.ndarray, " row"]) -> tuple[float, float]:
+def _foretold(
+    misfit: WeightedMisfit, fit: EffectFit, out: Bool[np.ndarray, " row"]
+) -> tuple[float, float]:
     """χ² of rows left out, with the fitted parameters taken as known and as uncertain.
 
     By one factor of the covariance with the rows left out last, where nothing large cancels.
     """
-    _, rows, root = _refitted(bench, fit, ~out)
-    shared, n_out = bench.weighing.shared, int(out.sum())
+    _, rows, root = _refitted(misfit, fit, ~out)
+    shared, n_out = misfit.noise.shared, int(out.sum())
     last = np.argsort(out, kind="stable")
     lower = np.linalg.cholesky(np.eye(len(shared)) + shared[last] @ shared[last].T)
     left, spread = (

@@ -3,32 +3,33 @@
 import numpy as np
 
 from snrmjax.diagnose.checks.doubts import DIRECTED
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 _EXCLUDED = 2.0  # 1σ from the even part that a damping of one direction has
 _SEEN = 3.0  # 1σ of an even part that is there
 
 
-def acts_both_ways(bench: Bench, fit: Fit, kind: str) -> bool:
+def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
     """Whether harmonic 2 excludes that a damping acts in one direction only.
 
     Where it does, its force c|q̇|ⁿ⁻¹q̇ has an even part c|q̇|ⁿ beside it (n = 2 or 3).
     """
-    chosen = bench.predictions.chosen
+    chosen = misfit.predictions.chosen
     if kind not in DIRECTED or 2 not in chosen.orders or chosen.phase_unknown.any():
         return False
-    share, std = even_share(bench, fit, kind)
+    share, std = even_share(misfit, fit, kind)
     return abs(share) < _SEEN * std and abs(share) + _EXCLUDED * std < 1
 
 
-def even_share(bench: Bench, fit: Fit, kind: str) -> tuple[float, float]:
+def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float, float]:
     """The even part of a damping over its odd one as harmonic 2 shows it, and 1σ.
 
     To first order, (ω₀² − 4Ω² + 4iζω₀Ω) X₂ = −c V²/2 for c|q̇|², and 0.509 c|V|V² for c|q̇|³ on
     the right-hand side, with the modal velocity V.
     """
-    states, modes = bench.predictions.chosen.states, bench.predictions.model.modes
-    j, sensors = modes.mode_of_interest, bench.predictions.chosen.sensors
+    states, modes = misfit.predictions.chosen.states, misfit.predictions.model.modes
+    j, sensors = modes.mode_of_interest, misfit.predictions.chosen.sensors
     shape = float(modes.mode_shape[sensors[0], j])
     own, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     omega = np.asarray(states.frequency)
@@ -40,14 +41,14 @@ def even_share(bench: Bench, fit: Fit, kind: str) -> tuple[float, float]:
         force = 0.509 * size * np.abs(velocity) * velocity**2
     answer = -force / (own**2 - 4 * omega**2 + 4j * ratio * own * omega)
     column = 2j * omega * shape * answer / np.abs(measured)
-    columns = np.zeros((1, *bench.weighing.known.shape))
-    place = 2 * (len(sensors) + bench.predictions.chosen.orders.index(2))
+    columns = np.zeros((1, *misfit.noise.known.shape))
+    place = 2 * (len(sensors) + misfit.predictions.chosen.orders.index(2))
     columns[0, :, place], columns[0, :, place + 1] = column.real, column.imag
-    arm = bench.weighing.decorrelated(bench.weighing.noise_units(columns)[0])
-    basis = np.linalg.qr(bench.weighing.decorrelated(fit.slopes.T).T)[0]
+    arm = misfit.noise.decorrelated(misfit.noise.noise_units(columns)[0])
+    basis = np.linalg.qr(misfit.noise.decorrelated(fit.slopes.T).T)[0]
     arm = arm - basis @ (basis.T @ arm)
     square = float(arm @ arm)
     if not square > 0:
         return 0.0, np.inf
-    left = bench.weighing.decorrelated(fit.rows)
+    left = misfit.noise.decorrelated(fit.rows)
     return -float(arm @ left) / square, 1 / float(np.sqrt(square))

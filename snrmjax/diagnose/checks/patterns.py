@@ -6,23 +6,28 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import fdtrc, ndtr
 
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 UNLIKELY = 1e-3
 _OF_AMPLITUDE, _OF_TEST = 6, 8  # knots of free curves
 _RESOLUTION = 1e-6  # of singular values: curves that an answer has already
 
 
-def pattern(bench: Bench, fit: Fit) -> str | None:
+def pattern(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     """Why what is left cannot be noise of any one size; None where it can."""
-    left = bench.weighing.without_shared(fit.rows)
-    for reason in (_by_level(bench, left), _by_direction(bench, left), _of_neighbours(bench, left)):
+    left = misfit.noise.without_shared(fit.rows)
+    for reason in (
+        _by_level(misfit, left),
+        _by_direction(misfit, left),
+        _of_neighbours(misfit, left),
+    ):
         if reason is not None:
             return reason
-    return left_curve(bench, fit)
+    return left_curve(misfit, fit)
 
 
-def left_curve(bench: Bench, fit: Fit) -> str | None:
+def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     """Which free curve still explains something beside an answer; None where chance does as much.
 
     Stiffness and damping may change with the amplitude as they like, and the stiffness with the
@@ -30,7 +35,7 @@ def left_curve(bench: Bench, fit: Fit) -> str | None:
     little of χ² and all of it in such a curve. The answer's own parameters stay free, and Fisher's
     ratio asks for no noise of the stated size.
     """
-    chosen, weighing = bench.predictions.chosen, bench.weighing
+    chosen, noise = misfit.predictions.chosen, misfit.noise
     if chosen.phase_unknown.any():
         return None  # sizes are not linear in a curve
     speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
@@ -42,13 +47,13 @@ def left_curve(bench: Bench, fit: Fit) -> str | None:
         ("the damping as a free function of the amplitude", 1, amplitude),
         ("a natural frequency that moves freely in the order of the test", 0, of_test),
     )
-    left = weighing.decorrelated(fit.rows)
-    own = _basis(weighing.decorrelated(fit.slopes.T).T)
+    left = noise.decorrelated(fit.rows)
+    own = _basis(noise.decorrelated(fit.slopes.T).T)
     found = []
     for name, part, hats in curves:
-        arms = weighing.decorrelated((bench.by_linear[:, [part]] * hats[weighing.state]).T).T
+        arms = noise.decorrelated((misfit.by_linear[:, [part]] * hats[noise.state]).T).T
         basis = _basis(np.concatenate([own, arms], axis=1))
-        n_free = bench.n_rows - basis.shape[1]
+        n_free = misfit.n_rows - basis.shape[1]
         n_own = basis.shape[1] - own.shape[1]
         rest = float(left @ left - np.sum((left @ basis) ** 2))
         gain = float(np.sum((left @ basis) ** 2) - np.sum((left @ own) ** 2))
@@ -64,10 +69,10 @@ def left_curve(bench: Bench, fit: Fit) -> str | None:
     )
 
 
-def _by_level(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
     """Misfits of one level, of the force or the harmonics, that are larger than elsewhere."""
-    level = np.asarray(bench.predictions.chosen.states.level)[bench.weighing.state]
-    of_force = bench.weighing.column < 2
+    level = np.asarray(misfit.predictions.chosen.states.level)[misfit.noise.state]
+    of_force = misfit.noise.column < 2
     groups = [
         (level == k) & (of_force == force) for k in np.unique(level) for force in (True, False)
     ]
@@ -75,7 +80,7 @@ def _by_level(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     for mine in groups:
         ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
         if fdtrc(mine.sum(), (~mine).sum(), ratio) < UNLIKELY / len(groups):
-            name = bench.level_numbers[int(level[mine][0])]
+            name = misfit.level_numbers[int(level[mine][0])]
             what = "the force" if of_force[mine][0] else "the harmonics"
             return (
                 f"what is left of {what} at level {name} is {np.sqrt(ratio):.2g} times as large as "
@@ -84,20 +89,20 @@ def _by_level(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     return None
 
 
-def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
     """Misfits of the force along what a natural frequency would do, larger than those across.
 
     Noise of one size is the same in every direction of whitened parts; a structure whose natural
     frequency is another one for every state, by its temperature for example, has one direction.
     """
-    weighing = bench.weighing
-    force = np.full((len(weighing.known), 2), np.nan)
+    noise = misfit.noise
+    force = np.full((len(noise.known), 2), np.nan)
     unit = np.full_like(force, np.nan)
-    mine = weighing.column < 2
-    force[weighing.state[mine], weighing.column[mine]] = left[mine]
-    unit[weighing.state[mine], weighing.column[mine]] = bench.by_linear[mine, 0]
+    mine = noise.column < 2
+    force[noise.state[mine], noise.column[mine]] = left[mine]
+    unit[noise.state[mine], noise.column[mine]] = misfit.by_linear[mine, 0]
     whole = np.isfinite(force).all(axis=1)
-    if not whole.any() or bench.predictions.chosen.phase_unknown.any():
+    if not whole.any() or misfit.predictions.chosen.phase_unknown.any():
         return None
     force, unit = force[whole], unit[whole]
     unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
@@ -113,10 +118,10 @@ def _by_direction(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
     )
 
 
-def _of_neighbours(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
+def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
     """Misfits that neighbours along a level share."""
     for of_test in (True, False):
-        parts = list(along(bench, left, of_test=of_test))
+        parts = list(along(misfit, left, of_test=of_test))
         number = sum(max(len(some) - 1, 0) for some in parts)
         if not number:
             continue
@@ -132,18 +137,18 @@ def _of_neighbours(bench: Bench, left: Float[np.ndarray, " row"]) -> str | None:
 
 
 def along(
-    bench: Bench, rows: Float[np.ndarray, " row"], *, of_test: bool = False
+    misfit: WeightedMisfit, rows: Float[np.ndarray, " row"], *, of_test: bool = False
 ) -> Iterator[Float[np.ndarray, " state"]]:
     """Rows of the force, level by level, along the resonance or in the order of the test.
 
     Along a resonance that bends over the phase of the velocity is what never turns back.
     """
-    weighing, chosen = bench.weighing, bench.predictions.chosen
+    noise, chosen = misfit.noise, misfit.predictions.chosen
     level = np.asarray(chosen.states.level)
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     for column in range(2):
-        mine = weighing.column == column
-        values, states = rows[mine], weighing.state[mine]
+        mine = noise.column == column
+        values, states = rows[mine], noise.state[mine]
         for number in range(chosen.n_levels):
             some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
             keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]

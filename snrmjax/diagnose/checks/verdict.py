@@ -11,8 +11,10 @@ from scipy.special import chdtr
 from snrmjax.diagnose.checks.cross_validation import HeldOut
 from snrmjax.diagnose.checks.doubts import Doubt
 from snrmjax.diagnose.checks.patterns import UNLIKELY, along, left_curve, pattern
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit, unlikely
-from snrmjax.diagnose.search.model_search import Named
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.model_search import FoundEffects
 
 _MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
 _MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
@@ -23,25 +25,25 @@ _WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
 _LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
 
 
-def neighbour_noise(bench: Bench, fit: Fit) -> tuple[float, float]:
+def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> tuple[float, float]:
     """Variance of the force's misfit as second differences along every level show it, and 1σ.
 
     What varies smoothly from state to state, explained or not, does not enter; what baseline and
     levels may have in common is taken out first. Where phases are those of the fit, which may be
     wrong, the order of the test counts too: noise is smooth in neither.
     """
-    left = bench.weighing.without_shared(fit.rows)
-    unsure = bench.predictions.chosen.phase_unknown.any()
-    return min(_scatter(bench, left, of_test=k) for k in ((False, True) if unsure else (False,)))
+    left = misfit.noise.without_shared(fit.rows)
+    unsure = misfit.predictions.chosen.phase_unknown.any()
+    return min(_scatter(misfit, left, of_test=k) for k in ((False, True) if unsure else (False,)))
 
 
 def _scatter(
-    bench: Bench, left: Float[np.ndarray, " row"], *, of_test: bool
+    misfit: WeightedMisfit, left: Float[np.ndarray, " row"], *, of_test: bool
 ) -> tuple[float, float]:
     """Variance from second differences in an order of the states, and 1σ."""
     squares = [
         (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
-        for some in along(bench, left, of_test=of_test)
+        for some in along(misfit, left, of_test=of_test)
         if len(some) > 2
     ]
     if not squares:
@@ -54,12 +56,12 @@ def _scatter(
     return value, value * float(np.sqrt(2 / (0.51 * len(every))))
 
 
-def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]]:
+def judged(found: FoundEffects, noise: float, noise_std: float) -> tuple[str, list[str]]:
     """Verdict and reasons from the fit; `noise` and 1σ are as neighbours show it."""
-    n = found.bench.n_rows - len(found.fit.values)
+    n = found.misfit.n_rows - len(found.fit.values)
     reduced = found.fit.chi_square / n
     too_good = float(chdtr(n, found.fit.chi_square))
-    stated = found.bench.predictions.chosen.noise_stated
+    stated = found.misfit.predictions.chosen.noise_stated
     if stated and too_good < UNLIKELY:
         return "noise_rejected", [
             f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
@@ -68,16 +70,16 @@ def judged(found: Named, noise: float, noise_std: float) -> tuple[str, list[str]
     misfit = found.p_value < UNLIKELY
     structure = curve = None
     if misfit:
-        structure = pattern(found.bench, found.fit)
+        structure = pattern(found.misfit, found.fit)
     elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
-        curve = left_curve(found.bench, found.fit)
+        curve = left_curve(found.misfit, found.fit)
     loud = noise - 1 > (0.5 if misfit else 1.0) * _WRONG_NOISE * noise_std
     if stated and loud and structure is None:
         return "noise_rejected", [
             f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
             "allows: it is understated; state it rightly before an effect is named."
         ]
-    if unlikely(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
+    if chi_square_p_value(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
         reasons = ["no effect of the library explains what is left."]
         if structure is not None:
             reasons.append(structure)

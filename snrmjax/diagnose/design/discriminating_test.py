@@ -20,9 +20,10 @@ from snrmjax.diagnose.design.further_states import (
     separation,
 )
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.predictions import Predicted
-from snrmjax.diagnose.search.model_search import AS_GOOD, Named
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
 
 STATES = 12
 """Of a level, or off resonance, that a request is for."""
@@ -38,7 +39,7 @@ _SEEN = 0.1  # of the larger of two harmonics, above which the smaller one has a
 _CLOSER, _FINEST = 3.0, 1e-4  # the steps in which less noise is asked for, and the end of it
 
 
-class Request(NamedTuple):
+class DiscriminatingTest(NamedTuple):
     """A measurement that is expected to settle what a diagnosis left open.
 
     What does not apply is None: a calibration has no level, and only harmonics have a noise that
@@ -77,7 +78,7 @@ class _Option(NamedTuple):
     floor: float | None  # m/s, that is asked for
 
 
-def requested(found: Named, places: tuple[int, ...]) -> Request | None:
+def requested(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTest | None:
     """The cheapest measurement that is expected to leave only what is true of some classes.
 
     Every member of a class at one of the `places` is taken for true in turn, further states are
@@ -86,21 +87,21 @@ def requested(found: Named, places: tuple[int, ...]) -> Request | None:
     with 95 % probability. Where nothing is enough, what comes nearest; None where no rival can be
     compared.
     """
-    bench = found.bench
-    speed = np.abs(np.asarray(bench.predictions.chosen.states.velocity)[:, 0])
-    floor = _floor(bench)
+    misfit = found.misfit
+    speed = np.abs(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
+    floor = _floor(misfit)
     ordinary = floor if floor is not None else _ORDINARY * float(speed.max())
     groups = [list(_rivals(found, place)) for place in places]
     every = [rival for group in groups for rival in group]
     tried = [(found.fit, every)]
     tried += [(truth, [found.fit, *group]) for group in groups for truth in group]
     hypotheses = [
-        _Hypothesis(bench, truth, [fit for fit in rivals if _can_be_told(truth, fit)], ordinary)
+        _Hypothesis(misfit, truth, [fit for fit in rivals if _can_be_told(truth, fit)], ordinary)
         for truth, rivals in tried
     ]
-    best: Request | None = None
+    best: DiscriminatingTest | None = None
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
-        worst: Request | None = None
+        worst: DiscriminatingTest | None = None
         for hypothesis in hypotheses if every else []:
             request = hypothesis.request(option)
             if request is not None and (worst is None or _share(request) < _share(worst)):
@@ -114,28 +115,28 @@ def requested(found: Named, places: tuple[int, ...]) -> Request | None:
     return best
 
 
-def _can_be_told(one: Fit, other: Fit) -> bool:
+def _can_be_told(one: EffectFit, other: EffectFit) -> bool:
     """Whether two answers are different ones that no calibration is needed for."""
     differ = set(one.kinds) ^ set(other.kinds)
     return bool(differ) and not only_by_calibration(differ)
 
 
-def _share(request: Request) -> float:
+def _share(request: DiscriminatingTest) -> float:
     return (request.expected_gain or 0.0) / (request.needed_gain or 1.0)
 
 
-def _floor(bench: Bench) -> float | None:
+def _floor(misfit: WeightedMisfit) -> float | None:
     """Noise of harmonics, m/s; None where none were measured."""
-    chosen = bench.predictions.chosen
+    chosen = misfit.predictions.chosen
     first = 2 * len(chosen.sensors)
     own = np.asarray(chosen.states.own_std)[:, first:] * np.sqrt(2)
     own = own * np.abs(np.asarray(chosen.states.velocity)[:, :1])
     return float(np.median(own[own > 0])) if np.any(own > 0) else None
 
 
-def _further(bench: Bench) -> tuple[Further, ...]:
+def _further(misfit: WeightedMisfit) -> tuple[Further, ...]:
     """The largest level as it is, both ends off resonance, a smaller level and larger ones."""
-    states = bench.predictions.chosen.states
+    states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
     peaks = [np.abs(velocity[level == k]).max() for k in range(level.max() + 1)]
     low, top = int(np.argmin(peaks)), int(np.argmax(peaks))
@@ -169,60 +170,64 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
         yield from (_Option("higher_level", p, HARMONICS, True, floor) for p in (4, 5))
 
 
-def _rivals(found: Named, place: int) -> Iterator[Fit]:
+def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
     """What the class at a place has beside the answer, as the table says that it fits."""
-    bench = found.bench
+    misfit = found.misfit
     for name in found.classes[place][1 : 1 + _RIVALS]:
         kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
         # One effect with more parameters may stand for two.
         fit = _from_table(found, kinds) or _from_table(found, {name})
-        columns = fit and predicted(bench.predictions, fit)
+        columns = fit and predicted(misfit.predictions, fit)
         if fit is None or columns is None:
             continue
-        rows = rows_of(bench, columns)
+        rows = rows_of(misfit, columns)
         if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
-            least = refitted(rows, bench.weighing.shared)
+            least = refitted(rows, misfit.noise.shared)
             yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
 
 
-def _from_table(found: Named, kinds: set[str]) -> Fit | None:
+def _from_table(found: FoundEffects, kinds: set[str]) -> EffectFit | None:
     """The last fit of some kinds that a table has, without its rows."""
     for row in (row for step in found.table[::-1] for row in step):
         if {label.partition(".")[0] for label in row.parameters} == kinds:
             values = np.array(list(row.parameters.values()))
             rows, slopes = np.zeros(0), np.zeros((0, len(values)))
             labels = tuple(row.parameters)
-            return Fit(tuple(kinds), labels, values, row.chi_square, rows, slopes, values, values)
+            return EffectFit(
+                tuple(kinds), labels, values, row.chi_square, rows, slopes, values, values
+            )
     return None
 
 
 class _Hypothesis:
     """One model that may be true, what it foretells of further states, and its rivals."""
 
-    def __init__(self, bench: Bench, truth: Fit, rivals: list[Fit], floor: float):
-        self.bench, self.truth, self.rivals = bench, truth, rivals
+    def __init__(
+        self, misfit: WeightedMisfit, truth: EffectFit, rivals: list[EffectFit], floor: float
+    ):
+        self.misfit, self.truth, self.rivals = misfit, truth, rivals
         self.floor = floor  # m/s, of harmonics where none is asked for
-        self.further = _further(bench)
+        self.further = _further(misfit)
 
     @cached_property
     def _foretold(self) -> dict[float, Foretold]:
         """By the noise of harmonics."""
-        first = foretold_states(self.bench, self.truth, self.further, self.floor)
+        first = foretold_states(self.misfit, self.truth, self.further, self.floor)
         return {self.floor: first}
 
     @cached_property
     def _predicted(self) -> list[Predicted | None]:
         """Of the truth, then of the rivals."""
-        predictions = self._foretold[self.floor].bench.predictions
+        predictions = self._foretold[self.floor].misfit.predictions
         return [predicted(predictions, fit) for fit in (self.truth, *self.rivals)]
 
     @cached_property
     def _measured(self) -> list[tuple[Rows, float]]:
         """Rows of the measured states, refitted, and the χ² that they leave: as `_predicted`."""
         rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
-        return [(one, refitted(one, self.bench.weighing.shared)) for one in rows]
+        return [(one, refitted(one, self.misfit.noise.shared)) for one in rows]
 
-    def request(self, option: _Option) -> Request | None:
+    def request(self, option: _Option) -> DiscriminatingTest | None:
         """What an option is expected to gain over the rival that it tells least well."""
         floor = self.floor if option.floor is None else option.floor
         if floor not in self._foretold:
@@ -232,14 +237,14 @@ class _Hypothesis:
         exact, *others = self._predicted
         if exact is None or not kept.any():
             return None
-        own = Compared(*self._measured[0], rows_of(foretold.bench, exact))
+        own = Compared(*self._measured[0], rows_of(foretold.misfit, exact))
         found = []
         for fit, before, columns in zip(self.rivals, self._measured[1:], others, strict=True):
             if columns is None:
                 continue
-            its = Compared(*before, rows_of(foretold.bench, columns))
-            gain = separation(self.bench, foretold.bench, own, its, kept)
-            n = self.bench.n_rows
+            its = Compared(*before, rows_of(foretold.misfit, columns))
+            gain = separation(self.misfit, foretold.misfit, own, its, kept)
+            n = self.misfit.n_rows
             needed = _needed(fit.criterion(n) - self.truth.criterion(n))
             said = _difference(foretold, (self.truth, exact), (fit, columns), option)
             found.append((gain, needed, *said))
@@ -248,11 +253,11 @@ class _Hypothesis:
         gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
         one = self.further[option.place]
         size = np.degrees(np.abs(one.phase))
-        request = Request(
+        request = DiscriminatingTest(
             kind=option.kind,
             sentence="",
             quantity=quantity,
-            level=int(self.bench.level_numbers[one.level]),
+            level=int(self.misfit.level_numbers[one.level]),
             force=foretold.force[option.place],
             frequency=foretold.frequency[option.place] / (2 * np.pi),
             states=len(one.phase),
@@ -267,13 +272,13 @@ class _Hypothesis:
         )
 
 
-def _place(request: Request, scale: float, foretold: Foretold, option: _Option) -> str:
+def _place(request: DiscriminatingTest, scale: float, foretold: Foretold, option: _Option) -> str:
     """Where and what to measure, in words."""
     at = f"near {request.frequency:.4g} Hz"
     level = f"level {request.level} ({request.force:.3g} N)"
     closely = ""
     if option.floor is not None:
-        velocity = np.asarray(foretold.bench.predictions.chosen.states.velocity)[:, 0]
+        velocity = np.asarray(foretold.misfit.predictions.chosen.states.velocity)[:, 0]
         largest = np.abs(velocity[foretold.rows_of[option.place]]).max()
         names = " and ".join(str(h) for h in option.orders)
         plural = "s" if len(option.orders) > 1 else ""
@@ -302,24 +307,24 @@ def _needed(ahead: float) -> float:
 
 
 def _rows(foretold: Foretold, option: _Option) -> Bool[np.ndarray, " row"]:
-    weighing = foretold.bench.weighing
-    mine = foretold.rows_of[option.place][weighing.state]
-    first = 2 * len(foretold.bench.predictions.chosen.sensors)
-    wanted = [weighing.column < 2] if option.of_force else []
+    noise = foretold.misfit.noise
+    mine = foretold.rows_of[option.place][noise.state]
+    first = 2 * len(foretold.misfit.predictions.chosen.sensors)
+    wanted = [noise.column < 2] if option.of_force else []
     for order in option.orders:
         at = first + 2 * HARMONICS.index(order)
-        wanted.append((weighing.column == at) | (weighing.column == at + 1))
+        wanted.append((noise.column == at) | (noise.column == at + 1))
     return mine & np.logical_or.reduce(wanted)
 
 
 def _difference(
     foretold: Foretold,
-    truth: tuple[Fit, Predicted],
-    rival: tuple[Fit, Predicted],
+    truth: tuple[EffectFit, Predicted],
+    rival: tuple[EffectFit, Predicted],
     option: _Option,
 ) -> tuple[str, str]:
     """In what two models differ most under an option, and by how much, in words."""
-    states = foretold.bench.predictions.chosen.states
+    states = foretold.misfit.predictions.chosen.states
     velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
     columns = rival[1].columns[0] - truth[1].columns[0]
     apart = columns[:, 0::2] + 1j * columns[:, 1::2]
@@ -335,7 +340,7 @@ def _difference(
     if option.floor is not None:
         places = [HARMONICS.index(h) for h in option.orders]
         own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
-        its = own + apart[at, [len(foretold.bench.predictions.chosen.sensors) + k for k in places]]
+        its = own + apart[at, [len(foretold.misfit.predictions.chosen.sensors) + k for k in places]]
         most = int(np.argmax(np.abs(own - its)))
         name = f"harmonic {option.orders[most]}"
         sizes = [f"{round(100 * abs(h[most]), 6):.2g} %" for h in (own, its)]
@@ -349,7 +354,7 @@ def _difference(
         share = 100 * float(np.abs(apart[mine, 0]).max())
         return "velocity", f"with {one} and {other} velocities differ by up to {share:.2g} %"
     # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
-    modes, j = foretold.bench.model.modes, foretold.bench.model.modes.mode_of_interest
+    modes, j = foretold.misfit.model.modes, foretold.misfit.model.modes.mode_of_interest
     slower = float(apart[at, 0].real)
     shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
     if abs(slower) / _RESOLVED["velocity"] > abs(shift) / _RESOLVED["frequency"]:

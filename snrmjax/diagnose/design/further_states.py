@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.linalg import solve_triangular
 
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
-from snrmjax.diagnose.misfit.predictions import Predicted, Predictions
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_errors_passed_on
+from snrmjax.diagnose.misfit.predictions import Predicted, Predictions, predictions_of
 from snrmjax.diagnose.misfit.programs import COMPARED
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.measure.states import SteadyStates, steady_states
 
 HARMONICS = COMPARED
@@ -28,7 +29,7 @@ class Further(NamedTuple):
 class Foretold(NamedTuple):
     """Further states as an answer foretells them, without noise."""
 
-    bench: Bench
+    misfit: WeightedMisfit
     rows_of: tuple[Bool[np.ndarray, " state"], ...]  # the states of every `Further`
     force: tuple[float, ...]  # N at resonance, of every `Further`
     frequency: tuple[float, ...]  # rad/s at resonance
@@ -36,21 +37,23 @@ class Foretold(NamedTuple):
 
     def with_floor(self, floor: float) -> "Foretold":
         """The same with another noise of harmonics."""
-        chosen = self.bench.predictions.chosen
+        chosen = self.misfit.predictions.chosen
         own = chosen.states.own_std * (floor / self.floor)
         states = chosen.states._replace(own_std=own)
-        bench = self.bench.with_errors(chosen._replace(states=states))
-        return self._replace(bench=bench, floor=floor)
+        misfit = self.misfit.with_states(chosen._replace(states=states))
+        return self._replace(misfit=misfit, floor=floor)
 
 
-def foretold_states(bench: Bench, fit: Fit, further: tuple[Further, ...], floor: float) -> Foretold:
+def foretold_states(
+    misfit: WeightedMisfit, fit: EffectFit, further: tuple[Further, ...], floor: float
+) -> Foretold:
     """Further states of the structure that a fit describes.
 
     A motion is held, as everywhere in a diagnosis, and its force follows: velocities of a level
     are scaled, and frequencies are moved to where the phase is the one wanted. Noise is that of the
     states measured, in the median; `floor` is that of harmonics, m/s.
     """
-    states = bench.predictions.chosen.states
+    states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
     speed, omega, member = [], [], []
     for number, one in enumerate(further):
@@ -63,29 +66,37 @@ def foretold_states(bench: Bench, fit: Fit, further: tuple[Further, ...], floor:
         member.append(np.full(len(one.phase), number))
     aim = np.concatenate([one.phase for one in further])
     size, at, whose = (np.concatenate(parts) for parts in (speed, omega, member))
-    modes, j = bench.model.modes, bench.model.modes.mode_of_interest
-    sensor = bench.predictions.chosen.sensors[0]
+    modes, j = misfit.model.modes, misfit.model.modes.mode_of_interest
+    sensor = misfit.predictions.chosen.sensors[0]
     unit = float(modes.mode_shape[sensor, j] * modes.participation[j])
-    data = _states(bench, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
-    force, _ = _needed(bench, fit, data)
+    data = _states(misfit, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    force, _ = _needed(misfit, fit, data)
     # The modal stiffness ω̃² − Ω² + iΩδ of the held motion, and Ω where tan φ is the one wanted.
     stiffness = unit * force / (np.exp(1j * aim) * size / (1j * at))
     half = 0.5 * stiffness.imag / at * np.tan(aim)
     square = stiffness.real + at**2 + half**2
     moved = np.sqrt(np.maximum(square, 0.0)) - half
     at = np.where(np.isfinite(moved) & (np.abs(moved / at - 1) < 0.5), moved, at)
-    data = _states(bench, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
-    force, harmonics = _needed(bench, fit, data)
+    data = _states(misfit, whose, at, np.exp(1j * aim) * size, np.ones(len(at)), None, floor)
+    force, harmonics = _needed(misfit, fit, data)
     good = np.isfinite(np.abs(force)) & np.all(np.isfinite(harmonics), axis=1)
     turn = np.exp(-1j * np.angle(force))
     seen = harmonics * turn[:, None] ** np.array(HARMONICS)
     own = np.exp(1j * aim) * size * turn
-    found = _states(bench, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor)
-    predictions = Predictions(bench.model, found, bench.predictions.force_gain_std)
+    found = _states(
+        misfit, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor
+    )
+    predictions = predictions_of(misfit.model, found, misfit.predictions.force_gain_std)
     rows = tuple(whose[good] == number for number in range(len(further)))
     ends = [_at_resonance(data=found, mine=mine, sensor=sensor) for mine in rows]
     force_at, frequency_at = zip(*ends, strict=True)
-    return Foretold(Bench(predictions).reweighed(fit), rows, force_at, frequency_at, floor)
+    return Foretold(
+        with_errors_passed_on(weighted_misfit(predictions), fit),
+        rows,
+        force_at,
+        frequency_at,
+        floor,
+    )
 
 
 def _at_resonance(
@@ -102,7 +113,7 @@ def _at_resonance(
 
 
 def _states(
-    bench: Bench,
+    misfit: WeightedMisfit,
     whose: Int[np.ndarray, " state"],
     omega: Float[np.ndarray, " state"],
     velocity: Complex[np.ndarray, " state"],
@@ -111,7 +122,7 @@ def _states(
     floor: float,
 ) -> SteadyStates:
     """States of the reference sensor with the noise of the measured ones."""
-    chosen, sensors = bench.predictions.chosen, bench.model.modes.sensors
+    chosen, sensors = misfit.predictions.chosen, misfit.model.modes.sensors
     n, sensor = len(omega), chosen.sensors[0]
     error = np.median(np.asarray(chosen.states.error), axis=0)
     alone = np.zeros((n, len(sensors)))
@@ -135,12 +146,12 @@ def _states(
 
 
 def _needed(
-    bench: Bench, fit: Fit, data: SteadyStates
+    misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
-    predictions = Predictions(bench.model, data)
+    predictions = predictions_of(misfit.model, data)
     group = predictions.group(max(fit.kinds, key=predictions.is_apart))
-    values, own = group.values.copy(), bench.baseline(fit)
+    values, own = group.values.copy(), misfit.baseline_parameters(fit.rows)
     for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
         values[group.place(name)] = value
     columns = predictions.of(group, values[None]).columns[0]
@@ -151,7 +162,7 @@ def _needed(
     return 1.0 + parts[:, 0], higher * np.abs(velocity)[:, None]
 
 
-def predicted(predictions: Predictions, fit: Fit) -> Predicted | None:
+def predicted(predictions: Predictions, fit: EffectFit) -> Predicted | None:
     """Columns of all states under a fit's parameters; None where no program has all its kinds."""
     group = predictions.group(max(fit.kinds, key=predictions.is_apart))
     if not set(fit.labels) <= set(group.names):
@@ -176,19 +187,19 @@ class Compared(NamedTuple):
     further: Rows
 
 
-def rows_of(bench: Bench, found: Predicted) -> Rows:
-    """Predictions of one trial in units of a bench's noise."""
-    slopes = bench.weighing.noise_units(np.moveaxis(found.slopes[0], 2, 0))
-    return Rows(bench.weighing.noise_units(found.columns)[0], slopes.T)
+def rows_of(misfit: WeightedMisfit, found: Predicted) -> Rows:
+    """Predictions of one trial in units of a misfit's noise."""
+    slopes = misfit.noise.noise_units(np.moveaxis(found.slopes[0], 2, 0))
+    return Rows(misfit.noise.noise_units(found.columns)[0], slopes.T)
 
 
 def together(
-    old: Bench, new: Bench, kept: Bool[np.ndarray, " row"]
+    old: WeightedMisfit, new: WeightedMisfit, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
     """What measured states and some rows of further ones share: the baseline, not their levels."""
     stated = sum(std > 0 for std in old.model.level_stds)
-    parts = old.weighing.shared, new.weighing.shared[kept]
-    own = [stated * bench.predictions.chosen.n_levels for bench in (old, new)]
+    parts = old.noise.shared, new.noise.shared[kept]
+    own = [stated * misfit.predictions.chosen.n_levels for misfit in (old, new)]
     common = [part[:, : part.shape[1] - n] for part, n in zip(parts, own, strict=True)]
     apart = [part[:, part.shape[1] - n :] for part, n in zip(parts, own, strict=True)]
     blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
@@ -218,8 +229,8 @@ def _least(rows: Rows, lower: Float[np.ndarray, "row row"]) -> float:
 
 
 def separation(
-    old: Bench,
-    new: Bench,
+    old: WeightedMisfit,
+    new: WeightedMisfit,
     truth: Compared,
     rival: Compared,
     kept: Bool[np.ndarray, " row"],

@@ -38,7 +38,7 @@ class Scales(NamedTuple):
         return _CHANGE * self.stiffness
 
 
-class Candidate(NamedTuple):
+class EffectCandidate(NamedTuple):
     """Starts of one kind of effect; parameters in the order of its constructor."""
 
     kind: str
@@ -130,7 +130,7 @@ _NOT_NEGATIVE = frozenset(
 )
 
 
-def candidate(kind: str, scales: Scales) -> Candidate:
+def candidate(kind: str, scales: Scales) -> EffectCandidate:
     """Starts, units and bounds of a kind of effect."""
     own = _STARTS[kind](scales) if kind in _STARTS else [_of_ones_own(kind, scales)]
     starts = tuple(tuple(float(v) for v in start) for start in own)
@@ -155,7 +155,7 @@ def candidate(kind: str, scales: Scales) -> Candidate:
         unit = (unit[0], 0.01 * unit[1], 0.5 * unit[2])
     if kind == CLOSE:
         unit = (unit[0], unit[2] * unit[1], 0.5 * unit[2])
-    return Candidate(kind, starts, unit, tuple(lower), tuple(upper))
+    return EffectCandidate(kind, starts, unit, tuple(lower), tuple(upper))
 
 
 def _of_ones_own(kind: str, scales: Scales) -> tuple[float, ...]:

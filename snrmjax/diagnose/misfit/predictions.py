@@ -4,7 +4,6 @@ Effects stand in a structure without strength, so that one program answers for m
 a candidate is a vector of parameters.
 """
 
-import copy
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
-from snrmjax.diagnose.misfit.amplitudes import sizes_of
+from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import Scales, candidate, parameter_labels
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
@@ -92,30 +91,21 @@ class Measured(NamedTuple):
         return self.chosen.states
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Predictions:
-    """Answers for one model and one set of data."""
+    """Predictions of one model for one set of data; `predictions_of` makes them."""
 
-    def __init__(self, model: Structure, data: SteadyStates, force_gain_std: float = 0.0):
-        # Its name would be a part of the programs.
-        self.model = dataclasses.replace(model, name="")
-        self.chosen = calibration_states(model, data, programs.HARMONICS)
-        self.sizes = sizes_of(self.chosen)
-        self.states, orders, self._own_columns = _widened(self.chosen)
-        self.held = (self.chosen.sensors, orders, programs.HARMONICS)
-        self.level_numbers = np.asarray(data.level)[self.chosen.rows]
-        self.force_gain_std = force_gain_std
-        numbers = parameter_values(self.model)
-        # What is stated of the baseline: numbers and their 1σ.
-        self.stated = {k: (numbers[k], std) for k, std in stated_stds(self.model).items()}
-        self._groups: dict[str, Group] = {}
-        found = by_blocks(self._baseline_motions, _GROWN, *self.states)
-        # Room for a power of two of states: few sizes compile.
-        room = [padded(rows) for rows in (*self.states, *found)]
-        arrays = jax.device_put(room)
-        self._stored = programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:])
-
-    def _baseline_motions(self, *rows: Array) -> tuple[Array, Array]:
-        return programs.grown(self.model, CalibrationStates(*rows), self.held)
+    model: Structure
+    chosen: ComparedColumns
+    sizes: Sizes
+    states: CalibrationStates  # with room for harmonics that were not measured
+    compared: programs.Compared
+    own_columns: Int[np.ndarray, " column"]  # those of `states` that the data have
+    level_numbers: Int[np.ndarray, " state"]
+    force_gain_std: float
+    stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
+    _stored: programs.Stored
+    _groups: dict[str, Group]  # those asked for so far
 
     def group(self, kind: str) -> Group:
         """The structure that has this kind of effect.
@@ -128,18 +118,18 @@ class Predictions:
             self._groups[key] = self._prepared([k for k in EFFECTS if k in _LIBRARY or k == kind])
         return self._groups[key]
 
-    def scale_errors(self, factor: float) -> None:
-        """Take all errors of force, velocities and phases so many times larger."""
+    def with_errors_scaled(self, factor: float) -> "Predictions":
+        """The same with all errors of force, velocities and phases so many times larger."""
         states = self.chosen.states
-        self.chosen = self.chosen._replace(states=states._replace(error=factor * states.error))
+        scaled = self.chosen._replace(states=states._replace(error=factor * states.error))
+        return dataclasses.replace(self, chosen=scaled)
 
-    def turned(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
+    def with_phases(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
         """The same with velocities of unknown phase at these phases, rad."""
         states, unknown = self.chosen.states, self.chosen.phase_unknown[:, :1]
         turn = np.where(unknown, np.exp(1j * phase)[:, None], 1.0)
-        other = copy.copy(self)
-        other.chosen = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
-        return other
+        turned = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
+        return dataclasses.replace(self, chosen=turned)
 
     def weighed(
         self,
@@ -194,7 +184,7 @@ class Predictions:
         length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
         own = np.clip(size, _LEAST * group.unit, group.unit)
         length = np.where(group.is_shape & (size > 0), own, length)[:, places]
-        steps = _Steps(places, length, np.zeros((self.states[6].shape[1], len(places))))
+        steps = _Steps(places, length, np.zeros((self.states.error.shape[1], len(places))))
         columns, slopes = self._in_turn(group, values, steps)
         slopes = slopes / length[:, None, None]
         force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
@@ -208,7 +198,7 @@ class Predictions:
 
         Returns the model's phasors too.
         """
-        inputs = self.states[6].shape[1]
+        inputs = self.states.error.shape[1]
         none = (np.full(inputs, -1), np.zeros((1, inputs)))
         steps = _Steps(*none, _ERROR * np.eye(inputs))
         columns, slopes = self._in_turn(group, values[None], steps)
@@ -238,7 +228,7 @@ class Predictions:
         used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
         active = np.zeros(group.force.max() + 1, dtype=bool)
         active[group.force[used & (group.force >= 0)]] = True
-        fixed = (group.model, group.names, self.held, len(self.model.effects))
+        fixed = (group.model, group.names, self.compared, len(self.model.effects))
         n, trials = len(self.chosen.rows), len(values)
         state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
 
@@ -252,7 +242,7 @@ class Predictions:
                 table = programs.Trials(*parts)
                 which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
                 found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
-                return [np.asarray(a)[: len(some), self._own_columns] for a in found]
+                return [np.asarray(a)[: len(some), self.own_columns] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))
             parts = over_cores(block, blocks)
@@ -269,6 +259,42 @@ class Predictions:
         return columns, slopes
 
 
+def predictions_of(
+    model: Structure, data: SteadyStates, force_gain_std: float = 0.0
+) -> Predictions:
+    """Predictions of a model for measured states, ready to be asked for.
+
+    The baseline's motions are found here. `force_gain_std` is the relative 1σ of a gain that all
+    forces share.
+    """
+    model = dataclasses.replace(model, name="")  # its name would be a part of the programs
+    chosen = calibration_states(model, data, programs.HARMONICS)
+    columns, orders, own_columns = _widened(chosen)
+    compared = programs.Compared(chosen.sensors, orders, programs.HARMONICS)
+
+    def motions(*rows: Array) -> tuple[Array, Array]:
+        return programs.grown(model, CalibrationStates(*rows), compared)
+
+    found = by_blocks(motions, _GROWN, *columns)
+    # Room for a power of two of states: few sizes compile.
+    arrays = jax.device_put([padded(rows) for rows in (*columns, *found)])
+    numbers = parameter_values(model)
+    every: list[Any] = columns
+    return Predictions(
+        model=model,
+        chosen=chosen,
+        sizes=sizes_of(chosen),
+        states=CalibrationStates(*every),
+        compared=compared,
+        own_columns=own_columns,
+        level_numbers=np.asarray(data.level)[chosen.rows],
+        force_gain_std=force_gain_std,
+        stated={name: (numbers[name], std) for name, std in stated_stds(model).items()},
+        _stored=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
+        _groups={},
+    )
+
+
 def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
     """The states as the programs take them, their harmonics, and which columns are the states' own.
 
@@ -281,15 +307,15 @@ def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...]
     harmonics = np.zeros((n, n_sensors, len(orders)), dtype=complex)
     harmonics[:, :, places] = chosen.states.harmonics
     first = n_sensors + len(orders) * np.arange(n_sensors)[:, None]
-    parts = np.append(np.arange(n_sensors), first + places)
-    columns = (2 * parts[:, None] + np.arange(2)).reshape(-1)
+    phasors = np.append(np.arange(n_sensors), first + places)
+    columns = (2 * phasors[:, None] + np.arange(2)).reshape(-1)
     wide = np.zeros((2, n, 2 * n_sensors * (1 + len(orders))))
     # Of a phasor whose size alone counts the programs give both parts.
     known = np.asarray(chosen.states.known)[:, ::2]
     wide[:, :, columns] = chosen.states.own_std, np.repeat(known, 2, axis=1)
     own = {"harmonics": harmonics, "own_std": wide[0], "known": wide[1] > 0}
-    states = (chosen.states._asdict() | own).values()
-    return [np.asarray(part) for part in states], orders, columns
+    parts = [np.asarray(a) for a in (chosen.states._asdict() | own).values()]
+    return parts, orders, columns
 
 
 def _filled(directions: np.ndarray) -> np.ndarray:

@@ -45,19 +45,26 @@ _SHARE = 1e-2  # of a slope's first step, below which the last one is
 _NOTHING = 1e-9  # relative difference of columns that solutions may have by chance
 _CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
 
-Held = tuple[tuple[int, ...], tuple[int, ...], int]
-"""The sensors (the reference first), the harmonics compared and the harmonics of a motion."""
+
+class Compared(NamedTuple):
+    """What of a motion is compared with the measured one, and with how many harmonics it moves."""
+
+    sensors: tuple[int, ...]  # the reference first
+    orders: tuple[int, ...]  # of the harmonics that are compared
+    harmonic_order: int  # of the motion
 
 
 @compiled
 def grown(
-    model: Structure, states: CalibrationStates, held: Held
+    model: Structure, states: CalibrationStates, compared: Compared
 ) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
     """Motions grown from small amplitudes, NaN where none was found, and inverse Jacobians."""
 
     def one(*row: Array) -> tuple[Array, Array]:
         state = CalibrationStates(*row)
-        motion = state_motion(model, state, state.velocity[0], held[0][0], held[2])
+        motion = state_motion(
+            model, state, state.velocity[0], compared.sensors[0], compared.harmonic_order
+        )
         point, jacobian = motion.grown_with_jacobian()
         return point, jnp.linalg.inv(jacobian)
 
@@ -85,7 +92,7 @@ class Trials(NamedTuple):
 def missed(
     model: Structure,
     names: tuple[str, ...],
-    held: Held,
+    compared: Compared,
     own: int,
     swings: bool,
     active: Bool[Array, " force"],
@@ -121,7 +128,7 @@ def missed(
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
             erring = StateWithErrors(measured, 1.0, trials.by_error @ along)
-            motion = erring.motion(changed, held[0][0], held[2])
+            motion = erring.motion(changed, compared.sensors[0], compared.harmonic_order)
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
             balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
             motion = dataclasses.replace(motion, balance=balance)
@@ -130,7 +137,7 @@ def missed(
             # Where the second motion is not found, the first step towards it is its slope.
             lost = (number > 0) & ~jnp.all(jnp.isfinite(end.point))
             point = jnp.where(lost, start.point + end.moves[0], end.point)
-            own_columns = residual_columns(erring, motion, point, *held[:2])
+            own_columns = residual_columns(erring, motion, point, compared.sensors, compared.orders)
             start = jax.tree.map(lambda a, b: jnp.where(number == 0, a, b), end, start)
             place = jnp.arange(n_directions + 1) == number
             return start, jnp.where(place, own_columns[:, None], columns)

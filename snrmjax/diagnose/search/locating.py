@@ -5,7 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit, unlikely
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
 _SEEN = 2.0  # 1σ of a free curve beyond which an amplitude belongs to the range
@@ -13,7 +16,7 @@ _P_VALUE = 1e-3
 _STEP = 0.01
 _POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
 _TELLING = 16.0  # of χ², that a power must explain before it is told
-_STEPS, _SETTLED = 30, 0.02  # of a fit of curves to sizes, and the change of χ² that ends it
+_RULE = StepRule(steps=30, settled=0.02)  # of a fit of curves to sizes
 _STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
@@ -37,36 +40,36 @@ class FreeFit(NamedTuple):
     @property
     def p_value(self) -> float:
         """Of what no function of amplitude explains."""
-        return unlikely(self.chi_square, self.freedom)
+        return chi_square_p_value(self.chi_square, self.freedom)
 
 
-def located(bench: Bench, base: Fit) -> FreeFit:
+def located(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     """Fit free curves of stiffness and damping to the force, and judge every part by itself.
 
     Where sizes alone are compared, states off resonance tell the stiffness and those near it the
     damping: a part that hides behind the other is not told.
     """
-    weighing, states = bench.weighing, bench.predictions.states
-    speed = np.abs(states[4][:, 0])
-    of_force = weighing.column < 2
+    noise, states = misfit.noise, misfit.predictions.states
+    speed = np.abs(states.velocity[:, 0])
+    of_force = noise.column < 2
     amplitude = np.log(speed / speed.max())
     knots = np.quantile(amplitude, np.linspace(0, 1, _FREE))
     knots = knots + 1e-9 * np.arange(_FREE)
     hats = np.stack([np.interp(amplitude, knots, row) for row in np.eye(_FREE)], axis=1)
     rows = np.where(of_force, base.rows, 0.0)
-    force = _Rows(bench, of_force)
+    force = _Rows(misfit, of_force)
     nothing = force.chi_square(rows, np.zeros((len(rows), 0)))[0]
-    both = [_curves(bench, rows, hats, [k]) for k in range(2)]
+    both = [_curves(misfit, rows, hats, [k]) for k in range(2)]
     alone = [force.fitted(curves, np.zeros(_FREE)) for curves in both]
     starts = (np.append(alone[0][1], np.zeros(_FREE)), np.append(np.zeros(_FREE), alone[1][1]))
-    together = _curves(bench, rows, hats, [0, 1])
+    together = _curves(misfit, rows, hats, [0, 1])
     fits = [force.fitted(together, start) for start in starts]
     free, values, covariance = min(fits, key=lambda fit: fit[0])
     if np.any(together.weight > 0):  # sizes bend: what curves of few knots leave is doubt as well
         covariance = covariance * max(free / max(int(of_force.sum()) - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
-        p_value = unlikely(alone[1 - k][0] - free, _FREE)
+        p_value = chi_square_p_value(alone[1 - k][0] - free, _FREE)
         if p_value < _P_VALUE:
             own = slice(k * _FREE, (k + 1) * _FREE)
             parts.append(
@@ -78,42 +81,44 @@ def located(bench: Bench, base: Fit) -> FreeFit:
                 )
             )
     n_force = int(of_force.sum())
-    left = unlikely(free, n_force - 2 * _FREE)
+    left = chi_square_p_value(free, n_force - 2 * _FREE)
     everywhere = (float(speed.min()), float(speed.max()))
     if left < _P_VALUE and nothing > n_force:
         parts.append(Located("not_a_function_of_amplitude", everywhere, left))
-    n_sensors = states[4].shape[1]
-    orders = bench.predictions.chosen.orders
+    n_sensors = states.velocity.shape[1]
+    orders = misfit.predictions.chosen.orders
     for place, order in enumerate(orders):
         if order not in (2, 3):
             continue
         first = 2 * (n_sensors + place)
-        mine = (weighing.column >= first) & (weighing.column < first + 2)
+        mine = (noise.column >= first) & (noise.column < first + 2)
         if not mine.any():
             continue
-        square = _Rows(bench, mine).chi_square(
+        square = _Rows(misfit, mine).chi_square(
             np.where(mine, base.rows, 0.0), np.zeros((len(rows), 0))
         )[0]
-        p_value = unlikely(square, int(mine.sum()))
+        p_value = chi_square_p_value(square, int(mine.sum()))
         if p_value < _P_VALUE:
             large = np.abs(base.rows[mine]) > 2.5
-            where = speed[weighing.state[mine][large]] if large.any() else speed
+            where = speed[noise.state[mine][large]] if large.any() else speed
             parts.append(
                 Located(f"harmonic_{order}", (float(where.min()), float(where.max())), p_value)
             )
     return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
 
 
-def own_power(bench: Bench, nothing: Fit, fit: Fit, part: str) -> float | None:
+def own_power(
+    misfit: WeightedMisfit, nothing: EffectFit, fit: EffectFit, part: str
+) -> float | None:
     """The power of amplitude that a fitted answer itself has, located as in what was measured.
 
     A law has its power to lowest order only: softening by q² has terms of the fourth power of the
     amplitude too. None where the answer follows no power or does not change the part.
     """
-    if bench.predictions.chosen.phase_unknown.any():
+    if misfit.predictions.chosen.phase_unknown.any():
         return None  # sizes are not linear in what an answer changes
     alone = nothing._replace(rows=nothing.rows - fit.rows)
-    powers = [one.exponent for one in located(bench, alone).parts if one.part == part]
+    powers = [one.exponent for one in located(misfit, alone).parts if one.part == part]
     return powers[0] if powers else None
 
 
@@ -136,26 +141,38 @@ class _Curves(NamedTuple):
         return np.where(alone, of_size, rows), np.where(alone[:, None], arms, self.arms)
 
 
-def _curves(bench: Bench, rows: np.ndarray, hats: np.ndarray, parts: list[int]) -> _Curves:
+def _curves(
+    misfit: WeightedMisfit, rows: np.ndarray, hats: np.ndarray, parts: list[int]
+) -> _Curves:
     """Curves of stiffness (0) or damping (1), or of both."""
-    weighing = bench.weighing
-    state, hats = weighing.state, hats[weighing.state]
-    alone = bench.predictions.sizes.alone[state, 0] & (weighing.column == 0)
+    noise = misfit.noise
+    state, hats = noise.state, hats[noise.state]
+    alone = misfit.predictions.sizes.alone[state, 0] & (noise.column == 0)
     return _Curves(
         rows,
-        np.concatenate([bench.by_linear[:, [k]] * hats for k in parts], axis=1),
-        bench.force[state],
-        np.concatenate([bench.force_by_linear[state][:, [k]] * hats for k in parts], axis=1),
-        np.where(alone, weighing.whiten[state, 0, 0], 0.0),
+        np.concatenate([misfit.by_linear[:, [k]] * hats for k in parts], axis=1),
+        misfit.baseline.force[state],
+        np.concatenate(
+            [misfit.baseline.force_by_linear[state][:, [k]] * hats for k in parts], axis=1
+        ),
+        np.where(alone, noise.whiten[state, 0, 0], 0.0),
     )
+
+
+class _Linearised(NamedTuple):
+    """The problem at some values of the curves."""
+
+    slopes: Float[np.ndarray, "row value"]
+    residuals: Float[np.ndarray, " kept"]
+    jacobian: Float[np.ndarray, "kept value"]
 
 
 class _Rows:
     """Least squares on some of the rows."""
 
-    def __init__(self, bench: Bench, keep: np.ndarray):
+    def __init__(self, misfit: WeightedMisfit, keep: np.ndarray):
         self.keep = keep
-        self.root = np.linalg.inv(bench.weighing.of_rows(keep))
+        self.root = np.linalg.inv(misfit.noise.of_rows(keep))
 
     def chi_square(
         self, rows: np.ndarray, columns: Float[np.ndarray, "row column"]
@@ -177,24 +194,19 @@ class _Rows:
         """χ², values and their covariance; Levenberg–Marquardt from a start where sizes count."""
         if not np.any(curves.weight > 0):
             return self.chi_square(curves.rows, curves.arms)
-        values, damping = start, 1e-3
-        rows, slopes = curves.at(values)
-        left = self.root @ rows[self.keep]
-        for _ in range(_STEPS):
-            arms = self.root @ slopes[self.keep]
-            size = np.linalg.norm(arms, axis=0)
-            size = np.where(size > 0, size, 1.0)
-            matrix = (arms / size).T @ (arms / size) + damping * np.eye(len(size))
-            moved = values - np.linalg.solve(matrix, (arms / size).T @ left) / size
-            new_rows, new_slopes = curves.at(moved)
-            new = self.root @ new_rows[self.keep]
-            gained = float(left @ left - new @ new)
-            if gained > 0:
-                values, rows, slopes, left = moved, new_rows, new_slopes, new
-            damping *= 0.1 if gained > 0 else 10.0
-            if 0 < gained < _SETTLED or damping > 1e6:
-                break
-        return float(left @ left), values, self.chi_square(rows, slopes)[2]
+
+        def linearised(points: np.ndarray) -> list[_Linearised]:
+            pairs = [curves.at(values) for values in points]
+            return [
+                _Linearised(slopes, self.root @ rows[self.keep], self.root @ slopes[self.keep])
+                for rows, slopes in pairs
+            ]
+
+        anywhere = np.full(len(start), np.inf)
+        points = start[None]
+        (end,) = minimise(linearised, points, linearised(points), (-anywhere, anywhere), _RULE)
+        covariance = self.chi_square(curves.at(end.point)[0], end.linearised.slopes)[2]
+        return end.sum_of_squares, end.point, covariance
 
 
 def _range(
@@ -222,7 +234,7 @@ def power_of_amplitude(
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < _TELLING or unlikely(left, _FREE - 2) < _P_VALUE:
+    if explained[best] < _TELLING or chi_square_p_value(left, _FREE - 2) < _P_VALUE:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
     if below[0] == 0 or below[-1] == len(_POWERS) - 1:

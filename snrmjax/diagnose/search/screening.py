@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.diagnose.misfit.candidates import SECOND_ORDER, Candidate
-from snrmjax.diagnose.misfit.effect_fit import Bench, Fit
+from snrmjax.diagnose.misfit.candidates import SECOND_ORDER, EffectCandidate
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 _KEPT = 2  # starts of a candidate
 _SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
@@ -13,21 +14,23 @@ _TIMES = 3  # that a kind stands in pairs
 _ALIKE = 1e-3  # 1 − cos² between changes, less than which is not relied upon
 
 
-def foretold(bench: Bench, candidate: Candidate, beside: Fit) -> tuple[float, Candidate]:
+def foretold(
+    misfit: WeightedMisfit, candidate: EffectCandidate, beside: EffectFit
+) -> tuple[float, EffectCandidate]:
     """How much χ² would fall if the best start were scaled as it fits, and the best starts.
 
     These are the candidate's own, scaled so.
     """
-    changes = bench.weighing.noise_units(bench.started(candidate))
+    changes = misfit.noise.noise_units(misfit.start_changes(candidate))
     if beside.slopes.shape[1]:
-        basis = np.linalg.qr(bench.weighing.decorrelated(beside.slopes.T).T)[0]
+        basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
     else:
-        basis = np.zeros((bench.n_rows, 0))
-    left = bench.weighing.decorrelated(beside.rows)
+        basis = np.zeros((misfit.n_rows, 0))
+    left = misfit.noise.decorrelated(beside.rows)
     moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
     if not moves.size:
         return 0.0, candidate  # no start has a motion
-    arms = bench.weighing.decorrelated(changes[moves])
+    arms = misfit.noise.decorrelated(changes[moves])
     arms = arms - (arms @ basis) @ basis.T
     size = np.sum(arms**2, axis=1)
     factor = -(arms @ left) / np.where(size > 0, size, np.inf)
@@ -39,29 +42,29 @@ def foretold(bench: Bench, candidate: Candidate, beside: Fit) -> tuple[float, Ca
 
 
 def foretold_pairs(
-    bench: Bench, candidates: Sequence[Candidate]
-) -> list[tuple[float, Candidate, Candidate]]:
+    misfit: WeightedMisfit, candidates: Sequence[EffectCandidate]
+) -> list[tuple[float, EffectCandidate, EffectCandidate]]:
     """How much the criterion would fall if a start each of two kinds were scaled as both fit.
 
     Of every two kinds the best starts, scaled so; the best two first. No kind stands in more than
     a few pairs: a strong one would fill them all.
     """
-    rows = [bench.weighing.noise_units(bench.started(c)) for c in candidates]
+    rows = [misfit.noise.noise_units(misfit.start_changes(c)) for c in candidates]
     whose = np.repeat(np.arange(len(candidates)), [len(some) for some in rows])
     which = np.concatenate([np.arange(len(some)) for some in rows])
-    arms = bench.weighing.decorrelated(np.concatenate(rows))
+    arms = misfit.noise.decorrelated(np.concatenate(rows))
     size = np.linalg.norm(arms, axis=1)
     moves = np.isfinite(size) & (size > 0)
     whose, which, arms, size = whose[moves], which[moves], arms[moves], size[moves]
     arms = arms / size[:, None]
-    along, across = -arms @ bench.weighing.decorrelated(bench.base), arms @ arms.T
+    along, across = -arms @ misfit.noise.decorrelated(misfit.base), arms @ arms.T
     left = np.maximum(1 - across**2, _ALIKE)
     factor = (along[:, None] - across * along) / left / size[:, None]  # of one beside another
     least = [-np.inf if c.kind not in SECOND_ORDER and c.lower[0] < 0 else 0.0 for c in candidates]
     good = factor > np.array(least)[whose][:, None]
     good = good & good.T & (whose[:, None] < whose)
     gain = (along[:, None] ** 2 + along**2 - 2 * across * np.outer(along, along)) / left
-    cost = np.array([len(c.unit) for c in candidates])[whose] * np.log(bench.n_rows)
+    cost = np.array([len(c.unit) for c in candidates])[whose] * np.log(misfit.n_rows)
     gain = np.where(good, gain - cost[:, None] - cost, -np.inf)
     found, seen, times = [], set(), np.zeros(len(candidates), dtype=int)
     for place in np.argsort(-gain, axis=None)[: int(np.isfinite(gain).sum())]:
@@ -79,7 +82,7 @@ def foretold_pairs(
     return found
 
 
-def _scaled(candidate: Candidate, start: int, factor: float) -> tuple[float, ...]:
+def _scaled(candidate: EffectCandidate, start: int, factor: float) -> tuple[float, ...]:
     """A start scaled so that its change has a factor."""
     strength, *shape = candidate.starts[start]
     # Those of second order change as the square of their strength, whatever its sign.

@@ -84,7 +84,7 @@ def test_errors_of_levels_are_looked_for_where_nothing_is_said(
         raise Reached
 
     monkeypatch.setattr(diagnosis, "with_levels_as_found", seen)
-    monkeypatch.setattr(diagnosis, "Bench", stop)
+    monkeypatch.setattr(diagnosis, "weighted_misfit", stop)
     given = balanced(quadratic, seed=SEED, levels=LEVELS, shift=SHIFT) if stated else data
     with pytest.raises(Reached):
         sj.diagnose_model(model, given, force_gain_std=gain_std)
@@ -97,7 +97,7 @@ def test_errors_of_levels_need_the_phases_of_every_sensor(monkeypatch, data):
     def stop(predictions):
         raise Reached
 
-    monkeypatch.setattr(diagnosis, "Bench", stop)
+    monkeypatch.setattr(diagnosis, "weighted_misfit", stop)
     velocity = np.asarray(data.velocity)
     modes = sj.model.linear_modes(
         *([OMEGA], [ZETA], [[SHAPE], [0.5 * SHAPE]], [PARTICIPATION]), sensors=("one", "other")

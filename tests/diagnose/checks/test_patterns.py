@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.checks.patterns import left_curve, pattern
-from snrmjax.diagnose.misfit.effect_fit import Fit, Weighing
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import NoiseModel
 
 LEVELS, PER_LEVEL, DAMPING = 5, 16, 0.01
 N = LEVELS * PER_LEVEL
@@ -17,7 +18,7 @@ ORDER = np.linspace(0.0, 1.0, N)
 AMPLITUDE_STD, PHASE_STD = 0.01, np.radians(0.7)
 
 
-def bench_of(phase_unknown=False):
+def misfit_of(phase_unknown=False):
     """A mode of unit frequency: K = 1 − Ω² + 2iζΩ, and what its errors make of K over noise.
 
     A velocity with an error ε + iφ needs the force K(1 + ε + iφ): whitening divides by K, and
@@ -45,7 +46,7 @@ def bench_of(phase_unknown=False):
         phase_unknown=np.full((N, 1), phase_unknown),
     )
     return SimpleNamespace(
-        weighing=Weighing(whiten, known, shared, lower, state, column),
+        noise=NoiseModel(whiten, known, shared, lower, state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
         by_linear=by_linear.reshape(2 * N, 2),
@@ -57,73 +58,73 @@ def noise(seed=0):
     return np.random.default_rng(seed).normal(size=2 * N)
 
 
-def misfit(bench, law, part=0):
+def misfit(misfit, law, part=0):
     """Of a change of the square of the natural frequency (part 0) or of the damping (1)."""
-    return bench.by_linear[:, part] * np.repeat(law, 2)
+    return misfit.by_linear[:, part] * np.repeat(law, 2)
 
 
-def fitted(bench, rows, law, part=0):
+def fitted(misfit, rows, law, part=0):
     """What is left when so much of a law is taken as fits."""
-    slopes = misfit(bench, law, part)[:, None]
-    left, arms = bench.weighing.decorrelated(rows), bench.weighing.decorrelated(slopes.T).T
+    slopes = misfit(misfit, law, part)[:, None]
+    left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(slopes.T).T
     rows = rows - slopes @ np.linalg.lstsq(arms, left)[0]
     bounds = np.full(1, np.inf)
-    square = float(np.sum(bench.weighing.decorrelated(rows) ** 2))
-    return Fit(("law",), (), np.zeros(1), square, rows, slopes, -bounds, bounds)
+    square = float(np.sum(misfit.noise.decorrelated(rows) ** 2))
+    return EffectFit(("law",), (), np.zeros(1), square, rows, slopes, -bounds, bounds)
 
 
 @pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
 def test_noise_of_any_size_has_no_pattern(size):
-    bench = bench_of()
+    misfit = misfit_of()
     for seed in range(8):
-        fit = fitted(bench, size * noise(seed), SIZE**2)
-        assert pattern(bench, fit) is None
-        assert left_curve(bench, fit) is None
+        fit = fitted(misfit, size * noise(seed), SIZE**2)
+        assert pattern(misfit, fit) is None
+        assert left_curve(misfit, fit) is None
 
 
 def test_a_natural_frequency_that_jumps_is_no_drift():
-    bench = bench_of()
-    drift = noise() + misfit(bench, 1e-3 * ORDER)
-    assert left_curve(bench, fitted(bench, drift, ORDER)) is None
-    jump = noise() + misfit(bench, 1e-3 * (ORDER > 0.5))
-    reason = left_curve(bench, fitted(bench, jump, ORDER))
+    misfit = misfit_of()
+    drift = noise() + misfit(misfit, 1e-3 * ORDER)
+    assert left_curve(misfit, fitted(misfit, drift, ORDER)) is None
+    jump = noise() + misfit(misfit, 1e-3 * (ORDER > 0.5))
+    reason = left_curve(misfit, fitted(misfit, jump, ORDER))
     assert reason is not None
     assert "order of the test" in reason
 
 
 @pytest.mark.parametrize(("part", "name"), [(0, "stiffness"), (1, "damping")])
 def test_a_law_of_another_power_leaves_a_curve_of_amplitude(part, name):
-    bench, share = bench_of(), SIZE / SIZE.max()
-    rows = noise() + misfit(bench, 3e-3 * share**4, part)
-    assert left_curve(bench, fitted(bench, rows, share**4, part)) is None
-    reason = left_curve(bench, fitted(bench, rows, share**2, part))
+    misfit, share = misfit_of(), SIZE / SIZE.max()
+    rows = noise() + misfit(misfit, 3e-3 * share**4, part)
+    assert left_curve(misfit, fitted(misfit, rows, share**4, part)) is None
+    reason = left_curve(misfit, fitted(misfit, rows, share**2, part))
     assert reason is not None
     assert f"the {name} as a free function of the amplitude" in reason
 
 
 def test_what_the_answer_itself_could_still_do_is_no_curve():
     """A fit a little away from its best is no other law."""
-    bench = bench_of()
-    fit = fitted(bench, noise(), SIZE**2)
-    away = fit._replace(rows=fit.rows + misfit(bench, 2e-3 * (SIZE / SIZE.max()) ** 2))
-    assert left_curve(bench, away) is None
-    assert left_curve(bench, away._replace(slopes=np.zeros((2 * N, 0)))) is not None
+    misfit = misfit_of()
+    fit = fitted(misfit, noise(), SIZE**2)
+    away = fit._replace(rows=fit.rows + misfit(misfit, 2e-3 * (SIZE / SIZE.max()) ** 2))
+    assert left_curve(misfit, away) is None
+    assert left_curve(misfit, away._replace(slopes=np.zeros((2 * N, 0)))) is not None
 
 
 def test_states_at_temperatures_of_their_own_are_no_noise():
     """Every state has a natural frequency of its own: misfits have one direction."""
-    bench = bench_of()
+    misfit = misfit_of()
     scatter = np.random.default_rng(5).normal(size=N)
-    rows = noise() + misfit(bench, 1e-3 * scatter)
-    reason = pattern(bench, fitted(bench, rows, SIZE**2))
+    rows = noise() + misfit(misfit, 1e-3 * scatter)
+    reason = pattern(misfit, fitted(misfit, rows, SIZE**2))
     assert reason is not None
     assert "temperatures" in reason
     # The same number of misfits as large, in all directions, is noise.
     large = float(np.sqrt(np.mean(rows**2)))
-    assert pattern(bench, fitted(bench, large * noise(1), SIZE**2)) is None
+    assert pattern(misfit, fitted(misfit, large * noise(1), SIZE**2)) is None
 
 
 def test_curves_are_not_asked_of_sizes():
-    bench = bench_of(phase_unknown=True)
-    rows = noise() + misfit(bench, 1e-3 * (ORDER > 0.5))
-    assert left_curve(bench, fitted(bench, rows, ORDER)) is None
+    misfit = misfit_of(phase_unknown=True)
+    rows = noise() + misfit(misfit, 1e-3 * (ORDER > 0.5))
+    assert left_curve(misfit, fitted(misfit, rows, ORDER)) is None

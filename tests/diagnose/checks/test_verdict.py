@@ -8,8 +8,9 @@ import pytest
 from snrmjax.diagnose.checks.cross_validation import HeldOut, held_out
 from snrmjax.diagnose.checks.patterns import pattern
 from snrmjax.diagnose.checks.verdict import judged, neighbour_noise, not_foretold, unproved
-from snrmjax.diagnose.misfit.effect_fit import Fit, Weighing
-from snrmjax.diagnose.search.model_search import Named
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import NoiseModel
+from snrmjax.diagnose.search.model_search import FoundEffects
 
 LEVELS, PER_LEVEL = 4, 15
 LEVEL = np.repeat(np.arange(LEVELS), PER_LEVEL)
@@ -22,10 +23,10 @@ def fit_to(rows, slopes=None, kinds=()):
     values = np.zeros(slopes.shape[1])
     bounds = np.full(slopes.shape[1], np.inf)
     square = float(np.sum(rows**2))
-    return Fit(kinds, (), values, square, rows, slopes, -bounds, bounds)
+    return EffectFit(kinds, (), values, square, rows, slopes, -bounds, bounds)
 
 
-def bench_of(order=None, shared=None, phase_unknown=False):
+def misfit_of(order=None, shared=None, phase_unknown=False):
     """Evidence of states in a given order, with real and imaginary part of the force each."""
     order = np.arange(len(LEVEL)) if order is None else order
     shared = np.zeros((N_ROWS, 0)) if shared is None else shared
@@ -39,7 +40,7 @@ def bench_of(order=None, shared=None, phase_unknown=False):
     )
     chosen.phase_unknown = np.full((len(LEVEL), 1), phase_unknown)
     return SimpleNamespace(
-        weighing=Weighing(whiten, known, shared, lower, state, column),
+        noise=NoiseModel(whiten, known, shared, lower, state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
         by_linear=np.tile(np.eye(2), (len(LEVEL), 1)),
@@ -51,23 +52,23 @@ def noise(seed=0):
     return np.random.default_rng(seed).normal(size=N_ROWS)
 
 
-def verdict_on(bench, rows):
+def verdict_on(misfit, rows):
     fit = fit_to(rows)
-    return judged(Named(bench, fit, fit, (), ()), *neighbour_noise(bench, fit))
+    return judged(FoundEffects(misfit, fit, fit, (), ()), *neighbour_noise(misfit, fit))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_twice_as_large_everywhere_is_refused_as_noise(seed):
-    bench = bench_of()
-    assert pattern(bench, fit_to(2 * noise(seed))) is None
-    verdict, reasons = verdict_on(bench, 2 * noise(seed))
+    misfit = misfit_of()
+    assert pattern(misfit, fit_to(2 * noise(seed))) is None
+    verdict, reasons = verdict_on(misfit, 2 * noise(seed))
     assert verdict == "noise_rejected"
     assert "understated" in reasons[0]
 
 
 def test_scatter_that_grows_with_the_level_is_no_noise():
     rows = noise() * np.repeat(1.0 + LEVEL, 2)
-    verdict, reasons = verdict_on(bench_of(), rows)
+    verdict, reasons = verdict_on(misfit_of(), rows)
     assert verdict == "unknown"
     assert "level 4" in reasons[1]
 
@@ -77,7 +78,7 @@ def test_what_neighbours_along_the_resonance_share_is_no_noise():
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
     shuffled = np.random.default_rng(1).permutation(len(LEVEL))
     mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
-    verdict, reasons = verdict_on(bench_of(shuffled), mixed)
+    verdict, reasons = verdict_on(misfit_of(shuffled), mixed)
     assert verdict == "unknown"
     assert "along the resonance" in reasons[1]
 
@@ -88,15 +89,15 @@ def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
     jump[::2] = np.where(np.arange(len(LEVEL)) < len(LEVEL) / 2, -0.8, 0.8)
     slopes = np.zeros((N_ROWS, 0))
     fit = fit_to(noise(1) + jump, slopes, kinds=("cubic_stiffness",))
-    bench = bench_of()
-    found = Named(bench, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
+    misfit = misfit_of()
+    found = FoundEffects(misfit, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
     assert found.p_value > 1e-3
     verdict, reasons = judged(found, 1.0, 0.2)
     assert verdict == "unknown"
     assert "order of the test" in reasons[0]
-    bench.predictions.chosen.noise_stated = False  # then it counts as noise
+    misfit.predictions.chosen.noise_stated = False  # then it counts as noise
     assert judged(found, 1.0, 0.2) == ("named", [])
-    bench.predictions.chosen.noise_stated = True
+    misfit.predictions.chosen.noise_stated = True
     plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
     assert judged(plain, 1.0, 0.2) == ("named", [])
 
@@ -106,7 +107,7 @@ def test_what_neighbours_in_the_test_share_is_no_noise():
         [np.random.default_rng(k).permutation(PER_LEVEL) + PER_LEVEL * k for k in range(LEVELS)]
     )
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
-    verdict, reasons = verdict_on(bench_of(shuffled), rows)
+    verdict, reasons = verdict_on(misfit_of(shuffled), rows)
     assert verdict == "unknown"
     assert "order of the test" in reasons[1]
 
@@ -115,8 +116,8 @@ def test_the_order_of_rows_does_not_change_the_noise_of_neighbours():
     rows = noise() + 3 * np.repeat(np.sin(np.pi * ANGLE), 2)
     shuffled = np.random.default_rng(2).permutation(len(LEVEL))
     mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
-    found = neighbour_noise(bench_of(shuffled), fit_to(mixed))
-    assert found == pytest.approx(neighbour_noise(bench_of(), fit_to(rows)), rel=1e-12)
+    found = neighbour_noise(misfit_of(shuffled), fit_to(mixed))
+    assert found == pytest.approx(neighbour_noise(misfit_of(), fit_to(rows)), rel=1e-12)
     assert found[0] == pytest.approx(1.0, abs=3 * found[1])
 
 
@@ -125,7 +126,7 @@ def test_a_level_left_out_is_judged_with_what_the_others_leave_open():
     rng = np.random.default_rng(3)
     shared = 0.5 * rng.normal(size=(N_ROWS, 2))
     slopes = rng.normal(size=(N_ROWS, 2)) * np.repeat(np.where(LEVEL == 3, 5.0, 0.1), 2)[:, None]
-    bench, rows = bench_of(shared=shared), noise(3)
+    misfit, rows = misfit_of(shared=shared), noise(3)
     covariance, out = np.eye(N_ROWS) + shared @ shared.T, np.repeat(LEVEL == 3, 2)
 
     def least(keep):
@@ -133,7 +134,7 @@ def test_a_level_left_out_is_judged_with_what_the_others_leave_open():
         left, arms = root @ rows[keep], root @ slopes[keep]
         return float(np.sum((left - arms @ np.linalg.lstsq(arms, left)[0]) ** 2))
 
-    held = held_out(bench, fit_to(rows), fit_to(rows, slopes), 3)
+    held = held_out(misfit, fit_to(rows), fit_to(rows, slopes), 3)
     from scipy.stats import chi2
 
     exact = chi2.sf(least(np.ones(N_ROWS, dtype=bool)) - least(~out), out.sum())
@@ -194,7 +195,7 @@ def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_gu
     order = (np.arange(LEVELS)[:, None] * PER_LEVEL + shuffled).reshape(-1)
     smooth = 5 * np.repeat(np.tile(np.linspace(-1.0, 1.0, PER_LEVEL) ** 2, LEVELS), 2)
     fit = fit_to(smooth + noise())
-    known, guessed = (bench_of(order, phase_unknown=k) for k in (False, True))
+    known, guessed = (misfit_of(order, phase_unknown=k) for k in (False, True))
     assert neighbour_noise(known, fit)[0] > 2
     assert neighbour_noise(guessed, fit)[0] == pytest.approx(1.0, abs=0.3)
     # Noise that is larger than stated is so in every order.

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.diagnose.design.discriminating_test import Request, requested
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, requested
 from snrmjax.diagnose.design.further_states import Further, Rows, foretold_states, refitted
 from snrmjax.diagnose.diagnosis import _decide_by
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
-from snrmjax.diagnose.misfit.effect_fit import Bench
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.diagnose.search.model_search import named
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 
@@ -90,19 +90,19 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
 
 
 def test_further_states_obey_the_law_that_foretells_them():
-    predictions = Predictions(linear_model(), measured())
-    bench, scales = Bench(predictions), scales_of(predictions)
-    found = named(bench, scales, ("cubic_damping",))
+    predictions = predictions_of(linear_model(), measured())
+    misfit, scales = weighted_misfit(predictions), scales_of(predictions)
+    found = named(misfit, scales, ("cubic_damping",))
     (size,) = found.fit.values
     phase = np.radians([-50.0, -10.0, 30.0])
-    foretold = foretold_states(found.bench, found.fit, (Further(4, 2.0, phase),), 1e-3)
-    states = foretold.bench.predictions.chosen.states
+    foretold = foretold_states(found.misfit, found.fit, (Further(4, 2.0, phase),), 1e-3)
+    states = foretold.misfit.predictions.chosen.states
     omega, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
     np.testing.assert_allclose(np.angle(velocity), phase, atol=2e-3)
     speed = np.abs(velocity) / SHAPE
     tip = np.max(np.abs(np.asarray(measured().velocity)[4 * len(PHASES) :, 0])) / SHAPE
     assert speed[1] == pytest.approx(2 * tip * np.cos(phase[1]), rel=0.03)
-    own = found.bench.baseline(found.fit)
+    own = found.misfit.baseline_parameters(found.fit.rows)
     natural, ratio = (own[f"mode_1.{name}"] for name in ("natural_frequency", "damping_ratio"))
     damping = 2 * ratio * natural + 0.75 * size * speed**2
     needed = (natural**2 - omega**2 + 1j * omega * damping) * speed / omega / PARTICIPATION
@@ -142,8 +142,8 @@ def test_the_measurement_that_was_asked_for_leaves_the_truth(ambiguous, truth):
 
 
 def test_where_no_measurement_would_settle_it_that_is_said():
-    predictions = Predictions(linear_model(), measured())
-    found = named(Bench(predictions), scales_of(predictions), tuple(THIRD))
+    predictions = predictions_of(linear_model(), measured())
+    found = named(weighted_misfit(predictions), scales_of(predictions), tuple(THIRD))
     request = requested(found, (0,))
     weak = request._replace(expected_gain=0.5 * request.needed_gain)
     said = _decide_by(found, weak, [], phases=True)
@@ -156,4 +156,4 @@ def test_what_no_test_of_one_mode_separates_needs_a_calibration():
     gains = {"force_gain_error", "sensor_gain_error"}
     assert only_by_calibration(gains | {"cubic_stiffness", "added_mass"}) == gains
     assert not only_by_calibration(("gap_stiffness", "one_sided_stop"))
-    assert Request("calibration", "").settles
+    assert DiscriminatingTest("calibration", "").settles

@@ -14,8 +14,9 @@ import snrmjax as sj
 from snrmjax.cli import diagnose
 from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
-from snrmjax.diagnose.misfit.effect_fit import Bench
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.effect_fit import at_phases_of, fit_effect, unfitted
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.calibrate.calibration import calibrate_model
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import EFFECTS
@@ -57,7 +58,7 @@ def at_starts(predictions, kind):
 def test_every_effect_has_the_same_sizes_whatever_the_phases():
     """A motion has its force, whatever the time is counted from."""
     model, data = files("blind_03")
-    measured, none = Predictions(model, data), Predictions(model, without_phases(data))
+    measured, none = predictions_of(model, data), predictions_of(model, without_phases(data))
     base = alone(none).columns
     for kind in EFFECTS:
         known, unknown = at_starts(measured, kind), at_starts(none, kind)
@@ -88,7 +89,7 @@ def alone(predictions):
 
 def test_given_phases_of_unknown_worth_are_not_used():
     model, data = files("blind_03")
-    one, other = (Predictions(model, without_phases(data, seed=k)).chosen.states for k in (0, 1))
+    one, other = (predictions_of(model, without_phases(data, seed=k)).chosen.states for k in (0, 1))
     for name, a, b in zip(one._fields, one, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, err_msg=name)
 
@@ -123,12 +124,14 @@ def test_small_harmonics_are_expected_as_noise_makes_them():
 
 def test_errors_are_passed_on_to_sizes():
     model, data = files("blind_03")
-    predictions = Predictions(model, without_phases(data))
+    predictions = predictions_of(model, without_phases(data))
     group = predictions.group("cubic_stiffness")
     slopes, _ = predictions.by_error(group, group.values)
     data, step = without_phases(data), 1e-3
     louder, softer = (
-        Predictions(model, dataclasses.replace(data, velocity=np.exp(sign * step) * data.velocity))
+        predictions_of(
+            model, dataclasses.replace(data, velocity=np.exp(sign * step) * data.velocity)
+        )
         for sign in (1, -1)
     )
     ends = [alone(p).columns[0, :, 0] for p in (louder, softer)]
@@ -163,10 +166,12 @@ def test_the_hidden_damping_is_named_without_phases():
     # The velocities are put where the answer has them: that is where they were measured.
     measured = np.angle(np.asarray(files("blind_12")[1].velocity)[:, 0])
     model, data = files("blind_12")
-    bench = Bench(Predictions(model, without_phases(data)))
-    one = candidate(truth, scales_of(bench.predictions))
-    fit = bench.fitted(one._replace(starts=((value,),)))
-    turned = np.angle(np.asarray(bench.turned(fit).predictions.chosen.states.velocity)[:, 0])
+    misfit = weighted_misfit(predictions_of(model, without_phases(data)))
+    one = candidate(truth, scales_of(misfit.predictions))
+    fit = fit_effect(misfit, one._replace(starts=((value,),)))
+    turned = np.angle(
+        np.asarray(at_phases_of(misfit, fit).predictions.chosen.states.velocity)[:, 0]
+    )
     assert np.degrees(np.abs(turned - measured)).max() < 4  # 0.7° of noise, and the model's own
 
 
@@ -216,13 +221,13 @@ def test_a_table_of_amplitudes_is_diagnosed(tmp_path):
     assert (out / "residuals.png").stat().st_size > 10_000
     # An effect as large as its limit moves χ² by what detection asks for.
     model, data = files("blind_03")
-    bench = Bench(Predictions(model, without_phases(data)))
+    misfit = weighted_misfit(predictions_of(model, without_phases(data)))
     for kind in ("linear_damping_change", "linear_frequency_shift", "cubic_stiffness"):
-        one = candidate(kind, scales_of(bench.predictions))
+        one = candidate(kind, scales_of(misfit.predictions))
         limit = limits[parameter_labels(kind)[0]]
-        rows = bench.at_start(one._replace(starts=((limit,),))).rows
-        need = 10.0 + np.log(bench.n_rows)
-        assert bench.chi_square(rows - bench.base) == pytest.approx(need, rel=0.1), kind
+        rows = unfitted(misfit, one._replace(starts=((limit,),))).rows
+        need = 10.0 + np.log(misfit.n_rows)
+        assert misfit.chi_square(rows - misfit.base) == pytest.approx(need, rel=0.1), kind
 
 
 def test_states_with_and_without_phases_stand_side_by_side():
@@ -238,9 +243,9 @@ def test_states_with_and_without_phases_stand_side_by_side():
 
 def test_amplitudes_count_once():
     model, data = linear_model(), without_phases(balanced(quadratic))
-    bench = Bench(Predictions(model, data))
-    assert bench.n_rows == data.n_states
-    assert sizes_of(bench.predictions.chosen).alone.all()
+    misfit = weighted_misfit(predictions_of(model, data))
+    assert misfit.n_rows == data.n_states
+    assert sizes_of(misfit.predictions.chosen).alone.all()
     few = balanced(quadratic, levels=1, per_level=11)
     sj.diagnose_model(model, few)
     with pytest.raises(ValueError, match="or 12 where phases are unknown, not 11"):

@@ -7,8 +7,9 @@ from scipy.optimize import least_squares
 import snrmjax as sj
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.coordinates import coordinates
-from snrmjax.diagnose.misfit.effect_fit import Bench
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.effect_fit import fit_effect
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 
 OMEGA, ZETA, NOISE = 300.0, 0.01, 1e-4
 LABELS = ("sensor_phase_error.phase_deg", "iwan_microslip.coefficient", "iwan_microslip.exponent")
@@ -61,18 +62,18 @@ def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
         [OMEGA], [ZETA], [[1.0]], [1.0],
         natural_frequency_std=[1e-4 * OMEGA], damping_ratio_std=[0.01 * ZETA],
     )  # fmt: skip
-    predictions = Predictions(sj.model.structure(modes), joint_states(), 1.0)
-    bench, kind = Bench(predictions), "iwan_microslip"
+    predictions = predictions_of(sj.model.structure(modes), joint_states(), 1.0)
+    misfit, kind = weighted_misfit(predictions), "iwan_microslip"
     one = candidate(kind, scales_of(predictions))
     one = one._replace(starts=one.starts[:1])  # p = 1.2, a hundred of its 1σ away
-    found = bench.fitted(one)
+    found = fit_effect(misfit, one)
     group, labels = predictions.group(kind), parameter_labels(kind)
     at = float(scales_of(predictions).amplitude)
 
     def left(point):
         size, p = point
         values = np.array([[size * at ** (1 - p), p]])
-        return bench.weighing.decorrelated(bench._evaluated(group, labels, values)[0][0])
+        return misfit.noise.decorrelated(misfit.evaluated(group, labels, values)[0][0])
 
     c, p = one.starts[0]
     begin = [c * at ** (p - 1), p]

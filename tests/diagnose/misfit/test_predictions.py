@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import snrmjax as sj
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.programs import HARMONICS
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
@@ -30,7 +30,7 @@ def predictions():
     needed = np.abs((OMEGA**2 - frequency**2 + 2j * ZETA * OMEGA * frequency) * q) / 3.0
     level = np.repeat([1, 2], 4)
     data = sj.measure.steady_states(level, frequency, 1.02 * needed, 2j * frequency * q)
-    return Predictions(model, data), data
+    return predictions_of(model, data), data
 
 
 class SmoothFriction(sj.model.AbstractMemoryless):
@@ -50,7 +50,7 @@ def own_friction(predictions):
     """Predictions with an effect of one's own, its structure and its parameters."""
     ours, data = predictions
     sj.model.register_effect(SmoothFriction)
-    own = Predictions(ours.model, data)
+    own = predictions_of(ours.model, data)
     yield own, own.group("smooth_friction"), parameter_labels("smooth_friction")
     del EFFECTS["smooth_friction"]
 
@@ -132,7 +132,7 @@ def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions)
     _, data = predictions
     linear = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
     potential = sj.model.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
-    ours = Predictions(dataclasses.replace(sj.model.structure(linear, potential), name=""), data)
+    ours = predictions_of(dataclasses.replace(sj.model.structure(linear, potential), name=""), data)
     group = ours.group("cubic_stiffness")
     slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
     frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from snrmjax.diagnose.checks.doubts import doubts
-from snrmjax.diagnose.misfit.effect_fit import Fit, Weighing
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import NoiseModel
 from snrmjax.diagnose.search.locating import located, own_power, power_of_amplitude
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
@@ -82,17 +83,18 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     n = len(size)
     by_linear = np.tile(np.eye(2), (n, 1)) / 1e-3
     known, state = np.ones((n, 2), dtype=bool), np.repeat(np.arange(n), 2)
-    weighing = Weighing(
+    noise = NoiseModel(
         np.tile(np.eye(2) / 1e-3, (n, 1, 1)), known, np.zeros((2 * n, 0)), np.eye(2 * n), state,
         np.tile([0, 1], n),
     )  # fmt: skip
-    bench = SimpleNamespace(
-        weighing=weighing,
+    misfit = SimpleNamespace(
+        noise=noise,
         by_linear=by_linear,
-        force=np.ones(n, dtype=complex),
-        force_by_linear=np.zeros((n, 2), dtype=complex),
+        baseline=SimpleNamespace(
+            force=np.ones(n, dtype=complex), force_by_linear=np.zeros((n, 2), dtype=complex)
+        ),
         predictions=SimpleNamespace(
-            states=[None] * 4 + [size[:, None]],
+            states=SimpleNamespace(velocity=size[:, None]),
             sizes=SimpleNamespace(alone=np.zeros((n, 1), dtype=bool)),
             chosen=SimpleNamespace(orders=(), phase_unknown=np.zeros((n, 1), dtype=bool)),
         ),
@@ -100,18 +102,18 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     left = np.random.default_rng(0).normal(size=2 * n)
     none, no_slopes = np.zeros(0), np.zeros((2 * n, 0))
     law = by_linear[:, 0] * np.repeat(change, 2)
-    nothing = Fit((), (), none, 0.0, left - law, no_slopes, none, none)
+    nothing = EffectFit((), (), none, 0.0, left - law, no_slopes, none, none)
     fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
-    parts = located(bench, nothing).parts
+    parts = located(misfit, nothing).parts
     (part,) = (one for one in parts if one.part == "stiffness")
-    own = own_power(bench, nothing, fit, "stiffness")
-    assert own_power(bench, nothing, fit, "damping") is None
+    own = own_power(misfit, nothing, fit, "stiffness")
+    assert own_power(misfit, nothing, fit, "damping") is None
     assert abs(part.exponent - 2) > 4 * part.exponent_std
     assert abs(part.exponent - own) < 2 * part.exponent_std
     for seed in range(1, 5):  # what noise leaves is no part of the answer's own
         other = np.random.default_rng(seed).normal(size=2 * n)
         again = nothing._replace(rows=other - law), fit._replace(rows=other)
-        assert own_power(bench, *again, "stiffness") == own
+        assert own_power(misfit, *again, "stiffness") == own
     (doubt,) = doubts(fit.kinds, parts)
     assert doubt.refutes
     assert doubts(fit.kinds, parts, own_power=own) == []

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.misfit.candidates import Candidate
-from snrmjax.diagnose.misfit.effect_fit import Weighing
+from snrmjax.diagnose.misfit.candidates import EffectCandidate
+from snrmjax.diagnose.misfit.noise_model import NoiseModel
 from snrmjax.diagnose.search.screening import foretold_pairs
 
 N = 60
@@ -16,9 +16,9 @@ def made_up(columns, base):
     """Evidence in which a candidate's starts change all rows by given columns."""
     empty = np.zeros((N, 0))
     whiten, known = np.ones((N, 1, 1)), np.ones((N, 1), dtype=bool)
-    weighing = Weighing(whiten, known, empty, np.eye(N), np.arange(N), np.zeros(N, dtype=int))
+    noise = NoiseModel(whiten, known, empty, np.eye(N), np.arange(N), np.zeros(N, dtype=int))
     return SimpleNamespace(
-        weighing=weighing,
+        noise=noise,
         base=base,
         n_rows=N,
         started=lambda c: np.stack(columns[c.kind])[:, :, None],
@@ -26,7 +26,7 @@ def made_up(columns, base):
 
 
 def candidate(kind, starts=((2.0,),), lower=-np.inf):
-    return Candidate(kind, starts, (1.0,), (lower,), (np.inf,))
+    return EffectCandidate(kind, starts, (1.0,), (lower,), (np.inf,))
 
 
 def test_the_two_that_explain_the_misfit_come_first_scaled_as_they_fit():
@@ -34,20 +34,20 @@ def test_the_two_that_explain_the_misfit_come_first_scaled_as_they_fit():
     one, two, other = rng.normal(size=(3, N))
     # What mixes both explains more by itself than either.
     columns = {"one": [one], "two": [other, two], "mixed": [one + two + 0.3 * other]}
-    bench = made_up(columns, -(3.0 * one - 0.5 * two))
+    misfit = made_up(columns, -(3.0 * one - 0.5 * two))
     kinds = [candidate("mixed"), candidate("one"), candidate("two", ((1.0, 7.0), (4.0, 8.0)))]
-    gain, first, second = foretold_pairs(bench, kinds)[0]
+    gain, first, second = foretold_pairs(misfit, kinds)[0]
     assert (first.kind, second.kind) == ("one", "two")
     assert first.starts == (pytest.approx((6.0,), rel=1e-9),)
     assert second.starts == (pytest.approx((-2.0, 8.0), rel=1e-9),)
-    assert gain == pytest.approx(np.sum(bench.base**2) - 2 * np.log(N), rel=1e-9)
+    assert gain == pytest.approx(np.sum(misfit.base**2) - 2 * np.log(N), rel=1e-9)
 
 
 def test_what_cannot_be_negative_is_not_promised_so():
     one, two = np.random.default_rng(1).normal(size=(2, N))
-    bench = made_up({"one": [one], "two": [two]}, -(one - two))
-    assert foretold_pairs(bench, [candidate("one"), candidate("two")])
-    assert not foretold_pairs(bench, [candidate("one"), candidate("two", lower=0.0)])
+    misfit = made_up({"one": [one], "two": [two]}, -(one - two))
+    assert foretold_pairs(misfit, [candidate("one"), candidate("two")])
+    assert not foretold_pairs(misfit, [candidate("one"), candidate("two", lower=0.0)])
 
 
 def test_no_kind_fills_all_pairs_and_what_is_nearly_alike_promises_little():
@@ -56,8 +56,8 @@ def test_no_kind_fills_all_pairs_and_what_is_nearly_alike_promises_little():
     # Their difference, a hundred times enlarged, would explain more than anything else.
     hidden = np.random.default_rng(3).normal(size=N)
     columns["twin"] = [changes[0] + 0.01 * hidden]
-    bench = made_up(columns, -100 * changes[0] - changes[1] + 1.5 * hidden)
-    pairs = foretold_pairs(bench, [candidate(kind) for kind in columns])
+    misfit = made_up(columns, -100 * changes[0] - changes[1] + 1.5 * hidden)
+    pairs = foretold_pairs(misfit, [candidate(kind) for kind in columns])
     kinds = [{one.kind, two.kind} for _, one, two in pairs]
     assert kinds[0] == {"kind 0", "kind 1"}
     assert max(sum(name in pair for pair in kinds) for name in columns) == 3

@@ -1,0 +1,226 @@
+"""The misfit of a model to measured states, in units of noise: what effects are fitted to."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from snrmjax.diagnose.misfit.candidates import SECOND_ORDER, EffectCandidate, parameter_labels
+from snrmjax.diagnose.misfit.noise_model import NoiseModel, noise_model
+from snrmjax.diagnose.misfit.predictions import PLAIN, Group, Predicted, Predictions
+from snrmjax.identify.calibrate.calibration_states import ComparedColumns
+from snrmjax.model.structures import Structure
+
+_WEAK = 0.1  # of its strength, at which a start without a motion is evaluated
+
+
+class BaselinePrediction(NamedTuple):
+    """What the model as given predicts of the measured states."""
+
+    columns: Float[np.ndarray, "state column"]
+    force: Complex[np.ndarray, " state"]  # over the measured one
+    force_by_linear: Complex[np.ndarray, "state two"]  # by natural frequency and damping ratio
+
+
+class ErrorPropagation(NamedTuple):
+    """What errors make of the misfit, as some model passes them on.
+
+    `slopes` are those by the baseline's uncertain parameters, times their 1σ, and last by natural
+    frequency and damping ratio of the mode of interest.
+    """
+
+    by_error: Float[np.ndarray, "state column input"]
+    phasors: Complex[np.ndarray, "state part"]
+    slopes: Float[np.ndarray, "state column direction"]
+
+
+class StartChanges:
+    """What the starting points of candidates change of the misfit: each is predicted once.
+
+    A memory that all weightings of one set of data share: changes do not depend on the noise.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple, Float[np.ndarray, "trial state column"]] = {}
+
+    def of(
+        self, misfit: "WeightedMisfit", candidate: EffectCandidate
+    ) -> Float[np.ndarray, "trial state column"]:
+        """Columns of every starting point less those of the baseline."""
+        key = (candidate.kind, candidate.starts)
+        if key not in self._known:
+            self._known[key] = _start_changes(misfit, candidate)
+        return self._known[key]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WeightedMisfit:
+    """Misfit of the baseline model to measured states, and the noise that weights it.
+
+    Rows are the measured numbers, in units of their own noise: real and imaginary part of the
+    force, of other sensors' velocities and of harmonics, state by state.
+    """
+
+    predictions: Predictions
+    baseline: BaselinePrediction
+    errors: ErrorPropagation  # of the baseline itself
+    passed_on: ErrorPropagation  # as the noise has it: of the baseline, or of a fitted answer
+    noise: NoiseModel
+    base: Float[np.ndarray, " row"]
+    by_linear: Float[np.ndarray, "row two"]  # by natural frequency and damping ratio
+    starts: StartChanges
+
+    @property
+    def model(self) -> Structure:
+        """The baseline."""
+        return self.predictions.model
+
+    @property
+    def n_rows(self) -> int:
+        """How many numbers were measured."""
+        return len(self.base)
+
+    @property
+    def level_numbers(self) -> Int[np.ndarray, " level"]:
+        """Numbers of the levels in the data."""
+        return np.unique(self.predictions.level_numbers)
+
+    def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
+        """χ² of misfits in units of noise."""
+        return float(np.sum(self.noise.decorrelated(rows) ** 2))
+
+    def start_changes(self, candidate: EffectCandidate) -> Float[np.ndarray, "trial state column"]:
+        """What the starting points of a candidate change."""
+        return self.starts.of(self, candidate)
+
+    def first_change(self, candidate: EffectCandidate) -> Float[np.ndarray, " row"]:
+        """What the first starting point of a candidate changes, in units of noise."""
+        return self.noise.noise_units(self.start_changes(candidate))[0]
+
+    def baseline_parameters(
+        self, rows: Float[np.ndarray, " row"], kept: Bool[np.ndarray, " row"] | None = None
+    ) -> dict[str, float]:
+        """Most likely values of the baseline's uncertain parameters, from misfits of some fit.
+
+        By all rows, or by the rows `kept`.
+        """
+        moved = self.noise.shared_errors(rows, kept)
+        stated = self.predictions.stated
+        return {
+            name: value + std * step
+            for (name, (value, std)), step in zip(
+                stated.items(), moved[: len(stated)].tolist(), strict=True
+            )
+        }
+
+    def predicted(
+        self,
+        group: Group,
+        labels: Sequence[str],
+        values: Float[np.ndarray, "trial parameter"],
+        *,
+        slopes: bool,
+    ) -> Predicted:
+        """Columns for trial values of some parameters, and perhaps slopes by them."""
+        every = np.tile(group.values, (len(values), 1))
+        every[:, [group.place(label) for label in labels]] = values
+        return self.predictions.of(group, every, labels if slopes else ())
+
+    def evaluated(
+        self, group: Group, labels: Sequence[str], values: Float[np.ndarray, "trial parameter"]
+    ) -> tuple[Float[np.ndarray, "trial row"], Float[np.ndarray, "trial row parameter"]]:
+        """Rows for trial values of some parameters, and their slopes by them."""
+        found = self.predicted(group, labels, values, slopes=True)
+        rows = self.noise.noise_units(found.columns)
+        slopes = self.noise.noise_units(np.moveaxis(found.slopes, 3, 0))
+        return rows, np.moveaxis(slopes, 0, 2)
+
+    def reweighted(self, passed_on: ErrorPropagation) -> "WeightedMisfit":
+        """The same misfit with errors passed on in another way."""
+        return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
+
+    def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
+        """The same with velocities of unknown phase at these phases, rad."""
+        return dataclasses.replace(self, predictions=self.predictions.with_phases(phase))
+
+    def with_states(self, chosen: ComparedColumns) -> "WeightedMisfit":
+        """The same states under other errors."""
+        predictions = dataclasses.replace(self.predictions, chosen=chosen)
+        return _weighted(predictions, self.baseline, self.errors, self.passed_on, self.starts)
+
+
+def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
+    """The baseline's misfit, weighted with the stated noise as the baseline passes it on."""
+    group = predictions.group(PLAIN)
+    found = by_baseline(predictions, group, group.values)
+    baseline = BaselinePrediction(
+        found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
+    )
+    errors = ErrorPropagation(*predictions.by_error(group, group.values), found.slopes[0])
+    missing = _of_missing_force(predictions, baseline, errors)
+    passed_on = errors._replace(by_error=errors.by_error + missing)
+    return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+
+
+def by_baseline(
+    predictions: Predictions, group: Group, values: Float[np.ndarray, " parameter"]
+) -> Predicted:
+    """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two."""
+    stated, j = predictions.stated, predictions.model.modes.mode_of_interest + 1
+    two = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
+    found = predictions.of(group, values[None], (*stated, *two))
+    std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
+    return found._replace(slopes=found.slopes * std, force_slopes=found.force_slopes * std)
+
+
+def _of_missing_force(
+    predictions: Predictions, baseline: BaselinePrediction, errors: ErrorPropagation
+) -> Float[np.ndarray, "state column input"]:
+    """What errors of the velocity do to the part of the force that the baseline lacks.
+
+    That force turns with the velocity, and is taken to grow with it: a baseline that lacks most
+    of the damping would otherwise pass on too little of the errors.
+    """
+    sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
+    missing = -(baseline.columns[:, 0] + 1j * baseline.columns[:, 1])
+    change = np.zeros_like(errors.by_error)
+    for place, part in ((1, missing), (1 + sensors, 1j * missing)):
+        change[:, 0, place], change[:, 1, place] = part.real, part.imag
+    known = np.asarray(predictions.chosen.states.known)
+    return np.where(known[:, :, None], change, 0.0)
+
+
+def _weighted(
+    predictions: Predictions,
+    baseline: BaselinePrediction,
+    errors: ErrorPropagation,
+    passed_on: ErrorPropagation,
+    starts: StartChanges,
+) -> WeightedMisfit:
+    measured = predictions.weighed(passed_on.by_error, passed_on.phasors)
+    own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
+    gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
+    shared = np.concatenate([own, gain], axis=2) if np.any(gain) else own
+    noise = noise_model(measured, shared, by_linear, np.array(predictions.model.level_stds))
+    base = noise.noise_units(baseline.columns[None])[0]
+    linear = noise.noise_units(np.moveaxis(by_linear, 2, 0)).T
+    return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear, starts)
+
+
+def _start_changes(
+    misfit: WeightedMisfit, candidate: EffectCandidate
+) -> Float[np.ndarray, "trial state column"]:
+    predictions, kind = misfit.predictions, candidate.kind
+    group, labels = predictions.group(kind), parameter_labels(kind)
+    starts = np.array(candidate.starts)
+    found = misfit.predicted(group, labels, starts, slopes=False)
+    changes = found.columns - misfit.baseline.columns
+    lost = ~np.isfinite(misfit.noise.noise_units(changes)).all(axis=1)
+    if lost.any():  # too strong to have a motion: what a weaker one does, scaled up
+        starts[:, 0] *= _WEAK
+        found = misfit.predicted(group, labels, starts[lost], slopes=False)
+        weak = found.columns - misfit.baseline.columns
+        changes[lost] = weak / _WEAK ** (2 if kind in SECOND_ORDER else 1)
+    return changes

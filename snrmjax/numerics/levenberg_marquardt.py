@@ -1,0 +1,153 @@
+"""Levenberg–Marquardt for small problems from several starting points at once, with early stopping.
+
+The joint fit takes optimistix's solver, which is compiled for one problem. Here an evaluation is
+costly, answers for many points in one call and lives on the host: all starting points step
+together, those that promise least are given up after a few steps, and a step too short to matter
+is taken without another evaluation.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+
+class FitStatus(StrEnum):
+    """How a least-squares fit ended."""
+
+    CONVERGED = "converged"  # a further step changes the sum of squares by less than `settled`
+    STALLED = "stalled"  # no step lowers the sum of squares, however short: a minimum at a bound
+    STEP_LIMIT = "step_limit"  # still falling after the last step
+    GIVEN_UP = "given_up"  # another starting point was more promising
+    NOT_FINITE = "not_finite"  # no finite residuals at the starting point
+    NOT_FITTED = "not_fitted"  # a starting point, or a model without anything to fit
+
+
+class AbstractLinearisation(Protocol):
+    """A least-squares problem at one point, as its evaluation gives it."""
+
+    @property
+    def residuals(self) -> Float[np.ndarray, " row"]:
+        """Residuals of unit variance; not finite where the problem has no solution."""
+
+    @property
+    def jacobian(self) -> Float[np.ndarray, "row unknown"]:
+        """Their derivatives by the unknowns."""
+
+
+Linearisation = TypeVar("Linearisation", bound=AbstractLinearisation)
+
+
+@dataclasses.dataclass(frozen=True)
+class StepRule:
+    """How steps are damped, and when a fit ends.
+
+    Marquardt's damping begins at `damping`, is multiplied by `eased` after a step that lowers the
+    sum of squares and by `stiffened` after one that does not; beyond `largest_damping` no step
+    will. A fit ends when a step lowers the sum by less than `settled`, or after `steps`. After
+    `screened` steps only the `kept` best starting points go on. With `trust_short_steps` a step
+    that promises less than `settled` is the last and is not evaluated.
+    """
+
+    steps: int = 30
+    settled: float = 1e-2
+    damping: float = 1e-3
+    eased: float = 0.1
+    stiffened: float = 10.0
+    largest_damping: float = 1e6
+    screened: int | None = None
+    kept: int = 1
+    trust_short_steps: bool = False
+
+
+class Minimum(NamedTuple, Generic[Linearisation]):
+    """Where a fit from one starting point ended."""
+
+    point: Float[np.ndarray, " unknown"]
+    sum_of_squares: float  # infinite where nothing finite was found
+    linearised: Linearisation  # at `point`, or a short last step before it
+    last_step: Float[np.ndarray, " unknown"]  # from where it was linearised; zero if evaluated
+    status: FitStatus
+
+
+def minimise(
+    evaluate: Callable[[Float[np.ndarray, "trial unknown"]], Sequence[Linearisation]],
+    points: Float[np.ndarray, "trial unknown"],
+    at_points: Sequence[Linearisation],
+    bounds: tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " unknown"]],
+    rule: StepRule,
+) -> list[Minimum[Linearisation]]:
+    """Minimise |r(x)|² from several starting points.
+
+    A step solves (JᵀJ + λ diag(JᵀJ)) s = −Jᵀr and is cut off at the bounds.
+
+    Arguments: `evaluate` linearises the problem at some points in one call; `points` are the
+    starting points and `at_points` the problem there; `bounds` are the lowest and the highest
+    value of every unknown.
+    Returns a `Minimum` for every starting point. One that is not `CONVERGED` or `STALLED` is not
+    at a minimum.
+
+    Reference: Marquardt, SIAM J. Appl. Math. 11 (1963) 431, doi:10.1137/0111030.
+    """
+    lower, upper = bounds
+    point, now = np.array(points), list(at_points)
+    last_step = np.zeros_like(point)
+    square = np.array([_sum_of_squares(one) for one in now])
+    damping = np.full(len(point), rule.damping)
+    status = [FitStatus.STEP_LIMIT if np.isfinite(one) else FitStatus.NOT_FINITE for one in square]
+    active = np.isfinite(square)
+    for turn in range(rule.steps):
+        if turn == rule.screened:
+            behind = active & ~(square <= np.sort(square)[min(rule.kept, len(point)) - 1])
+            status = [FitStatus.GIVEN_UP if b else s for b, s in zip(behind, status, strict=True)]
+            active &= ~behind
+        moved = point.copy()
+        for t in np.flatnonzero(active):
+            residuals, jacobian = now[t].residuals, now[t].jacobian
+            step = damped_step(jacobian, residuals, damping[t])
+            moved[t] = np.clip(point[t] + step, lower, upper)
+            free = np.array_equal(moved[t], point[t] + step)
+            after = residuals + jacobian @ step
+            promised = float(residuals @ residuals - after @ after)
+            if rule.trust_short_steps and free and promised < rule.settled:
+                point[t], last_step[t], square[t] = moved[t], step, float(after @ after)
+                status[t], active[t] = FitStatus.CONVERGED, False
+        at = np.flatnonzero(active)
+        if not at.size:
+            break
+        for t, new in zip(at, evaluate(moved[at]), strict=True):
+            new_square = _sum_of_squares(new)
+            lowered = square[t] - new_square
+            if lowered > 0:
+                point[t], now[t], square[t] = moved[t], new, new_square
+                damping[t] *= rule.eased
+                if lowered <= rule.settled:
+                    status[t], active[t] = FitStatus.CONVERGED, False
+            else:
+                damping[t] *= rule.stiffened
+                if damping[t] >= rule.largest_damping:
+                    status[t], active[t] = FitStatus.STALLED, False
+    return [
+        Minimum(*row) for row in zip(point, square.tolist(), now, last_step, status, strict=True)
+    ]
+
+
+def damped_step(
+    jacobian: Float[np.ndarray, "row unknown"],
+    residuals: Float[np.ndarray, " row"],
+    damping: float,
+) -> Float[np.ndarray, " unknown"]:
+    """Marquardt's step with unknowns in units of their columns' lengths."""
+    size = np.linalg.norm(jacobian, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    scaled = jacobian / size
+    matrix = scaled.T @ scaled + damping * np.eye(len(size))
+    return -np.linalg.solve(matrix, scaled.T @ residuals) / size
+
+
+def _sum_of_squares(one: AbstractLinearisation) -> float:
+    value = float(np.sum(one.residuals**2))
+    return value if np.isfinite(value) else np.inf
