@@ -19,11 +19,16 @@ class FitStatus(StrEnum):
     """How a least-squares fit ended."""
 
     CONVERGED = "converged"  # a further step changes the sum of squares by less than `settled`
-    STALLED = "stalled"  # no step lowers the sum of squares, however short: a minimum at a bound
+    STALLED = "stalled"  # no step lowers the sum of squares, however short
     STEP_LIMIT = "step_limit"  # still falling after the last step
     GIVEN_UP = "given_up"  # another starting point was more promising
     NOT_FINITE = "not_finite"  # no finite residuals at the starting point
     NOT_FITTED = "not_fitted"  # a starting point, or a model without anything to fit
+
+    @property
+    def found_minimum(self) -> bool:
+        """Whether the fit ended at a minimum."""
+        return self in (FitStatus.CONVERGED, FitStatus.STALLED)
 
 
 class AbstractLinearisation(Protocol):
@@ -82,13 +87,13 @@ def minimise(
 ) -> list[Minimum[Linearisation]]:
     """Minimise |r(x)|² from several starting points.
 
-    A step solves (JᵀJ + λ diag(JᵀJ)) s = −Jᵀr and is cut off at the bounds.
+    A step solves (JᵀJ + λ diag(JᵀJ)) s = −Jᵀr. It is cut off at the bounds, each unknown by
+    itself: where a bound holds one of them, the others may end short of their best values.
 
     Arguments: `evaluate` linearises the problem at some points in one call; `points` are the
     starting points and `at_points` the problem there; `bounds` are the lowest and the highest
     value of every unknown.
-    Returns a `Minimum` for every starting point. One that is not `CONVERGED` or `STALLED` is not
-    at a minimum.
+    Returns a `Minimum` for every starting point; its `status` says whether it is one.
 
     Reference: Marquardt, SIAM J. Appl. Math. 11 (1963) 431, doi:10.1137/0111030.
     """
