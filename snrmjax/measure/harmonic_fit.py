@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 
 from snrmjax.measure.signals import checked_amplitudes, require_orders
+from snrmjax.numerics.finite_slopes import safe_root
 
 
 class FitStatus(IntEnum):
@@ -64,18 +65,18 @@ class HarmonicFit(eqx.Module):
     @property
     def real_std(self) -> Float[Array, "*batch harmonic"]:
         """1σ of the real parts, in the unit of the record."""
-        return _root(self._variance[..., : len(self.harmonic_order)])
+        return safe_root(self._variance[..., : len(self.harmonic_order)])
 
     @property
     def imag_std(self) -> Float[Array, "*batch harmonic"]:
         """1σ of the imaginary parts, in the unit of the record."""
-        return _root(self._variance[..., len(self.harmonic_order) :])
+        return safe_root(self._variance[..., len(self.harmonic_order) :])
 
     @property
     def complex_std(self) -> Float[Array, "*batch harmonic"]:
         """Root mean square of the complex errors, in the unit of the record."""
         n = len(self.harmonic_order)
-        return _root(self._variance[..., :n] + self._variance[..., n:])
+        return safe_root(self._variance[..., :n] + self._variance[..., n:])
 
     @property
     def amplitude_std(self) -> Float[Array, "*batch harmonic"]:
@@ -97,18 +98,12 @@ class HarmonicFit(eqx.Module):
         n = len(self.harmonic_order)
         mixed = jnp.diagonal(self.covariance[..., :n, n:], axis1=-2, axis2=-1)
         variance = real**2 * self._variance[..., :n] + imag**2 * self._variance[..., n:]
-        return _root(jnp.maximum(variance + 2 * real * imag * mixed, 0.0))
+        return safe_root(jnp.maximum(variance + 2 * real * imag * mixed, 0.0))
 
     def _index(self, order: int) -> int:
         if order not in self.harmonic_order:
             raise ValueError(f"`order` must be one of {self.harmonic_order}, but is {order}.")
         return self.harmonic_order.index(order)
-
-
-def _root(variance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Square root with a finite (zero) slope at zero: the mean has no imaginary error."""
-    known = variance != 0
-    return jnp.where(known, jnp.sqrt(jnp.where(known, variance, 1.0)), 0.0)
 
 
 def fit_harmonics(
@@ -223,7 +218,7 @@ def _fit_one(
     root = scale[:, None] * jax.scipy.linalg.solve_triangular(upper, jnp.eye(unknown.size))
     frequency_std = jnp.array(jnp.nan)
     if refine:
-        frequency_std = _root(noise_variance) * jnp.linalg.norm(root[-1])
+        frequency_std = safe_root(noise_variance) * jnp.linalg.norm(root[-1])
         # Five standard deviations of a tone, and what noise puts into every harmonic. Written so
         # that an unknown (NaN) noise passes.
         explained = jnp.sum((values - jnp.mean(values)) ** 2) - squares
@@ -249,8 +244,8 @@ def _fit_one(
         covariance=masked(noise_variance * (turned @ turned.T)),
         frequency=masked(omega),
         frequency_std=masked(frequency_std),
-        noise_std=masked(_root(noise_variance)),
-        residual_rms=masked(_root(squares / record.size)),
+        noise_std=masked(safe_root(noise_variance)),
+        residual_rms=masked(safe_root(squares / record.size)),
         condition=condition,
         reference_time=reference_time,
         status=status,

@@ -144,7 +144,10 @@ def steady_states(
 
 def check_phases(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
-    unknown = np.any(np.asarray(data.phase_unknown), axis=1)
+    phases: Any = data.phase_unknown
+    if isinstance(phases, jax.core.Tracer):  # within `jax.jit` nothing has a value yet
+        return
+    unknown = np.any(np.asarray(phases), axis=1)
     if unknown.any():
         raise ValueError(
             f"{purpose} needs the phases of all velocities relative to the force, but those of "
@@ -157,7 +160,9 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
 
 def check_force(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
-    if np.any(np.isfinite(np.asarray(data.force))):
+    known: Any = jnp.isfinite(data.force)
+    # Within `jax.jit` nothing has a value yet; within a derivative this still has one.
+    if isinstance(known, jax.core.Tracer) or np.any(known):
         return
     if not np.any(np.isfinite(np.asarray(data.drive))):
         raise ValueError(f"{purpose} needs the force, but no steady state has one.")
@@ -216,10 +221,15 @@ def relative_errors(data: SteadyStates) -> Float[Array, "state sensor input"]:
     A state for which nothing is stated has NaN throughout. NumPy's arrays stay so.
     """
     xp: Any = data.velocity.__array_namespace__()
+
+    def over(std: Any, size: Any) -> Any:
+        # What is not stated is kept out of the division: its NaN would pass `where` in a gradient.
+        known = xp.isfinite(std) & (size > 0)
+        return xp.where(known, xp.where(known, std, 0.0) / xp.where(known, size, 1.0), xp.nan)
+
     amplitude = xp.abs(data.velocity)
-    force = data.force_std / xp.where(data.force > 0, data.force, xp.nan)
-    force = xp.broadcast_to(force[:, None], amplitude.shape)
-    velocity = data.velocity_std / xp.where(amplitude > 0, amplitude, xp.nan)
+    force = xp.broadcast_to(over(data.force_std, data.force)[:, None], amplitude.shape)
+    velocity = over(data.velocity_std, amplitude)
     # A velocity error without a phase error is taken as a circle in the complex plane.
     phase = xp.where(xp.isfinite(data.phase_std), data.phase_std, velocity)
     stated = xp.stack([force, velocity, phase], axis=2)

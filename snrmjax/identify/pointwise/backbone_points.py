@@ -1,12 +1,13 @@
 """From measured steady states to points of the backbone and of the damping, with errors."""
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.identify.pointwise.inversion import PointStatus, SnrmPoints, invert_one, invert_phasor
 from snrmjax.identify.pointwise.snrm import reference_sensor
@@ -14,6 +15,7 @@ from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.finite_slopes import safe_root
 
 AmplitudeArgument = Literal["displacement", "velocity"]
 AmplitudeMeasure = Literal["fundamental", "peak"]
@@ -118,36 +120,57 @@ def _identify(
     amplitude: AmplitudeArgument,
     measure: AmplitudeMeasure,
 ) -> BackbonePoints:
-    velocity, relative_std = data.velocity, relative_errors(data)
+    # States without a force or a frequency are solved for harmless ones and masked afterwards:
+    # in a derivative `where` does not stop a NaN that was computed.
+    forced = jnp.isfinite(data.force) & (data.force > 0)
+    timed = jnp.isfinite(data.frequency) & (data.frequency > 0)
+    sound = forced & timed
+    raw, data = (
+        data,
+        dataclasses.replace(
+            data,
+            force=jnp.where(sound, data.force, 1.0),
+            frequency=jnp.where(sound, data.frequency, 1.0),
+        ),
+    )
+    velocity, relative_std = data.velocity, relative_errors(raw)
     if measure == "peak":
         velocity = velocity * _peak_ratio(data)
     combined, share, filtered_std, filter_residual = modal_filter(
         data, modes, r, velocity, relative_std
     )
-    inputs = jnp.stack(
-        [jnp.log(data.force), jnp.log(jnp.abs(combined)), jnp.angle(combined)], axis=1
-    )
+    moving = jnp.isfinite(combined) & (combined != 0)
+    usable = sound & moving
+    phasor = jnp.where(moving, combined, 1.0)
+    inputs = jnp.stack([jnp.log(data.force), jnp.log(jnp.abs(phasor)), jnp.angle(phasor)], axis=1)
     solved, mode_velocity, argument, sensitivity, linear_variance = _solve(
-        modes, r, amplitude, data.frequency, inputs, share
+        modes, r, amplitude, data.frequency, inputs, share, usable
     )
     natural, damping = solved.natural_frequency, solved.damping_ratio
-    covariance = jnp.einsum("soi,si,spi->sop", sensitivity, filtered_std**2, sensitivity)
-    covariance = covariance + jax.vmap(jnp.diag)(linear_variance)
-    natural_std, damping_std = _ratios_std(natural, damping, covariance)
+    found = jnp.isfinite(natural)
+    natural_std, damping_std = _ratios_std(
+        natural, damping, sensitivity, filtered_std, linear_variance
+    )
     on_backbone = jnp.abs(mode_velocity)
     if amplitude == "displacement":
-        on_backbone = on_backbone * natural / data.frequency
+        on_backbone = on_backbone * jnp.where(found, natural, 1.0) / data.frequency
+    measured = mode_velocity + residual_velocity(modes, data.frequency, data.force)[:, r]
+    # Nothing is subtracted where nothing drives the other modes, or nothing moves.
+    bare = jnp.where(sound | (raw.force == 0), combined, jnp.nan)
+    status = jnp.where(
+        (raw.force == 0) & moving & timed, int(PointStatus.ZERO_FORCE), int(PointStatus.NOT_FINITE)
+    )
     return BackbonePoints(
         level=data.level,
-        frequency=data.frequency,
-        force=data.force,
-        velocity=mode_velocity + residual_velocity(modes, data.frequency, data.force)[:, r],
-        mode_velocity=mode_velocity,
-        appropriation=appropriation_of(data),
+        frequency=raw.frequency,
+        force=raw.force,
+        velocity=jnp.where(usable, measured, bare),
+        mode_velocity=jnp.where(usable, mode_velocity, bare),
+        appropriation=appropriation_of(raw),
         natural_frequency=natural,
         damping_ratio=damping,
-        amplitude=jnp.where(jnp.isfinite(natural), argument, jnp.nan),
-        backbone_velocity=on_backbone,
+        amplitude=jnp.where(found, argument, jnp.nan),
+        backbone_velocity=jnp.where(found, on_backbone, jnp.nan),
         natural_frequency_std=natural_std,
         damping_ratio_std=damping_std,
         alternative_natural_frequency=solved.alternative_natural_frequency,
@@ -155,22 +178,38 @@ def _identify(
         sensitivity=sensitivity,
         relative_std=filtered_std,
         linear_variance=linear_variance,
-        filter_residual=filter_residual,
-        status=solved.status,
+        filter_residual=jnp.where(sound, filter_residual, jnp.nan),
+        status=jnp.where(usable, solved.status, status),
         sensor=modes.sensors[r],
         argument=amplitude,
     )
 
 
 def _ratios_std(
-    natural: Array, damping: Array, covariance: Float[Array, "state output output"]
+    natural: Array,
+    damping: Array,
+    sensitivity: Float[Array, "state output input"],
+    relative_std: Float[Array, "state input"],
+    linear_variance: Float[Array, "state output"],
 ) -> tuple[Array, Array]:
-    """1σ of ω̃ and ζ̃ from the covariance of ω̃² and 2ζ̃ω̃."""
-    natural_std = jnp.sqrt(covariance[:, 0, 0]) / (2 * natural)
+    """1σ of ω̃ and ζ̃ from what the errors of the inputs and of the linear modes make of them."""
+    known = jnp.isfinite(natural) & jnp.all(jnp.isfinite(relative_std), axis=1)
+
+    def safe(value: Array, stand_in: float) -> Array:
+        return jnp.where(known.reshape(-1, *(1,) * (value.ndim - 1)), value, stand_in)
+
+    natural, damping = safe(natural, 1.0), safe(damping, 0.0)
+    slopes, variance = safe(sensitivity, 0.0), safe(relative_std, 0.0) ** 2
+    covariance = jnp.einsum("soi,si,spi->sop", slopes, variance, slopes)
+    covariance = covariance + jax.vmap(jnp.diag)(safe(linear_variance, 0.0))
+    natural_std = safe_root(covariance[:, 0, 0]) / (2 * natural)
     # ζ̃ = δ/(2ω̃): dζ̃ = dδ/(2ω̃) − ζ̃ dω̃²/(2ω̃²).
     slope = jnp.stack([-damping / (2 * natural**2), 1 / (2 * natural)], axis=1)
-    variance = jnp.einsum("so,sop,sp->s", slope, covariance[:, :2, :2], slope)
-    return natural_std, jnp.sqrt(variance)
+    of_damping = jnp.einsum("so,sop,sp->s", slope, covariance[:, :2, :2], slope)
+    return (
+        jnp.where(known, natural_std, jnp.nan),
+        jnp.where(known, safe_root(of_damping), jnp.nan),
+    )
 
 
 def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
@@ -178,10 +217,12 @@ def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
     orders = tuple(h for h in data.harmonic_order if h != 1)
     keep = [data.harmonic_order.index(h) for h in orders]
     harmonics = jnp.where(jnp.isfinite(data.harmonics.real), data.harmonics, 0.0)[..., keep]
-    spectrum = jnp.concatenate([data.velocity[..., None], harmonics], axis=-1)
+    moving = jnp.isfinite(data.velocity) & (data.velocity != 0)
+    velocity = jnp.where(moving, data.velocity, 1.0)
+    spectrum = jnp.concatenate([velocity[..., None], harmonics], axis=-1)
     flat = spectrum.reshape(-1, len(orders) + 1)
     peak = jax.vmap(lambda row: peak_amplitude(row, (1, *orders)))(flat)
-    return peak.reshape(data.velocity.shape) / jnp.abs(data.velocity)
+    return jnp.where(moving, peak.reshape(velocity.shape) / jnp.abs(velocity), jnp.nan)
 
 
 @eqx.filter_jit
@@ -199,27 +240,44 @@ def modal_filter(
     the relative errors of the sum and the relative residual of the least squares.
     """
     shape = modes.mode_shape[:, modes.mode_of_interest]
-    measured = data.measured & jnp.isfinite(jnp.abs(velocity))
+    measured = data.measured & jnp.isfinite(velocity)
+    velocity = jnp.where(measured, velocity, 0.0)
     residual = residual_velocity(modes, data.frequency, data.force)
     own = jnp.where(measured, velocity - residual, 0.0)
-    absolute = relative_std[..., 1] * jnp.abs(velocity)
-    known = jnp.all(jnp.where(measured, absolute > 0, True), axis=1, keepdims=True)
-    weight = jnp.where(measured, jnp.where(known, 1 / absolute**2, 1.0), 0.0)
+    errors = relative_std[..., 1:]
+    stated = jnp.isfinite(errors)
+    absolute = jnp.where(stated, errors, 0.0) * jnp.abs(velocity)[..., None]
+    # 1σ of the amplitude of every velocity that was measured, where all of them state it.
+    along = jnp.where(measured, absolute[..., 0], 1.0)
+    known = jnp.all(stated[..., 0] & (along > 0) | ~measured, axis=1, keepdims=True)
+    weight = jnp.where(measured, 1 / jnp.where(known, along, 1.0) ** 2, 0.0)
     norm = jnp.sum(weight * shape**2, axis=1, keepdims=True)
-    share = weight * shape * shape[r] / jnp.where(norm > 0, norm, jnp.nan)
+    seen = norm > 0
+    share = jnp.where(seen, weight * shape * shape[r] / jnp.where(seen, norm, 1.0), 0.0)
     modal = jnp.sum(share * own, axis=1, keepdims=True) / shape[r]
     misfit = jnp.where(measured, own - shape * modal, 0.0)
-    size = jnp.sqrt(jnp.sum(weight * jnp.abs(own) ** 2, axis=1))
-    relative_misfit = jnp.sqrt(jnp.sum(weight * jnp.abs(misfit) ** 2, axis=1)) / size
-    combined = jnp.sum(share * jnp.where(measured, velocity, 0.0), axis=1)
+
+    def size_of(parts: Complex[Array, "state sensor"]) -> Float[Array, " state"]:
+        return safe_root(jnp.sum(weight * (parts.real**2 + parts.imag**2), axis=1))
+
+    relative_misfit = _ratio(size_of(misfit), size_of(own))
+    combined = jnp.sum(share * velocity, axis=1)
+    length = jnp.abs(combined)
 
     # Errors of the sensors are independent; amplitude and phase errors lie along and across V.
     def error(component: int) -> Array:
-        each = jnp.where(measured, share * relative_std[..., component] * jnp.abs(velocity), 0.0)
-        return jnp.sqrt(jnp.sum(each**2, axis=1)) / jnp.abs(combined)
+        each = jnp.where(measured, share * absolute[..., component], 0.0)
+        told = jnp.all(stated[..., component] | ~measured, axis=1)
+        return jnp.where(told, _ratio(safe_root(jnp.sum(each**2, axis=1)), length), jnp.nan)
 
-    std = jnp.stack([relative_std[:, 0, 0], error(1), error(2)], axis=1)
-    return combined, share, std, relative_misfit
+    std = jnp.stack([relative_std[:, 0, 0], error(0), error(1)], axis=1)
+    return jnp.where(seen[:, 0], combined, jnp.nan), share, std, relative_misfit
+
+
+def _ratio(part: Float[Array, " state"], whole: Float[Array, " state"]) -> Float[Array, " state"]:
+    """part/whole, NaN where the whole is zero."""
+    there = whole > 0
+    return jnp.where(there, part / jnp.where(there, whole, 1.0), jnp.nan)
 
 
 def _solve(
@@ -229,6 +287,7 @@ def _solve(
     frequency: Array,
     inputs: Float[Array, "state input"],
     share: Float[Array, "state sensor"],
+    sound: Bool[Array, " state"],
 ) -> tuple[SnrmPoints, Array, Array, Array, Array]:
     """Points, mode's velocity, amplitude, derivatives, the linear modes' share of the variance."""
     j = modes.mode_of_interest
@@ -271,6 +330,9 @@ def _solve(
 
     constant, velocity, residual = measured(inputs, parameters, frequency, share)
     points = invert_phasor(constant, frequency, velocity, residual)
+    points = jax.tree.map(
+        lambda value: jnp.where(sound, value, jnp.nan) if value.dtype.kind == "f" else value, points
+    )
     solved = jnp.isfinite(points.natural_frequency)
     slopes = jax.vmap(jax.jacfwd(outputs, argnums=(0, 1)), in_axes=(0, None, 0, 0, 0))
     by_input, by_parameter = slopes(inputs, parameters, frequency, share, solved)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 
 class PointStatus(IntEnum):
@@ -52,7 +52,13 @@ class SnrmPoints(NamedTuple):
 
 
 class CramersRule(lx.AbstractLinearSolver[Any]):
-    """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step."""
+    """Solves a 2×2 linear system by Cramer's rule: the whole cost of a small Newton step.
+
+    With `zero_stays_zero` a zero right side has a zero answer even of a singular matrix: on the
+    way back of a derivative a failed member of a batch then adds nothing to the others.
+    """
+
+    zero_stays_zero: bool = False
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Array:
         """See `lineax.AbstractLinearSolver.init`."""
@@ -65,10 +71,12 @@ class CramersRule(lx.AbstractLinearSolver[Any]):
     ) -> tuple[Array, lx.RESULTS, dict[str, Any]]:
         """See `lineax.AbstractLinearSolver.compute`."""
         (a, b), (c, d) = state
-        determinant = a * d - b * c
-        x = (d * vector[0] - b * vector[1]) / determinant
-        y = (a * vector[1] - c * vector[0]) / determinant
-        return jnp.stack([x, y]), lx.RESULTS.successful, {}
+        x = (d * vector[0] - b * vector[1]) / (a * d - b * c)
+        y = (a * vector[1] - c * vector[0]) / (a * d - b * c)
+        found = jnp.stack([x, y])
+        if self.zero_stays_zero:
+            found = jnp.where(jnp.all(vector == 0), 0.0, found)
+        return found, lx.RESULTS.successful, {}
 
     def transpose(self, state: Array, options: dict[str, Any]) -> tuple[Array, dict[str, Any]]:
         """See `lineax.AbstractLinearSolver.transpose`."""
@@ -86,7 +94,7 @@ class CramersRule(lx.AbstractLinearSolver[Any]):
 _NEWTON: optx.AbstractRootFinder = optx.Newton(rtol=1e-11, atol=1e-12, linear_solver=CramersRule())
 _STEPS = 8  # from the closed form one step is enough, two where the two roots nearly meet
 _CHUNK = 1 << 14  # members that are solved at a time on a CPU: they stay in its cache
-_ADJOINT = optx.ImplicitAdjoint(linear_solver=CramersRule())
+_ADJOINT = optx.ImplicitAdjoint(linear_solver=CramersRule(zero_stays_zero=True))
 
 
 def closed_form(
@@ -130,14 +138,18 @@ def invert_phasor(
     Returns `SnrmPoints`. Differentiable (implicitly, through the two equations).
     Reference: Kwarta & Allen, Eqs. (12), (17), (18).
     """
-    mode_velocity = velocity - residual_velocity
+    return _invert_phasor(modal_constant, frequency, velocity, residual_velocity)
+
+
+@jax.jit
+def _invert_phasor(
+    modal_constant: Array, frequency: Array, velocity: Array, residual: Array
+) -> SnrmPoints:
+    amplitude = _length(velocity)
+    mode_velocity = velocity - residual
+    direction = _direction(mode_velocity)
     return _invert(
-        modal_constant,
-        frequency,
-        jnp.abs(velocity),
-        *_direction(mode_velocity),
-        residual_velocity,
-        jnp.abs(mode_velocity),
+        modal_constant, frequency, amplitude, *direction, residual, _length(mode_velocity)
     )
 
 
@@ -199,9 +211,26 @@ def invert_amplitude_phase(
 
 
 def _direction(phasor: Complex[Array, "*batch"]) -> tuple[Array, Array]:
-    """Cosine and sine of the phase, without the loss of an arctangent."""
-    length = jnp.abs(phasor)
-    return phasor.real / length, phasor.imag / length
+    """Cosine and sine of the phase, without the loss of an arctangent; NaN where there is none."""
+    phasor = jnp.asarray(phasor)
+    known = _is_known(phasor)
+    safe = jnp.where(known, phasor, 1.0)
+    length = jnp.abs(safe)
+    return jnp.where(known, safe.real / length, jnp.nan), jnp.where(
+        known, safe.imag / length, jnp.nan
+    )
+
+
+def _length(phasor: Complex[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """|phasor|, without derivatives where it is zero or not finite."""
+    phasor = jnp.asarray(phasor)
+    known = _is_known(phasor)
+    plain = jax.lax.stop_gradient(jnp.abs(phasor))
+    return jnp.where(known, jnp.abs(jnp.where(known, phasor, 1.0)), plain)
+
+
+def _is_known(phasor: Complex[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    return jnp.isfinite(phasor) & (phasor != 0)
 
 
 def _from_polar(
@@ -209,8 +238,13 @@ def _from_polar(
 ) -> tuple[Array, Array]:
     ratio = frequency * modal_constant / length
     squared = frequency**2 + ratio * sine
-    natural_frequency = jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
-    return natural_frequency, ratio * cosine / (2 * natural_frequency * frequency)
+    real = squared > 0
+    natural_frequency = jnp.sqrt(jnp.where(real, squared, 1.0))
+    damping_ratio = ratio * cosine / (2 * natural_frequency * frequency)
+    return (
+        jnp.where(real, natural_frequency, jnp.nan),
+        jnp.where(real, damping_ratio, jnp.nan),
+    )
 
 
 def _equations(unknowns: Array, args: tuple) -> Array:
@@ -255,8 +289,12 @@ def _newton(
     )
     good = jnp.asarray(solution.result == optx.RESULTS.successful)
     squared = 1.0 + solution.value[0] / scale
-    x = jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
-    return x * frequency, solution.value[1] / (2.0 * scale * x), good
+    real = squared > 0
+    # NaN only at the end: inside it would pass every `where` on a derivative's way back.
+    x = jnp.sqrt(jnp.where(real, squared, 1.0))
+    natural = jnp.where(real, x * frequency, jnp.nan)
+    damping = jnp.where(real, solution.value[1] / (2.0 * scale * x), jnp.nan)
+    return natural, damping, good
 
 
 @jax.jit
@@ -290,21 +328,7 @@ def _invert_flat(
     residual: Array,
     known_length: Array,
 ) -> SnrmPoints:
-    # r² + 2br + d = 0 with b = Re(e^{−iφ} W), d = |W|² − v²; the root far from zero first.
-    half = cosine * residual.real + sine * residual.imag
-    product = (jnp.abs(residual) - amplitude) * (jnp.abs(residual) + amplitude)
-    discriminant = half * half - product
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    far = -(half + jnp.copysign(root, half))
-    near = product / jnp.where(far == 0, jnp.nan, far)
-    larger, smaller = jnp.fmax(far, near), jnp.fmin(far, near)
     known = jnp.isfinite(known_length)
-    # With the phasor measured, r is known and the other root follows from the sum −2b.
-    length = jnp.where(known, known_length, larger)
-    other = jnp.where(known, -2.0 * half - known_length, smaller)
-    has_root = known | ((discriminant >= 0) & (length > 0))
-    has_other = (other > 0) & (jnp.abs(other - length) > 1e-12 * length)
-
     finite = (
         jnp.isfinite(modal_constant)
         & jnp.isfinite(frequency)
@@ -314,6 +338,34 @@ def _invert_flat(
         & (amplitude > 0)
         & (frequency > 0)
     )
+    # What is not finite is kept out of every step: in a derivative `where` does not stop a NaN.
+    modal_constant, frequency, amplitude, cosine, sine, residual, known_length = (
+        jnp.where(finite, value, stand_in)
+        for value, stand_in in (
+            (modal_constant, 1.0),
+            (frequency, 1.0),
+            (amplitude, 1.0),
+            (cosine, 1.0),
+            (sine, 0.0),
+            (residual, 0.0),
+            (jnp.where(known, known_length, 1.0), 1.0),
+        )
+    )
+    # r² + 2br + d = 0 with b = Re(e^{−iφ} W), d = |W|² − v²; the root far from zero first.
+    half = cosine * residual.real + sine * residual.imag
+    product = (jnp.abs(residual) - amplitude) * (jnp.abs(residual) + amplitude)
+    discriminant = half * half - product
+    several = discriminant > 0
+    root = jnp.where(several, jnp.sqrt(jnp.where(several, discriminant, 1.0)), 0.0)
+    far = -(half + jnp.copysign(root, half))
+    near = jnp.where(far == 0, jnp.nan, product / jnp.where(far == 0, 1.0, far))
+    larger, smaller = jnp.fmax(far, near), jnp.fmin(far, near)
+    # With the phasor measured, r is known and the other root follows from the sum −2b.
+    length = jnp.where(known, known_length, larger)
+    other = jnp.where(known, -2.0 * half - known_length, smaller)
+    has_root = known | ((discriminant >= 0) & (length > 0))
+    has_other = (other > 0) & (jnp.abs(other - length) > 1e-12 * length)
+
     forced = modal_constant != 0
     solvable = finite & forced & has_root
 

@@ -1,15 +1,14 @@
 """Points of the backbone against steady states whose ω̃ and ζ̃ are known; errors by Monte Carlo."""
 
-import dataclasses
-
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from snrmjax.identify.pointwise.backbone_points import identify_points
 from snrmjax.identify.pointwise.inversion import PointStatus
-from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_modes
 
 SENSORS = ("tip", "middle", "root")
@@ -167,14 +166,7 @@ class TestExactStates:
         data = TRUTH.table(velocity_std=0.01 * np.abs(TRUTH.velocity))
         plain = identify_points(data, three_modes())
         moved = identify_points(
-            SteadyStates(
-                **{
-                    f.name: getattr(data, f.name)[order]
-                    if f.name not in ("sensors", "harmonic_order")
-                    else getattr(data, f.name)
-                    for f in dataclasses.fields(data)
-                }
-            ),
+            jax.tree.map(lambda column: column[order], data),
             three_modes(),
         )
         for name in ("natural_frequency", "damping_ratio", "amplitude", "damping_ratio_std"):
