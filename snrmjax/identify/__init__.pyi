@@ -2,7 +2,7 @@ from .calibrate.calibration import CalibratedModel, calibrate_model
 from .curves.families import FAMILIES
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedPoint, FittedResponse, fitted_response
-from .inference.optimal_design import NextMeasurement, next_measurements
+from .inference.optimal_design import AdviceStatus, NextMeasurement, NextMeasurements, next_measurements
 from .inference.uncertainty import (
     bootstrap,
     compare_bands,
@@ -33,6 +33,7 @@ from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velo
 
 __all__ = [
     "FAMILIES",
+    "AdviceStatus",
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
@@ -42,6 +43,7 @@ __all__ = [
     "Identification",
     "JointFit",
     "NextMeasurement",
+    "NextMeasurements",
     "PointStatus",
     "PredictedResponse",
     "Resonance",

@@ -13,7 +13,7 @@ from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedPoint, FittedResponse
-from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
 from snrmjax.identify.inference.uncertainty import Contribution
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.joint.joint_fit import JointFit, Rival
@@ -33,13 +33,18 @@ def write_fitted_backbone(path: Path, fit: JointFit) -> None:
     write_values(path, values_to_the_largest(fit, BAND_POINTS))
 
 
-def write_next(path: Path, advice: Sequence[NextMeasurement]) -> None:
-    """Write the advised measurements, the best first."""
+def write_next(path: Path, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:
+    """Write the advised measurements, the best first.
+
+    Where only the drive is known, `drive_v` stands in place of `force_n`, as in measured data.
+    """
+    drives = [one.drive for one in advice if one.drive is not None]
+    load = {"drive_v": drives} if drives else {"force_n": [one.force for one in advice]}
     write_table(
         path,
         {
             "rank": [one.rank for one in advice],
-            "force_n": [one.force for one in advice],
+            **load,
             "frequency_hz": [one.frequency / HERTZ for one in advice],
             "expected_band_ratio": [one.expected_band_ratio for one in advice],
             "reason": [one.reason for one in advice],

@@ -1,7 +1,8 @@
 """Which steady state to measure next: the one that makes a band narrowest."""
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,25 +29,114 @@ from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import whitened
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 
 Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
 
+_HERTZ = 2 * np.pi  # rad/s
+_SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
 _TARGETS = 25  # amplitudes at which the band of a curve counts
 _FROM_FOLD = 0.002  # relative frequency by which a state must keep away from a fold
 _FARTHEST = np.radians(70.0)  # from resonance: beyond it other errors rule
 
 
+class AdviceStatus(IntEnum):
+    """How the search for the next measurements ended."""
+
+    COMPLETE = 0  # as many states as were asked for
+    FEWER_STATES = 1  # all states that a test can reach, fewer than were asked for
+    NO_STATE = 2  # no state that a test can reach
+
+
+ADVICE_MESSAGE: dict[AdviceStatus, str] = {
+    AdviceStatus.COMPLETE: "as many states as were asked for",
+    AdviceStatus.FEWER_STATES: "fewer candidate states than were asked for",
+    AdviceStatus.NO_STATE: (
+        "no stable state of the fitted responses within 70° of resonance can be measured in this "
+        "range of forces, frequencies and measured amplitudes"
+    ),
+}
+
+
 class NextMeasurement(NamedTuple):
     """One advised steady state."""
 
     rank: int
-    force: float  # N
+    force: float  # N; by the gain that the fit found where only the drive is known
     frequency: float  # rad/s
     velocity: float  # m/s, expected
     phase: float  # rad, expected of the velocity relative to the force
     expected_band_ratio: float  # mean band after this and the ones before it, over today's
     reason: str
+    drive: float | None = None  # V, where only the drive is known
+
+
+class NextMeasurements(AbstractResult):
+    """Advised steady states, the best first; a sequence of `NextMeasurement`."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("rank",)
+
+    measurements: tuple[NextMeasurement, ...]
+    responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
+    sensor: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    status: AdviceStatus = eqx.field(static=True)
+    drive_known_only: bool = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        """Number of advised states."""
+        return len(self.measurements)
+
+    def __getitem__(self, place: int) -> NextMeasurement:
+        """The state at a place, the best at 0."""
+        return self.measurements[place]
+
+    def __iter__(self) -> Iterator[NextMeasurement]:
+        """The states, the best first."""
+        return iter(self.measurements)
+
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return ADVICE_MESSAGE[self.status]
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
+        for one in self.measurements[:_SHOWN]:
+            load = f"{one.force:.4g} N" if one.drive is None else f"{one.drive:.4g} V"
+            lines.append(f"{one.rank}. {load} at {one.frequency / _HERTZ:.6g} Hz: {one.reason}")
+        if len(self) > _SHOWN:
+            lines.append(f"and {len(self) - _SHOWN} more")
+        if self.status != AdviceStatus.COMPLETE:
+            lines.append(f"status: {self.message}")
+        return tuple(lines)
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+
+        def column(values: list, unit: str, meaning: str) -> Variable:
+            return Variable(("rank",), np.array(values), unit, meaning)
+
+        rows = self.measurements
+        load = {"force_n": column([one.force for one in rows], "N", "force")}
+        if self.drive_known_only:
+            load = {"drive_v": column([one.drive for one in rows], "V", "drive voltage")}
+        ratio = [one.expected_band_ratio for one in rows]
+        return {
+            "rank": column([one.rank for one in rows], "1", "rank, the best first"),
+            **load,
+            "frequency_hz": column([one.frequency / _HERTZ for one in rows], "Hz", "frequency"),
+            "velocity_m_s": column([one.velocity for one in rows], "m/s", "expected velocity"),
+            "phase_deg": column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
+            "expected_band_ratio": column(ratio, "1", "mean band width after it, over today's"),
+            "reason": column([one.reason for one in rows], "", "why this state"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {"target": self.target, "sensor": self.sensor, "status": self.message}
 
 
 def next_measurements(
@@ -55,10 +145,10 @@ def next_measurements(
     *,
     target: Target = "curves",
     target_force: float | None = None,
-    forces: Sequence[float] | None = None,
+    forces: Sequence[float] | Float[np.ndarray, " force"] | None = None,
     from_frequency: float = 0.0,
     to_frequency: float = np.inf,
-) -> list[NextMeasurement]:
+) -> NextMeasurements:
     """Rank steady states by how much they would narrow a band, each given the ones before it.
 
     Candidates are the stable states of the fitted responses within 70° of resonance; left out are
@@ -68,28 +158,49 @@ def next_measurements(
     are those of the families taken, without what the choice among families leaves open.
 
     Arguments: `target` is the band to narrow: of both curves (relative), of natural frequency or
-    damping alone, or of the frequency of the resonance or upper fold under `target_force` (N).
-    `forces` in N, by default twelve from the smallest to the largest measured; frequencies in
-    rad/s.
-    Returns at most `count` states, fewer when there are no more candidates.
-    Raises `ValueError` when the target needs a force and has none, does not exist there, or when
-    no state can be measured.
+    damping alone, or of the frequency of the resonance or upper fold under `target_force`.
+    `forces`, by default twelve from the smallest to the largest measured. Both are in N, or in V
+    where the fitted data know the drive only. Frequencies in rad/s.
+    Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so.
+    Raises `ValueError` when the target needs a force and has none, or does not exist there.
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
     """
     measured = np.asarray(fit.motion().force)
-    wanted = forces if forces is not None else np.geomspace(measured.min(), measured.max(), 12)
-    ends = (from_frequency, to_frequency)
-    states = _candidates(fit, [float(f) for f in wanted], ends)
-    if states is None:
-        raise ValueError("no stable state of the fitted responses can be measured in this range.")
+    wanted = np.geomspace(measured.min(), measured.max(), 12)
+    if forces is not None:
+        wanted = fit.force_of_drive(np.asarray(forces)) if fit.drive_known_only else forces
+    if target_force is not None and fit.drive_known_only:
+        target_force = float(fit.force_of_drive(target_force))
+    states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
     slopes, scale = _target(fit, target, target_force)
+    advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
+    loads = {one.force for one in advice}
+    status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
+    return NextMeasurements(
+        measurements=tuple(advice),
+        responses=() if states is None else tuple(c for c in states.curves if c.force in loads),
+        sensor=fit.modes.sensors[fit.data.sensor],
+        target=target,
+        status=status if states is not None else AdviceStatus.NO_STATE,
+        drive_known_only=fit.drive_known_only,
+    )
+
+
+def _ranked(
+    fit: JointFit,
+    states: "_States",
+    slopes: Float[np.ndarray, "output unknown"],
+    target: Target,
+    count: int,
+) -> list[NextMeasurement]:
+    """The best states one after the other; `slopes` of what shall become better known."""
     rows = _information(fit, states)
     p, n_levels = fit.covariance.shape[0], rows.shape[2] - fit.covariance.shape[0]
     covariance = np.zeros((p + n_levels, p + n_levels))
     covariance[:p, :p] = fit.covariance
     covariance[p:, p:] = np.eye(n_levels)
-    slopes = np.pad(slopes / scale[:, None], ((0, 0), (0, n_levels)))
+    slopes = np.pad(slopes, ((0, 0), (0, n_levels)))
     before = _mean_band(slopes, covariance)
     advice: list[NextMeasurement] = []
     open_states = np.ones(len(states.frequency), dtype=bool)
@@ -101,15 +212,17 @@ def next_measurements(
         arm = rows[best] @ covariance
         covariance = covariance - arm.T @ np.linalg.solve(np.eye(2) + arm @ rows[best].T, arm)
         open_states[best] = False
+        force = float(states.force[best])
         advice.append(
             NextMeasurement(
                 rank=rank,
-                force=float(states.force[best]),
+                force=force,
                 frequency=float(states.frequency[best]),
                 velocity=float(abs(states.velocity[best])),
                 phase=float(np.angle(states.velocity[best])),
                 expected_band_ratio=float(_mean_band(slopes, covariance) / before),
                 reason=_reason(target, states, best, old, variance),
+                drive=float(fit.recorded_force(force)) if fit.drive_known_only else None,
             )
         )
     return advice
@@ -120,13 +233,15 @@ class _States(NamedTuple):
     force: np.ndarray
     frequency: np.ndarray
     velocity: Complex[np.ndarray, " state"]
+    curves: tuple[FittedResponse, ...]  # that they are of
 
 
 def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -> _States | None:
-    rows = []
+    rows, every = [], []
     for number, force in enumerate(forces):
         curves = fitted_response(fit, force, from_frequency=ends[0], to_frequency=ends[1])
         for curve in curves[:1]:
+            every.append(curve)
             keep = _measurable(curve)
             at = np.flatnonzero(keep)
             if at.size > _PER_FORCE:
@@ -139,7 +254,7 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
             )
     if not rows or not sum(len(row[0]) for row in rows):
         return None
-    return _States(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    return _States(*(np.concatenate(c) for c in zip(*rows, strict=True)), tuple(every))
 
 
 def _measurable(curve: FittedResponse) -> np.ndarray:
@@ -174,14 +289,12 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
     """Whitened slopes of every candidate's balance, by the unknowns and by new levels' errors."""
     n, n_levels = len(states.force), int(states.level.max()) + 1
     std = np.median(np.asarray(fit.data.std), axis=0)
-    gain = float(jnp.exp(fit.unknowns.log_force_gain))
-    offset = float(fit.unknowns.force_offset) * float(jnp.min(fit.data.force))
     share = np.zeros((n, fit.data.share.shape[1]))
     share[:, fit.data.sensor] = 1.0
     data = BalanceData(
         level=jnp.asarray(states.level),
         frequency=jnp.asarray(states.frequency),
-        force=jnp.asarray((states.force - offset) / gain),
+        force=jnp.asarray(fit.recorded_force(states.force)),
         velocity=jnp.asarray(states.velocity * np.exp(1j * float(fit.unknowns.instrument_phase))),
         share=jnp.asarray(share),
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),

@@ -124,6 +124,18 @@ class JointFit(eqx.Module):
         """The nonlinear mode's motion in the states as the fit sees it."""
         return recorded_motion(in_one_form(self.unknowns), self.data, self.modes, self.spread)
 
+    def recorded_force(self, force: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """What the test records of a force in N: in N, or in V where only the drive is known."""
+        gain = float(jnp.exp(self.unknowns.log_force_gain))
+        offset = float(self.unknowns.force_offset) * float(jnp.min(self.data.force))
+        return (np.asarray(force) - offset) / gain
+
+    def force_of_drive(self, drive: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+        """The force in N that belongs to what a test records (`recorded_force`)."""
+        gain = float(jnp.exp(self.unknowns.log_force_gain))
+        offset = float(self.unknowns.force_offset) * float(jnp.min(self.data.force))
+        return np.asarray(drive) * gain + offset
+
     def vector(self) -> tuple[Float[Array, " unknown"], Restore]:
         """The free unknowns as a vector, and the way back to all of them."""
         restore = Restore(self.unknowns, self.free)
