@@ -267,11 +267,12 @@ def identify(
         notes = measured.notes
         for note in notes:
             _warn(note)
-        joint, advice = None, []
+        joint: sj.identify.JointFit | None = None
+        advice: tuple[sj.identify.NextMeasurement, ...] = ()
         if fit is not None or free or advise:
             joint = fit_as_asked(measured, structure, fit or "auto", free or [], robust=robust)
             measured = corrected(measured, joint)
-            advice = sj.next_measurements(joint, advise) if advise else []
+            advice = tuple(sj.next_measurements(joint, advise)) if advise else ()
         told = present_identification(
             measured,
             structure,

@@ -2,7 +2,12 @@ from .calibrate.calibration import CalibratedModel, calibrate_model
 from .curves.families import FAMILIES
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedPoint, FittedResponse, fitted_response
-from .inference.optimal_design import AdviceStatus, NextMeasurement, NextMeasurements, next_measurements
+from .inference.optimal_design import (
+    AdviceStatus,
+    NextMeasurement,
+    NextMeasurements,
+    next_measurements,
+)
 from .inference.uncertainty import (
     bootstrap,
     compare_bands,

@@ -38,8 +38,10 @@ def write_next(path: Path, advice: Sequence[NextMeasurement] | NextMeasurements)
 
     Where only the drive is known, `drive_v` stands in place of `force_n`, as in measured data.
     """
+    load = {"force_n": [one.force for one in advice]}
     drives = [one.drive for one in advice if one.drive is not None]
-    load = {"drive_v": drives} if drives else {"force_n": [one.force for one in advice]}
+    if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
+        load = {"drive_v": drives}
     write_table(
         path,
         {

@@ -169,9 +169,10 @@ def next_measurements(
     measured = np.asarray(fit.motion().force)
     wanted = np.geomspace(measured.min(), measured.max(), 12)
     if forces is not None:
-        wanted = fit.force_of_drive(np.asarray(forces)) if fit.drive_known_only else forces
+        given = np.asarray(forces, dtype=np.float64)
+        wanted = fit.force_of_drive(given) if fit.drive_known_only else given
     if target_force is not None and fit.drive_known_only:
-        target_force = float(fit.force_of_drive(target_force))
+        target_force = float(fit.force_of_drive(np.asarray(target_force)))
     states = _candidates(fit, [float(f) for f in wanted], (from_frequency, to_frequency))
     slopes, scale = _target(fit, target, target_force)
     advice = [] if states is None else _ranked(fit, states, slopes / scale[:, None], target, count)
@@ -213,6 +214,7 @@ def _ranked(
         covariance = covariance - arm.T @ np.linalg.solve(np.eye(2) + arm @ rows[best].T, arm)
         open_states[best] = False
         force = float(states.force[best])
+        drive = float(fit.recorded_force(states.force[best]))
         advice.append(
             NextMeasurement(
                 rank=rank,
@@ -222,7 +224,9 @@ def _ranked(
                 phase=float(np.angle(states.velocity[best])),
                 expected_band_ratio=float(_mean_band(slopes, covariance) / before),
                 reason=_reason(target, states, best, old, variance),
-                drive=float(fit.recorded_force(force)) if fit.drive_known_only else None,
+                drive=float(fit.recorded_force(np.asarray(force)))
+                if fit.drive_known_only
+                else None,
             )
         )
     return advice
@@ -254,7 +258,8 @@ def _candidates(fit: JointFit, forces: list[float], ends: tuple[float, float]) -
             )
     if not rows or not sum(len(row[0]) for row in rows):
         return None
-    return _States(*(np.concatenate(c) for c in zip(*rows, strict=True)), tuple(every))
+    level, load, frequency, velocity = (np.concatenate(c) for c in zip(*rows, strict=True))
+    return _States(level, load, frequency, velocity, tuple(every))
 
 
 def _measurable(curve: FittedResponse) -> np.ndarray:

@@ -1,5 +1,6 @@
 """How sure a joint fit is: by implicit derivatives, profiles, resampling and sampling."""
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -43,7 +44,7 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
 
 _PIN = 1e4  # weight, in its own 1σ, with which a profile holds an unknown
-_HALF = 1.96
+_RISE = 3.84  # of χ² at the ends of a 95 % interval
 
 
 class Sensitivity(NamedTuple):
@@ -63,14 +64,31 @@ class Contribution(NamedTuple):
     kind: str  # of source: what all levels, or all linear parameters, have in common
 
 
+class IntervalEnd(IntEnum):
+    """How an end of a profile's 95 % interval is known."""
+
+    BRACKETED = 0  # between two values whose refits converged
+    BEYOND_REACH = 1  # χ² rises by less than 3.84 up to the last value tried: farther away
+    NOT_COMPUTED = 2  # the refits that would bracket it failed
+
+
+END_MESSAGE: dict[IntervalEnd, str] = {
+    IntervalEnd.BRACKETED: "between two computed values",
+    IntervalEnd.BEYOND_REACH: "beyond the values tried: ask for a larger `reach`",
+    IntervalEnd.NOT_COMPUTED: "not computed: the refits that would bracket it failed",
+}
+
+
 class Profile(NamedTuple):
     """The best fit's cost against one unknown, the others fitted anew."""
 
     name: str
     values: Float[np.ndarray, " point"]
-    rise: Float[np.ndarray, " point"]  # of χ² over its least value
-    lower: float  # 95 %, where the rise is 3.84; NaN where it does not get there
-    upper: float
+    rise: Float[np.ndarray, " point"]  # of χ² over its least value; NaN where the refit failed
+    lower: float  # 95 %, where the rise is 3.84; −∞ beyond the values tried, NaN not computed
+    upper: float  # likewise, +∞
+    lower_status: IntervalEnd
+    upper_status: IntervalEnd
 
 
 def sensitivity(fit: JointFit) -> Sensitivity:
@@ -260,11 +278,28 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
             *(np.array(fit.freed), jnp.asarray(std), np.array(index), jnp.asarray(values)),
         )
     )
-    rise = cost - cost[len(cost) // 2]
-    middle = len(rise) // 2
-    below = np.interp(-3.84, -rise[: middle + 1], values[: middle + 1], left=np.nan)
-    above = np.interp(3.84, rise[middle:], values[middle:], right=np.nan)
-    return Profile(name, values, rise, float(below), float(above))
+    middle = len(cost) // 2
+    # The value in the middle is the fit's own.
+    rise = cost - cost[middle]
+    below, below_status = _crossing(values[middle::-1], rise[middle::-1])
+    above, above_status = _crossing(values[middle:], rise[middle:])
+    return Profile(name, values, rise, below, above, below_status, above_status)
+
+
+def _crossing(values: np.ndarray, rise: np.ndarray) -> tuple[float, IntervalEnd]:
+    """Where the rise first passes 3.84, going outwards from the fit's own value.
+
+    Values at which the refit failed are left out: neighbours that were computed bracket the end.
+    """
+    known = np.isfinite(rise)
+    outside = np.flatnonzero(rise[known] >= _RISE)
+    if outside.size and outside[0] > 0:
+        pair = slice(outside[0] - 1, outside[0] + 1)
+        end = np.interp(_RISE, rise[known][pair], values[known][pair])
+        return float(end), IntervalEnd.BRACKETED
+    if known[-1] and known[0]:
+        return float(np.sign(values[-1] - values[0]) * np.inf), IntervalEnd.BEYOND_REACH
+    return float("nan"), IntervalEnd.NOT_COMPUTED
 
 
 @compiled

@@ -19,6 +19,7 @@ from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonan
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
 
@@ -68,6 +69,26 @@ class Spread(eqx.Module):
 
     level: Float[Array, " error"]  # of `LEVEL_ERRORS`
     linear: Float[Array, " deviation"]  # natural frequencies (rad/s), then damping ratios
+
+
+def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
+    """Stated 1σ of `LEVEL_ERRORS`, zero where nothing is stated, as for linear modes alone.
+
+    A natural frequency with 1σ of σ rad/s has a relative stiffness with 2σ/ω; the damping ratio's
+    1σ counts relative to the linear one.
+    Raises `ValueError` for a stated 1σ of the damping ratio of a mode without damping.
+    """
+    if isinstance(model, LinearModes):
+        return np.zeros(len(LEVEL_ERRORS))
+    gain, phase, frequency, damping = model.level_stds
+    j = model.modes.mode_of_interest
+    own, ratio = float(model.modes.natural_frequency[j]), float(model.modes.damping_ratio[j])
+    if damping > 0 and ratio <= 0:
+        raise ValueError(
+            "`level_damping_std` is stated, but the linear damping ratio that it is relative to "
+            "is 0: state a damping ratio."
+        )
+    return np.array([gain, phase, 2 * frequency / own, damping / ratio if damping > 0 else 0.0])
 
 
 def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:

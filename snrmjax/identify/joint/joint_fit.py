@@ -19,6 +19,7 @@ from snrmjax.identify.joint.force_balance import (
     Weighing,
     balance_data,
     recorded_motion,
+    stated_level_std,
     weighing_at,
 )
 from snrmjax.identify.joint.free_unknowns import (
@@ -181,15 +182,16 @@ def fit_jointly(
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
     chosen by predicting left-out levels, and so is the family itself for "auto". `free` may name
     "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only the
-    drive is known. `level_gain_std` relative, `level_phase_std` in rad; what is not given is what
-    the structure states where `modes` is one, and nothing where it is not.
+    drive is known. `modes` may be a structure, which also states the 1σ of what the states of a
+    level share: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
+    `level_phase_std` (rad), where given, stand in place of the first two.
     Returns a `JointFit`. Raises `ValueError` for too few states, an unknown family or name, and a
     family with more parameters than there are data.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     """
-    gain, phase = (0.0, 0.0) if isinstance(modes, LinearModes) else modes.level_stds[:2]
-    level_gain_std = gain if level_gain_std is None else level_gain_std
-    level_phase_std = phase if level_phase_std is None else level_phase_std
+    level_std = stated_level_std(modes)
+    for k, std in enumerate((level_gain_std, level_phase_std)):
+        level_std[k] = level_std[k] if std is None else std
     modes = modes_of(modes)
     unknown = [name for name in free if name not in FREE]
     if unknown:
@@ -208,7 +210,7 @@ def fit_jointly(
     linear_std = np.concatenate(
         [np.asarray(modes.natural_frequency_std)[keep], np.asarray(modes.damping_ratio_std)[keep]]
     )
-    spread = Spread(jnp.array([level_gain_std, level_phase_std, 0.0, 0.0]), jnp.asarray(linear_std))
+    spread = Spread(jnp.asarray(level_std), jnp.asarray(linear_std))
     wanted = parse_family(backbone), parse_family(damping)
 
     def select(pilot: Unknowns, data: BalanceData, *, scatter_too: bool) -> Selection:

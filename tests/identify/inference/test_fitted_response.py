@@ -6,10 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.exact_states import CONSTANT, damping, modes, noisy, squared
+from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_response import as_backbone, point_slopes
+from snrmjax.io.joint_results import write_next
 
 FORCE = 2.2  # N: folds are there
 
@@ -225,5 +226,47 @@ def test_wrong_targets_are_said(fit):
         sj.next_measurements(fit, 1, target="fold")
     with pytest.raises(ValueError, match="has no fold"):
         sj.next_measurements(fit, 1, target="fold", target_force=0.05)
-    with pytest.raises(ValueError, match="no stable state"):
-        sj.next_measurements(fit, 1, from_frequency=5000.0)
+
+
+def test_no_state_that_a_test_can_reach_is_an_answer(fit):
+    none = sj.next_measurements(fit, 2, from_frequency=5000.0)
+    assert len(none) == 0
+    assert none.status == sj.identify.AdviceStatus.NO_STATE
+    assert "no stable state" in none.message
+    assert "no stable state" in repr(none)
+    few = sj.next_measurements(fit, 10_000, forces=[1.0])
+    assert 0 < len(few) < 10_000
+    assert few.status == sj.identify.AdviceStatus.FEWER_STATES
+
+
+def test_where_only_the_drive_is_known_advice_is_in_volts(tmp_path):
+    level, omega, force, velocity = exact()
+    gain = 0.4  # N/V
+    data = sj.measure.steady_states(
+        *(level, omega, np.full(len(level), np.nan), velocity),
+        velocity_std=0.01 * np.abs(velocity),
+        phase_std=np.full((len(level), 1), 0.01),
+        drive=force / gain,
+    )
+    fit = sj.fit_jointly(data, modes(), **TRUE)
+    advice = sj.next_measurements(fit, 2, forces=[2.0, 4.0])  # V
+    assert {round(one.drive, 9) for one in advice} <= {2.0, 4.0}
+    for one in advice:
+        assert one.force == pytest.approx(gain * one.drive, rel=1e-6)
+    assert " V at " in repr(advice)
+    assert advice.to_xarray()["drive_v"].attrs["units"] == "V"
+    assert "force_n" not in advice.to_pandas()
+    write_next(tmp_path / "next.csv", advice)
+    header, first, _ = (tmp_path / "next.csv").read_text().splitlines()
+    assert header == "rank,drive_v,frequency_hz,expected_band_ratio,reason"
+    assert float(first.split(",")[1]) == pytest.approx(advice[0].drive)
+
+
+def test_advice_is_a_table(fit):
+    advice = sj.next_measurements(fit, 3)
+    table = advice.to_pandas()
+    assert list(table["rank"]) == [1, 2, 3]
+    assert table["frequency_hz"][0] == pytest.approx(advice[0].frequency / (2 * np.pi))
+    assert advice.to_xarray()["force_n"].attrs["units"] == "N"
+    assert repr(advice).startswith("NextMeasurements: 3 states")
+    assert advice.plot().axes

@@ -7,7 +7,9 @@ import pytest
 from truth.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
 
 import snrmjax as sj
+from snrmjax.identify.inference import uncertainty
 from snrmjax.identify.inference.uncertainty import (
+    IntervalEnd,
     bootstrap,
     compare_bands,
     contributions,
@@ -119,6 +121,30 @@ def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
     assert np.all(found.rise > -1e-6)
     with pytest.raises(ValueError, match="no unknown"):
         profile(fit, "damping.dry")
+
+
+@pytest.mark.parametrize(
+    ("failed", "end", "status"),
+    [
+        ([8], 2.0, IntervalEnd.BRACKETED),  # within: neighbours bracket the end all the same
+        ([12], 2.0, IntervalEnd.BRACKETED),  # beyond it
+        ([*range(9, 15)], np.nan, IntervalEnd.NOT_COMPUTED),
+        ([], np.inf, IntervalEnd.BEYOND_REACH),
+    ],
+)
+def test_a_profile_does_not_pass_through_refits_that_failed(fit, monkeypatch, failed, end, status):
+    """χ² that rises by 3.84 two values from the best one, with refits that failed."""
+    offsets = np.arange(-7, 8)
+    rise = 3.84 * (offsets / 2) ** 2 if end != np.inf else 0.01 * offsets**2.0
+    rise[failed] = np.nan
+    monkeypatch.setattr(uncertainty, "_pinned", lambda *_: 100.0 + rise)
+    found = profile(fit, "damping.viscous", n_points=15, reach=7.0)
+    middle, std = float(fit.vector()[0][2]), np.sqrt(fit.covariance[2, 2])
+    assert found.upper_status == status
+    assert (found.upper - middle) / std == pytest.approx(end, nan_ok=True)
+    lower = -np.inf if end == np.inf else -2.0
+    assert (found.lower - middle) / std == pytest.approx(lower)
+    assert found.lower_status != IntervalEnd.NOT_COMPUTED
 
 
 @pytest.mark.long

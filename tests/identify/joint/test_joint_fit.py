@@ -49,6 +49,21 @@ def test_a_structure_states_the_errors_of_its_levels(fit):
     np.testing.assert_array_equal(found.covariance, fit.covariance)
 
 
+def test_stated_differences_of_frequency_and_damping_between_levels_reach_the_fit():
+    """At 500 rad/s, 1σ of 1 rad/s is 0.4 % of the stiffness; 0.0006 of 0.012 is 5 %."""
+    model = sj.model.structure(modes(), level_frequency_std=1.0, level_damping_std=6e-4)
+    found = fit_jointly(noisy(2), model, **TRUE)
+    np.testing.assert_allclose(found.spread.level, [0.0, 0.0, 0.004, 0.05], rtol=1e-12)
+    plain = fit_jointly(noisy(2), modes(), **TRUE)
+    wide, narrow = (sj.identify.fitted_values(f, SPEEDS) for f in (found, plain))
+    # Five levels that each differ by 1 rad/s leave their mean known to 1/sqrt(5) of it at best.
+    assert np.all(np.asarray(wide.natural_frequency_std) > 0.99 / np.sqrt(5))
+    assert np.all(np.asarray(narrow.natural_frequency_std) < 0.5 / np.sqrt(5))
+    stiff = sj.model.linear_modes([OMEGA], [0.0], [[2.0]], [3.0])
+    with pytest.raises(ValueError, match="level_damping_std"):
+        fit_jointly(noisy(2), sj.model.structure(stiff, level_damping_std=1e-3), **TRUE)
+
+
 def test_exact_states_give_back_the_curves():
     found = fit_jointly(noisy(), modes(), **TRUE)
     values = sj.identify.fitted_values(found, SPEEDS)
