@@ -224,9 +224,7 @@ def _ranked(
                 phase=float(np.angle(states.velocity[best])),
                 expected_band_ratio=float(_mean_band(slopes, covariance) / before),
                 reason=_reason(target, states, best, old, variance),
-                drive=float(fit.recorded_force(np.asarray(force)))
-                if fit.drive_known_only
-                else None,
+                drive=drive if fit.drive_known_only else None,
             )
         )
     return advice
