@@ -26,9 +26,10 @@ from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_with_slopes
-from snrmjax.identify.inference.uncertainty import sensitivity
+from snrmjax.identify.inference.sensitivity import sensitivity
+from snrmjax.identify.joint.fitting import _solve
 from snrmjax.identify.joint.force_balance import weighing_at
-from snrmjax.identify.joint.joint_fit import JointFit, _solve
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import all_residuals
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states

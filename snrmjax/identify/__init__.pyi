@@ -8,14 +8,9 @@ from .inference.optimal_design import (
     NextMeasurements,
     next_measurements,
 )
-from .inference.uncertainty import (
-    bootstrap,
-    compare_bands,
-    contributions,
-    profile,
-    sample_posterior,
-    sensitivity,
-)
+from .inference.profiles import profile
+from .inference.resampling import bootstrap, compare_bands, sample_posterior
+from .inference.sensitivity import contributions, sensitivity
 from .joint.joint_fit import JointFit, fit_jointly
 from .pointwise.backbone import Backbone, BackboneFit, fit_backbone
 from .pointwise.backbone_points import BackbonePoints, identify_points

@@ -14,7 +14,7 @@ from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedPoint, FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
-from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
 from snrmjax.identify.joint.joint_fit import JointFit, Rival
 from snrmjax.identify.joint.selection import Candidate

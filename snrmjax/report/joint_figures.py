@@ -10,7 +10,7 @@ from matplotlib.ticker import PercentFormatter
 
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
 from snrmjax.identify.inference.optimal_design import NextMeasurement
-from snrmjax.identify.inference.uncertainty import Contribution, contributions
+from snrmjax.identify.inference.sensitivity import Contribution, contributions
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.joint_results import summarise_fit

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.inference.fitted_curves import fitted_values
-from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints

@@ -7,7 +7,7 @@ import pytest
 from truth.exact_states import damping, modes, noisy, squared
 
 import snrmjax as sj
-from snrmjax.identify.inference.uncertainty import Contribution
+from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import joint_figures as joint_plot

@@ -7,15 +7,10 @@ import pytest
 from truth.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
 
 import snrmjax as sj
-from snrmjax.identify.inference import uncertainty
-from snrmjax.identify.inference.uncertainty import (
-    IntervalEnd,
-    bootstrap,
-    compare_bands,
-    contributions,
-    profile,
-    sensitivity,
-)
+from snrmjax.identify.inference import profiles
+from snrmjax.identify.inference.profiles import IntervalEnd, profile
+from snrmjax.identify.inference.resampling import bootstrap, compare_bands
+from snrmjax.identify.inference.sensitivity import contributions, sensitivity
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +22,9 @@ def fit():
 def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 
+    from snrmjax.identify.joint.fitting import SOLVER
     from snrmjax.identify.joint.force_balance import weighing_at
     from snrmjax.identify.joint.free_unknowns import Restore
-    from snrmjax.identify.joint.joint_fit import SOLVER
     from snrmjax.identify.joint.residuals import freed_residuals
 
     slopes = sensitivity(fit).by_measurement
@@ -137,7 +132,7 @@ def test_a_profile_does_not_pass_through_refits_that_failed(fit, monkeypatch, fa
     offsets = np.arange(-7, 8)
     rise = 3.84 * (offsets / 2) ** 2 if end != np.inf else 0.01 * offsets**2.0
     rise[failed] = np.nan
-    monkeypatch.setattr(uncertainty, "_pinned", lambda *_: 100.0 + rise)
+    monkeypatch.setattr(profiles, "_pinned", lambda *_: 100.0 + rise)
     found = profile(fit, "damping.viscous", n_points=15, reach=7.0)
     middle, std = float(fit.vector()[0][2]), np.sqrt(fit.covariance[2, 2])
     assert found.upper_status == status

@@ -22,9 +22,10 @@ from truth.exact_states import (
 )
 
 import snrmjax as sj
+from snrmjax.identify.joint.fitting import _linearised
 from snrmjax.identify.joint.force_balance import Weighing
 from snrmjax.identify.joint.free_unknowns import programmed, with_room
-from snrmjax.identify.joint.joint_fit import _linearised, fit_jointly
+from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.joint.selection import parse_family
 from snrmjax.io.joint_results import (
     read_joint_fit,

@@ -11,7 +11,7 @@ from truth.exact_states import modes, noisy
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import beyond_estimation, open_choice
 from snrmjax.identify.inference.fitted_response import as_backbone
-from snrmjax.identify.inference.uncertainty import contributions
+from snrmjax.identify.inference.sensitivity import contributions
 from snrmjax.identify.joint.joint_fit import Rival
 from snrmjax.identify.joint.selection import ARGUMENTS, _weights
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit

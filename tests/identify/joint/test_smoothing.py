@@ -7,7 +7,7 @@ from truth.exact_states import CONSTANT, NOISE, OMEGA, modes, stated
 
 import snrmjax as sj
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.inference.uncertainty import sensitivity
+from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.joint.smoothness import curve_columns, moved, with_sizes
 from snrmjax.identify.joint.variance_components import (

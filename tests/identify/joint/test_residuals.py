@@ -9,12 +9,17 @@ from scipy.optimize import least_squares
 from truth.exact_states import LEVELS, OMEGA, PARTICIPATION, SHAPE, noisy
 
 import snrmjax as sj
+from snrmjax.identify.joint.fitting import SOLVER
 from snrmjax.identify.joint.force_balance import Spread, balance_data, weighing_at
 from snrmjax.identify.joint.free_unknowns import FREE, Restore, programmed, with_room
 from snrmjax.identify.joint.initial_guess import pilot_start
-from snrmjax.identify.joint.joint_fit import SOLVER
-from snrmjax.identify.joint.level_slopes import LevelPattern, NormalSteps, _Normal, on_levels
-from snrmjax.identify.joint.residuals import all_residuals
+from snrmjax.identify.joint.residuals import (
+    LevelPattern,
+    NormalSteps,
+    _Normal,
+    all_residuals,
+    on_levels,
+)
 
 
 def drawn(free, *, room=False):
