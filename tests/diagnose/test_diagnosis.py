@@ -162,7 +162,7 @@ def test_an_imitation_that_misses_the_level_left_out_is_no_answer():
 def test_a_start_that_is_too_strong_to_have_a_motion_is_known_by_a_weaker_one(monkeypatch):
     predictions = predictions_of(linear_model(), balanced(quadratic))
     one = candidate("cubic_damping", scales_of(predictions))
-    usual = weighted_misfit(predictions).change(one)
+    usual = weighted_misfit(predictions).first_change(one)
     whole = WeightedMisfit.predicted
 
     def only_weak(self, group, labels, values, *, slopes):
@@ -329,7 +329,7 @@ def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
     misfit = weighted_misfit(predictions)
     turned = candidate("sensor_phase_error", scales_of(predictions))
     fit = unfitted(misfit, turned._replace(starts=((10.0,),)))
-    own, other = misfit._slopes, with_errors_passed_on(misfit, fit)._slopes
+    own, other = (one.passed_on.slopes for one in (misfit, with_errors_passed_on(misfit, fit)))
     before, after = (part[:, 0] + 1j * part[:, 1] for part in (own, other))
     # The motion is the recorded one turned back by 10°, and so is the force that it needs. Slopes
     # are differences over 2.5e-6 of a parameter: 1e-5 of each is 2.5e-11 of the force.

@@ -58,14 +58,14 @@ def noise(seed=0):
     return np.random.default_rng(seed).normal(size=2 * N)
 
 
-def misfit(misfit, law, part=0):
+def changed(misfit, law, part=0):
     """Of a change of the square of the natural frequency (part 0) or of the damping (1)."""
     return misfit.by_linear[:, part] * np.repeat(law, 2)
 
 
 def fitted(misfit, rows, law, part=0):
     """What is left when so much of a law is taken as fits."""
-    slopes = misfit(misfit, law, part)[:, None]
+    slopes = changed(misfit, law, part)[:, None]
     left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(slopes.T).T
     rows = rows - slopes @ np.linalg.lstsq(arms, left)[0]
     bounds = np.full(1, np.inf)
@@ -84,9 +84,9 @@ def test_noise_of_any_size_has_no_pattern(size):
 
 def test_a_natural_frequency_that_jumps_is_no_drift():
     misfit = misfit_of()
-    drift = noise() + misfit(misfit, 1e-3 * ORDER)
+    drift = noise() + changed(misfit, 1e-3 * ORDER)
     assert left_curve(misfit, fitted(misfit, drift, ORDER)) is None
-    jump = noise() + misfit(misfit, 1e-3 * (ORDER > 0.5))
+    jump = noise() + changed(misfit, 1e-3 * (ORDER > 0.5))
     reason = left_curve(misfit, fitted(misfit, jump, ORDER))
     assert reason is not None
     assert "order of the test" in reason
@@ -95,7 +95,7 @@ def test_a_natural_frequency_that_jumps_is_no_drift():
 @pytest.mark.parametrize(("part", "name"), [(0, "stiffness"), (1, "damping")])
 def test_a_law_of_another_power_leaves_a_curve_of_amplitude(part, name):
     misfit, share = misfit_of(), SIZE / SIZE.max()
-    rows = noise() + misfit(misfit, 3e-3 * share**4, part)
+    rows = noise() + changed(misfit, 3e-3 * share**4, part)
     assert left_curve(misfit, fitted(misfit, rows, share**4, part)) is None
     reason = left_curve(misfit, fitted(misfit, rows, share**2, part))
     assert reason is not None
@@ -106,7 +106,7 @@ def test_what_the_answer_itself_could_still_do_is_no_curve():
     """A fit a little away from its best is no other law."""
     misfit = misfit_of()
     fit = fitted(misfit, noise(), SIZE**2)
-    away = fit._replace(rows=fit.rows + misfit(misfit, 2e-3 * (SIZE / SIZE.max()) ** 2))
+    away = fit._replace(rows=fit.rows + changed(misfit, 2e-3 * (SIZE / SIZE.max()) ** 2))
     assert left_curve(misfit, away) is None
     assert left_curve(misfit, away._replace(slopes=np.zeros((2 * N, 0)))) is not None
 
@@ -115,7 +115,7 @@ def test_states_at_temperatures_of_their_own_are_no_noise():
     """Every state has a natural frequency of its own: misfits have one direction."""
     misfit = misfit_of()
     scatter = np.random.default_rng(5).normal(size=N)
-    rows = noise() + misfit(misfit, 1e-3 * scatter)
+    rows = noise() + changed(misfit, 1e-3 * scatter)
     reason = pattern(misfit, fitted(misfit, rows, SIZE**2))
     assert reason is not None
     assert "temperatures" in reason
@@ -126,5 +126,5 @@ def test_states_at_temperatures_of_their_own_are_no_noise():
 
 def test_curves_are_not_asked_of_sizes():
     misfit = misfit_of(phase_unknown=True)
-    rows = noise() + misfit(misfit, 1e-3 * (ORDER > 0.5))
+    rows = noise() + changed(misfit, 1e-3 * (ORDER > 0.5))
     assert left_curve(misfit, fitted(misfit, rows, ORDER)) is None

@@ -21,7 +21,7 @@ def made_up(columns, base):
         noise=noise,
         base=base,
         n_rows=N,
-        started=lambda c: np.stack(columns[c.kind])[:, :, None],
+        start_changes=lambda c: np.stack(columns[c.kind])[:, :, None],
     )
 
 
