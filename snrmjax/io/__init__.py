@@ -1,4 +1,7 @@
-"""Files in and out: tables of steady states and of results, models, joint fits."""
+"""Files in and out: tables of steady states and of results, models, joint fits.
+
+Readers are `read_X(path)`, writers `write_X(path, what)`; both take any path that Python takes.
+"""
 
 import lazy_loader
 

@@ -1,12 +1,27 @@
-from .joint_results import read_joint_fit, write_joint_fit
+from .joint_results import read_joint_fit, write_fitted_backbone, write_joint_fit, write_next
 from .models import read_model, write_model
-from .tables import read_steady_states, write_steady_states
+from .results import (
+    write_backbone,
+    write_normal_mode,
+    write_points,
+    write_prediction,
+    write_response,
+)
+from .tables import read_steady_states, write_steady_states, write_table
 
 __all__ = [
     "read_joint_fit",
     "read_model",
     "read_steady_states",
+    "write_backbone",
+    "write_fitted_backbone",
     "write_joint_fit",
     "write_model",
+    "write_next",
+    "write_normal_mode",
+    "write_points",
+    "write_prediction",
+    "write_response",
     "write_steady_states",
+    "write_table",
 ]

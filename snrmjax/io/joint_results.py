@@ -33,25 +33,23 @@ def write_fitted_backbone(path: Path, fit: JointFit) -> None:
     write_values(path, values_to_the_largest(fit, BAND_POINTS))
 
 
-def write_next(path: Path, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:
+def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasurements) -> None:
     """Write the advised measurements, the best first.
 
-    Where only the drive is known, `drive_v` stands in place of `force_n`, as in measured data.
+    Where only the drive is known a column `drive_v` has it, and `force_n` is by the gain that the
+    fit found.
     """
-    load = {"force_n": [one.force for one in advice]}
+    columns: dict[str, Sequence[object]] = {
+        "rank": [one.rank for one in advice],
+        "force_n": [one.force for one in advice],
+        "frequency_hz": [one.frequency / HERTZ for one in advice],
+        "expected_band_ratio": [one.expected_band_ratio for one in advice],
+        "reason": [one.reason for one in advice],
+    }
     drives = [one.drive for one in advice if one.drive is not None]
     if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
-        load = {"drive_v": drives}
-    write_table(
-        path,
-        {
-            "rank": [one.rank for one in advice],
-            **load,
-            "frequency_hz": [one.frequency / HERTZ for one in advice],
-            "expected_band_ratio": [one.expected_band_ratio for one in advice],
-            "reason": [one.reason for one in advice],
-        },
-    )
+        columns["drive_v"] = drives
+    write_table(path, columns)
 
 
 def summarise_fit(

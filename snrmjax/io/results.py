@@ -1,7 +1,6 @@
 """Results as tables and as one summary: what the commands write."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +10,25 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
-from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.model.structures import Structure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 BACKBONE_POINTS = 200
 
 
-def write_response(path: Path, model: Structure, curves: Sequence[ResponseCurve]) -> None:
-    """Write simulated responses at the sensor that sees the mode of interest best."""
-    r = reference_sensor(model.modes)
+def write_response(
+    path: FilePath, curves: Sequence[ResponseCurve], *, sensor: str | None = None
+) -> None:
+    """Write simulated responses: frequency, velocity at one sensor, stability and events.
+
+    Arguments: `sensor` is the name of one, by default the first.
+    Raises `ValueError` when there is no such sensor or the file cannot be written.
+    """
+    r = _place(curves[0].sensors, sensor) if curves else 0
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in curves])
     fundamental = np.concatenate([c.velocity[:, 1, r] for c in curves])
     write_table(
@@ -42,9 +46,15 @@ def write_response(path: Path, model: Structure, curves: Sequence[ResponseCurve]
     )
 
 
-def write_normal_mode(path: Path, model: Structure, branch: NormalModeBranch) -> None:
-    """Write a nonlinear normal mode at the sensor that sees it best."""
-    r = reference_sensor(model.modes)
+def write_normal_mode(
+    path: FilePath, branch: NormalModeBranch, *, sensor: str | None = None
+) -> None:
+    """Write a nonlinear normal mode: frequency, velocity at one sensor, energy.
+
+    Arguments: `sensor` is the name of one, by default the first.
+    Raises `ValueError` when there is no such sensor or the file cannot be written.
+    """
+    r = _place(branch.sensors, sensor)
     write_table(
         path,
         {
@@ -57,7 +67,7 @@ def write_normal_mode(path: Path, model: Structure, branch: NormalModeBranch) ->
     )
 
 
-def write_points(path: Path, identification: Identification) -> None:
+def write_points(path: FilePath, identification: Identification) -> None:
     """Write the identified points, one row a steady state."""
     points = identification.points
     write_table(
@@ -79,7 +89,7 @@ def write_points(path: Path, identification: Identification) -> None:
     )
 
 
-def write_backbone(path: Path, identification: Identification) -> None:
+def write_backbone(path: FilePath, identification: Identification) -> None:
     """Write the backbone with its 1σ between the smallest and the largest point used.
 
     An anchored backbone starts at zero amplitude.
@@ -89,7 +99,7 @@ def write_backbone(path: Path, identification: Identification) -> None:
     write_values(path, _sampled(backbone, start))
 
 
-def write_values(path: Path, values: BackboneValues) -> None:
+def write_values(path: FilePath, values: BackboneValues) -> None:
     """Write natural frequency and damping against velocity, with 1σ."""
     write_table(
         path,
@@ -103,10 +113,20 @@ def write_values(path: Path, values: BackboneValues) -> None:
     )
 
 
-def write_prediction(path: Path, responses: Sequence[PredictedResponse]) -> None:
-    """Write predicted responses at the backbone's sensor; isolated parts follow the main curve."""
+def write_prediction(
+    path: FilePath,
+    responses: Sequence[PredictedResponse],
+    *,
+    drives: Sequence[float | None] = (),
+) -> None:
+    """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
+
+    Arguments: `drives` are the drive voltages of the responses in V where the force is known as
+    one: a column `drive_v` has them. Raises `ValueError` when the file cannot be written.
+    """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in responses])
     velocity = np.concatenate([c.velocity for c in responses])
+    volts = [d for d, c in zip(drives, responses, strict=False) for _ in c.frequency if d]
     write_table(
         path,
         {
@@ -116,17 +136,21 @@ def write_prediction(path: Path, responses: Sequence[PredictedResponse]) -> None
             "velocity_re_m_s": velocity.real,
             "velocity_im_m_s": velocity.imag,
             "stable": np.concatenate([c.stable for c in responses]),
-        },
+        }
+        | ({"drive_v": volts} if volts else {}),
     )
 
 
-def summarise(
-    identification: Identification, predictions: Sequence[tuple[float, Sequence[Resonance]]]
-) -> dict:
-    """The headline numbers of an identification, by name, in the units of the files."""
+def summarise(identification: Identification, values: BackboneValues | None = None) -> dict:
+    """The headline numbers of an identification, by name, in the units of the files.
+
+    Arguments: `values` of the curves between the smallest and the largest measured amplitude, by
+    default those of the identification's backbone.
+    """
     points, fit = identification.points, identification.fit
     backbone = fit.backbone
-    values = _sampled(backbone, float(backbone.smallest))
+    if values is None:
+        values = _sampled(backbone, float(backbone.smallest))
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
@@ -165,19 +189,26 @@ def summarise(
             "largest_shift_hz": anchor.largest_frequency_shift / HERTZ,
             "largest_damping_ratio_shift": anchor.largest_damping_shift,
         },
-        "resonances": [
-            {
-                "force_n": force,
-                "velocity_m_s": resonance.velocity,
-                "frequency_hz": resonance.frequency / HERTZ,
-                "damping_ratio": resonance.damping_ratio,
-                "beyond_the_data": resonance.continued,
-            }
-            for force, found in predictions
-            for resonance in found
-        ],
         "notes": list(identification.notes),
     }
+
+
+def summarise_resonance(resonance: Resonance) -> dict:
+    """A predicted resonance by name, in the units of the files."""
+    return {
+        "force_n": resonance.force,
+        "velocity_m_s": resonance.velocity,
+        "frequency_hz": resonance.frequency / HERTZ,
+        "damping_ratio": resonance.damping_ratio,
+        "beyond_the_data": resonance.continued,
+    }
+
+
+def _place(sensors: tuple[str, ...], name: str | None) -> int:
+    """Where a sensor is among all; the first without a name."""
+    if name is not None and name not in sensors:
+        raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
+    return 0 if name is None else sensors.index(name)
 
 
 def _sampled(backbone: Backbone, start: float) -> BackboneValues:

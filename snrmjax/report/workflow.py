@@ -1,19 +1,23 @@
-"""What a result is told with: predictions beside an identification, its figures, its report."""
+"""What the commands do with a table of steady states: identify, predict, and write all of it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.identify.inference.fitted_response import as_backbone
-from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
+from snrmjax.identify.inference.optimal_design import AdviceStatus, NextMeasurements, next_measurements
+from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
-from snrmjax.identify.pointwise.backbone import BackboneFit
+from snrmjax.identify.pointwise.backbone import CurveFamily
+from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
@@ -22,9 +26,10 @@ from snrmjax.identify.pointwise.prediction import (
     predict_response,
     resonances,
 )
-from snrmjax.io import results
+from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
-from snrmjax.measure.states import SteadyStates
+from snrmjax.io.units import HERTZ
+from snrmjax.measure.states import SteadyStates, check_force
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
@@ -34,65 +39,205 @@ from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 
+@dataclass(frozen=True)
+class CurveSettings:
+    """How the points of single states are joined to curves: settings of `identify_backbone`."""
+
+    amplitude: AmplitudeArgument = "displacement"
+    measure: AmplitudeMeasure = "fundamental"
+    family: CurveFamily = "spline"
+    n_knots: int | None = None
+    anchor: bool = False
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What is asked of a joint fit: families, free unknowns of the instruments, further states."""
+
+    families: str = "auto"  # BACKBONE[,DAMPING]
+    free: tuple[str, ...] = ()
+    robust: bool = False
+    further: int = 0  # measurements to advise
+
+
+@dataclass(frozen=True)
+class Loads:
+    """The forces for which responses are predicted, and how far curves are continued."""
+
+    forces: tuple[float, ...] = ()  # N
+    drives: tuple[float, ...] = ()  # V, where the force is known as a drive voltage
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+
+
 class Prediction(NamedTuple):
-    """What the identified backbone says about one force."""
+    """What the identified curves predict under one force."""
 
     force: float  # N
     resonances: list[Resonance]
     responses: list[PredictedResponse]
+    drive: float | None = None  # V, where the force is known as a drive voltage
+    banded: tuple[FittedResponse, ...] = ()  # the same of a joint fit, with 1σ
+
+    @property
+    def load(self) -> str:
+        """The force in words, as it was asked for."""
+        return f"{self.force:g} N" if self.drive is None else f"{self.drive:.6g} V"
 
 
-class Presentation(NamedTuple):
-    """An identification with its predictions and, where it is known, the truth."""
+class Findings(NamedTuple):
+    """An identification with its predictions and, where they are known, the true responses."""
 
     data: SteadyStates
     model: Structure
     identification: Identification
     predictions: tuple[Prediction, ...]
     notes: tuple[str, ...]
-    truth: NormalModeBranch | None
-    simulated: tuple[ResponseCurve, ...]
+    settings: dict[str, str]  # in words, for the summary and the report
     fitted: ToldFit | None = None
+    advice: NextMeasurements | None = None  # none where nobody asked
+    truth: NormalModeBranch | None = None
+    simulated: tuple[ResponseCurve, ...] = ()
+
+    @property
+    def responses(self) -> list[PredictedResponse]:
+        """Predicted responses of all forces."""
+        return [response for one in self.predictions for response in one.responses]
+
+    @property
+    def resonances(self) -> list[Resonance]:
+        """Predicted resonances of all forces."""
+        return [resonance for one in self.predictions for resonance in one.resonances]
 
 
-def present_identification(
-    data: SteadyStates,
-    model: Structure,
-    forces: Sequence[float],
-    *,
-    truth: NormalModeBranch | None = None,
-    simulated: Sequence[ResponseCurve] = (),
-    fit: JointFit | None = None,
-    advice: Sequence[NextMeasurement] = (),
-    **options: Any,
-) -> Presentation:
-    """Identify the mode of interest and predict its responses to some forces (N).
+def identify_by_points(
+    data: SteadyStates, model: Structure, settings: CurveSettings, loads: Loads
+) -> Findings:
+    """Identify state by state, draw curves through the points, and predict responses from these.
 
-    `truth` and `simulated` are shown for comparison; `fit` gives the curves where there is a
-    joint one, and `advice` what to measure next; `options` go to `identify_backbone`.
+    Raises `ValueError` where the force is known as a drive voltage only, and what
+    `identify_backbone` and `predict_response` raise.
     """
-    identification = identify_backbone(data, model.modes, **options)
-    if fit is not None:
-        identification = with_joint_fit(identification, fit)
-    backbone = identification.fit.backbone
-    predictions, notes = [], list(identification.notes)
-    for force in forces:
-        found = resonances(backbone, model.modes, force)
-        responses = predict_response(backbone, model.modes, force)
-        if not found:
-            notes.append(
-                f"no resonance at {force:g} N up to {LARGEST_AMPLITUDE_RATIO:g} times the largest "
-                "measured amplitude."
-            )
-        elif any(one.continued for one in found):
-            notes.append(f"the resonance at {force:g} N lies beyond the measured amplitudes.")
-        if len(found) > 1:
-            notes.append(f"{len(found)} resonances at {force:g} N: the damping allows several.")
-        predictions.append(Prediction(force, found, responses))
-    return Presentation(
-        *(data, model, identification, tuple(predictions), tuple(notes), truth, tuple(simulated)),
-        fitted=None if fit is None else tell_fit(fit, advice),
+    if loads.drives:
+        _require_drive(data)
+    check_force(data, "an identification state by state")
+    found = identify_backbone(
+        data,
+        model,
+        amplitude=settings.amplitude,
+        measure=settings.measure,
+        family=settings.family,
+        n_knots=settings.n_knots,
+        anchor=settings.anchor,
     )
+    backbone, ratio = found.fit.backbone, loads.largest_amplitude_ratio
+    predictions = tuple(
+        Prediction(
+            force,
+            resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+            predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+        )
+        for force in dict.fromkeys(loads.forces)
+    )
+    notes = (*data.notes, *found.notes, *notes_on_predictions(predictions, ratio))
+    words = {
+        "amplitude": f"{settings.amplitude}, {settings.measure}",
+        "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
+    }
+    return Findings(data, model, found, predictions, notes, words)
+
+
+def identify_jointly(
+    data: SteadyStates, model: Structure, settings: FitSettings, loads: Loads
+) -> Findings:
+    """Fit both curves to all states at once, predict responses from the fit, advise further states.
+
+    Raises `ValueError` for more than two families, for a drive voltage where the data have a
+    force, and what `fit_jointly` and `fitted_response` raise.
+    """
+    if loads.drives:
+        _require_drive(data)
+    names = settings.families.split(",")
+    if len(names) > 2:
+        raise ValueError(
+            f"--fit takes one or two families, but {settings.families!r} names {len(names)}."
+        )
+    fit = fit_jointly(
+        data,
+        model,
+        backbone=names[0],
+        damping=names[1] if len(names) == 2 else "auto",
+        free=[name for names in settings.free for name in names.split(",")],
+        robust=settings.robust,
+    )
+    data = corrected(data, fit)
+    found = identification_of_fit(data, fit)
+    asked: list[tuple[float, float | None]] = [
+        (force, float(fit.recorded_force(np.asarray(force))) if fit.drive_known_only else None)
+        for force in dict.fromkeys(loads.forces)
+    ]
+    asked += [(float(fit.force_of_drive(np.asarray(drive))), drive) for drive in dict.fromkeys(loads.drives)]
+    ratio, predictions = loads.largest_amplitude_ratio, []
+    for force, drive in asked:
+        banded = fitted_response(fit, force, largest_amplitude_ratio=ratio)
+        predictions.append(Prediction(force, *without_bands(fit, banded), drive, tuple(banded)))
+    advice = next_measurements(fit, settings.further) if settings.further else None
+    notes = [*data.notes, *found.notes]
+    if fit.drive_known_only:
+        place = fit.names().index("force_gain")
+        std = float(np.sqrt(fit.covariance[place, place]))
+        notes.append(
+            "forces in newtons are those of the fitted gain, "
+            f"{float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} % (1σ), which "
+            "rests on the mode shapes and participations of the model; volts are measured."
+        )
+    notes += [*notes_on_predictions(predictions, ratio)]
+    if advice is not None and advice.status != AdviceStatus.COMPLETE:
+        notes.append(
+            f"{len(advice)} of {settings.further} further measurements are advised: "
+            f"{advice.message}."
+        )
+    pair = (fit.unknowns.squared_frequency, fit.unknowns.modal_damping)
+    words = {
+        "amplitude": "displacement, fundamental",
+        "curves": " and ".join(joint_results.described(curve) for curve in pair),
+    }
+    fitted = tell_fit(fit, advice or ())
+    return Findings(*(data, model, found, tuple(predictions), tuple(notes), words), fitted, advice)
+
+
+def _require_drive(data: SteadyStates) -> None:
+    if np.any(np.isfinite(np.asarray(data.force))):
+        raise ValueError(
+            "--predict-drive is for data with a drive voltage (`drive_v`), but these have the "
+            "force in newtons (`force_n`): use --predict-force."
+        )
+
+
+def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> list[str]:
+    """Sentences on forces without a resonance, with several, or with one beyond the data."""
+    notes = []
+    for one in predictions:
+        if not one.resonances:
+            notes.append(
+                f"no resonance at {one.load} up to {ratio:g} times the largest measured amplitude "
+                "(--extrapolate)."
+            )
+        elif any(each.continued for each in one.resonances):
+            notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")
+        if len(one.resonances) > 1:
+            notes.append(
+                f"{len(one.resonances)} resonances at {one.load}: the damping allows several."
+            )
+    return notes
+
+
+def advice_lines(found: Findings) -> list[str]:
+    """One line for each measurement that is advised: rank, force, frequency and reason."""
+    lines = []
+    for one in found.advice or ():
+        load = f"{one.force:.4g} N" if one.drive is None else f"{one.drive:.4g} V"
+        lines.append(f"{one.rank}. {load} at {one.frequency / HERTZ:.6g} Hz: {one.reason}")
+    return lines
 
 
 def corrected(data: SteadyStates, fit: JointFit) -> SteadyStates:
@@ -108,22 +253,6 @@ def corrected(data: SteadyStates, fit: JointFit) -> SteadyStates:
             data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
         ),
     )
-
-
-def with_joint_fit(identification: Identification, fit: JointFit) -> Identification:
-    """The identified points with the curves of a joint fit in place of their own."""
-    both = (fit.noise_scale, fit.noise_scale)
-    own = float(fit.modes.natural_frequency[fit.modes.mode_of_interest])
-    ratio = float(fit.modes.damping_ratio[fit.modes.mode_of_interest])
-    curves = BackboneFit(
-        backbone=as_backbone(fit),
-        noise_scale=both,
-        level_frequency_std=0.5 * float(fit.level_std[2]) * own,
-        level_damping_std=float(fit.level_std[3]) * ratio,
-        noise_stated=fit.noise_stated,
-        anchor=None,
-    )
-    return identification._replace(fit=curves, notes=fit.notes)
 
 
 def equilibria_notes(model: Structure) -> list[str]:
@@ -142,30 +271,32 @@ def equilibria_notes(model: Structure) -> list[str]:
     return [f"the model has {len(others)} further equilibria: {listed}. Curves start from rest."]
 
 
-def identification_figures(told: Presentation) -> dict[str, Figure]:
+def identification_figures(found: Findings) -> dict[str, Figure]:
     """Figures of an identification by the names of their files."""
-    points, backbone = told.identification.points, told.identification.fit.backbone
-    modes = told.model.modes
+    points, backbone = found.identification.points, found.identification.fit.backbone
+    modes = found.model.modes
     figures = {
-        "backbone": plot.backbone_figure(points, backbone, truth=told.truth, modes=modes),
+        "backbone": plot.backbone_figure(points, backbone, truth=found.truth, modes=modes),
         "modal_damping": plot.modal_damping_figure(
             [plot.DampingSeries("identified", points=points, backbone=backbone)],
-            linear=_linear_modal_damping(told.model),
+            linear=_linear_modal_damping(found.model),
         ),
-        "loops": plot.force_velocity_figure(told.data, _typical_states(told), sensor=points.sensor),
+        "loops": plot.force_velocity_figure(
+            found.data, _typical_states(found), sensor=points.sensor
+        ),
     }
-    if told.predictions:
+    if found.predictions:
         figures["prediction"] = plot.response_figure(
             backbone,
-            [response for one in told.predictions for response in one.responses],
-            [resonance for one in told.predictions for resonance in one.resonances],
-            simulated=told.simulated,
-            measured=told.data,
+            found.responses,
+            found.resonances,
+            simulated=found.simulated,
+            measured=found.data,
         )
-    if told.fitted is not None:
-        figures |= joint_figures(told.fitted, points)
-    if told.truth is not None:
-        figures["nnm"] = plot.normal_mode_figure(told.truth, sensor=points.sensor)
+    if found.fitted is not None:
+        figures |= joint_figures(found.fitted, points)
+    if found.truth is not None:
+        figures["nnm"] = plot.normal_mode_figure(found.truth, sensor=points.sensor)
     return figures
 
 
@@ -174,9 +305,9 @@ def _linear_modal_damping(model: Structure) -> float:
     return 2 * float(model.modes.damping_ratio[j] * model.modes.natural_frequency[j])
 
 
-def _typical_states(told: Presentation) -> list[int]:
+def _typical_states(found: Findings) -> list[int]:
     """Three states of the largest level: nearest to resonance, farthest and one between."""
-    points = told.identification.points
+    points = found.identification.points
     phase = np.abs(np.angle(np.asarray(points.mode_velocity)))
     amplitude = np.where(np.asarray(points.usable), np.asarray(points.amplitude), -np.inf)
     level = np.asarray(points.level)[int(np.argmax(amplitude))]
@@ -200,15 +331,11 @@ MODE_CAPTION = (
 )
 
 
-def presentation_report(
-    told: Presentation,
-    title: str,
-    done: dict[str, str],
-    notes: Sequence[str],
-    figures: dict[str, Figure],
+def findings_report(
+    found: Findings, title: str, done: dict[str, str], figures: dict[str, Figure]
 ) -> Report:
-    """The report of an identification; `notes` are those of the reader, before its own."""
-    further = [] if told.fitted is None else joint_sections(told.fitted, figures)
+    """The report of an identification; `done` says what was done with which files."""
+    further = [] if found.fitted is None else joint_sections(found.fitted, figures)
     further.append(
         Section(
             "What was measured, and its damping",
@@ -223,62 +350,60 @@ def presentation_report(
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))
     return identification_report(
-        told.identification,
-        told.model.modes,
+        found.identification,
+        found.model.modes,
         title=title,
         done=done,
-        notes=[*notes, *told.notes],
-        predicted=[response for one in told.predictions for response in one.responses],
-        resonances=[resonance for one in told.predictions for resonance in one.resonances],
-        simulated=told.simulated,
-        truth=told.truth,
-        measured=told.data,
+        notes=found.notes,
+        predicted=found.responses,
+        resonances=found.resonances,
+        simulated=found.simulated,
+        truth=found.truth,
+        measured=found.data,
         further=further,
     )
 
 
-def fit_as_asked(
-    data: SteadyStates, structure: Structure, fit: str, free: Sequence[str], *, robust: bool
-) -> JointFit:
-    """The joint fit that `--fit BACKBONE[,DAMPING]` and `--free NAME[,NAME]` ask for.
+def write_findings(folder: Path, found: Findings, title: str, done: dict[str, str]) -> None:
+    """Write what `identify` found into a folder: tables, summary, figures and report.
 
-    Raises `ValueError` for more than two families, and what `fit_jointly` raises.
+    Arguments: `done` says with which files.
     """
-    names = fit.split(",")
-    if len(names) > 2:
-        raise ValueError(f"--fit takes one or two families, but {fit!r} names {len(names)}.")
-    return fit_jointly(
-        data,
-        structure,
-        backbone=names[0],
-        damping=names[1] if len(names) == 2 else "auto",
-        free=[name for names in free for name in names.split(",")],
-        robust=robust,
-    )
-
-
-def write_identification(
-    folder: Path,
-    told: Presentation,
-    title: str,
-    done: dict[str, str],
-    notes: tuple[str, ...],
-    further: dict[str, object] | None = None,
-) -> None:
-    """Write what `identify` found into a folder: tables, summary, figures and report."""
-    identification = told.identification
-    results.write_points(folder / "points.csv", identification)
-    results.write_backbone(folder / "backbone.csv", identification)
-    if told.predictions:
-        responses = [response for one in told.predictions for response in one.responses]
-        results.write_prediction(folder / "prediction.csv", responses)
-    pairs = [(one.force, one.resonances) for one in told.predictions]
+    done = done | found.settings
+    results.write_points(folder / "points.csv", found.identification)
+    if found.predictions:
+        drives = [one.drive for one in found.predictions for _ in one.responses]
+        results.write_prediction(folder / "prediction.csv", found.responses, drives=drives)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
-    summary |= results.summarise(identification, pairs)
-    summary |= {"notes": [*notes, *told.notes], **(further or {})}
+    if found.fitted is None:
+        results.write_backbone(folder / "backbone.csv", found.identification)
+        summary |= results.summarise(found.identification)
+    else:
+        summary |= _write_fit(folder, found, found.fitted)
+    summary["resonances"] = [
+        results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
+        for one in found.predictions
+        for each in one.resonances
+    ]
+    summary["notes"] = list(found.notes)
     write_summary(folder / "summary.json", summary)
-    figures = identification_figures(told)
+    figures = identification_figures(found)
     for name, figure in figures.items():
         plot.save_figure(figure, folder / f"{name}.png")
-    report = presentation_report(told, title, done, notes, figures)
-    write_report(folder / "report.html", report)
+    write_report(folder / "report.html", findings_report(found, title, done, figures))
+
+
+def _write_fit(folder: Path, found: Findings, fitted: ToldFit) -> dict[str, object]:
+    """Write what a joint fit adds; its part of the summary."""
+    fit, backbone = fitted.fit, found.identification.fit.backbone
+    joint_results.write_fitted_backbone(folder / "backbone.csv", fit)
+    joint_results.write_joint_fit(folder / "fit.json", fit)
+    if found.advice is not None:
+        joint_results.write_next(folder / "next.csv", found.advice)
+    ends = float(backbone.smallest), float(backbone.largest)
+    values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
+    banded = [response for one in found.predictions for response in one.banded]
+    return {
+        **results.summarise(found.identification, values),
+        "joint_fit": joint_results.summarise_fit(fit, banded, fitted.shares),
+    }

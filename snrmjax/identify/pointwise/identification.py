@@ -51,11 +51,11 @@ def identify_backbone(
     points = identify_points(data, modes, amplitude=amplitude, measure=measure)
     fit = fit_backbone(points, modes, family=family, n_knots=n_knots, anchor=anchor)
     if not fit.noise_stated:
-        points = _with_scatter(points, fit)
+        points = errors_from_scatter(points, fit)
     return Identification(points, fit, _notes(points, fit, modes))
 
 
-def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
+def errors_from_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not."""
     sensitivity = np.asarray(points.sensitivity)
     scale = off_resonance_error_factor(np.asarray(points.mode_velocity))[:, None] * np.array(
@@ -75,20 +75,7 @@ def _with_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
 
 
 def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tuple[str, ...]:
-    notes = []
-    status = np.asarray(points.status)
-    for kind in PointStatus:
-        count = int(np.sum(status == kind))
-        if kind != PointStatus.OK and count:
-            notes.append(
-                f"{count} of {len(status)} points are left out of the curves: "
-                f"{STATUS_MESSAGE[kind]}."
-            )
-    other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
-    if other:
-        notes.append(
-            f"{other} points have a second root that amplitude and phase alone would also allow."
-        )
+    notes = notes_on_points(points, modes, "are left out of the curves")
     scale = max(fit.noise_scale)
     if fit.noise_stated and scale > 1.5:
         notes.append(
@@ -109,7 +96,7 @@ def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tupl
         notes.append(
             f"levels differ from one another by {' and '.join(shared)} (1σ); the bands include it."
         )
-    notes += _phase_trend(points, fit)
+    notes += notes_on_phases(points, fit)
     if fit.anchor is not None:
         anchor = fit.anchor
         hz = 1 / (2 * np.pi)
@@ -120,16 +107,35 @@ def _notes(points: BackbonePoints, fit: BackboneFit, modes: LinearModes) -> tupl
             f"measured points were moved by up to {anchor.largest_frequency_shift * hz:+.2g} Hz "
             f"and {100 * anchor.largest_damping_shift:+.2g} %."
         )
+    return tuple(notes)
+
+
+def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str) -> list[str]:
+    """Sentences on states without a point (`consequence` says what follows), roots and sensors."""
+    notes = []
+    status = np.asarray(points.status)
+    for kind in PointStatus:
+        count = int(np.sum(status == kind))
+        if kind != PointStatus.OK and count:
+            notes.append(
+                f"{count} of {len(status)} steady states {consequence}: {STATUS_MESSAGE[kind]}."
+            )
+    other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
+    if other:
+        notes.append(
+            f"{other} steady states have a second solution that amplitude and phase alone would "
+            "also allow."
+        )
     if np.asarray(points.filter_residual).max(initial=0.0) > 0.1 and len(modes.sensors) > 1:
         notes.append(
             "the sensors do not move as the mode shape says (residual up to "
             f"{100 * np.nanmax(np.asarray(points.filter_residual)):.0f} %): check the shape, or "
             "the mode's shape changes with amplitude."
         )
-    return tuple(notes)
+    return notes
 
 
-def _phase_trend(points: BackbonePoints, fit: BackboneFit) -> list[str]:
+def notes_on_phases(points: BackbonePoints, fit: BackboneFit) -> list[str]:
     """A sentence when damping changes with the phase inside the levels, which it should not."""
     use = np.asarray(points.usable)
     level = np.asarray(points.level)[use]

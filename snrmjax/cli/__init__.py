@@ -1,0 +1,55 @@
+"""The commands: demo, simulate, nnm, identify, diagnose.
+
+Each imports what it needs by itself: none waits for the imports of another.
+"""
+
+import os
+import sys
+
+import jax
+import platformdirs
+import typer
+
+from snrmjax.cli.console import refuse
+from snrmjax.cli.demo_command import demo
+from snrmjax.cli.diagnose_command import diagnose
+from snrmjax.cli.identify_command import identify
+from snrmjax.cli.simulate_commands import nnm, simulate
+
+app = typer.Typer(
+    name="snrmjax",
+    help="Backbones and damping of nonlinear normal modes from near-resonant steady states.",
+    epilog="Try it: snrmjax demo --out demo. Each command has its own --help with an example.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+app.command(epilog="Example: snrmjax demo --out demo, then open demo/report.html.")(demo)
+app.command(
+    epilog="Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
+    "--out result"
+)(simulate)
+app.command(epilog="Example: snrmjax nnm beam.toml --to-hz 110 --out result")(nnm)
+app.command(
+    epilog="Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 --out "
+    "result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain --next "
+    "5 --out result"
+)(identify)
+app.command(
+    epilog="Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
+    "snrmjax diagnose sets/*.csv --model model.toml --out results"
+)(diagnose)
+
+
+def main() -> None:
+    """Run the commands; wrong input ends with exit code 2 and one sentence."""
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("snrmjax")
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    try:
+        app()
+    except ValueError as error:
+        refuse(str(error))
+        sys.exit(2)

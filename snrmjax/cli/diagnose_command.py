@@ -1,0 +1,80 @@
+"""The command `diagnose`: what a model lacks."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from snrmjax.cli.console import say, staged, warn
+from snrmjax.cli.options import FILES, Out
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+
+
+def diagnose(
+    data: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Measured steady states (CSV), one file or more. A file with `velocity_m_s` in "
+            "place of real and imaginary part has amplitudes without phases.",
+            metavar="DATA...",
+            show_default=False,
+        ),
+    ],
+    model: Annotated[
+        Path,
+        typer.Option(
+            help="Model of the structure as it is believed to be (TOML); with several files, one "
+            "of the same name beside a CSV takes its place.",
+            metavar="MODEL",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ],
+    out: Out,
+    responses: Annotated[
+        bool | None,
+        typer.Option(
+            help="Simulate the responses of the model as given and as completed, for comparison "
+            "with the data. Default: for a single file.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Find the physics that a model lacks: where it disagrees with the data, and what that is.
+
+    Writes diagnosis.json, figures, report.html and model.toml, the completed model; of several
+    files each into a folder of its own name.
+
+    Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what cannot
+    be told.
+    """
+    from snrmjax.report.diagnosis_report import write_diagnosis
+
+    several = len(data) > 1
+    if len({path.stem for path in data}) < len(data):
+        raise ValueError("two of the data files have the same name: they would share a folder.")
+    refused = []
+    for path in data:
+        beside = path.with_suffix(".toml")
+        own = beside if several and beside.exists() else model
+        try:
+            with staged(out / path.stem if several else out) as folder:
+                structure = read_model(own)
+                measured = read_steady_states(path, structure)
+                for note in measured.notes:
+                    warn(note)
+                simulate = not several if responses is None else responses
+                found = write_diagnosis(folder, path.stem, structure, measured, simulate=simulate)
+        except ValueError as error:
+            if not several:
+                raise
+            warn(f"{path.name}: {error}")
+            refused.append(path.name)
+            continue
+        effects = f" ({', '.join(found.effects)})" if found.effects else ""
+        say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
+        if found.decide_by:
+            say(f"  what would decide: {found.decide_by}")
+    if refused:
+        raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")

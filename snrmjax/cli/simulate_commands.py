@@ -1,0 +1,158 @@
+"""The commands `simulate` and `nnm`: what a model does."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import snrmjax as sj
+from snrmjax.cli.console import say, staged, warn
+from snrmjax.cli.options import Harmonics, Model, Out
+from snrmjax.io.models import read_model
+from snrmjax.io.units import HERTZ
+from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE
+
+
+class Tongues(StrEnum):
+    """What to do where a normal mode runs out on an internal resonance and back."""
+
+    follow = "follow"
+    skip = "skip"
+
+
+def simulate(
+    model: Model,
+    force: Annotated[
+        list[float],
+        typer.Option(
+            help="Peak amplitude of the harmonic force in N; give it again for further forces.",
+            metavar="N",
+            show_default=False,
+        ),
+    ],
+    from_hz: Annotated[
+        float,
+        typer.Option(help="Lowest frequency of the force in Hz.", metavar="HZ", show_default=False),
+    ],
+    to_hz: Annotated[
+        float,
+        typer.Option(
+            help="Highest frequency of the force in Hz.", metavar="HZ", show_default=False
+        ),
+    ],
+    out: Out,
+    harmonics: Harmonics = 9,
+    isolated: Annotated[
+        bool,
+        typer.Option(
+            "--isolated",
+            help="Also search for responses that are not connected to those of small motion "
+            "(takes longer).",
+        ),
+    ] = False,
+) -> None:
+    """Simulate responses to a harmonic force, around their folds and with unstable parts.
+
+    Harmonic balance with arclength continuation. Writes response.csv and response.png.
+    """
+    from snrmjax.io import results
+    from snrmjax.report.figures import save_figure, simulated_response_figure
+
+    with staged(out) as folder:
+        structure = read_model(model)
+        _report_equilibria(structure)
+        ends = (from_hz * HERTZ, to_hz * HERTZ)
+        curves = []
+        for number, one in enumerate(force):
+            say(f"force {one:g} N ({number + 1} of {len(force)})")
+            main_curves = sj.forced_response(structure, [one], *ends, harmonic_order=harmonics)
+            curves += main_curves
+            if isolated:
+                further = sj.simulate.isolated_responses(
+                    structure, one, *ends, known=main_curves, harmonic_order=harmonics
+                )
+                say(f"  {len(further)} further branches found")
+                curves += further
+        for curve in curves:
+            if curve.branch == "main" and curve.status != sj.simulate.CurveStatus.UPPER_END:
+                warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
+        _report_truncation(curves, harmonics)
+        if not any(len(curve.frequency) for curve in curves):
+            raise ValueError("no response was found in this range; start farther from resonance.")
+        sensor = _sensor(structure)
+        results.write_response(folder / "response.csv", curves, sensor=sensor)
+        save_figure(simulated_response_figure(curves, sensor=sensor), folder / "response.png")
+
+
+def nnm(
+    model: Model,
+    to_hz: Annotated[
+        float,
+        typer.Option(
+            help="Frequency in Hz at which to stop, above the linear one or, for a mode that "
+            "softens, below it.",
+            metavar="HZ",
+            show_default=False,
+        ),
+    ],
+    out: Out,
+    harmonics: Harmonics = 9,
+    tongues: Annotated[
+        Tongues,
+        typer.Option(
+            help="Where an internal resonance lets the mode run out and back: follow this tongue, "
+            "or skip it."
+        ),
+    ] = Tongues.follow,
+) -> None:
+    """Follow the undamped nonlinear normal mode of interest from its linear frequency.
+
+    Writes nnm.csv (frequency, velocity, energy) and nnm.png.
+    """
+    from snrmjax.io import results
+    from snrmjax.report.figures import normal_mode_figure, save_figure
+
+    with staged(out) as folder:
+        structure = read_model(model)
+        _report_equilibria(structure)
+        branch = sj.nonlinear_normal_mode(
+            structure, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues.value
+        )
+        for tongue in branch.tongues:
+            say(
+                f"internal resonance: harmonic {tongue.harmonic} drives mode {tongue.mode + 1} "
+                f"from {tongue.from_frequency / HERTZ:.2f} to {tongue.to_frequency / HERTZ:.2f} Hz"
+            )
+        if branch.status not in (
+            sj.simulate.CurveStatus.UPPER_END,
+            sj.simulate.CurveStatus.LOWER_END,
+        ):
+            warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
+        sensor = _sensor(structure)
+        results.write_normal_mode(folder / "nnm.csv", branch, sensor=sensor)
+        save_figure(normal_mode_figure(branch, sensor=sensor), folder / "nnm.png")
+
+
+def _sensor(structure: sj.model.Structure) -> str:
+    return structure.modes.sensors[sj.identify.reference_sensor(structure.modes)]
+
+
+def _report_truncation(curves: list[sj.simulate.ResponseCurve], harmonics: int) -> None:
+    """Say where the harmonics that are left out would matter."""
+    worst = max(
+        (float(np.max(c.truncation, initial=0.0)) for c in curves if c.truncation is not None),
+        default=0.0,
+    )
+    if worst > 0.02:
+        warn(
+            f"the harmonics above {harmonics} would change the velocity by up to about "
+            f"{100 * worst:.0f} % somewhere; use more --harmonics."
+        )
+
+
+def _report_equilibria(structure: sj.model.Structure) -> None:
+    from snrmjax.report.workflow import equilibria_notes
+
+    for note in equilibria_notes(structure):
+        warn(note)
