@@ -13,7 +13,11 @@ from matplotlib.figure import Figure
 
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
-from snrmjax.identify.inference.optimal_design import AdviceStatus, NextMeasurements, next_measurements
+from snrmjax.identify.inference.optimal_design import (
+    AdviceStatus,
+    NextMeasurements,
+    next_measurements,
+)
 from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
 from snrmjax.identify.pointwise.backbone import CurveFamily
@@ -175,7 +179,10 @@ def identify_jointly(
         (force, float(fit.recorded_force(np.asarray(force))) if fit.drive_known_only else None)
         for force in dict.fromkeys(loads.forces)
     ]
-    asked += [(float(fit.force_of_drive(np.asarray(drive))), drive) for drive in dict.fromkeys(loads.drives)]
+    asked += [
+        (float(fit.force_of_drive(np.asarray(drive))), drive)
+        for drive in dict.fromkeys(loads.drives)
+    ]
     ratio, predictions = loads.largest_amplitude_ratio, []
     for force, drive in asked:
         banded = fitted_response(fit, force, largest_amplitude_ratio=ratio)
@@ -201,7 +208,7 @@ def identify_jointly(
         "amplitude": "displacement, fundamental",
         "curves": " and ".join(joint_results.described(curve) for curve in pair),
     }
-    fitted = tell_fit(fit, advice or ())
+    fitted = tell_fit(fit, tuple(advice or ()))
     return Findings(*(data, model, found, tuple(predictions), tuple(notes), words), fitted, advice)
 
 

@@ -258,8 +258,9 @@ def test_where_only_the_drive_is_known_advice_is_in_volts(tmp_path):
     assert "force_n" not in advice.to_pandas()
     write_next(tmp_path / "next.csv", advice)
     header, first, _ = (tmp_path / "next.csv").read_text().splitlines()
-    assert header == "rank,drive_v,frequency_hz,expected_band_ratio,reason"
-    assert float(first.split(",")[1]) == pytest.approx(advice[0].drive)
+    assert header == "rank,force_n,frequency_hz,expected_band_ratio,reason,drive_v"
+    assert float(first.split(",")[1]) == pytest.approx(advice[0].force)
+    assert float(first.split(",")[-1]) == pytest.approx(advice[0].drive)
 
 
 def test_advice_is_a_table(fit):
