@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut, gap, held_out, without_level
 from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
-from snrmjax.diagnose.checks.doubts import GROWING, Doubt, doubts, never_seen, part_of
+from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, never_seen, part_of
 from snrmjax.diagnose.checks.level_variance import says_of_levels, with_levels_as_found
 from snrmjax.diagnose.checks.verdict import (
     judged,
@@ -19,12 +19,9 @@ from snrmjax.diagnose.checks.verdict import (
     unproved,
 )
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, requested
-from snrmjax.diagnose.misfit.amplitudes import UNSEEN, what_is_lost
+from snrmjax.diagnose.misfit.amplitudes import what_is_lost
 from snrmjax.diagnose.misfit.candidates import (
-    CLOSE,
-    SECOND_ORDER,
     EffectCandidate,
-    Scales,
     candidate,
     decide_by,
     only_by_calibration,
@@ -36,6 +33,8 @@ from snrmjax.diagnose.search.locating import Located, located, own_power
 from snrmjax.diagnose.search.model_search import DETECTED, FoundEffects, Row, named
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_base import AbstractLinearChange
+from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
@@ -133,11 +132,11 @@ def diagnose_model(
     scales = scales_of(predictions)
     present = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
-        present |= {"force_gain_error", "sensor_gain_error", "added_mass"}
+        present |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
     if force_gain_std > _LOOSE:  # beside a force that may be nothing a mode could be all one sees
-        present.add(CLOSE)
+        present |= {kind for kind, effect in EFFECTS.items() if not effect.searched}
     if unknown.all():
-        present |= set(UNSEEN)
+        present |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
     kinds = tuple(kind for kind in EFFECTS if kind not in present)
     if predictions.chosen.noise_stated:
         found = named(misfit, scales, kinds)
@@ -156,7 +155,7 @@ def diagnose_model(
         both_ways = frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind))
         part = part_of(fit.kinds)
         power = own_power(misfit, found.nothing, fit, part) if part else None
-        feeding = frozenset(k for k in fit.kinds if k in GROWING and fit.of_kind(k)[0] < 0)
+        feeding = frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0)
         orders = predictions.chosen.orders
         stepped = np.asarray(predictions.chosen.states.frequency)
         wide = frozenset(k for k in fit.kinds if never_seen(k, fit.of_kind(k)[1:], stepped))
@@ -200,7 +199,9 @@ def diagnose_model(
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     lost = what_is_lost(chosen, phase, misfit.level_numbers)
     notes = [*reasons, *notes, *lost, *predictions.chosen.notes]
-    shift = values.get("linear_frequency_shift.relative_shift", (0.0, 0.0))[0]
+    best = {name: value for name, (value, _) in values.items()}
+    completed = _completed(model if fit.kinds else given, own, fit.kinds, best)
+    shift = _frequency_shift(model, completed)
     if abs(shift) > _ANOTHER:
         notes.append(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
@@ -209,7 +210,6 @@ def diagnose_model(
     # Without phases the first thing to measure is these.
     request = _request(found) if verdict == "ambiguous" and not unknown.any() else None
     force = misfit.noise.column < 2
-    best = {name: value for name, (value, _) in values.items()}
     return Diagnosis(
         verdict=verdict,
         effects=fit.kinds if verdict != "none" else (),
@@ -223,7 +223,7 @@ def diagnose_model(
         noise_scale=float(np.sqrt(noise)),
         notes=tuple(notes),
         table=found.table,
-        completed=_completed(model if fit.kinds else given, own, fit.kinds, best),
+        completed=completed,
         request=request,
         blind=blind,
         force_gain=_force_gain(misfit, fit),
@@ -235,7 +235,7 @@ def diagnose_model(
 
 
 def _named_and_noise(
-    predictions: Predictions, misfit: WeightedMisfit, scales: Scales, kinds: tuple[str, ...]
+    predictions: Predictions, misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]
 ) -> tuple[FoundEffects, float]:
     """What is missing, with noise as large as what is left; its size over the assumed one.
 
@@ -337,12 +337,12 @@ def _values(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, tuple[float, fl
 
 
 def _limits(
-    misfit: WeightedMisfit, fit: EffectFit, scales: Scales, present: set[str]
+    misfit: WeightedMisfit, fit: EffectFit, scales: MotionScales, present: set[str]
 ) -> dict[str, float]:
     """The size of every effect that would have been seen beside what was found."""
     limits = {}
     for kind in EFFECTS:
-        if kind in present or kind in fit.kinds or kind == CLOSE:
+        if kind in present or kind in fit.kinds or not EFFECTS[kind].searched:
             continue
         tried = candidate(kind, scales)
         change = misfit.first_change(tried)
@@ -350,7 +350,7 @@ def _limits(
         if not square > 0:
             continue
         need = DETECTED + len(tried.unit) * np.log(misfit.n_rows)
-        power = 4 if kind in SECOND_ORDER and not misfit.predictions.chosen.orders else 2
+        power = 2 if misfit.predictions.chosen.orders else 2 * tried.strength_order
         name = f"{kind}.{effect_parameters(kind)[0]}"
         limit = float(abs(tried.starts[0][0]) * (need / square) ** (1 / power))
         limits[name] = _tried(misfit, tried, limit, need)
@@ -371,6 +371,16 @@ def _tried(misfit: WeightedMisfit, one: EffectCandidate, limit: float, need: flo
         # χ² grows with a power between the second and the fourth.
         limit *= float(np.clip(need / square, 0.01, 100.0)) ** (1 / 3)
     return limit
+
+
+def _frequency_shift(model: Structure, completed: Structure) -> float:
+    """Relative shift of the natural frequency by the linear changes that were found."""
+    j, added = model.modes.mode_of_interest, completed.effects[len(model.effects) :]
+    linear = [effect for effect in added if isinstance(effect, AbstractLinearChange)]
+    changed = dataclasses.replace(model, effects=(*model.effects, *linear))
+    before, after = model.linear_terms(), changed.linear_terms()
+    square = after.stiffness[j] / before.stiffness[j] * (before.mass[j] / after.mass[j])
+    return float(jnp.sqrt(square)) - 1
 
 
 def _completed(

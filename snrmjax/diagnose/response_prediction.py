@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.misfit.predictions import without_strength
+from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -100,12 +100,9 @@ def level_simulations(
     every, seen = list(forces.values()), [level for level in forces if level in blind]
     after = [completed] * len(every) + [blind[level] for level in seen]
     loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
-    same = without_strength(model, completed)
-    if same is None:
-        old, new = responses(model, data, every), responses(after, data, loads)
-    else:
-        found = responses([*[same] * len(every), *after], data, [*every, *loads])
-        old, new = found[: len(every)], found[len(every) :]
+    same = with_idle_effects(model, [e.kind for e in completed.effects[len(model.effects) :]])
+    found = responses([*[same] * len(every), *after], data, [*every, *loads])
+    old, new = found[: len(every)], found[len(every) :]
     return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
 
 

@@ -246,11 +246,11 @@ def _effect(table: _Table) -> AbstractEffect:
     if not isinstance(kind, str):
         raise table.refusal("kind", "a text", kind)
     if kind in EFFECTS:
-        names = effect_parameters(kind)
+        wanted = EFFECTS[kind].parameters()
         table = _Table(table.entries, f"{table.place} ({kind})")
-        table.check_keys(("kind", *names))
-        rules = EFFECTS[kind].rules
-        return make_effect(kind, {name: table.number(name, *rules.get(name, ())) for name in names})
+        table.check_keys(("kind", *wanted))
+        values = {name: table.number(name, *one.rules) for name, one in wanted.items()}
+        return make_effect(kind, values)
     near = suggestion(kind, EFFECTS)
     known = "" if near else f" (known are {', '.join(sorted(EFFECTS))})"
     raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}{known}.")

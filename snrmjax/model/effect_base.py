@@ -1,12 +1,12 @@
-"""What an effect is: the base classes, one for each way in which a model may lack something.
+"""Base classes of effects, one for each way in which a model may be incomplete.
 
 A force acts on the mode of interest: f is added on the left of q̈ + 2ζω₀q̇ + ω₀²q + … = p, with
-q in kg^1/2 m. Other effects change the linear terms, add a mode, shape the force's spectrum or
-falsify what the instruments write down.
+q in kg^1/2 m. Other effects change the linear terms, add a mode, add harmonics to the force or
+change what the instruments record.
 """
 
+import dataclasses
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar, Self
 
 import equinox as eqx
@@ -14,22 +14,95 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.model.effect_metadata import (
+    Confusion,
+    Imitation,
+    MotionScales,
+    Parameter,
+    Part,
+    Shape,
+)
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import PolynomialPotential
-from snrmjax.numerics.rules import Rule
 
 Scalar = Float[Array, ""]
+Starts = list[tuple[float, ...]]
+"""Parameters, in the order of the constructor, from which a fit begins."""
+Bounds = list[tuple[float, float]]
+"""Of every parameter the least and the largest value that a fit considers."""
 
 
 class AbstractEffect(eqx.Module):
-    """One effect: its parameters are its fields without a default.
+    """One physical effect, defined once: its equation and all that other rooms ask about it.
 
-    Fields with a default are settings of the computation, which no file holds. `rules` says
-    which values a parameter may have.
+    Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
+    what is recorded of it. A nonlinearity that couples modes belongs in the potential.
+
+    The parameters are the fields without a default, the first of them the effect's strength: at
+    zero the effect does nothing. `parameter` gives a field its unit, rules and prior; a field
+    without it has none. Fields with a default are settings of the computation, which no file
+    holds.
+
+    Only `kind` must be stated. What a force does not state of its `shape` is computed from the
+    force (see `effect_shape`).
     """
 
     kind: ClassVar[str]
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {}
+    description: ClassVar[str] = ""  # what it is physically: one sentence
+    shape: ClassVar[Shape | None] = None
+    confusions: ClassVar[tuple[Confusion, ...]] = ()
+    imitations: ClassVar[tuple[Imitation, ...]] = ()
+    # Two effects of one answer that act alike may stand for one law that the library lacks.
+    # Forces that state nothing act like others that change the same part of the balance.
+    acts_like: ClassVar[str | None] = None
+    is_linear: ClassVar[bool] = False  # a linear structure stays linear with it
+    like_force_gain: ClassVar[bool] = False  # all that it does, a gain of all forces does as well
+    only_phase: ClassVar[bool] = False  # amplitudes do not show it
+    # A diagnosis adds it to an answer only as an alternative to what was found, not by itself.
+    searched: ClassVar[bool] = True
+
+    @classmethod
+    def parameters(cls) -> dict[str, Parameter]:
+        """The parameters by name, in the order of the constructor."""
+        return {
+            field.name: field.metadata.get("parameter", Parameter())
+            for field in dataclasses.fields(cls)
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        }
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """Parameters from which a fit to measured states begins, of a strength plainly seen.
+
+        Those of a force whose `shape` has a factor and a power of amplitude follow from these.
+        Empty where nothing is stated: the strength is then found from the force itself.
+        """
+        shape = cls.shape
+        if shape is None or shape.factor is None or shape.power is None:
+            return []
+        size = shape.factor * scales.amplitude**shape.power
+        strength = scales.change / (size * scales.frequency**shape.frequency_power)
+        others = list(cls.parameters().values())[1:]
+        return [(strength, *(other.typical for other in others))]
+
+    @classmethod
+    def bounds(cls, scales: MotionScales) -> Bounds:
+        """The least and the largest value of every parameter that a fit considers."""
+        return [one.prior.bounds(scales) for one in cls.parameters().values()]
+
+    @classmethod
+    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
+        """A change of every parameter that is plainly seen, from the sizes of a start."""
+        return start
+
+    @classmethod
+    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
+        """The effect as it does nothing: strength zero, other parameters at their typical values.
+
+        Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
+        """
+        _, *others = cls.parameters().values()
+        return cls(*(jnp.asarray(value) for value in (0.0, *(one.typical for one in others))))
 
 
 class AbstractForce(AbstractEffect):
@@ -44,6 +117,20 @@ class AbstractForce(AbstractEffect):
         Arguments: q in kg^1/2 m and q̇ in kg^1/2 m/s; sample 0 is at phase 0 of the force and the
         end of the period is left out. Returns kg^1/2 m/s², on the left of the modal equation.
         """
+
+    def quick_cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """`cycle_force` by a shorter formula, where there is one; NaN where that does not hold.
+
+        Of friction it is Masing's rule, which holds for cycles with two turning points.
+        """
+        return self.cycle_force(displacement, velocity)
+
+    @classmethod
+    def has_quick_formula(cls) -> bool:
+        """Whether `quick_cycle_force` is another formula than `cycle_force`."""
+        return cls.quick_cycle_force is not AbstractForce.quick_cycle_force
 
 
 class AbstractMemoryless(AbstractForce):
@@ -142,6 +229,8 @@ class AbstractHysteresis(AbstractForce):
 class AbstractLinearChange(AbstractEffect):
     """A change of the linear terms of the mode of interest."""
 
+    is_linear: ClassVar[bool] = True
+
     @abstractmethod
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
@@ -167,18 +256,21 @@ class AbstractAddedMode(AbstractEffect):
 class AbstractForceSpectrum(AbstractEffect):
     """Harmonics of the force beside its fundamental."""
 
+    shape: ClassVar[Shape | None] = Shape(Part.HARMONICS)
+
     @abstractmethod
     def load_orders(self) -> Float[Array, " order"]:
         """Cosine amplitudes of the force's harmonics 0 to 3, relative to the fundamental."""
 
 
 class AbstractMeasurementEffect(AbstractEffect):
-    """What the instruments write down in place of what happens; the motion is untouched.
+    """A difference between the true motion and its record; the motion itself is unchanged.
 
-    Several act in the order of their `stage`: what the structure shows the sensors comes before
-    what the instruments (stage 2) make of it.
+    Several act in the order of their `stage`: what the sensors see of the structure (0 and 1)
+    comes before what the instruments make of it (2).
     """
 
+    shape: ClassVar[Shape | None] = Shape(Part.INSTRUMENTS)
     stage: ClassVar[int] = 2
 
     @abstractmethod

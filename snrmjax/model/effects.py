@@ -1,6 +1,5 @@
 """All effects by their kind: the library's and those that a user registers."""
 
-import dataclasses
 from collections.abc import Mapping
 
 import jax
@@ -79,24 +78,22 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
 def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     """Make an effect of your own known to files, simulations, calibrations and diagnoses.
 
-    Use as a decorator of a class with a `kind`, parameters as fields and a force. A diagnosis
-    begins where the first parameter changes the motion plainly, with the others at what a class
-    attribute `typical` gives (a mapping; 1 where it is silent).
-    Raises `ValueError` for a kind that exists already.
+    Use as a decorator of a class with a `kind`, parameters as fields and a force. The class may
+    state what the library's do (see `AbstractEffect` and `parameter`); it is treated like these
+    wherever and whenever it is registered.
+    Raises `ValueError` for a kind that exists already and for a class without parameters.
     """
     if effect.kind in EFFECTS:
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
+    if not effect.parameters():
+        raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
     EFFECTS[effect.kind] = effect
     return effect
 
 
 def effect_parameters(kind: str) -> tuple[str, ...]:
     """Names of the parameters of one kind of effect, in the order of its constructor."""
-    return tuple(
-        field.name
-        for field in dataclasses.fields(EFFECTS[kind])
-        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-    )
+    return tuple(EFFECTS[kind].parameters())
 
 
 def make_effect(kind: str, parameters: Mapping[str, float | Array]) -> AbstractEffect:
@@ -111,7 +108,7 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array]) -> AbstractE
     """
     if kind not in EFFECTS:
         raise ValueError(f"unknown effect kind {kind!r}; known are {sorted(EFFECTS)}.")
-    wanted = effect_parameters(kind)
+    wanted = EFFECTS[kind].parameters()
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
     for name, value in parameters.items():
@@ -120,7 +117,7 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array]) -> AbstractE
         for entry in np.ravel(value).tolist():
             if not np.isfinite(entry):
                 raise ValueError(f"`{name}` of {kind} must be finite, but is {entry}.")
-            for rule in EFFECTS[kind].rules.get(name, ()):
+            for rule in wanted[name].rules:
                 if not rule.good(entry):
                     raise ValueError(
                         f"`{name}` of {kind} must be {rule.expected}, but is {entry:g}."

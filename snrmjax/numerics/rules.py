@@ -1,6 +1,6 @@
 """Rules that a number must keep: what is expected, and whether a number is it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 
@@ -23,8 +23,8 @@ SHORT = Rule("of at most 15 digits", lambda value: abs(value) < 1e15)
 # In rad/s it must still be a number.
 IN_RANGE_HZ = Rule("below 1e300 Hz", lambda value: value < 1e300)
 
-OF_A_MODE: Mapping[str, tuple[Rule, ...]] = {
-    "frequency_hz": (POSITIVE, IN_RANGE_HZ),
-    "damping_ratio": (BELOW_ONE,),
-}
-"""Of the frequency and the damping of a further mode, by their names."""
+OF_A_FREQUENCY = (POSITIVE, IN_RANGE_HZ)
+"""Of the natural frequency of a further mode, in Hz."""
+
+OF_A_DAMPING_RATIO = (BELOW_ONE,)
+"""Of the damping ratio of a further mode."""

@@ -1,22 +1,28 @@
 """Whether a damping acts in both directions alike, which only even harmonics tell."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from snrmjax.diagnose.checks.doubts import DIRECTED
+from snrmjax.diagnose.checks.doubts import is_drag
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.model.effect_base import AbstractMemoryless
+from snrmjax.model.effects import EFFECTS
 
 _EXCLUDED = 2.0  # 1σ from the even part that a damping of one direction has
 _SEEN = 3.0  # 1σ of an even part that is there
+_SAMPLES = 256  # of a cycle
 
 
 def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
     """Whether harmonic 2 excludes that a damping acts in one direction only.
 
-    Where it does, its force c|q̇|ⁿ⁻¹q̇ has an even part c|q̇|ⁿ beside it (n = 2 or 3).
+    Where it does, its force, such as c|q̇|ⁿ⁻¹q̇, has an even part c|q̇|ⁿ beside it.
     """
     chosen = misfit.predictions.chosen
-    if kind not in DIRECTED or 2 not in chosen.orders or chosen.phase_unknown.any():
+    if not is_drag(kind) or 2 not in chosen.orders or chosen.phase_unknown.any():
         return False
     share, std = even_share(misfit, fit, kind)
     return abs(share) < _SEEN * std and abs(share) + _EXCLUDED * std < 1
@@ -25,8 +31,8 @@ def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
 def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float, float]:
     """The even part of a damping over its odd one as harmonic 2 shows it, and 1σ.
 
-    To first order, (ω₀² − 4Ω² + 4iζω₀Ω) X₂ = −c V²/2 for c|q̇|², and 0.509 c|V|V² for c|q̇|³ on
-    the right-hand side, with the modal velocity V.
+    To first order, (ω₀² − 4Ω² + 4iζω₀Ω) X₂ = −F₂, where F₂ is the second harmonic of the force
+    f(|q̇|): c V²/2 for c|q̇|², with the modal velocity V.
     """
     states, modes = misfit.predictions.chosen.states, misfit.predictions.model.modes
     j, sensors = modes.mode_of_interest, misfit.predictions.chosen.sensors
@@ -35,10 +41,8 @@ def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float
     omega = np.asarray(states.frequency)
     measured = np.asarray(states.velocity)[:, 0]
     velocity = measured / shape
-    (size,) = fit.of_kind(kind)
-    force = size * velocity**2 / 2
-    if kind == "cubic_damping":
-        force = 0.509 * size * np.abs(velocity) * velocity**2
+    force = _second_harmonic(kind, fit.of_kind(kind), np.abs(velocity))
+    force = force * (velocity / np.abs(velocity)) ** 2
     answer = -force / (own**2 - 4 * omega**2 + 4j * ratio * own * omega)
     column = 2j * omega * shape * answer / np.abs(measured)
     columns = np.zeros((1, *misfit.noise.known.shape))
@@ -52,3 +56,16 @@ def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float
         return 0.0, np.inf
     left = misfit.noise.decorrelated(fit.rows)
     return -float(arm @ left) / square, 1 / float(np.sqrt(square))
+
+
+def _second_harmonic(
+    kind: str, parameters: tuple[float, ...], speed: Float[np.ndarray, " state"]
+) -> Float[np.ndarray, " state"]:
+    """Cosine amplitude of harmonic 2 of a drag's force f(|q̇|) over q̇ = V cos β."""
+    effect = EFFECTS[kind](*(jnp.asarray(value) for value in parameters))
+    if not isinstance(effect, AbstractMemoryless):
+        return np.zeros_like(speed)
+    phase = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
+    velocity = jnp.asarray(speed[:, None] * np.abs(np.cos(phase)))
+    force = jax.vmap(jax.vmap(effect.force))(jnp.zeros_like(velocity), velocity)
+    return 2 * np.mean(np.asarray(force) * np.cos(2 * phase), axis=1)

@@ -6,8 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.misfit.candidates import CLOSE, RESONANCE_ORDER
 from snrmjax.diagnose.search.locating import Located
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_metadata import Imitation, Shape
+from snrmjax.model.effect_shape import acts_like, shape_of
+from snrmjax.model.effects import EFFECTS
+from snrmjax.model.library.internal_resonances import AbstractInternalResonance
 
 _CONTRADICTED = 4.0  # 1σ between an exponent and the law that was named
 _CURVE = 0.05  # 1σ of an exponent that a free curve of few knots adds
@@ -22,37 +26,6 @@ class Doubt(NamedTuple):
     twin: bool = False  # the other law does the same to all that was measured
 
 
-# Exponents of the change of ω̃² or δ against amplitude, by the part where it shows.
-_EXPONENTS = {
-    "coulomb_friction": ("damping", -1.0),
-    "quadratic_damping": ("damping", 1.0),
-    "cubic_damping": ("damping", 2.0),
-    "van_der_pol_damping": ("damping", 2.0),
-    "cubic_stiffness": ("stiffness", 2.0),
-    "quadratic_stiffness": ("stiffness", 2.0),
-    "quintic_stiffness": ("stiffness", 4.0),
-}
-
-_SAME_PART = (
-    frozenset(
-        {
-            *("quadratic_stiffness", "cubic_stiffness", "quintic_stiffness", "static_preload"),
-            *("bilinear_stiffness", "gap_stiffness", "one_sided_stop"),
-        }
-    ),
-    frozenset(
-        {
-            *("coulomb_friction", "quadratic_damping", "cubic_damping", "van_der_pol_damping"),
-            "linear_damping_change",
-        }
-    ),
-    frozenset({"jenkins_slider", "iwan_microslip"}),
-    frozenset({"force_gain_error", "sensor_gain_error", "mode_shape_change", "residual_mode"}),
-)
-DIRECTED = ("quadratic_damping", "cubic_damping")
-"""Damping as of a fluid, which a valve may let pass in one direction only."""
-GROWING = (*DIRECTED, "van_der_pol_damping")
-"""Damping that grows with the amplitude and takes energy out where its coefficient is positive."""
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
 
 
@@ -87,15 +60,12 @@ def doubts(
     ]
     if len(effects) == 1:
         found += _of_exponent(effects[0], located, own_power)
-    if "iwan_microslip" in effects:
-        found.append(
-            Doubt(
-                "other laws of friction with the same backbone, such as Bouc and Wen's, fit as "
-                "well.",
-                "measure a hysteresis loop, or levels over two decades",
-                twin=True,
-            )
-        )
+    found += [
+        _doubt(one)
+        for kind in effects
+        for one in EFFECTS[kind].imitations
+        if one.unless_harmonic is None and one.near_power is None
+    ]
     found += [
         Doubt(
             f"{kind} is wider than all frequencies measured: nothing was seen of it as a "
@@ -105,19 +75,9 @@ def doubts(
         for kind in effects
         if kind in wide
     ]
-    if CLOSE in effects:
-        found.append(
-            Doubt(
-                "a mode close by has three numbers of its own: to one sensor a clearance beside a "
-                "cubic stiffness, or several small errors, can look like it.",
-                "measure with a second sensor, where a further mode has another shape, or sweep "
-                "through the frequency at which it is said to be",
-                twin=True,
-            )
-        )
     if len(effects) > 2:
         found.append(Doubt("three effects together can follow most laws.", _WIDER))
-    alike = [pair for pair in combinations(effects, 2) if any(g >= set(pair) for g in _SAME_PART)]
+    alike = [pair for pair in combinations(effects, 2) if _act_alike(*pair)]
     if alike:
         found.append(
             Doubt(
@@ -126,7 +86,7 @@ def doubts(
                 _WIDER,
             )
         )
-    elif len(effects) > 1 and RESONANCE_ORDER.keys() & set(effects):
+    elif len(effects) > 1 and any(_resonance(kind) for kind in effects):
         found.append(
             Doubt(
                 "a further mode beside another effect can imitate a law that the library does not "
@@ -142,10 +102,11 @@ def never_seen(kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray,
 
     Arguments: the further mode's frequency in Hz and damping ratio; frequencies of states in rad/s.
     """
-    if kind not in RESONANCE_ORDER:
+    resonance = _resonance(kind)
+    if resonance is None:
         return False
     hz, ratio = shape
-    width = 2 * ratio * hz / RESONANCE_ORDER[kind]  # half-power, as the force steps
+    width = 2 * ratio * hz / resonance.order  # half-power, as the force steps
     return width > float(np.ptp(frequency)) / (2 * np.pi)
 
 
@@ -154,7 +115,7 @@ def _of_harmonics(
 ) -> list[Doubt]:
     """What has the same fundamental, and is told by a harmonic that was not or hardly measured."""
     found = []
-    mine = [kind for kind in effects if kind in DIRECTED and kind not in both_ways]
+    mine = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
     if mine:
         closer = " with less noise" if 2 in orders else ""
         found.append(
@@ -164,27 +125,61 @@ def _of_harmonics(
                 twin=True,
             )
         )
-    if "mode_shape_change" in effects and 3 not in orders:
-        found.append(
-            Doubt(
-                "a sensor that saturates can do what mode_shape_change does.",
-                "record harmonic 3 at the largest level, or use a second sensor",
-            )
-        )
+    found += [
+        _doubt(one)
+        for kind in effects
+        for one in EFFECTS[kind].imitations
+        if one.unless_harmonic is not None and one.unless_harmonic not in orders
+    ]
     return found
 
 
+def _doubt(one: Imitation) -> Doubt:
+    return Doubt(one.reason, one.separated_by, twin=one.identical)
+
+
+def _resonance(kind: str) -> type[AbstractInternalResonance] | None:
+    """The internal resonance of a kind; None for other effects."""
+    effect = EFFECTS[kind]
+    return effect if issubclass(effect, AbstractInternalResonance) else None
+
+
+def _act_alike(one: str, other: str) -> bool:
+    """Whether two effects may be one law that the library lacks."""
+    return acts_like(EFFECTS[one]) == acts_like(EFFECTS[other]) is not None
+
+
+def is_drag(kind: str) -> bool:
+    """Whether an effect is a drag, which a valve may let act in one direction only."""
+    shape = shape_of(EFFECTS[kind])
+    return shape is not None and shape.is_drag
+
+
+def grows(kind: str) -> bool:
+    """Whether an effect is a damping that grows with amplitude, from a positive strength."""
+    shape = shape_of(EFFECTS[kind])
+    return shape is not None and shape.grows
+
+
 def part_of(effects: tuple[str, ...]) -> str | None:
-    """The part that a single effect changes with a power of amplitude; None for others."""
-    return _EXPONENTS[effects[0]][0] if len(effects) == 1 and effects[0] in _EXPONENTS else None
+    """The part that a single force changes with a power of amplitude; None for others."""
+    law = _power_law(effects[0]) if len(effects) == 1 else None
+    return None if law is None else law.part
+
+
+def _power_law(kind: str) -> Shape | None:
+    """The shape of a force that changes one part with a power of amplitude; None for others."""
+    shape = shape_of(EFFECTS[kind])
+    force = issubclass(EFFECTS[kind], AbstractForce)
+    return shape if force and shape is not None and shape.power is not None else None
 
 
 def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | None) -> list[Doubt]:
     """The power of amplitude that was located, against that of the law that was named."""
-    if effect not in _EXPONENTS:
+    law = _power_law(effect)
+    if law is None or law.power is None:
         return []
-    part, expected = _EXPONENTS[effect]
-    expected = expected if own_power is None else own_power
+    part, expected = law.part, law.power if own_power is None else own_power
     mine = [p for p in located if p.part == part and p.exponent is not None]
     if not mine or mine[0].exponent is None or mine[0].exponent_std is None:
         return []
@@ -195,7 +190,8 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
             f"which is not the {expected:.3g} of {effect}."
         )
         return [Doubt(reason, _WIDER, refutes=True)]
-    if effect == "coulomb_friction" and abs(exponent + 0.5) < 2 * std:
-        reason = "damping that goes with the square root of the velocity fits as well."
-        return [Doubt(reason, "measure smaller amplitudes, or a free decay")]
-    return []
+    return [
+        _doubt(one)
+        for one in EFFECTS[effect].imitations
+        if one.near_power is not None and abs(exponent - one.near_power) < 2 * std
+    ]

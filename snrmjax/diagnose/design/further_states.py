@@ -150,7 +150,7 @@ def _needed(
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
     predictions = predictions_of(misfit.model, data)
-    group = predictions.group(max(fit.kinds, key=predictions.is_apart))
+    group = predictions.group
     values, own = group.values.copy(), misfit.baseline_parameters(fit.rows)
     for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
         values[group.place(name)] = value
@@ -164,7 +164,7 @@ def _needed(
 
 def predicted(predictions: Predictions, fit: EffectFit) -> Predicted | None:
     """Columns of all states under a fit's parameters; None where no program has all its kinds."""
-    group = predictions.group(max(fit.kinds, key=predictions.is_apart))
+    group = predictions.group
     if not set(fit.labels) <= set(group.names):
         return None
     values = group.values.copy()

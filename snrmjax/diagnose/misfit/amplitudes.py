@@ -16,9 +16,6 @@ from snrmjax.identify.calibrate.calibration_states import CalibrationStates, Com
 
 _OFF = np.radians(30.0)  # beyond which a state is off resonance, and within which it is at it
 
-UNSEEN = ("sensor_phase_error",)
-"""Kinds that change nothing but phases."""
-
 
 class Sizes(NamedTuple):
     """What the columns compare, as phasors, and of which of them the size alone counts.

@@ -1,4 +1,4 @@
-"""Coordinates in which a fit of effects steps, where an effect's own parameters bend its valley."""
+"""Coordinates in which a fit of effects steps: of a power law its size at a typical amplitude."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,14 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-_LAWS = (("iwan_microslip.coefficient", "iwan_microslip.exponent"),)
+from snrmjax.model.effects import EFFECTS
 
 
 class Coordinates(NamedTuple):
-    """A law c x^p as its stiffness c R^(p − 1) at a typical amplitude R, and p.
+    """A law c x^p by its stiffness c R^(p − 1) at a typical amplitude R, and by p.
 
-    Data fix what the law does at the amplitudes measured. Its coefficient, which is that at unit
-    amplitude, then changes by powers of ten with the exponent: steps in both follow a narrow bend.
+    Data determine the force at the measured amplitudes. The coefficient c is that at unit
+    amplitude and changes by powers of ten with the exponent: a fit in c and p would follow a
+    narrow, bent valley.
     """
 
     pairs: tuple[tuple[int, int], ...]  # places of a coefficient and its exponent
@@ -48,5 +49,10 @@ class Coordinates(NamedTuple):
 
 def coordinates(labels: Sequence[str], reference: float) -> Coordinates:
     """Coordinates for parameters of these names; `reference` is a typical amplitude."""
-    pairs = [(labels.index(c), labels.index(p)) for c, p in _LAWS if c in labels]
+    pairs = []
+    for place, label in enumerate(labels):
+        kind, _, name = label.partition(".")
+        exponent = EFFECTS[kind].parameters()[name].exponent
+        if exponent is not None:
+            pairs.append((place, labels.index(f"{kind}.{exponent}")))
     return Coordinates(tuple(pairs), reference)

@@ -1,6 +1,6 @@
 """Fits of effects to a weighted misfit."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.coordinates import coordinates
-from snrmjax.diagnose.misfit.predictions import Group, scales_of
+from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import FitStatus, StepRule, minimise
@@ -75,7 +75,7 @@ def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
 def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
     """A candidate at its first starting point."""
     kind = candidate.kind
-    group, labels = misfit.predictions.group(kind), parameter_labels(kind)
+    group, labels = misfit.predictions.group, parameter_labels(kind)
     values = np.array(candidate.starts[:1])
     rows, slopes = misfit.evaluated(group, labels, values)
     bounds = np.array(candidate.lower), np.array(candidate.upper)
@@ -154,62 +154,35 @@ def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMis
 
     An effect turns and scales the errors of what it turns and scales.
     """
-    known = misfit.errors
-    totals = ErrorPropagation(*(part.copy() for part in known))
-    for group, values in _groups_of(misfit, fit):
-        slopes = by_baseline(misfit.predictions, group, values).slopes[0]
-        own = ErrorPropagation(*misfit.predictions.by_error(group, values), slopes)
-        changes = [
-            np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(own, known, strict=True)
-        ]
-        totals = ErrorPropagation(*(a + b for a, b in zip(totals, changes, strict=True)))
-    return misfit.reweighted(totals)
+    predictions, known, values = misfit.predictions, misfit.errors, _values(misfit, fit)
+    if not fit.kinds:
+        return misfit.reweighted(known)
+    slopes = by_baseline(predictions, predictions.group, values).slopes[0]
+    own = ErrorPropagation(*predictions.by_error(predictions.group, values), slopes)
+    changes = (np.where(np.isfinite(a - b), a - b, 0.0) for a, b in zip(own, known, strict=True))
+    return misfit.reweighted(
+        ErrorPropagation(*(a + b for a, b in zip(known, changes, strict=True)))
+    )
 
 
 def at_phases_of(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
     """The misfit with velocities of unknown phase where a fit has them."""
-    force = misfit.baseline.force.copy()
-    for group, values in _groups_of(misfit, fit):
-        own = misfit.predictions.of(group, values[None])
-        force += own.phasors[0, :, 0] - misfit.baseline.force
+    force = misfit.baseline.force
+    if fit.kinds:
+        own = misfit.predictions.of(misfit.predictions.group, _values(misfit, fit)[None])
+        force = own.phasors[0, :, 0]
     return misfit.with_phases(-np.angle(force))
 
 
-def _groups_of(
-    misfit: WeightedMisfit, fit: EffectFit
-) -> Iterator[tuple[Group, Float[np.ndarray, " parameter"]]]:
-    """The structures that have a fit's effects, and their parameters."""
-    predictions, left = misfit.predictions, list(dict.fromkeys(fit.kinds))
-    while left:
-        group = predictions.group(max(left, key=predictions.is_apart))
-        values, mine = group.values.copy(), dict(zip(fit.labels, fit.values, strict=True))
-        for label, value in mine.items():
-            if label in group.names:
-                values[group.place(label)] = value
-        inside = [kind for kind in left if parameter_labels(kind)[0] in group.names]
-        left = [kind for kind in left if kind not in inside]
-        yield group, values
+def _values(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " parameter"]:
+    """A fit's parameters among those of all effects."""
+    group = misfit.predictions.group
+    values = group.values.copy()
+    values[[group.place(label) for label in fit.labels]] = fit.values
+    return values
 
 
 def _together(misfit: WeightedMisfit, candidate: EffectCandidate, before: EffectFit) -> _Evaluation:
-    """Rows and slopes by a candidate's parameters and those of what was fitted before.
-
-    One program answers for both where it has both. Otherwise their changes are added, which
-    leaves out what one changes in what the other does: of second order in both.
-    """
+    """Rows and slopes by a candidate's parameters and those of what was fitted before."""
     labels = (*parameter_labels(candidate.kind), *before.labels)
-    kinds = (candidate.kind, *before.kinds)
-    for kind in kinds:
-        group = misfit.predictions.group(kind)
-        if set(labels) <= set(group.names):
-            return lambda values: misfit.evaluated(group, labels, values)
-    group, n = misfit.predictions.group(candidate.kind), len(candidate.unit)
-
-    def added(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows, slopes = misfit.evaluated(group, labels[:n], values[:, :n])
-        moved = (values[:, n:] - before.values) @ before.slopes.T
-        others = np.broadcast_to(before.slopes, (len(values), *before.slopes.shape))
-        rows = rows + before.rows - misfit.base + moved
-        return rows, np.concatenate([slopes, others], axis=2)
-
-    return added
+    return lambda values: misfit.evaluated(misfit.predictions.group, labels, values)

@@ -6,7 +6,6 @@ a candidate is a vector of parameters.
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
 from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
-from snrmjax.diagnose.misfit.candidates import Scales, candidate, parameter_labels
+from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -24,8 +23,9 @@ from snrmjax.identify.calibrate.calibration_states import (
     state_whitener,
 )
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effect_base import AbstractEffect
-from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.effect_base import AbstractForce
+from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effects import EFFECTS
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
@@ -39,7 +39,7 @@ _TRIALS = _BLOCK  # that may meet in a block, at most
 
 
 class Group(NamedTuple):
-    """A structure with several effects without strength."""
+    """A structure with all effects that are known, without strength."""
 
     model: Structure
     names: tuple[str, ...]
@@ -104,19 +104,8 @@ class Predictions:
     level_numbers: Int[np.ndarray, " state"]
     force_gain_std: float
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
+    group: Group
     _stored: programs.Stored
-    _groups: dict[str, Group]  # those asked for so far
-
-    def group(self, kind: str) -> Group:
-        """The structure that has this kind of effect.
-
-        The library shares one; effects of a user have structures of their own, which have the
-        library's too.
-        """
-        key = kind if kind not in _LIBRARY else ""
-        if key not in self._groups:
-            self._groups[key] = self._prepared([k for k in EFFECTS if k in _LIBRARY or k == kind])
-        return self._groups[key]
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
@@ -142,33 +131,6 @@ class Predictions:
             own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
             chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
         return whitened_states(chosen, by_error)
-
-    def is_apart(self, kind: str) -> bool:
-        """Whether a kind has a program of its own."""
-        return kind not in _LIBRARY
-
-    def _prepared(self, kinds: list[str]) -> Group:
-        present = [effect.kind for effect in self.model.effects]
-        frequency, ratio = _of_interest(self.model)
-        added = tuple(
-            _without_strength(EFFECTS[k], frequency, ratio) for k in kinds if k not in present
-        )
-        model = dataclasses.replace(self.model, effects=(*self.model.effects, *added))
-        numbers, stds = parameter_values(model), stated_stds(model)
-        names, values = tuple(numbers), np.array(list(numbers.values()))
-        kinds = [added[k].kind for k in programs.forces_of(added)]
-        owner = [name.split(".")[0] for name in names]
-        force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
-        std = np.array([stds.get(name, 0.0) for name in names])
-        unit = np.maximum(0.01 * np.abs(values), std)
-        unit[unit == 0] = 1.0
-        scales, where = scales_of(self), {name: k for k, name in enumerate(names)}
-        is_strength, is_shape = np.zeros((2, len(names)), dtype=bool)
-        for effect in added:
-            places = [where[label] for label in parameter_labels(effect.kind)]
-            unit[places] = candidate(effect.kind, scales).unit
-            is_strength[places[0]], is_shape[places[1:]] = True, True
-        return Group(model, names, values, unit, is_strength, is_shape, force)
 
     def of(
         self,
@@ -251,8 +213,7 @@ class Predictions:
         found = answered(True, np.arange(n * trials))
         good = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in found]
         left = np.flatnonzero(~(good[0] & good[1]))
-        slides = any(group.names[k].split(".")[0] in _SLIDING for k in np.flatnonzero(used))
-        if left.size and slides:
+        if left.size and any(_has_quick_formula(group.names[k]) for k in np.flatnonzero(used)):
             for part, own in zip(found, answered(False, left), strict=True):
                 part[left] = own
         columns, slopes = (a.reshape(trials, n, *a.shape[1:]) for a in found)
@@ -290,9 +251,45 @@ def predictions_of(
         level_numbers=np.asarray(data.level)[chosen.rows],
         force_gain_std=force_gain_std,
         stated={name: (numbers[name], std) for name, std in stated_stds(model).items()},
+        group=_all_effects(model, _scales(model, chosen)),
         _stored=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
-        _groups={},
     )
+
+
+def _all_effects(baseline: Structure, scales: MotionScales) -> Group:
+    """The structure with every registered kind of effect that the baseline does not have."""
+    present = [effect.kind for effect in baseline.effects]
+    model = with_idle_effects(baseline, [kind for kind in EFFECTS if kind not in present])
+    added = model.effects[len(present) :]
+    numbers, stds = parameter_values(model), stated_stds(model)
+    names, values = tuple(numbers), np.array(list(numbers.values()))
+    kinds = [added[k].kind for k in programs.forces_of(added)]
+    owner = [name.split(".")[0] for name in names]
+    force = np.array([kinds.index(o) if o in kinds else -1 for o in owner])
+    std = np.array([stds.get(name, 0.0) for name in names])
+    unit = np.maximum(0.01 * np.abs(values), std)
+    unit[unit == 0] = 1.0
+    where = {name: k for k, name in enumerate(names)}
+    is_strength, is_shape = np.zeros((2, len(names)), dtype=bool)
+    for effect in added:
+        places = [where[label] for label in parameter_labels(effect.kind)]
+        unit[places] = candidate(effect.kind, scales).unit
+        is_strength[places[0]], is_shape[places[1:]] = True, True
+    return Group(model, names, values, unit, is_strength, is_shape, force)
+
+
+def with_idle_effects(model: Structure, kinds: Sequence[str]) -> Structure:
+    """The model with further effects that have no strength: the same physics."""
+    modes, j = model.modes, model.modes.mode_of_interest
+    own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    added = tuple(EFFECTS[kind].without_strength(*own) for kind in kinds)
+    return dataclasses.replace(model, effects=(*model.effects, *added))
+
+
+def _has_quick_formula(name: str) -> bool:
+    """Whether a parameter is one of an effect that has a quick formula."""
+    effect = EFFECTS.get(name.split(".")[0])
+    return effect is not None and issubclass(effect, AbstractForce) and effect.has_quick_formula()
 
 
 def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
@@ -336,16 +333,19 @@ def whitened_states(
     return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
 
 
-def scales_of(predictions: Predictions) -> Scales:
-    """What is typical of the measured motions."""
-    modes, j = predictions.model.modes, predictions.model.modes.mode_of_interest
-    states = predictions.chosen.states
+def scales_of(predictions: Predictions) -> MotionScales:
+    """Typical sizes of the measured motions."""
+    return _scales(predictions.model, predictions.chosen)
+
+
+def _scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
+    modes, j, states = model.modes, model.modes.mode_of_interest, chosen.states
     speed, omega, force = (
         np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
     )
-    shape = abs(float(modes.mode_shape[predictions.chosen.sensors[0], j]))
+    shape = abs(float(modes.mode_shape[chosen.sensors[0], j]))
     amplitude = speed / omega / shape
-    return Scales(
+    return MotionScales(
         amplitude=float(np.median(amplitude)),
         largest=float(np.max(amplitude)),
         frequency=float(modes.natural_frequency[j]),
@@ -354,54 +354,3 @@ def scales_of(predictions: Predictions) -> Scales:
         smallest_force=float(np.min(force)),
         damping_ratio=float(modes.damping_ratio[j]),
     )
-
-
-PLAIN = "cubic_stiffness"
-"""A kind of the library, whose program also answers for the baseline by itself."""
-
-_LIBRARY = frozenset(EFFECTS)
-_SLIDING = frozenset({"jenkins_slider", "iwan_microslip"})
-
-
-def without_strength(model: Structure, completed: Structure) -> Structure | None:
-    """The first model with the kinds of effects that the second has beside it, without strength.
-
-    The same physics. None where a kind is a user's own, of
-    which nobody knows what takes its strength.
-    """
-    kinds = [effect.kind for effect in completed.effects[len(model.effects) :]]
-    if not _LIBRARY.issuperset(kinds):
-        return None
-    added = tuple(_without_strength(EFFECTS[kind], *_of_interest(model)) for kind in kinds)
-    return dataclasses.replace(model, effects=(*model.effects, *added))
-
-
-def _of_interest(model: Structure) -> tuple[float, float]:
-    """Natural frequency (rad/s) and damping ratio of the mode of interest."""
-    modes, j = model.modes, model.modes.mode_of_interest
-    return float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
-
-
-@lru_cache(maxsize=256)
-def _without_strength(one: type[AbstractEffect], frequency: float, ratio: float) -> AbstractEffect:
-    """An effect that does nothing, with shapes that no rule forbids.
-
-    Arguments: natural frequency (rad/s) and damping ratio of the mode of interest.
-    """
-    shapes = {
-        "gap_stiffness": {"gap": 1.0},
-        "one_sided_stop": {"gap": 1.0},
-        "jenkins_slider": {"slip_displacement": 1.0},
-        "iwan_microslip": {"exponent": 1.5},
-        "internal_resonance_1_3": {
-            "frequency_hz": 3.3 * frequency / (2 * np.pi),
-            "damping_ratio": ratio,
-        },
-        "internal_resonance_1_2": {
-            "frequency_hz": 2.2 * frequency / (2 * np.pi),
-            "damping_ratio": ratio,
-        },
-        "close_mode": {"frequency_hz": 1.1 * frequency / (2 * np.pi), "damping_ratio": ratio},
-    }
-    zero = dict.fromkeys(effect_parameters(one.kind), 0.0)
-    return make_effect(one.kind, zero | shapes.get(one.kind, {}))

@@ -24,7 +24,6 @@ from snrmjax.model.effect_base import (
     AbstractKinked,
     AbstractMemoryless,
 )
-from snrmjax.model.library.friction import IwanMicroslip, JenkinsSlider
 from snrmjax.model.library.internal_resonances import AbstractInternalResonance
 from snrmjax.model.parameters import with_parameters
 from snrmjax.model.structures import Structure
@@ -211,11 +210,20 @@ def _samples(force: AbstractForce) -> int:
 def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:
     if isinstance(effect, AbstractInternalResonance):
         return _Resonance(effect)
-    if swings and isinstance(effect, JenkinsSlider):
-        return _SwingingSlider(effect.stiffness, effect.slip_displacement)
-    if swings and isinstance(effect, IwanMicroslip):
-        return _SwingingIwan(effect.coefficient, effect.exponent)
-    return cast(AbstractForce, effect)  # one of `forces_of`
+    force = cast(AbstractForce, effect)  # one of `forces_of`
+    return _Quick(force) if swings and force.has_quick_formula() else force
+
+
+class _Quick(AbstractForce):
+    """A force by its quick formula, which is NaN over cycles for which it does not hold."""
+
+    kind: ClassVar[str] = "quick"
+    effect: AbstractForce
+
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        return self.effect.quick_cycle_force(displacement, velocity)
 
 
 class _Resonance(AbstractForce):
@@ -241,46 +249,3 @@ class _Resonance(AbstractForce):
 
 
 _KEPT = (0, *range(2, 2 * HARMONICS + 2))  # the mean has no sine
-
-
-class _SwingingSlider(JenkinsSlider):
-    """A slider over a cycle between two turns; NaN over others."""
-
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        q, slip = displacement, self.slip_displacement
-        high, low, falling = _swing(q)
-        down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
-        stuck = jnp.clip(0.0, high - slip, low + slip)
-        position = jnp.where(2 * slip < high - low, jnp.where(falling, down, up), stuck)
-        return -self.stiffness * position
-
-
-class _SwingingIwan(IwanMicroslip):
-    """Masing's rule over a cycle between two turns; NaN over others."""
-
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        high, low, falling = _swing(displacement)
-        backbone = 0.5 * (high - low)
-        gone = jnp.where(falling, high - displacement, displacement - low) / 2
-        branch = self._lost(backbone) - 2 * self._lost(gone)
-        return jnp.where(falling, -branch, branch)
-
-    def _lost(self, stretch: Array) -> Array:
-        """What the virgin curve c|x|^p has lost."""
-        safe = jnp.where(stretch > 0, stretch, 1.0)
-        return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
-
-
-def _swing(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
-    """The largest and the smallest sample, NaN where there are further turns, and what falls."""
-    n = q.shape[0]
-    top, bottom = jnp.argmax(q), jnp.argmin(q)
-    since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
-    ahead = jnp.roll(q, -1) - q
-    swings = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
-    nothing = jnp.where(swings, 0.0, jnp.nan)
-    return q[top] + nothing, q[bottom] + nothing, since <= fall

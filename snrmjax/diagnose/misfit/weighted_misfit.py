@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.diagnose.misfit.candidates import SECOND_ORDER, EffectCandidate, parameter_labels
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import NoiseModel, noise_model
-from snrmjax.diagnose.misfit.predictions import PLAIN, Group, Predicted, Predictions
+from snrmjax.diagnose.misfit.predictions import Group, Predicted, Predictions
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.structures import Structure
 
@@ -153,7 +153,7 @@ class WeightedMisfit:
 
 def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     """The baseline's misfit, weighted with the stated noise as the baseline passes it on."""
-    group = predictions.group(PLAIN)
+    group = predictions.group
     found = by_baseline(predictions, group, group.values)
     baseline = BaselinePrediction(
         found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
@@ -212,8 +212,7 @@ def _weighted(
 def _start_changes(
     misfit: WeightedMisfit, candidate: EffectCandidate
 ) -> Float[np.ndarray, "trial state column"]:
-    predictions, kind = misfit.predictions, candidate.kind
-    group, labels = predictions.group(kind), parameter_labels(kind)
+    group, labels = misfit.predictions.group, parameter_labels(candidate.kind)
     starts = np.array(candidate.starts)
     found = misfit.predicted(group, labels, starts, slopes=False)
     changes = found.columns - misfit.baseline.columns
@@ -222,5 +221,5 @@ def _start_changes(
         starts[:, 0] *= _WEAK
         found = misfit.predicted(group, labels, starts[lost], slopes=False)
         weak = found.columns - misfit.baseline.columns
-        changes[lost] = weak / _WEAK ** (2 if kind in SECOND_ORDER else 1)
+        changes[lost] = weak / _WEAK**candidate.strength_order
     return changes

@@ -5,13 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.misfit.candidates import (
-    CLOSE,
-    LIKE_A_MODE,
-    EffectCandidate,
-    Scales,
-    candidate,
-)
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     baseline_fit,
@@ -23,6 +17,8 @@ from snrmjax.diagnose.misfit.effect_fit import (
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.screening import foretold, foretold_pairs
+from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.blocks import over_cores
 
 DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
@@ -64,16 +60,18 @@ class FoundEffects(NamedTuple):
         return chi_square_p_value(self.fit.chi_square, freedom)
 
 
-def named(misfit: WeightedMisfit, scales: Scales, kinds: tuple[str, ...]) -> FoundEffects:
+def named(misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]) -> FoundEffects:
     """Add effects one after the other while the criterion asks for them, three at most.
 
     A linear mode close by has three numbers of its own and would follow a part of most laws: it
     is no candidate, but what it may have caused is compared with it.
     """
     every = {kind: candidate(kind, scales) for kind in kinds}
-    close = every.pop(CLOSE, None)
+    alternatives = [every.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
     found = _searched(misfit, every)
-    return found if close is None else _questioned(found, close, every)
+    for one in alternatives:
+        found = _questioned(found, one, every)
+    return found
 
 
 def _questioned(
@@ -86,8 +84,8 @@ def _questioned(
     linear mode does the same at every level.
     """
     misfit, fit = found.misfit, found.fit
-    alike = [kind for kind in fit.kinds if kind in LIKE_A_MODE]
-    others = [kind for kind in fit.kinds if kind not in LIKE_A_MODE]
+    alike = [kind for kind in fit.kinds if EFFECTS[kind].is_linear]
+    others = [kind for kind in fit.kinds if not EFFECTS[kind].is_linear]
     refuted = _is_below(misfit, fit, _REFUTED)
     fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
     if not fit.kinds or fits_by_itself or misfit.predictions.sizes.alone.any():

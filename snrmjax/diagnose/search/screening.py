@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.diagnose.misfit.candidates import SECOND_ORDER, EffectCandidate
+from snrmjax.diagnose.misfit.candidates import EffectCandidate
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
@@ -60,7 +60,7 @@ def foretold_pairs(
     along, across = -arms @ misfit.noise.decorrelated(misfit.base), arms @ arms.T
     left = np.maximum(1 - across**2, _ALIKE)
     factor = (along[:, None] - across * along) / left / size[:, None]  # of one beside another
-    least = [-np.inf if c.kind not in SECOND_ORDER and c.lower[0] < 0 else 0.0 for c in candidates]
+    least = [-np.inf if c.strength_order == 1 and c.lower[0] < 0 else 0.0 for c in candidates]
     good = factor > np.array(least)[whose][:, None]
     good = good & good.T & (whose[:, None] < whose)
     gain = (along[:, None] ** 2 + along**2 - 2 * across * np.outer(along, along)) / left
@@ -86,6 +86,6 @@ def _scaled(candidate: EffectCandidate, start: int, factor: float) -> tuple[floa
     """A start scaled so that its change has a factor."""
     strength, *shape = candidate.starts[start]
     # Those of second order change as the square of their strength, whatever its sign.
-    times = float(np.sqrt(abs(factor))) if candidate.kind in SECOND_ORDER else factor
+    times = float(np.sqrt(abs(factor))) if candidate.strength_order > 1 else factor
     times = float(np.clip(abs(times), *_SCALED)) * (-1.0 if times < 0 else 1.0)
     return (strength * times, *shape)

@@ -3,15 +3,35 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
 from snrmjax.model.effect_base import AbstractMemoryless, Scalar
+from snrmjax.model.effect_metadata import (
+    NOT_BELOW_ZERO,
+    Argument,
+    Confusion,
+    Part,
+    Shape,
+    Symmetry,
+    parameter,
+)
+from snrmjax.model.library.confusions import TOLD_BY_THIRD_HARMONIC
+
+_OF_VELOCITY = Shape(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY)
 
 
 class QuadraticDamping(AbstractMemoryless):
-    """f = c|q̇|q̇ (fluid drag); 2ζ̃ω̃ rises by 8cΩQ/3π."""
+    """f = c|q̇|q̇, which raises 2ζ̃ω̃ by 8cΩQ/3π; `coefficient` is c in 1/(kg^1/2 m)."""
 
     kind: ClassVar[str] = "quadratic_damping"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "Drag of the surrounding air or liquid: a damping force with the square of the velocity."
+    )
+    shape: ClassVar[Shape] = _OF_VELOCITY._replace(
+        power=1, factor=8 / (3 * np.pi), frequency_power=2
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    coefficient: Scalar = parameter("1/(kg^1/2 m)", "quadratic damping", prior=NOT_BELOW_ZERO)
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""
@@ -19,10 +39,15 @@ class QuadraticDamping(AbstractMemoryless):
 
 
 class CubicDamping(AbstractMemoryless):
-    """f = c q̇³; 2ζ̃ω̃ rises by ¾cΩ²Q²."""
+    """f = c q̇³, which raises 2ζ̃ω̃ by ¾cΩ²Q²; `coefficient` is c in s/(kg m²)."""
 
     kind: ClassVar[str] = "cubic_damping"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "A damping force with the third power of the velocity, as of some dampers and seals."
+    )
+    shape: ClassVar[Shape] = _OF_VELOCITY._replace(power=2, factor=0.75, frequency_power=3)
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    coefficient: Scalar = parameter("s/(kg m²)", "cubic damping")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""
@@ -30,10 +55,18 @@ class CubicDamping(AbstractMemoryless):
 
 
 class VanDerPolDamping(AbstractMemoryless):
-    """f = c q²q̇; 2ζ̃ω̃ rises by cQ²/4."""
+    """f = c q²q̇, which raises 2ζ̃ω̃ by cQ²/4; `coefficient` is c in 1/(kg m² s)."""
 
     kind: ClassVar[str] = "van_der_pol_damping"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "Damping that grows with the square of the displacement, as of a material under large "
+        "strain; below zero, a feedback that feeds the motion."
+    )
+    shape: ClassVar[Shape] = Shape(
+        *(Part.DAMPING, Symmetry.ODD, Argument.BOTH), power=2, factor=0.25, frequency_power=1
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_THIRD_HARMONIC,)
+    coefficient: Scalar = parameter("1/(kg m² s)", "damping per squared displacement")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""

@@ -1,4 +1,4 @@
-"""Friction: forces that depend on the way the motion took, and on its direction.
+"""Friction: forces that depend on the history of the motion, and on its direction.
 
 A slider with the stuck stiffness k_t and the slip displacement x_s is a spring k_t to a block
 that rests on a friction surface. The block's position z is pushed along where the spring's
@@ -9,7 +9,6 @@ Reference: Iwan, ASME J. Appl. Mech. 33 (1966), 893, doi:10.1115/1.3625199.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -18,9 +17,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from snrmjax.model.effect_base import AbstractHysteresis, Scalar
-from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE, Rule
+from snrmjax.model.effect_base import AbstractHysteresis, Scalar, Starts
+from snrmjax.model.effect_metadata import (
+    NOT_BELOW_ZERO,
+    Argument,
+    Confusion,
+    Imitation,
+    MotionScales,
+    Part,
+    Prior,
+    Shape,
+    Symmetry,
+    parameter,
+)
+from snrmjax.model.library.confusions import FRICTION_OR_FORCE_OFFSET
+from snrmjax.numerics.rules import BETWEEN_ONE_AND_THREE, NOT_NEGATIVE, POSITIVE
 
+_SLIP = Shape(Part.STIFFNESS_AND_DAMPING, Symmetry.ODD, Argument.HISTORY)
 SMOOTHING = 0.05  # width of the smoothed jump of Coulomb's force over the rms velocity
 # In w = u^(p−1) on (0, 1), where the thresholds of an Iwan element are evenly dense.
 _NODE, _WEIGHT = (0.5 * part for part in np.polynomial.legendre.leggauss(48))
@@ -120,12 +133,25 @@ class JenkinsSlider(AbstractSliders):
     """
 
     kind: ClassVar[str] = "jenkins_slider"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {
-        "stiffness": (NOT_NEGATIVE,),
-        "slip_displacement": (POSITIVE,),
-    }
-    stiffness: Scalar
-    slip_displacement: Scalar
+    description: ClassVar[str] = (
+        "A joint that sticks and, beyond a certain displacement, slips as a whole: it then loses "
+        "stiffness and dissipates energy."
+    )
+    shape: ClassVar[Shape] = _SLIP
+    stiffness: Scalar = parameter(
+        "1/s²", "stiffness while it sticks", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
+    )
+    slip_displacement: Scalar = parameter(
+        *("kg^1/2 m", "displacement at slip"),
+        rules=(POSITIVE,),
+        prior=Prior(1e-3, 1.2, lambda scales: scales.largest),
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: slip at several shares of the largest amplitude."""
+        shares = (0.05, 0.15, 0.3, 0.5, 0.75)
+        return [(3.0 * scales.change, share * scales.largest) for share in shares]
 
     def sliders(self) -> Sliders:
         """See `AbstractSliders.sliders`."""
@@ -136,6 +162,17 @@ class JenkinsSlider(AbstractSliders):
     ) -> Float[Array, " time"]:
         """See `AbstractForce.cycle_force`; the direction of time is the samples' own."""
         return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
+
+    def quick_cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
+        q, slip = displacement, self.slip_displacement
+        high, low, falling = _turning_points(q)
+        down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
+        stuck = jnp.clip(0.0, high - slip, low + slip)
+        position = jnp.where(2 * slip < high - low, jnp.where(falling, down, up), stuck)
+        return -self.stiffness * position
 
 
 class IwanMicroslip(AbstractSliders):
@@ -152,13 +189,36 @@ class IwanMicroslip(AbstractSliders):
     """
 
     kind: ClassVar[str] = "iwan_microslip"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {
-        "coefficient": (NOT_NEGATIVE,),
-        "exponent": (BETWEEN_ONE_AND_THREE,),
-    }
-    coefficient: Scalar
-    exponent: Scalar
+    description: ClassVar[str] = (
+        "A bolted joint whose contact slips bit by bit: the stiffness falls and the damping grows "
+        "with a power of the amplitude."
+    )
+    shape: ClassVar[Shape] = _SLIP
+    imitations: ClassVar[tuple[Imitation, ...]] = (
+        Imitation(
+            "other laws of friction with the same backbone, such as Bouc and Wen's, fit as well.",
+            "measure a hysteresis loop, or levels over two decades",
+            identical=True,
+        ),
+    )
+    coefficient: Scalar = parameter(
+        *("(kg^1/2 m)^(1-exponent)/s²", "stiffness that slip takes away at unit amplitude"),
+        rules=(NOT_NEGATIVE,),
+        prior=NOT_BELOW_ZERO,
+        exponent="exponent",
+    )
+    exponent: Scalar = parameter(
+        *("", "power of the backbone's amplitude"),
+        rules=(BETWEEN_ONE_AND_THREE,),
+        prior=Prior(1.02, 2.98),
+        typical=1.5,
+    )
     largest_slip: Scalar | None = None  # kg^1/2 m, of the sliders for integration in time
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: several exponents p, with Δ(ω̃²) ≈ −cQ^(p−1)."""
+        return [(scales.change / scales.amplitude ** (p - 1), p) for p in (1.2, 1.5, 2.0, 2.6)]
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
         """See `AbstractHysteresis.scaled_for`."""
@@ -197,6 +257,32 @@ class IwanMicroslip(AbstractSliders):
         sliders = self._sliders_up_to(half_range)
         return settled_positions(displacement, sliders.slip_displacement) @ -sliders.stiffness
 
+    def quick_cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """See `AbstractForce.quick_cycle_force`: Masing's rule between two turning points."""
+        high, low, falling = _turning_points(displacement)
+        backbone = 0.5 * (high - low)
+        gone = jnp.where(falling, high - displacement, displacement - low) / 2
+        branch = self._lost(backbone) - 2 * self._lost(gone)
+        return jnp.where(falling, -branch, branch)
+
+    def _lost(self, stretch: Array) -> Array:
+        """The force c x^p that slip has taken from the backbone."""
+        safe = jnp.where(stretch > 0, stretch, 1.0)
+        return jnp.where(stretch > 0, self.coefficient * safe**self.exponent, 0.0)
+
+
+def _turning_points(q: Float[Array, " time"]) -> tuple[Array, Array, Array]:
+    """The largest and the smallest sample, NaN where there are further turns, and what falls."""
+    n = q.shape[0]
+    top, bottom = jnp.argmax(q), jnp.argmin(q)
+    since, fall = (jnp.arange(n) - top) % n, (bottom - top) % n
+    ahead = jnp.roll(q, -1) - q
+    only_two = jnp.all(jnp.where(since < fall, ahead <= 0, ahead >= 0))
+    nothing = jnp.where(only_two, 0.0, jnp.nan)
+    return q[top] + nothing, q[bottom] + nothing, since <= fall
+
 
 class CoulombFriction(AbstractHysteresis):
     """f = F_c sgn q̇ (dry friction); 2ζ̃ω̃ rises by 4F_c/(πΩQ).
@@ -208,8 +294,24 @@ class CoulombFriction(AbstractHysteresis):
     """
 
     kind: ClassVar[str] = "coulomb_friction"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"force": (NOT_NEGATIVE,)}
-    force: Scalar
+    description: ClassVar[str] = (
+        "Dry friction: a force of constant size against the direction of motion, which matters "
+        "most at small amplitudes."
+    )
+    shape: ClassVar[Shape] = Shape(
+        *(Part.DAMPING, Symmetry.ODD, Argument.VELOCITY), power=-1, factor=4 / np.pi
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
+    imitations: ClassVar[tuple[Imitation, ...]] = (
+        Imitation(
+            "damping that goes with the square root of the velocity fits as well.",
+            "measure smaller amplitudes, or a free decay",
+            near_power=-0.5,
+        ),
+    )
+    force: Scalar = parameter(
+        "kg^1/2 m/s²", "friction force", rules=(NOT_NEGATIVE,), prior=NOT_BELOW_ZERO
+    )
     smoothing_velocity: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
 
     def cycle_force(

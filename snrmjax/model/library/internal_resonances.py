@@ -1,31 +1,79 @@
 """Internal resonances: a further mode that the mode of interest drives through the potential."""
 
 import dataclasses
-from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from snrmjax.model.effect_base import AbstractAddedMode, Scalar
+from snrmjax.model.effect_base import AbstractAddedMode, Bounds, Scalar, Starts
+from snrmjax.model.effect_metadata import (
+    FURTHER_DAMPING,
+    Confusion,
+    MotionScales,
+    Part,
+    Shape,
+    Symmetry,
+    parameter,
+)
+from snrmjax.model.library.confusions import WHICH_RESONANCE
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.potential import Monomial, PolynomialPotential
-from snrmjax.numerics.rules import OF_A_MODE, Rule
+from snrmjax.numerics.rules import OF_A_DAMPING_RATIO, OF_A_FREQUENCY
+
+_NEAR = (0.8, 1.2)  # over the multiple of the natural frequency: where a further mode may lie
 
 
 class AbstractInternalResonance(AbstractAddedMode):
-    """V gains b q_jⁿ q_new, with a mode that no sensor sees and that the force does not drive.
+    """V gains b q_jⁿ q_new, with a mode that no sensor sees and that no force drives directly.
 
     `coefficient` b in (kg^1/2 m)^(1−n)/s²; `frequency_hz` and `damping_ratio` are those of the
     new mode, which is excited strongly where it lies near n times the mode of interest.
     """
 
-    order: ClassVar[int]
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = OF_A_MODE
+    order: ClassVar[int]  # n: cycles of the further mode to one of the mode of interest
+    confusions: ClassVar[tuple[Confusion, ...]] = (WHICH_RESONANCE,)
     coefficient: Scalar
-    frequency_hz: Scalar
-    damping_ratio: Scalar
+    frequency_hz: Scalar = parameter(
+        "Hz", "natural frequency of the further mode", rules=OF_A_FREQUENCY
+    )
+    damping_ratio: Scalar = parameter(
+        *("1", "damping ratio of the further mode"),
+        rules=OF_A_DAMPING_RATIO,
+        prior=FURTHER_DAMPING,
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: further modes at and near n times the frequency.
+
+        At resonance q_new ~ bQⁿ/(2ⁿ⁻¹·2ζω²), which acts back like n b Qⁿ⁻² q_new.
+        """
+        n, hz = cls.order, scales.frequency / (2 * np.pi)
+        size = np.sqrt(scales.change * 0.02 * (n * scales.frequency) ** 2)
+        size = float(size / scales.amplitude ** (n - 1))
+        shares = (0.95, 0.985, 1.0, 1.015, 1.05)
+        return [(size, n * hz * share, scales.damping_ratio) for share in shares]
+
+    @classmethod
+    def bounds(cls, scales: MotionScales) -> Bounds:
+        """See `AbstractEffect.bounds`: the further mode lies near n times the frequency."""
+        hz = cls.order * scales.frequency / (2 * np.pi)
+        free, _, damped = super().bounds(scales)
+        return [free, (_NEAR[0] * hz, _NEAR[1] * hz), damped]
+
+    @classmethod
+    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
+        """See `AbstractEffect.steps`."""
+        coefficient, hz, ratio = start
+        return abs(coefficient), 0.01 * hz, 0.5 * ratio
+
+    @classmethod
+    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
+        """See `AbstractEffect.without_strength`: the further mode a tenth above n times ω₀."""
+        hz = 1.1 * cls.order * natural_frequency / (2 * np.pi)
+        return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
 
     def expanded(
         self, modes: LinearModes, potential: PolynomialPotential
@@ -50,6 +98,12 @@ class InternalResonanceOneToThree(AbstractInternalResonance):
     """V gains b q_j³ q_new: a third harmonic that resonates with a further mode."""
 
     kind: ClassVar[str] = "internal_resonance_1_3"
+    description: ClassVar[str] = (
+        "A further mode near three times the frequency resonates with the third harmonic and "
+        "draws energy from the mode of interest."
+    )
+    shape: ClassVar[Shape] = Shape(Part.HARMONICS, Symmetry.ODD, strength_order=2)
+    coefficient: Scalar = parameter("1/(kg m² s²)", "coupling of the two modes")
     order: ClassVar[int] = 3
 
 
@@ -57,6 +111,12 @@ class InternalResonanceOneToTwo(AbstractInternalResonance):
     """V gains b q_j² q_new: a second harmonic that resonates with a further mode."""
 
     kind: ClassVar[str] = "internal_resonance_1_2"
+    description: ClassVar[str] = (
+        "A further mode near twice the frequency resonates with the second harmonic and draws "
+        "energy from the mode of interest."
+    )
+    shape: ClassVar[Shape] = Shape(Part.HARMONICS, Symmetry.EVEN, strength_order=2)
+    coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "coupling of the two modes")
     order: ClassVar[int] = 2
 
 

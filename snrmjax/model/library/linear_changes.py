@@ -1,18 +1,19 @@
 """Changes of the linear terms of the mode of interest: frequency, damping and mass."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
 
-from snrmjax.model.effect_base import AbstractLinearChange, Scalar
-from snrmjax.numerics.rules import ABOVE_MINUS_ONE, Rule
+from snrmjax.model.effect_base import AbstractLinearChange, Scalar, Starts
+from snrmjax.model.effect_metadata import Confusion, MotionScales, Part, Shape, parameter
+from snrmjax.model.library.confusions import DRIFT, STIFFNESS_OR_MASS
+from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 
 
 def _shifted(
     natural_frequency: Scalar, damping_ratio: Scalar, relative_shift: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """What ω₀ → ω₀(1 + s) with the same ζ adds."""
+    """What ω₀ → ω₀(1 + s) with the same ζ adds to mass, damping and stiffness."""
     damping = 2 * damping_ratio * natural_frequency * relative_shift
     stiffness = natural_frequency**2 * relative_shift * (2 + relative_shift)
     return jnp.zeros(()), damping, stiffness
@@ -22,8 +23,20 @@ class LinearFrequencyShift(AbstractLinearChange):
     """ω₀ → ω₀(1 + s) with the damping ratio unchanged; `relative_shift` is s."""
 
     kind: ClassVar[str] = "linear_frequency_shift"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"relative_shift": (ABOVE_MINUS_ONE,)}
-    relative_shift: Scalar
+    description: ClassVar[str] = (
+        "The natural frequency differs from the one stated: the linear stiffness is not that of "
+        "the linear test."
+    )
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
+    confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
+    relative_shift: Scalar = parameter(
+        "1", "relative shift of the natural frequency", rules=(ABOVE_MINUS_ONE,)
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(0.5 * scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
@@ -39,8 +52,20 @@ class FrequencyDrift(AbstractLinearChange):
     """
 
     kind: ClassVar[str] = "frequency_drift"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"relative_drift": (ABOVE_MINUS_ONE,)}
-    relative_drift: Scalar
+    description: ClassVar[str] = (
+        "The natural frequency drifts in the course of the test, with temperature or as a joint "
+        "settles."
+    )
+    shape: ClassVar[Shape] = Shape(Part.TIME)
+    confusions: ClassVar[tuple[Confusion, ...]] = (DRIFT,)
+    relative_drift: Scalar = parameter(
+        "1", "relative shift of the natural frequency over the test", rules=(ABOVE_MINUS_ONE,)
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
@@ -53,7 +78,15 @@ class LinearDampingChange(AbstractLinearChange):
     """ζ → ζ + Δ: 2ζω₀ rises by 2Δω₀; `damping_ratio_change` is Δ, a fraction of critical."""
 
     kind: ClassVar[str] = "linear_damping_change"
-    damping_ratio_change: Scalar
+    description: ClassVar[str] = "The linear damping differs from the one stated."
+    shape: ClassVar[Shape] = Shape(Part.DAMPING, power=0)
+    acts_like: ClassVar[str | None] = Part.DAMPING
+    damping_ratio_change: Scalar = parameter("1", "change of the damping ratio")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(0.5 * scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
@@ -66,8 +99,18 @@ class AddedMass(AbstractLinearChange):
     """f = m q̈: Δ(ω̃²) = −mΩ²; `mass` is m, relative to the modal mass."""
 
     kind: ClassVar[str] = "added_mass"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"mass": (ABOVE_MINUS_ONE,)}
-    mass: Scalar
+    description: ClassVar[str] = (
+        "A mass that the model lacks, such as that of a sensor or of a shaker's armature."
+    )
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
+    confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
+    like_force_gain: ClassVar[bool] = True
+    mass: Scalar = parameter("1", "mass over the modal mass", rules=(ABOVE_MINUS_ONE,))
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(scales.change / scales.frequency**2,)]
 
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar

@@ -1,15 +1,41 @@
 """Errors of the force's spectrum and of the instruments, and what sensors see beside a mode."""
 
-from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from snrmjax.model.effect_base import AbstractForceSpectrum, AbstractMeasurementEffect, Scalar
-from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_MODE, Rule
+from snrmjax.model.effect_base import (
+    AbstractForceSpectrum,
+    AbstractMeasurementEffect,
+    Scalar,
+    Starts,
+)
+from snrmjax.model.effect_metadata import (
+    FURTHER_DAMPING,
+    VISIBLE_CHANGE,
+    Confusion,
+    Imitation,
+    MotionScales,
+    Part,
+    Prior,
+    Shape,
+    parameter,
+)
+from snrmjax.model.library.confusions import (
+    FAR_MODE_OR_PHASE_ERROR,
+    FORCE_OR_SENSOR_GAIN,
+    FRICTION_OR_FORCE_OFFSET,
+    FURTHER_MODE,
+    SIZE_OF_RESPONSE,
+    STRUCTURE_OR_FORCE_SPECTRUM,
+)
+from snrmjax.numerics.rules import ABOVE_MINUS_ONE, OF_A_DAMPING_RATIO, OF_A_FREQUENCY
 
+_SIZE = "size of the response"
+_LIGHT = 1e-3  # damping ratio of a close mode, where the model itself has none
+_WIDE = 0.15  # relative distance in frequency, beyond which a mode is a far one
 Amplitude = Float[Array, " state"]
 Velocity = Complex[Array, "state harmonic sensor"]
 
@@ -18,8 +44,18 @@ class ForceHarmonics(AbstractForceSpectrum):
     """The force F cos Ωt is F (cos Ωt + `second` cos 2Ωt + `third` cos 3Ωt)."""
 
     kind: ClassVar[str] = "force_harmonics"
-    second: Scalar
-    third: Scalar
+    description: ClassVar[str] = (
+        "The force of the shaker is not a pure sine: it has harmonics 2 and 3 of its own."
+    )
+    shape: ClassVar[Shape] = Shape(Part.HARMONICS)
+    confusions: ClassVar[tuple[Confusion, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
+    second: Scalar = parameter("1", "harmonic 2 of the force over its fundamental")
+    third: Scalar = parameter("1", "harmonic 3 of the force over its fundamental", typical=0.0)
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(0.02, 0.02)]
 
     def load_orders(self) -> Float[Array, " order"]:
         """See `AbstractForceSpectrum.load_orders`."""
@@ -30,8 +66,20 @@ class ForceGainError(AbstractMeasurementEffect):
     """The true force is the recorded one times 1 + g; `gain` is g."""
 
     kind: ClassVar[str] = "force_gain_error"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"gain": (ABOVE_MINUS_ONE,)}
-    gain: Scalar
+    description: ClassVar[str] = (
+        "The force is recorded in a wrong scale: the calibration factor of the force sensor, or a "
+        "mass between it and the structure."
+    )
+    acts_like: ClassVar[str | None] = _SIZE
+    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    is_linear: ClassVar[bool] = True
+    like_force_gain: ClassVar[bool] = True
+    gain: Scalar = parameter("1", "relative error of the force", rules=(ABOVE_MINUS_ONE,))
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(VISIBLE_CHANGE,)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -44,7 +92,17 @@ class ForceOffsetError(AbstractMeasurementEffect):
     """The true force's amplitude is the recorded one plus f₀; `offset` is f₀ in N."""
 
     kind: ClassVar[str] = "force_offset_error"
-    offset: Scalar
+    description: ClassVar[str] = (
+        "The recorded amplitude of the force is too small or too large by a constant, as a noise "
+        "floor or a threshold makes it."
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (FRICTION_OR_FORCE_OFFSET,)
+    offset: Scalar = parameter("N", "true less recorded amplitude of the force")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(VISIBLE_CHANGE * scales.smallest_force,)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -57,8 +115,20 @@ class SensorGainError(AbstractMeasurementEffect):
     """The recorded velocity, every harmonic of it, is the true one times 1 + s; `gain` is s."""
 
     kind: ClassVar[str] = "sensor_gain_error"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"gain": (ABOVE_MINUS_ONE,)}
-    gain: Scalar
+    description: ClassVar[str] = (
+        "The velocity is recorded in a wrong scale: the calibration factor of the sensor, or peak "
+        "values taken for amplitudes."
+    )
+    acts_like: ClassVar[str | None] = _SIZE
+    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
+    is_linear: ClassVar[bool] = True
+    like_force_gain: ClassVar[bool] = True
+    gain: Scalar = parameter("1", "relative error of the velocity", rules=(ABOVE_MINUS_ONE,))
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(VISIBLE_CHANGE,)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -74,7 +144,19 @@ class SensorPhaseError(AbstractMeasurementEffect):
     """
 
     kind: ClassVar[str] = "sensor_phase_error"
-    phase_deg: Scalar
+    description: ClassVar[str] = (
+        "The recorded velocity leads or lags by a constant phase, as a filter or a delay between "
+        "the channels makes it."
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
+    is_linear: ClassVar[bool] = True
+    only_phase: ClassVar[bool] = True
+    phase_deg: Scalar = parameter("°", "phase by which the recorded velocity leads")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(float(np.degrees(VISIBLE_CHANGE)),)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -91,8 +173,20 @@ class ResidualMode(AbstractMeasurementEffect):
     """
 
     kind: ClassVar[str] = "residual_mode"
+    description: ClassVar[str] = (
+        "Modes far from the measured frequencies, which the model lacks, add a displacement that "
+        "is proportional to the force."
+    )
+    acts_like: ClassVar[str | None] = _SIZE
+    confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
+    is_linear: ClassVar[bool] = True
     stage: ClassVar[int] = 1
-    receptance: Scalar
+    receptance: Scalar = parameter("m/N", "displacement of the far modes over the force")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(VISIBLE_CHANGE * scales.receptance,)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -111,11 +205,56 @@ class CloseMode(AbstractMeasurementEffect):
     """
 
     kind: ClassVar[str] = "close_mode"
+    description: ClassVar[str] = (
+        "A further linear mode near the measured frequencies, which the model lacks, adds its own "
+        "response."
+    )
+    confusions: ClassVar[tuple[Confusion, ...]] = (FURTHER_MODE,)
+    imitations: ClassVar[tuple[Imitation, ...]] = (
+        Imitation(
+            "a mode close by has three numbers of its own: to one sensor a clearance beside a "
+            "cubic stiffness, or several small errors, can look like it.",
+            "measure with a second sensor, where a further mode has another shape, or sweep "
+            "through the frequency at which it is said to be",
+            identical=True,
+        ),
+    )
+    is_linear: ClassVar[bool] = True
+    searched: ClassVar[bool] = False
     stage: ClassVar[int] = 1
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = OF_A_MODE
-    modal_constant: Scalar
-    frequency_hz: Scalar
-    damping_ratio: Scalar
+    modal_constant: Scalar = parameter("1/kg", "product of its shapes at sensor and force")
+    frequency_hz: Scalar = parameter(
+        *("Hz", "its natural frequency"),
+        rules=OF_A_FREQUENCY,
+        prior=Prior(1 - 2 * _WIDE, 1 + 2 * _WIDE, lambda scales: scales.frequency / (2 * np.pi)),
+    )
+    damping_ratio: Scalar = parameter(
+        *("1", "its damping ratio"), rules=OF_A_DAMPING_RATIO, prior=FURTHER_DAMPING
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """Modes some half-power bandwidths away, as strong as a visible change at resonance."""
+        starts: Starts = []
+        ratio = max(scales.damping_ratio, _LIGHT)
+        for away in (-8.0, -3.0, 3.0, 8.0):
+            share = 1 + float(np.clip(away * ratio, -_WIDE, _WIDE))
+            distance = abs(share**2 - 1 + 2j * ratio * share) * scales.frequency**2
+            hz = share * scales.frequency / (2 * np.pi)
+            starts.append((VISIBLE_CHANGE * scales.receptance * distance, hz, ratio))
+        return starts
+
+    @classmethod
+    def steps(cls, start: tuple[float, ...]) -> tuple[float, ...]:
+        """See `AbstractEffect.steps`: a half bandwidth in frequency."""
+        constant, hz, ratio = start
+        return abs(constant), ratio * hz, 0.5 * ratio
+
+    @classmethod
+    def without_strength(cls, natural_frequency: float, damping_ratio: float) -> Self:
+        """See `AbstractEffect.without_strength`."""
+        hz = 1.1 * natural_frequency / (2 * np.pi)
+        return cls(*(jnp.asarray(value) for value in (0.0, hz, damping_ratio)))
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude
@@ -130,8 +269,26 @@ class ModeShapeChange(AbstractMeasurementEffect):
     """Φ → Φ(1 + s Q²) at every sensor; `coefficient` is s in 1/(kg m²), Q the amplitude."""
 
     kind: ClassVar[str] = "mode_shape_change"
+    description: ClassVar[str] = (
+        "The mode shape changes with the amplitude: the sensor's share of the motion is not "
+        "constant."
+    )
+    acts_like: ClassVar[str | None] = _SIZE
+    confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE,)
+    imitations: ClassVar[tuple[Imitation, ...]] = (
+        Imitation(
+            "a sensor that saturates can do what mode_shape_change does.",
+            "record harmonic 3 at the largest level, or use a second sensor",
+            unless_harmonic=3,
+        ),
+    )
     stage: ClassVar[int] = 0
-    coefficient: Scalar
+    coefficient: Scalar = parameter("1/(kg m²)", "relative change per squared amplitude")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`."""
+        return [(VISIBLE_CHANGE / scales.amplitude**2,)]
 
     def recorded(
         self, frequency: Amplitude, force: Amplitude, velocity: Velocity, displacement: Amplitude

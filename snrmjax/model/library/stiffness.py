@@ -1,19 +1,50 @@
 """Elastic restoring forces: smooth stiffness laws, contacts with a kink, and a preload."""
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 
-from snrmjax.model.effect_base import AbstractKinked, AbstractMemoryless, Scalar, ramp
-from snrmjax.numerics.rules import NOT_NEGATIVE, Rule
+from snrmjax.model.effect_base import AbstractKinked, AbstractMemoryless, Scalar, Starts, ramp
+from snrmjax.model.effect_metadata import (
+    NOT_BELOW_ZERO,
+    Argument,
+    Confusion,
+    MotionScales,
+    Part,
+    Prior,
+    Shape,
+    Symmetry,
+    parameter,
+)
+from snrmjax.model.library.confusions import (
+    ONE_SIDED_OR_TWO_SIDED,
+    STRUCTURE_OR_FORCE_SPECTRUM,
+    TOLD_BY_MEAN_OR_SECOND_HARMONIC,
+)
+from snrmjax.numerics.rules import NOT_NEGATIVE
+
+_ODD = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
+_EVEN = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
+_OF_A_GAP = Prior(0.0, 1.2, lambda scales: scales.largest)
+_SHARES = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude, at which a contact is looked for
+
+
+def _contact_starts(scales: MotionScales, share: float) -> Starts:
+    return [(share * scales.change, gap * scales.largest) for gap in _SHARES]
 
 
 class CubicStiffness(AbstractMemoryless):
-    """f = a q³; raises ω̃² by ¾aQ²."""
+    """f = a q³, which raises ω̃² by ¾aQ²; `coefficient` is a in 1/(kg m² s²)."""
 
     kind: ClassVar[str] = "cubic_stiffness"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "A spring that stiffens (below zero: softens) with the square of the amplitude, as the "
+        "stretching of a clamped beam makes it."
+    )
+    shape: ClassVar[Shape] = _ODD._replace(power=2, factor=0.75)
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    coefficient: Scalar = parameter("1/(kg m² s²)", "cubic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""
@@ -21,10 +52,26 @@ class CubicStiffness(AbstractMemoryless):
 
 
 class QuadraticStiffness(AbstractMemoryless):
-    """f = a q²; a mean displacement and a second harmonic, softening in second order."""
+    """f = a q²; `coefficient` is a in 1/(kg^1/2 m s²).
+
+    To first order it makes a mean displacement and a second harmonic; through these it softens:
+    Δ(ω̃²) = −(5/6) a²Q²/ω₀².
+    """
 
     kind: ClassVar[str] = "quadratic_stiffness"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "A spring that is stiffer on one side than on the other, as curvature or a static load "
+        "makes it: the motion loses its symmetry and softens."
+    )
+    shape: ClassVar[Shape] = _EVEN._replace(power=2)
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    coefficient: Scalar = parameter("1/(kg^1/2 m s²)", "quadratic stiffness")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: softening by the visible change, with either sign."""
+        size = float(np.sqrt(1.2 * scales.change) * scales.frequency / scales.amplitude)
+        return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""
@@ -32,10 +79,15 @@ class QuadraticStiffness(AbstractMemoryless):
 
 
 class QuinticStiffness(AbstractMemoryless):
-    """f = a q⁵; raises ω̃² by ⅝aQ⁴."""
+    """f = a q⁵, which raises ω̃² by ⅝aQ⁴; `coefficient` is a in 1/(kg² m⁴ s²)."""
 
     kind: ClassVar[str] = "quintic_stiffness"
-    coefficient: Scalar
+    description: ClassVar[str] = (
+        "A spring whose stiffness changes with the fourth power of the amplitude, as at large "
+        "deflections."
+    )
+    shape: ClassVar[Shape] = _ODD._replace(power=4, factor=0.625)
+    coefficient: Scalar = parameter("1/(kg² m⁴ s²)", "quintic stiffness")
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""
@@ -43,10 +95,24 @@ class QuinticStiffness(AbstractMemoryless):
 
 
 class BilinearStiffness(AbstractKinked):
-    """f = k|q|/2: stiffness differs by k between the two sides; even harmonics ∝ Q."""
+    """f = k|q|/2: the stiffness differs by k between the two sides; `stiffness` is k in 1/s².
+
+    Its even harmonics are proportional to the amplitude.
+    """
 
     kind: ClassVar[str] = "bilinear_stiffness"
-    stiffness: Scalar
+    description: ClassVar[str] = (
+        "A spring with one stiffness for each direction, as a crack or a contact that opens and "
+        "closes makes it."
+    )
+    shape: ClassVar[Shape] = _EVEN
+    confusions: ClassVar[tuple[Confusion, ...]] = (STRUCTURE_OR_FORCE_SPECTRUM,)
+    stiffness: Scalar = parameter("1/s²", "difference of stiffness between the two sides")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: a twentieth of the linear stiffness, with either sign."""
+        return [(0.05 * scales.frequency**2,), (-0.05 * scales.frequency**2,)]
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
         """See `AbstractKinked.rounded_force`."""
@@ -54,12 +120,27 @@ class BilinearStiffness(AbstractKinked):
 
 
 class GapStiffness(AbstractKinked):
-    """A spring k that engages beyond ±gap; threshold and odd harmonics."""
+    """A spring that engages beyond ±`gap` (kg^1/2 m); its `stiffness` is in 1/s².
+
+    It shows above an amplitude of `gap` only, in odd harmonics.
+    """
 
     kind: ClassVar[str] = "gap_stiffness"
-    rules: ClassVar[Mapping[str, tuple[Rule, ...]]] = {"gap": (NOT_NEGATIVE,)}
-    stiffness: Scalar
-    gap: Scalar
+    description: ClassVar[str] = (
+        "A clearance with contacts on both sides: a further spring that engages where the "
+        "displacement exceeds the gap."
+    )
+    shape: ClassVar[Shape] = _ODD
+    confusions: ClassVar[tuple[Confusion, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
+    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
+    gap: Scalar = parameter(
+        "kg^1/2 m", "displacement at contact", rules=(NOT_NEGATIVE,), prior=_OF_A_GAP
+    )
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: gaps at several shares of the largest amplitude."""
+        return _contact_starts(scales, 3.0)
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
         """See `AbstractKinked.rounded_force`."""
@@ -68,11 +149,24 @@ class GapStiffness(AbstractKinked):
 
 
 class OneSidedStop(AbstractKinked):
-    """A spring k that engages beyond +gap; threshold and even harmonics."""
+    """A spring that engages beyond +`gap` (kg^1/2 m); its `stiffness` is in 1/s².
+
+    It shows above an amplitude of `gap` only, in even and odd harmonics.
+    """
 
     kind: ClassVar[str] = "one_sided_stop"
-    stiffness: Scalar
-    gap: Scalar
+    description: ClassVar[str] = (
+        "A stop on one side: a further spring that engages where the displacement exceeds the gap."
+    )
+    shape: ClassVar[Shape] = Shape(Part.STIFFNESS, Symmetry.NEITHER, Argument.DISPLACEMENT)
+    confusions: ClassVar[tuple[Confusion, ...]] = (ONE_SIDED_OR_TWO_SIDED,)
+    stiffness: Scalar = parameter("1/s²", "stiffness of the contact", prior=NOT_BELOW_ZERO)
+    gap: Scalar = parameter("kg^1/2 m", "displacement at contact", prior=_OF_A_GAP)
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: gaps at several shares of the largest amplitude."""
+        return _contact_starts(scales, 6.0)
 
     def rounded_force(self, displacement: Scalar, velocity: Scalar, width: Scalar) -> Scalar:
         """See `AbstractKinked.rounded_force`."""
@@ -80,10 +174,25 @@ class OneSidedStop(AbstractKinked):
 
 
 class StaticPreload(AbstractMemoryless):
-    """A constant force; with a cubic stiffness it shifts ω₀ and brings a second harmonic."""
+    """A constant force, which moves the position of rest; `constant_force` in kg^1/2 m/s².
+
+    With a nonlinear stiffness it shifts ω₀ and brings a second harmonic.
+    """
 
     kind: ClassVar[str] = "static_preload"
-    constant_force: Scalar
+    description: ClassVar[str] = (
+        "A constant force, such as weight or a clamping force, that moves the position of rest to "
+        "where a nonlinear spring is stiffer or softer."
+    )
+    shape: ClassVar[Shape] = _EVEN
+    confusions: ClassVar[tuple[Confusion, ...]] = (TOLD_BY_MEAN_OR_SECOND_HARMONIC,)
+    constant_force: Scalar = parameter("kg^1/2 m/s²", "constant force")
+
+    @classmethod
+    def starts(cls, scales: MotionScales) -> Starts:
+        """See `AbstractEffect.starts`: a static displacement of a fifth of the amplitude."""
+        size = 0.2 * scales.frequency**2 * scales.amplitude
+        return [(size,), (-size,)]
 
     def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
         """See `AbstractMemoryless.force`."""

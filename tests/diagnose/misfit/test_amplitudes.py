@@ -47,7 +47,7 @@ def stripped(name):
 def at_starts(predictions, kind):
     """What the first start of a kind makes of the states, by its first parameter."""
     one = candidate(kind, scales_of(predictions))
-    group, labels = predictions.group(kind), parameter_labels(kind)
+    group, labels = predictions.group, parameter_labels(kind)
     values = group.values.copy()
     values[[group.place(label) for label in labels]] = one.starts[0]
     found = predictions.of(group, values[None], labels[:1])
@@ -83,7 +83,7 @@ def test_every_effect_has_the_same_sizes_whatever_the_phases():
 
 def alone(predictions):
     """The baseline by itself."""
-    group = predictions.group("cubic_stiffness")
+    group = predictions.group
     return predictions.of(group, group.values[None])
 
 
@@ -125,7 +125,7 @@ def test_small_harmonics_are_expected_as_noise_makes_them():
 def test_errors_are_passed_on_to_sizes():
     model, data = files("blind_03")
     predictions = predictions_of(model, without_phases(data))
-    group = predictions.group("cubic_stiffness")
+    group = predictions.group
     slopes, _ = predictions.by_error(group, group.values)
     data, step = without_phases(data), 1e-3
     louder, softer = (

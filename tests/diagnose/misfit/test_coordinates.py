@@ -67,7 +67,7 @@ def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
     one = candidate(kind, scales_of(predictions))
     one = one._replace(starts=one.starts[:1])  # p = 1.2, a hundred of its 1σ away
     found = fit_effect(misfit, one)
-    group, labels = predictions.group(kind), parameter_labels(kind)
+    group, labels = predictions.group, parameter_labels(kind)
     at = float(scales_of(predictions).amplitude)
 
     def left(point):

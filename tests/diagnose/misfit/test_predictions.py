@@ -51,7 +51,7 @@ def own_friction(predictions):
     ours, data = predictions
     sj.model.register_effect(SmoothFriction)
     own = predictions_of(ours.model, data)
-    yield own, own.group("smooth_friction"), parameter_labels("smooth_friction")
+    yield own, own.group, parameter_labels("smooth_friction")
     del EFFECTS["smooth_friction"]
 
 
@@ -83,7 +83,7 @@ def test_what_states_miss_is_what_newtons_method_finds(predictions, kind):
 def test_slopes_are_those_of_finite_differences(predictions, kind):
     ours, _ = predictions
     values = moderate(kind, scales_of(ours))
-    group, labels = ours.group(kind), parameter_labels(kind)
+    group, labels = ours.group, parameter_labels(kind)
     every = group.values.copy()
     every[[group.place(label) for label in labels]] = values
     slopes = ours.of(group, every[None], labels).slopes[0]
@@ -99,7 +99,7 @@ def test_slopes_are_those_of_finite_differences(predictions, kind):
 
 def asked(ours, kind, values):
     """Complex force misfits of trials, over the measured force."""
-    group, labels = ours.group(kind), parameter_labels(kind)
+    group, labels = ours.group, parameter_labels(kind)
     every = np.tile(group.values, (len(values), 1))
     every[:, [group.place(label) for label in labels]] = values
     found = ours.of(group, every)
@@ -108,14 +108,14 @@ def asked(ours, kind, values):
 
 def missed_by(ours):
     """The same of the baseline."""
-    group = ours.group("cubic_stiffness")
+    group = ours.group
     found = ours.of(group, group.values[None])
     return found.columns[0, :, 0] + 1j * found.columns[0, :, 1]
 
 
 def test_where_no_motion_ends_a_step_the_way_towards_it_is_the_slope(predictions):
     ours, _ = predictions
-    group, label = ours.group("cubic_stiffness"), "cubic_stiffness.coefficient"
+    group, label = ours.group, "cubic_stiffness.coefficient"
     usual = ours.of(group, group.values[None], [label]).slopes[0, :, :2, 0]
     far = group._replace(unit=1e7 * group.unit)
     there = group.values.copy()
@@ -133,7 +133,7 @@ def test_what_the_model_is_unsure_of_has_slopes_however_small_it_is(predictions)
     linear = sj.model.linear_modes([OMEGA], [ZETA], [[2.0]], [3.0])
     potential = sj.model.polynomial_potential({"1111": 1e3}, 1, coefficient_std={"1111": 1e6})
     ours = predictions_of(dataclasses.replace(sj.model.structure(linear, potential), name=""), data)
-    group = ours.group("cubic_stiffness")
+    group = ours.group
     slopes = ours.of(group, group.values[None], ["potential.1111"]).slopes[0]
     frequency, velocity = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
     # ∂V/∂q = 4 a q³, whose fundamental is 3 a |q|² q.

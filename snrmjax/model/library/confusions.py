@@ -1,0 +1,44 @@
+"""Effects of the library that measured states may not tell apart, and what separates them."""
+
+from snrmjax.model.effect_metadata import Confusion
+
+TOLD_BY_MEAN_OR_SECOND_HARMONIC = Confusion(
+    "record harmonic 2 or the mean displacement at the largest level"
+)
+ONE_SIDED_OR_TWO_SIDED = Confusion(
+    "record harmonic 2 at the largest level: only a one-sided contact makes it"
+)
+TOLD_BY_THIRD_HARMONIC = Confusion(
+    "record harmonic 3 at the largest level, whose sign and size differ, and widen the range of "
+    "levels"
+)
+STRUCTURE_OR_FORCE_SPECTRUM = Confusion(
+    "record harmonic 2 against level and the force's own spectrum"
+)
+SIZE_OF_RESPONSE = Confusion(
+    "calibrate force and velocity statically, or repeat a level with a known added mass"
+)
+FORCE_OR_SENSOR_GAIN = Confusion(SIZE_OF_RESPONSE.separated_by, by_calibration=True)
+STIFFNESS_OR_MASS = Confusion("add a known mass, or measure a second mode", by_calibration=True)
+FRICTION_OR_FORCE_OFFSET = Confusion(
+    "measure at the smallest level 30° and more off resonance, on both sides"
+)
+DRIFT = Confusion("repeat the first level last", by_itself=True)
+FAR_MODE_OR_PHASE_ERROR = Confusion(
+    "measure 60° and more off resonance on both sides, or with a second sensor"
+)
+FURTHER_MODE = Confusion(
+    "measure with a second sensor, where a further mode has another shape, or sweep wider",
+    by_itself=True,
+)
+WHICH_RESONANCE = Confusion(
+    "step through the frequency of the disturbance and record the second and third harmonics of "
+    "the velocity (with their noise floor)"
+)
+
+CONFUSIONS = (
+    *(TOLD_BY_MEAN_OR_SECOND_HARMONIC, ONE_SIDED_OR_TWO_SIDED, TOLD_BY_THIRD_HARMONIC),
+    *(STRUCTURE_OR_FORCE_SPECTRUM, SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN, STIFFNESS_OR_MASS),
+    *(FRICTION_OR_FORCE_OFFSET, DRIFT, FAR_MODE_OR_PHASE_ERROR, FURTHER_MODE, WHICH_RESONANCE),
+)
+"""In the order in which their measurements are asked for: recordings first, further tests last."""
