@@ -48,11 +48,10 @@ def _plain(value: object) -> object:
     return [float(f"{x:.4g}") for x in array.reshape(-1)] if array.ndim else float(f"{array:.4g}")
 
 
-def load(folder: Path) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
+def load(folder: Path, table: str) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
     """Data and model of one beam."""
     model = read_model(folder / "model.toml")
-    (table,) = folder.glob("*.csv")
-    return read_steady_states(table, model), model
+    return read_steady_states(folder / table, model), model
 
 
 def only(data: sj.measure.SteadyStates, rows: np.ndarray) -> sj.measure.SteadyStates:
@@ -239,8 +238,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
     chosen = parser.parse_args()
-    brake, brake_model = load(chosen.data / "brake_reuss_beam")
-    hung, hung_model = load(chosen.data / "suspended_beam")
+    brake, brake_model = load(chosen.data / "brake_reuss_beam", "response_controlled.csv")
+    hung, hung_model = load(chosen.data / "suspended_beam", "lock_in_stepped_sine.csv")
     free = ("force_gain", "instrument_phase")
     for name, data, model, freed in (
         ("brake_reuss", brake, brake_model, ()),

@@ -1,10 +1,11 @@
-"""One store of compiled programs for all workers and all commands that the tests start."""
+"""One way of compiling and one store of compiled programs for all that the tests start."""
 
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -16,12 +17,25 @@ _QUICK = "--xla_cpu_use_fusion_emitters=false"  # compiles in two thirds of the 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Before JAX is imported, and before workers, which inherit the environment, are started."""
+    # Compiling is most of the time: no program of a test runs long enough to be worth optimising.
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     if _STORE not in os.environ:
-        config.snrmjax_store = tempfile.mkdtemp(prefix="snrmjax-tests-")
-        os.environ[_STORE] = config.snrmjax_store
+        os.environ[_STORE] = _store(config)
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
     if "XLA_FLAGS" not in os.environ:
         os.environ["XLA_FLAGS"] = _QUICK if _knows_quick() else ""
+
+
+def _store(config: pytest.Config) -> str:
+    """Beside pytest's own cache, kept between runs, one for each version of the compiler."""
+    if not hasattr(config, "cache"):  # pytest was asked to keep nothing
+        config.snrmjax_store = tempfile.mkdtemp(prefix="snrmjax-tests-")
+        return config.snrmjax_store
+    own = config.cache.mkdir(f"programs-jaxlib-{version('jaxlib')}")
+    for other in own.parent.glob("programs-jaxlib-*"):
+        if other != own:
+            shutil.rmtree(other, ignore_errors=True)
+    return str(own)
 
 
 def _knows_quick() -> bool:
@@ -42,17 +56,12 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def quick_compilation(request: pytest.FixtureRequest):
-    """Compile quickly where compilation is most of the time; simulations run long and are not."""
-    import jax
-
-    before = jax.config.values["jax_disable_most_optimizations"]
-    quick = "simulate" not in request.path.parts
-    jax.config.update("jax_disable_most_optimizations", quick)
+def bounded_memory():
+    """The programs of all modules together would fill gigabytes; the store has them on disk."""
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
-    # The programs of all modules together would fill gigabytes; the store has them on disk.
     if _memory() > _ROOM:
+        import jax
+
         jax.clear_caches()
 
 
