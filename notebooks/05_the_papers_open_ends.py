@@ -558,7 +558,7 @@ free = stated(
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
 report(misled)
-show(diagnosis_report.candidates_figure(misled), "peak_candidates")
+show(sj.plot.candidates_figure(misled), "peak_candidates")
 by_kind = gains(misled)
 law = next(row for row in misled.table[0] if row.kind.endswith("_damping"))
 print(f"best damping law: {law.kind}, gain {law.gain:.0f}", law.parameters)

@@ -1,6 +1,11 @@
 """Figures of what was measured, identified, simulated and diagnosed."""
 
-from snrmjax.report.diagnosis_report import candidates_figure, residual_figure, simulated_figure
+from snrmjax.report.diagnosis_figures import (
+    candidates_figure,
+    comparison_figure,
+    effect_laws_figure,
+    misfit_figure,
+)
 from snrmjax.report.figures import (
     DampingSeries,
     backbone_figure,
@@ -25,15 +30,16 @@ __all__ = [
     "advice_figure",
     "backbone_figure",
     "candidates_figure",
+    "comparison_figure",
     "contributions_figure",
+    "effect_laws_figure",
     "fitted_curves_figure",
     "force_velocity_figure",
+    "misfit_figure",
     "modal_damping_figure",
     "normal_mode_figure",
-    "residual_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",
-    "simulated_figure",
     "simulated_response_figure",
 ]

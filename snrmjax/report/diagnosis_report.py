@@ -1,7 +1,9 @@
-"""Figures and report of a diagnosis."""
+"""The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,35 +17,61 @@ from snrmjax.diagnose.response_prediction import (
     level_simulations,
 )
 from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
+from snrmjax.diagnose.search.model_search import Row
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
-from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
-from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
-from snrmjax.report.style import (
-    IDENTIFIED,
-    MEASURED,
-    SERIES,
-    name_axes,
-    panels,
-    png_bytes,
-    unit_for,
+from snrmjax.report.diagnosis_figures import (
+    at_curve_force,
+    candidates_figure,
+    comparison_figure,
+    effect_laws_figure,
+    effect_name,
+    found_effects,
+    misfit_figure,
 )
-from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.report.html import (
+    Report,
+    ReportFigure,
+    ReportTable,
+    Section,
+    number,
+    with_error,
+    write_report,
+)
+from snrmjax.report.style import png_bytes, unit_for, with_unit
 
 _SHOWN = 10  # candidates
-_LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
+_LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
+_RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
 
-VERDICTS = {
-    "none": "Nothing is missing that these data could show.",
-    "named": "One answer fits, and no other does nearly as well.",
-    "ambiguous": "Several effects fit about equally well: the data cannot tell them apart.",
-    "unknown": "Something is missing that no effect of the library explains.",
-    "noise_rejected": "The stated noise does not fit the data: no effect is named before it does.",
+_CAPTIONS = {
+    "laws": (
+        "What the completed model adds, over the measured range of motion. Forces are those that "
+        "would have to act at the drive to do the same to the mode."
+    ),
+    "responses": (
+        "Responses at the force of every level, without and with the effects that were found, over "
+        "the measured states. Lines should pass through the dots."
+    ),
+    "residuals": (
+        "How far the force that each measured state needs is from the one that acted, in standard "
+        "deviations of the noise (of its size alone where the phase is unknown). A correct model "
+        "leaves about 1 everywhere; dark regions show where the model is wrong."
+    ),
+    "candidates": (
+        "How much better each effect, added alone, makes the model: gain of the Bayesian "
+        "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
+        "are about as good as the best."
+    ),
 }
+_HELD_RESPONSE = (
+    " These levels hold the response, not the force: lines of constant force meet a level at its "
+    "resonance only, and pale dots were measured under other forces than the line's."
+)
 
 
 def write_diagnosis(
@@ -73,238 +101,333 @@ def write_diagnosis(
     if gain_std and found.effects:
         notes = (*notes, f"the answer puts that gain at {gain * found.force_gain:.4g} N/V.")
     found = dataclasses.replace(found, notes=(*notes, *found.notes))
-    foretold: list[LevelResponse] = []
+    predicted: list[LevelResponse] = []
     figures = diagnosis_figures(found, data)
     if simulate and found.effects:
-        foretold, figures["responses"] = with_responses(found, model, data)
-    write_summary(folder / "diagnosis.json", summarise_diagnosis(found, foretold))
+        predicted, figures["responses"] = with_responses(found, model, data)
+    write_summary(folder / "diagnosis.json", summarise_diagnosis(found, predicted))
     write_model(folder / "model.toml", found.completed)
     drawn = {name: png_bytes(figure) for name, figure in figures.items()}
     for name, png in drawn.items():
         write_atomically(folder / f"{name}.png", png)
-    report = diagnosis_report(found, title.replace("_", " "), figures, foretold, drawn)
+    report = diagnosis_report(
+        found,
+        f"Diagnosis of {title.replace('_', ' ')}",
+        figures,
+        predicted,
+        drawn,
+        done={"data": f"{title}.csv", "model": model.name},
+        response_held=holds_response(data, predicted),
+    )
     write_report(folder / "report.html", report)
     return found
 
 
 def with_responses(
-    found: Diagnosis, model: Structure, data: SteadyStates
+    diagnosis: Diagnosis, model: Structure, data: SteadyStates
 ) -> tuple[list[LevelResponse], Figure]:
-    """What simulation adds: resonances and responses of all levels."""
+    """Resonances and responses of all levels, simulated with the model as given and completed."""
     simulated = level_simulations(
-        model, found.completed, found.blind, data, found.sensor, found.force_gain
+        *(model, diagnosis.completed, diagnosis.blind, data),
+        *(diagnosis.sensor, diagnosis.force_gain),
     )
-    foretold = level_responses(simulated, data, found.sensor)
+    predicted = level_responses(simulated, data, diagnosis.sensor)
     old, new = ([c for one in curves for c in one] for curves in simulated[:2])
-    figure = simulated_figure(old, new, data, found.sensor)
-    return foretold, figure
-
-
-def residual_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
-    """Misfit of the force in units of noise over frequency and velocity, before and after."""
-    rows = diagnosis.rows
-    frequency = np.asarray(data.frequency)[rows] / HERTZ
-    speed = np.abs(np.asarray(data.velocity))[rows, diagnosis.sensor]
-    unit = unit_for(speed, "m/s")
-    figure, grid = panels(9.5, 4.2, 1, 2)
-    out = diagnosis.gap.interpolated
-    held = np.asarray(data.level)[rows] == out.level if out else np.zeros(len(rows), dtype=bool)
-    for axes, title, misfit in zip(
-        grid[0], ("Before", "After"), (diagnosis.before, diagnosis.after), strict=True
-    ):
-        size = np.sqrt(np.nanmean(misfit**2, axis=1))
-        marks = axes.scatter(
-            frequency, speed / unit.size, c=size, cmap="viridis", vmin=0.0, vmax=_LARGEST, s=34
-        )
-        ringed = axes.scatter(
-            frequency[held],
-            speed[held] / unit.size,
-            s=90,
-            facecolors="none",
-            edgecolors=IDENTIFIED,
-            linewidths=0.9,
-        )
-        name_axes(axes, title, "frequency (Hz)", f"velocity ({unit.name})")
-        if out:
-            axes.legend([ringed], [f"level {out.level}, held out"], fontsize=9, loc="best")
-    figure.colorbar(marks, ax=grid[0].tolist(), label="misfit of the force (units of noise)")
-    return figure
-
-
-def candidates_figure(diagnosis: Diagnosis) -> Figure:
-    """What every effect would gain in the first step; those that cannot be told apart in colour."""
-    rows = [row for row in diagnosis.table[0][:_SHOWN] if np.isfinite(row.gain)][::-1]
-    figure, grid = panels(7.0, 0.8 + 0.32 * max(len(rows), 3), 1, 1)
-    axes = grid[0, 0]
-    best = max((row.gain for row in rows), default=0.0)
-    near = [row.gain > max(best - AS_GOOD, DETECTED) for row in rows]
-    colours = [IDENTIFIED if one else MEASURED for one in near]
-    axes.barh([row.kind for row in rows], [row.gain for row in rows], color=colours)
-    axes.axvline(DETECTED, color="black", linestyle="--", linewidth=1.0)
-    name_axes(axes, "What each effect explains by itself", "gain of the criterion", "")
-    return figure
-
-
-def simulated_figure(
-    before: Sequence[ResponseCurve],
-    after: Sequence[ResponseCurve],
-    data: SteadyStates,
-    sensor: int,
-) -> Figure:
-    """Responses of the model before and after, over the measured states."""
-    speed = np.abs(np.asarray(data.velocity))[:, sensor]
-    unit = unit_for(speed, "m/s")
-    figure, grid = panels(8.0, 4.6, 1, 1)
-    axes = grid[0, 0]
-    for label, curves, colour in (
-        ("model as given", before, "0.55"),
-        ("completed model", after, IDENTIFIED),
-    ):
-        for k, curve in enumerate(curves):
-            size = np.abs(np.asarray(curve.velocity)[:, 1, sensor]) / unit.size
-            axes.plot(
-                np.asarray(curve.frequency) / HERTZ,
-                size,
-                color=colour,
-                linewidth=1.3,
-                label=label if k == 0 else None,
-            )
-    axes.plot(
-        np.asarray(data.frequency) / HERTZ,
-        speed / unit.size,
-        linestyle="none",
-        marker="o",
-        markersize=4.0,
-        color=SERIES[1],
-        label="measured",
-    )
-    axes.legend(fontsize=9)
-    name_axes(axes, "Responses", "frequency (Hz)", f"velocity ({unit.name})")
-    return figure
+    sensor = data.sensors[diagnosis.sensor]
+    return predicted, comparison_figure(old, new, data, sensor=sensor)
 
 
 def diagnosis_figures(diagnosis: Diagnosis, data: SteadyStates) -> dict[str, Figure]:
-    """The figures that need no simulation, by name."""
-    return {
-        "residuals": residual_figure(diagnosis, data),
+    """The figures that need no simulation, by the names of their files."""
+    figures = {
+        "residuals": misfit_figure(diagnosis, data),
         "candidates": candidates_figure(diagnosis),
     }
+    if diagnosis.effects:
+        sensor = data.sensors[diagnosis.sensor]
+        figures["laws"] = effect_laws_figure(found_effects(diagnosis), data, sensor=sensor)
+    return figures
 
 
 def diagnosis_report(
     diagnosis: Diagnosis,
     title: str,
-    figures: dict[str, Figure],
-    foretold: Sequence[LevelResponse] = (),
+    figures: Mapping[str, Figure],
+    predicted: Sequence[LevelResponse] = (),
     drawn: Mapping[str, bytes] | None = None,
+    *,
+    done: Mapping[str, str] | None = None,
+    response_held: bool = False,
 ) -> Report:
-    """The report of a diagnosis; `foretold` are resonances of the simulated responses.
+    """The report of a diagnosis.
 
-    `drawn` are the figures as PNG, where they are drawn already.
+    Arguments: `figures` by the names that `diagnosis_figures` gives them, and `responses`;
+    `predicted` resonances of the levels; `drawn` the figures as PNG, where they are drawn already;
+    `done` names the inputs; `response_held` says that the levels hold the response and not the
+    force, as `holds_response` finds.
     """
-    png = drawn or {}
-    gap = diagnosis.gap
-    answers = [
-        (effect, " or ".join(group))
-        for effect, group in zip(diagnosis.effects, diagnosis.candidates, strict=True)
-    ]
-    summary = [
-        ("verdict", diagnosis.verdict.replace("_", " ")),
-        ("effects", ", ".join(diagnosis.effects) or "none"),
-        *((f"what {effect} may be", group) for effect, group in answers),
-        ("misfit before and after, in units of noise", f"{gap.before:.3g} → {gap.after:.3g}"),
-    ]
-    for name, out in (("interpolated", gap.interpolated), ("extrapolated", gap.extrapolated)):
-        if out:
-            summary.append(
-                (f"level {out.level}, held out ({name})", f"{out.before:.3g} → {out.after:.3g}")
-            )
-    if diagnosis.decide_by:
-        summary.append(("what would decide", diagnosis.decide_by))
-    captions = {
-        "residuals": "Misfit of the force of every state, of its size alone where the phase is "
-        "unknown. Where the model is right it is 1.",
-        "candidates": "Gain of Schwarz's criterion. Right of the dashed line an effect is seen; "
-        "orange ones cannot be told from the best.",
-        "responses": "Simulated responses under each level's force at resonance.",
-    }
-    pictured = {
-        name: ReportFigure(figure, captions[name], png.get(name))
+    captions = {**_CAPTIONS}
+    if response_held:
+        captions["responses"] += _HELD_RESPONSE
+    shown = {
+        name: ReportFigure(figure, captions[name], (drawn or {}).get(name))
         for name, figure in figures.items()
     }
-    sections = [
-        Section(
-            "Where model and data disagree",
-            tables=[
-                ReportTable(("part", "velocities", "p", "exponent"), _parts(diagnosis.located))
-            ],
-            figures=[pictured["residuals"]],
-        ),
-        Section(
-            "What explains it",
-            tables=[
-                ReportTable(
-                    ("parameter", "value", "1σ"),
-                    [(n, f"{v:.5g}", f"{s:.2g}") for n, (v, s) in diagnosis.parameters.items()],
-                ),
-                *(
-                    ReportTable(
-                        ("effect", "gain", "parameters"),
-                        [
-                            (
-                                row.kind,
-                                f"{row.gain:.1f}",
-                                ", ".join(f"{v:.4g}" for v in row.parameters.values()),
-                            )
-                            for row in step[:_SHOWN]
-                        ],
-                        f"Step {number + 1}.",
-                    )
-                    for number, step in enumerate(diagnosis.table)
-                ),
-            ],
-            figures=[pictured["candidates"]],
-        ),
-    ]
-    if "responses" in figures:
-        table = ReportTable(
-            ("level", "force (N)", "measured", "model as given", "completed model"),
-            [_resonances(row) for row in foretold],
-            "Resonances: frequency, velocity and, of models, where the branch ends; measured "
-            "without phases, the state with the largest velocity over force. Levels marked with * "
-            "are foretold by a model that has not seen them.",
-        )
-        sections.append(
-            Section("Simulated responses", tables=[table], figures=[pictured["responses"]])
-        )
-    limits = sorted(diagnosis.detection_limits.items())
-    sections.append(
-        Section(
-            "What would have been seen",
-            tables=[ReportTable(("parameter", "least size"), [(n, f"{v:.3g}") for n, v in limits])],
-        )
+    return Report(
+        title=title,
+        done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
+        result=verdict_sentence(diagnosis),
+        summary=_key_numbers(diagnosis, predicted),
+        notes=[_readable(note) for note in diagnosis.notes],
+        sections=[
+            *([_effects_section(diagnosis, shown)] if diagnosis.effects else []),
+            _comparison_section(diagnosis, predicted, shown),
+            _candidates_section(diagnosis, shown),
+            _limits_section(diagnosis),
+        ],
     )
-    notes = (VERDICTS[diagnosis.verdict], *diagnosis.notes)
-    return Report(title=title, summary=summary, notes=notes, sections=sections)
 
 
-def _parts(parts: Sequence[Located]) -> list[tuple[str, str, str, str]]:
-    rows = []
-    for part in parts:
-        low, high = part.velocity_range
-        exponent = "" if part.exponent is None else f"{part.exponent:.2g} ± {part.exponent_std:.1g}"
-        name = part.part.replace("_", " ")
-        rows.append((name, f"{low:.3g} to {high:.3g} m/s", f"{part.p_value:.1e}", exponent))
+def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
+    """Whether the force changes along the levels of a test, which then hold the response."""
+    if not predicted:
+        return False
+    same = at_curve_force(data, [one.force for one in predicted])
+    return bool(np.mean(~same) > _RESPONSE_CONTROLLED)
+
+
+def verdict_sentence(diagnosis: Diagnosis) -> str:
+    """What a diagnosis says, in one plain sentence."""
+    gap = diagnosis.gap
+    found = " and ".join(effect_name(kind) for kind in diagnosis.effects)
+    before, after = _times(gap.before), _times(gap.after)
+    falls = f"the misfit falls from {before} to {after} times the noise"
+    with_it = "with them" if len(diagnosis.effects) > 1 else "with it"
+    if diagnosis.verdict == "none":
+        return (
+            "Nothing is missing that these data could show: the model as given fits them to "
+            f"{after} times the noise."
+        )
+    if diagnosis.verdict == "noise_rejected":
+        return (
+            "The stated noise does not fit the scatter of these data, so no effect is named: state "
+            "the noise of a repeated test, or none, and diagnose again."
+        )
+    if diagnosis.verdict == "unknown":
+        start = "Something is missing that no effect of the library explains reliably"
+        return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
+    if diagnosis.verdict == "named":
+        return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
+    rivals = " and ".join(_alternatives(group) for group in diagnosis.candidates)
+    if any(len(group) > 1 for group in diagnosis.candidates):
+        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
+    return (
+        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
+        "same effect (see the notes)."
+    )
+
+
+def _times(misfit: float) -> str:
+    return f"{misfit:.1f}" if misfit < 10 else number(misfit, 2)
+
+
+def _alternatives(group: Sequence[str]) -> str:
+    *others, last = map(effect_name, group)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> list[tuple[str, str]]:
+    gap, rows = diagnosis.gap, []
+    for kind in diagnosis.effects:
+        values = [
+            " ".join((_words(name), *_value_and_unit(kind, name, pair))).strip()
+            for name, pair in _own(kind, diagnosis.parameters).items()
+        ]
+        rows.append((effect_name(kind), ", ".join(values)))
+    rows.append(
+        ("misfit of the force (rms)", f"{_times(gap.before)} → {_times(gap.after)} × noise")
+    )
+    for place, out in (
+        ("misfit of a level between others", gap.interpolated),
+        ("misfit of the largest level", gap.extrapolated),
+    ):
+        if out:
+            name = f"{place} (level {out.level}), left out"
+            text = f"{_times(out.before)} → {_times(out.after)} × its prediction error"
+            rows.append((name, text))
+    if predicted:
+        top = max(predicted, key=lambda one: one.force)
+        each = ("measured", top.measured), ("model as given", top.before)
+        pairs = (*each, ("completed model", top.after))
+        text = "; ".join(f"{name}: {_resonance(one)}" for name, one in pairs)
+        rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
+    if diagnosis.decide_by:
+        rows.append(("what to measure next", _readable(diagnosis.decide_by)))
     return rows
 
 
-def _resonances(row: LevelResponse) -> tuple[str, ...]:
-    def words(one: Resonance) -> str:
-        if not np.isfinite(one.frequency):
-            return "none"
-        fold = f", fold {one.fold:.5g} Hz" if np.isfinite(one.fold) else ""
-        return f"{one.frequency:.5g} Hz, {one.velocity:.3g} m/s{fold}"
+def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
+    """What was found: what it is physically, its law, its parameters."""
+    text = []
+    for kind, group in zip(diagnosis.effects, diagnosis.candidates, strict=True):
+        name = effect_name(kind)
+        text.append(f"{name[0].upper()}{name[1:]}. {_description(kind)}")
+        others = [effect_name(other) for other in group if other != kind]
+        if others:
+            text[-1] += f" These data do not tell it from: {', '.join(others)}."
+    rows = [
+        (effect_name(kind), _meaning(kind, name), *_value_and_unit(kind, name, pair))
+        for kind in diagnosis.effects
+        for name, pair in _own(kind, diagnosis.parameters).items()
+    ]
+    caption = "Parameters of the effects ± 1σ, as model.toml has them."
+    table = ReportTable(("effect", "parameter", "value ± 1σ", "unit"), rows, caption)
+    figures = [shown["laws"]] if "laws" in shown else []
+    return Section("What is missing", text, figures, [table])
 
+
+def _comparison_section(
+    diagnosis: Diagnosis, predicted: Sequence[LevelResponse], shown: Mapping[str, ReportFigure]
+) -> Section:
+    """Responses and misfit before and after, what disagrees, and the resonances."""
+    tables = []
+    if predicted:
+        header = ("level", "force", "measured", "model as given", "completed model")
+        caption = (
+            "Phase resonances of the levels: frequency, velocity amplitude and, of models, the "
+            "fold where the branch ends. Where no phase was measured: the state with the largest "
+            "velocity over force. Levels with * are predicted by a model fitted without them."
+        )
+        tables.append(ReportTable(header, [_resonances(row) for row in predicted], caption))
+    figures = [shown[name] for name in ("responses", "residuals") if name in shown]
+    text = [_located(part) for part in diagnosis.located]
+    if not text:
+        text = ["No part of the force balance differs from the model by more than the noise."]
+    return Section("Model and data, before and after", text, figures, tables)
+
+
+def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) -> Section:
+    header = ("effect", "gain", "parameters")
+    tables = [
+        ReportTable(header, [_tried(row) for row in step[:_SHOWN]], folded=_step(k, len(step)))
+        for k, step in enumerate(diagnosis.table)
+        if step
+    ]
+    return Section("What else was considered", (), [shown["candidates"]], tables)
+
+
+def _step(number_of: int, count: int) -> str:
+    return f"Comparison {number_of + 1}: the best {min(count, _SHOWN)} of {count} candidates"
+
+
+def _limits_section(diagnosis: Diagnosis) -> Section:
+    rows = []
+    for name, limit in sorted(diagnosis.detection_limits.items()):
+        kind, parameter = name.split(".", 1)
+        size = (number(limit, 2), _unit(kind, parameter))
+        rows.append((effect_name(kind), _meaning(kind, parameter), *size))
+    table = ReportTable(
+        ("effect", "parameter", "detected from", "unit"),
+        rows,
+        folded=f"Detection limits of {len(rows)} further effects",
+    )
+    text = "Effects larger than these limits would have been detected beside what was found."
+    return Section("What would have been detected", [text], (), [table])
+
+
+def _own(kind: str, parameters: Mapping[str, tuple[float, float]]) -> dict:
+    """The parameters of one effect by their own names."""
+    start = f"{kind}."
+    return {k.removeprefix(start): v for k, v in parameters.items() if k.startswith(start)}
+
+
+def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[str, str]:
+    value, std = pair
+    if std > 0:
+        return with_error(value, std), _unit(kind, name)
+    return f"{number(value)} (1σ not determined by these data)", _unit(kind, name)
+
+
+def _description(kind: str) -> str:
+    """What an effect is physically, as its class states it."""
+    return str(getattr(EFFECTS[kind], "description", ""))
+
+
+def _unit(kind: str, name: str) -> str:
+    unit = _stated(kind, name, "unit").replace("kg^1/2", "√kg")
+    return "" if unit == "1" else unit
+
+
+def _meaning(kind: str, name: str) -> str:
+    return _stated(kind, name, "meaning") or _words(name)
+
+
+def _stated(kind: str, name: str, what: str) -> str:
+    """Unit or meaning of a parameter, as the effect's class states it."""
+    parameters: dict[str, object] = getattr(EFFECTS[kind], "parameters", dict)()
+    return str(getattr(parameters.get(name), what, ""))
+
+
+def _readable(text: str) -> str:
+    """A sentence of the diagnosis with the effects' names in words."""
+    for kind in sorted(EFFECTS, key=len, reverse=True):
+        text = re.sub(rf"\b{kind}\b", effect_name(kind), text, flags=re.IGNORECASE)
+    return text
+
+
+def _words(name: str) -> str:
+    return name.removesuffix("_hz").removesuffix("_deg").replace("_", " ")
+
+
+def _tried(row: Row) -> tuple[str, str, str]:
+    own = _own(row.kind, {name: (value, 0.0) for name, value in row.parameters.items()})
+    own = own or {name: (value, 0.0) for name, value in row.parameters.items()}
+    values = [
+        f"{_words(name)} {number(value, 3)} {_unit(row.kind, name)}".strip()
+        for name, (value, _) in own.items()
+    ]
+    return effect_name(row.kind), f"{row.gain:.0f}", ", ".join(values)
+
+
+_PARTS = {
+    "stiffness": "The stiffness, and with it the natural frequency, differs from the model's",
+    "damping": "The damping differs from the model's",
+    "harmonic_2": "The second harmonic of the velocity differs from the model's",
+    "harmonic_3": "The third harmonic of the velocity differs from the model's",
+    "not_a_function_of_amplitude": (
+        "A part of the misfit is no function of the amplitude: it differs between states of one "
+        "amplitude"
+    ),
+}
+
+
+def _located(part: Located) -> str:
+    """One part of the disagreement as a sentence."""
+    unit = unit_for(part.velocity_range, "m/s")
+    low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)
+    small = part.p_value < _LEAST_P_VALUE
+    chance = "below 10⁻¹²" if small else number(part.p_value, 1)
+    text = f"{_PARTS[part.part]}, at velocity amplitudes from {low} to {high} {unit.name}"
+    if part.exponent is not None:
+        power = with_error(part.exponent, part.exponent_std or 0.0)
+        text += f"; the change goes with the power {power} of the amplitude"
+    return f"{text} (probability by chance: {chance})."
+
+
+def _resonances(row: LevelResponse) -> tuple[str, ...]:
     mark = "*" if row.held_out else ""
-    each = (words(one) for one in (row.measured, row.before, row.after))
-    return (f"{row.level}{mark}", f"{row.force:.3g}", *each)
+    each = (_resonance(one) for one in (row.measured, row.before, row.after))
+    return (f"{row.level}{mark}", _unbroken(with_unit(row.force, "N")), *each)
+
+
+def _resonance(one: Resonance) -> str:
+    if not np.isfinite(one.frequency):
+        return "no resonance"
+    fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""
+    speed = _unbroken(with_unit(one.velocity, "m/s", 3))
+    return f"{_unbroken(f'{one.frequency:.5g} Hz')}, {speed}{fold}"
+
+
+def _unbroken(text: str) -> str:
+    """A value that keeps its unit in its line."""
+    return text.replace(" ", "\u00a0")

@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from snrmjax.io.files import FilePath, write_atomically
-from snrmjax.report.style import png_bytes
+from snrmjax.report.style import COLUMN, png_bytes
 
 Rows = Sequence[tuple[str, str]]
 
@@ -25,11 +25,12 @@ class ReportFigure(NamedTuple):
 
 
 class ReportTable(NamedTuple):
-    """A table of texts."""
+    """A table of texts; with a line `folded` it shows that line, and its rows when opened."""
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    folded: str = ""
 
 
 class Section(NamedTuple):
@@ -42,13 +43,14 @@ class Section(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a report tells, in the order in which it is read."""
+    """What a report tells: title, inputs and result fit the first screen, the rest follows."""
 
     title: str
-    done: Rows = ()  # what was done: name and value
+    done: Rows = ()  # data, model and settings: name and value, in one line under the title
     summary: Rows = ()  # the headline numbers
     notes: Sequence[str] = ()
     sections: Sequence[Section] = ()
+    result: str = ""  # the result in one plain sentence
 
 
 def write_report(path: FilePath, report: Report) -> None:
@@ -77,19 +79,54 @@ def report_html(report: Report) -> str:
     return template.render(report=report._replace(notes=notes), sections=sections)
 
 
-def _embedded(one: ReportFigure) -> dict[str, str]:
-    drawn = one.png or png_bytes(one.figure)
-    png = base64.b64encode(drawn).decode("ascii")
-    width = f"{_REM_PER_INCH * one.figure.get_figwidth():g}"
-    return {"png": png, "width": width, "alt": one.caption.split(". ")[0], "caption": one.caption}
+def _embedded(one: ReportFigure) -> dict[str, str | bool]:
+    png = base64.b64encode(one.png or png_bytes(one.figure)).decode("ascii")
+    width = one.figure.get_figwidth()
+    return {
+        "png": png,
+        "width": f"{_REM_PER_INCH * width:g}",
+        "wide": width > COLUMN,
+        "alt": one.caption.split(". ")[0],
+        "caption": one.caption,
+    }
+
+
+_PLAIN = (-4, 5)  # powers of ten between which numbers are written without one
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def with_error(value: float, spread: float) -> str:
-    """A value with its error, to two digits of the error."""
-    if not spread >= 1e-6 or not np.isfinite(spread):
-        return f"{value:.4g}"
+    """A value with its error, to two digits of the error; the value alone where there is none.
+
+    >>> with_error(79.1234, 0.0841), with_error(2.4731e9, 6.2e7)
+    ('79.123 ± 0.084', '(2.473 ± 0.062) × 10⁹')
+    """
+    if not np.isfinite(spread) or not spread > 1e-7 * abs(value):
+        return number(value)
+    power = int(np.floor(np.log10(max(abs(value), spread))))
+    ten = 0 if _PLAIN[0] <= power <= _PLAIN[1] else power
+    value, spread = value / 10.0**ten, spread / 10.0**ten
     digits = max(0, int(1 - np.floor(np.log10(spread))))
-    return f"{value:.{digits}f} ± {spread:.{digits}f}"
+    text = minus(f"{value:.{digits}f} ± {spread:.{digits}f}")
+    return f"({text}) × {_ten_to(ten)}" if ten else text
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number to some digits, with a power of ten where it is very large or very small.
+
+    >>> number(0.25), number(-1.2345e-9, 2)
+    ('0.25', '−1.2 × 10⁻⁹')
+    """
+    if not value or not np.isfinite(value):
+        return f"{value:.{digits}g}"
+    power = int(np.floor(np.log10(abs(value))))
+    if _PLAIN[0] <= power <= _PLAIN[1]:
+        return minus(f"{float(f'{value:.{digits}g}'):.{max(digits, power + 1)}g}")
+    return f"{minus(f'{value / 10.0**power:.{digits}g}')} × {_ten_to(power)}"
+
+
+def _ten_to(power: int) -> str:
+    return "10" + str(power).translate(_SUPERSCRIPT)
 
 
 def minus(text: str) -> str:

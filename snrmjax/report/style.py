@@ -56,14 +56,14 @@ def unit_for(values: Any, base: str) -> Unit:
     return Unit(1e-6, "µ" + base)
 
 
-def with_unit(value: float, base: str) -> str:
-    """A value to four digits with its unit.
+def with_unit(value: float, base: str, digits: int = 4) -> str:
+    """A value to some digits with its unit.
 
     >>> with_unit(2.669e-3, "N")
     '2.669 mN'
     """
     unit = unit_for(value, base)
-    return f"{value / unit.size:.4g} {unit.name}"
+    return f"{value / unit.size:.{digits}g} {unit.name}"
 
 
 def plain(text: str) -> str:
