@@ -2,6 +2,7 @@
 
 import ast
 import itertools
+import re
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,13 @@ FILE_FORMATS = {
 }
 LABELLED = "snrmjax.numerics.result"
 LONGEST = 450
+# Rules about effects stand in the classes of effects: no other room knows an effect by its kind.
+KINDS = {
+    kind
+    for path in (PACKAGE / "model").rglob("*.py")
+    for kind in re.findall(r'kind: ClassVar\[str\] = "(\w+)"', path.read_text(encoding="utf-8"))
+}
+KIND = re.compile(r"\b(" + "|".join(sorted(KINDS)) + r")\b")
 
 
 def imported_modules(tree, module, *, is_package):
@@ -117,10 +125,31 @@ def violations(module, source, *, rooms, is_package=False):
             found.append(f"{module}:{node.lineno}: an assert statement")
         if isinstance(node, ast.ExceptHandler) and node.type is None:
             found.append(f"{module}:{node.lineno}: a bare except")
+    found += [
+        f"{module}:{line}: the kind {kind!r} of an effect" for line, kind in kinds(module, tree)
+    ]
     length = len(source.splitlines())
     if length > LONGEST:
         found.append(f"{module}: {length} lines, more than {LONGEST}")
     return found
+
+
+def kinds(module, tree):
+    """(line, kind) of every effect that a module outside the model knows by its kind.
+
+    In a text of its code; in the diagnosis in docstrings and as a name too.
+    """
+    if room_of(module) == "model":
+        return
+    strict = room_of(module) == "diagnose"
+    docs = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr) and not strict]
+    for node in ast.walk(tree):
+        words = [node.value] if isinstance(node, ast.Constant) and node not in docs else []
+        if strict:
+            words += [getattr(node, part, None) for part in ("id", "attr", "arg", "name")]
+        for word in words:
+            if isinstance(word, str):
+                yield from ((node.lineno, kind) for kind in KIND.findall(word))
 
 
 def package_modules():
@@ -198,6 +227,18 @@ BROKEN = {
         ("from snrmjax.identify.inference import fitted_curves", "identify.joint imports"),
         ("from snrmjax.diagnose import search", "identify imports"),
     ],
+    "snrmjax.diagnose.checks.doubts": [
+        ('if kind == "cubic_damping":\n    pass', "the kind 'cubic_damping' of an effect"),
+        ('"""What one_sided_stop does."""', "the kind 'one_sided_stop' of an effect"),
+        ("def found(gap_stiffness):\n    pass", "the kind 'gap_stiffness' of an effect"),
+        ("NAMES = {'close_mode.frequency_hz': 1}", "the kind 'close_mode' of an effect"),
+        ("from snrmjax.model.effects import EFFECTS", ""),
+    ],
+    "snrmjax.report.sampling": [
+        ("NAME = 'added_mass'", "the kind 'added_mass' of an effect"),
+        ("def force_harmonics():\n    pass", ""),  # of a record: another thing of that name
+        ('"""As an example: added_mass."""', ""),
+    ],
     "snrmjax.diagnose.misfit.programs": [
         ("from snrmjax.diagnose.diagnosis import Diagnosis", "diagnose.misfit imports"),
     ],
@@ -207,6 +248,12 @@ BROKEN = {
     ],
     "snrmjax.cli": [("import typer\nfrom snrmjax.identify import snrm", "")],  # the roof may
 }
+
+
+def test_the_kinds_are_those_of_the_library():
+    from snrmjax.model.effects import EFFECTS
+
+    assert set(EFFECTS) == KINDS
 
 
 @pytest.mark.parametrize(

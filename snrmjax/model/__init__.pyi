@@ -1,17 +1,51 @@
 from .averaging import averaged_effect, averaged_force, averaged_response
 from .beams import curved_beam, flat_beam
-from .effect_base import AbstractHysteresis, AbstractMemoryless
-from .effects import make_effect, register_effect
+from .effect_base import (
+    AbstractForce,
+    AbstractHysteresis,
+    AbstractKinked,
+    AbstractLinearChange,
+    AbstractMeasurementEffect,
+    AbstractMemoryless,
+)
+from .effect_metadata import (
+    Argument,
+    Confusion,
+    Imitation,
+    MotionScales,
+    Parameter,
+    Part,
+    Prior,
+    Shape,
+    Symmetry,
+    parameter,
+)
+from .effect_shape import shape_of
+from .effects import EFFECTS, make_effect, register_effect
 from .modes import LinearModes, linear_modes, linear_response
 from .potential import PolynomialPotential, polynomial_potential, potential_from_force_table
 from .structures import Structure, equilibria, structure
 
 __all__ = [
+    "EFFECTS",
+    "AbstractForce",
     "AbstractHysteresis",
+    "AbstractKinked",
+    "AbstractLinearChange",
+    "AbstractMeasurementEffect",
     "AbstractMemoryless",
+    "Argument",
+    "Confusion",
+    "Imitation",
     "LinearModes",
+    "MotionScales",
+    "Parameter",
+    "Part",
     "PolynomialPotential",
+    "Prior",
+    "Shape",
     "Structure",
+    "Symmetry",
     "averaged_effect",
     "averaged_force",
     "averaged_response",
@@ -21,8 +55,10 @@ __all__ = [
     "linear_modes",
     "linear_response",
     "make_effect",
+    "parameter",
     "polynomial_potential",
     "potential_from_force_table",
     "register_effect",
+    "shape_of",
     "structure",
 ]

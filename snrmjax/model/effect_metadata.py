@@ -108,7 +108,7 @@ class Symmetry(StrEnum):
 
 
 class Argument(StrEnum):
-    """What a force is a function of."""
+    """What a force is a function of, against which it is drawn; others are drawn as loops."""
 
     DISPLACEMENT = "displacement"
     VELOCITY = "velocity"
@@ -139,13 +139,6 @@ class Shape(NamedTuple):
         if self.symmetry is None:
             return None
         return 3 if self.symmetry is Symmetry.ODD else 2
-
-    @property
-    def drawn_against(self) -> Argument | None:
-        """Against what the force is drawn: velocity where it damps, displacement elsewhere."""
-        if self.argument in (Argument.VELOCITY, Argument.BOTH):
-            return Argument.VELOCITY
-        return None if self.argument is None else Argument.DISPLACEMENT
 
     @property
     def is_drag(self) -> bool:

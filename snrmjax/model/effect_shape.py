@@ -1,7 +1,6 @@
-"""What follows from a force by itself: its shape, a strength that is seen, and its drawing."""
+"""What follows from a force by itself: its shape, and the strength from which a fit begins."""
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from snrmjax.model.effect_metadata import Argument, MotionScales, Part, Shape, S
 _AMPLITUDES = np.logspace(-5, -1, 5)  # kg^1/2 m, at which a force is looked at
 _FREQUENCY = 100.0  # rad/s, there
 _SAMPLES = 256
+_PHASE = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
 _NOTHING = 1e-8  # of a force's size: what rounding leaves of a part that is not there
 _SAME_POWER = 1e-3  # by which powers between amplitudes may differ
 
@@ -40,9 +40,8 @@ def shape_of(effect: type[AbstractEffect]) -> Shape | None:
 def computed_shape(effect: type[AbstractForce]) -> Shape | None:
     """The shape that follows from a force alone, whatever the class states; see `shape_of`."""
     own = _with_unit_strength(effect)
-    phase = 2 * np.pi * np.arange(_SAMPLES) / _SAMPLES
-    q = _AMPLITUDES[:, None] * np.cos(phase)
-    v = -_AMPLITUDES[:, None] * _FREQUENCY * np.sin(phase)
+    q = _AMPLITUDES[:, None] * np.cos(_PHASE)
+    v = -_AMPLITUDES[:, None] * _FREQUENCY * np.sin(_PHASE)
     force = np.asarray(jax.vmap(own.cycle_force)(jnp.asarray(q), jnp.asarray(v)))
     size = np.max(np.abs(force), axis=1)
     if not np.all(np.isfinite(force)) or not np.any(size > 0):
@@ -67,7 +66,7 @@ def computed_shape(effect: type[AbstractForce]) -> Shape | None:
         power = _power(changes[number]) if seen[number].all() else None
     else:  # the fundamental changes through other harmonics only
         part, order = Part.STIFFNESS, 2
-    argument = _argument(own, q, v, force)
+    argument = _argument(own, q, v)
     return Shape(part, symmetry, argument, power, strength_order=order)
 
 
@@ -81,21 +80,16 @@ def _power(changes: Float[np.ndarray, " amplitude"]) -> float | None:
     return float(np.round(np.mean(powers), 3)) if np.ptp(powers) < _SAME_POWER else None
 
 
-def _argument(own: AbstractForce, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> Argument:
+def _argument(own: AbstractForce, q: np.ndarray, v: np.ndarray) -> Argument:
     if not isinstance(own, AbstractMemoryless):
         return Argument.HISTORY
-    scale = _NOTHING * np.max(np.abs(force))
-
-    def law(displacement: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        both = jnp.asarray(displacement), jnp.asarray(velocity)
-        return np.asarray(jax.vmap(jax.vmap(own.force))(*both))
-
-    nothing = np.zeros_like(q)
-    if np.max(np.abs(law(q, nothing) - force)) <= scale:
+    nothing, law = np.zeros_like(q), jax.vmap(jax.vmap(own.force))
+    states = ((q, v), (q, nothing), (nothing, v))
+    both, of_q, of_v = (np.asarray(law(*(jnp.asarray(a) for a in state))) for state in states)
+    scale = _NOTHING * np.max(np.abs(both))
+    if np.max(np.abs(of_q - both)) <= scale:
         return Argument.DISPLACEMENT
-    if np.max(np.abs(law(nothing, v) - force)) <= scale:
-        return Argument.VELOCITY
-    return Argument.BOTH
+    return Argument.VELOCITY if np.max(np.abs(of_v - both)) <= scale else Argument.BOTH
 
 
 def starts_of(effect: type[AbstractEffect], scales: MotionScales) -> Starts:
@@ -115,7 +109,9 @@ def starts_of(effect: type[AbstractEffect], scales: MotionScales) -> Starts:
     shape = shape_of(effect)
     if shape is not None and shape.strength_order > 1:
         # As a quadratic stiffness softens: Δ(ω̃²) = −(5/6) (f/Q)²/ω₀².
-        size = float(np.max(np.abs(sampled_law(own, scales.amplitude, scales.frequency).force)))
+        q = scales.amplitude * np.cos(_PHASE)
+        v = -scales.amplitude * scales.frequency * np.sin(_PHASE)
+        size = float(jnp.max(jnp.abs(own.cycle_force(jnp.asarray(q), jnp.asarray(v)))))
         strength = np.sqrt(1.2 * scales.change) * scales.frequency * scales.amplitude / size
         return [(float(sign * first * strength), *others) for sign in (1.0, -1.0)]
     at = (jnp.asarray(scales.amplitude), jnp.asarray(scales.frequency))
@@ -133,38 +129,3 @@ def acts_like(effect: type[AbstractEffect]) -> str | None:
         return effect.acts_like
     shape = shape_of(effect)
     return None if shape is None else shape.part
-
-
-class SampledLaw(NamedTuple):
-    """A force over one cycle of q = Q cos Ωt, as it is drawn."""
-
-    argument: Argument  # against what it is drawn: displacement or velocity
-    displacement: Float[np.ndarray, " time"]  # kg^1/2 m
-    velocity: Float[np.ndarray, " time"]  # kg^1/2 m/s
-    force: Float[np.ndarray, " time"]  # kg^1/2 m/s²
-
-    @property
-    def abscissa(self) -> Float[np.ndarray, " time"]:
-        """The displacement or the velocity, whichever the force is drawn against."""
-        return self.velocity if self.argument is Argument.VELOCITY else self.displacement
-
-
-def sampled_law(
-    effect: AbstractForce, amplitude: float, frequency: float, *, n_samples: int = _SAMPLES
-) -> SampledLaw:
-    """The force of an effect over one cycle, for a drawing of its law.
-
-    Arguments: amplitude Q in kg^1/2 m and frequency Ω in rad/s of the motion q = Q cos Ωt.
-    Friction is drawn as a loop over the displacement, damping over the velocity.
-
-    >>> from snrmjax.model.effects import make_effect
-    >>> law = sampled_law(make_effect("cubic_stiffness", {"coefficient": 2.0}), 1.0, 3.0)
-    >>> law.argument, float(law.force.max())
-    (<Argument.DISPLACEMENT: 'displacement'>, 2.0)
-    """
-    phase = 2 * np.pi * np.arange(n_samples) / n_samples
-    q, v = amplitude * np.cos(phase), -amplitude * frequency * np.sin(phase)
-    force = np.asarray(effect.cycle_force(jnp.asarray(q), jnp.asarray(v)))
-    shape = shape_of(type(effect))
-    drawn = None if shape is None else shape.drawn_against
-    return SampledLaw(drawn or Argument.DISPLACEMENT, q, v, force)

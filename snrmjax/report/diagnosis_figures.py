@@ -22,6 +22,8 @@ from snrmjax.model.effect_base import (
     AbstractLinearChange,
     AbstractMeasurementEffect,
 )
+from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.structures import Structure
 from snrmjax.report.sampling import sensor_index
 from snrmjax.report.style import (
@@ -277,7 +279,7 @@ def _law(effect: AbstractEffect, model: Structure, data: SteadyStates, sensor: i
             cycles, names = cycles[1:], [""]
     else:
         names = [one.name for one in motion.reached]
-    axis = _single_valued_against(*cycles[-1])
+    axis = _axis(effect, cycles[-1])
     if axis is not None and len(cycles) > 2:
         cycles, names = cycles[-1:], [""]
     quantity = ("Velocity", "m/s") if axis == 1 else ("Displacement", "m")
@@ -338,6 +340,14 @@ def _cycle(effect: AbstractEffect, motion: _Motion, reached: _Reached, order: fl
         mass, damping, stiffness = map(float, effect.linear_terms(*linear, jnp.asarray(order)))
         return q, v, (stiffness - mass * reached.frequency**2) * q + damping * v
     raise ValueError(f"no law can be drawn of an effect of the class {type(effect).__name__}.")
+
+
+def _axis(effect: AbstractEffect, cycle: Cycle) -> int | None:
+    """0 where an effect is drawn against displacement, 1 against velocity, None as a loop."""
+    shape = shape_of(type(effect))
+    if shape is None or shape.argument is None:
+        return _single_valued_against(*cycle)
+    return {Argument.DISPLACEMENT: 0, Argument.VELOCITY: 1}.get(shape.argument)
 
 
 def _single_valued_against(q: np.ndarray, v: np.ndarray, force: np.ndarray) -> int | None:

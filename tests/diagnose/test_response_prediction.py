@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.diagnose.misfit.predictions import without_strength
+from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
     level_forces,
     level_responses,
@@ -16,7 +16,7 @@ from snrmjax.diagnose.response_prediction import (
     responses,
     simulated_resonance,
 )
-from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.effects import EFFECTS, make_effect
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
 FORCES = (1.0, 4.0)
@@ -54,19 +54,10 @@ def test_resonances_of_a_linear_mode_are_its_own():
             assert found.velocity == pytest.approx(exact, rel=1e-6)
 
 
-def with_kinds(model, kinds):
-    """The model with effects of these kinds."""
-    effects = [
-        make_effect(k, {n: 1.5 if n == "exponent" else 0.1 for n in effect_parameters(k)})
-        for k in kinds
-    ]
-    return dataclasses.replace(model, effects=tuple(effects))
-
-
 @pytest.mark.parametrize("kinds", [FEW, pytest.param(tuple(EFFECTS), marks=pytest.mark.long)])
 def test_without_strength_no_kind_counts(kinds):
     model, data = linear(), states(linear())
-    same = without_strength(model, with_kinds(model, kinds))
+    same = with_idle_effects(model, kinds)
     assert [effect.kind for effect in same.effects] == list(kinds)
     for force, curves in zip(FORCES, responses(same, data, FORCES), strict=True):
         found = simulated_resonance(curves, 0)

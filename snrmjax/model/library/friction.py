@@ -208,7 +208,7 @@ class IwanMicroslip(AbstractSliders):
         exponent="exponent",
     )
     exponent: Scalar = parameter(
-        *("", "power of the backbone's amplitude"),
+        *("1", "power of the backbone's amplitude"),
         rules=(BETWEEN_ONE_AND_THREE,),
         prior=Prior(1.02, 2.98),
         typical=1.5,

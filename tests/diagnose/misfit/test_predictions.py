@@ -1,6 +1,8 @@
 """Predictions of the quick programs against Newton's method and finite differences."""
 
 import dataclasses
+import importlib
+import sys
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
+import snrmjax
 import snrmjax as sj
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
@@ -53,6 +56,39 @@ def own_friction(predictions):
     own = predictions_of(ours.model, data)
     yield own, own.group, parameter_labels("smooth_friction")
     del EFFECTS["smooth_friction"]
+
+
+@pytest.mark.parametrize("registered", ["before", "after"])
+def test_an_effect_of_ones_own_is_treated_alike_whenever_it_is_registered(
+    predictions, registered, monkeypatch
+):
+    """Before or after the diagnosis is imported for the first time, which is when it is used."""
+    for name in [name for name in sys.modules if name.startswith("snrmjax.diagnose")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(snrmjax, "diagnose", sj.diagnose)
+    monkeypatch.delitem(EFFECTS, "smooth_friction", raising=False)
+    if registered == "before":
+        monkeypatch.setitem(EFFECTS, "smooth_friction", SmoothFriction)
+    weighted, own, simulation = (
+        importlib.import_module(f"snrmjax.diagnose.{name}")
+        for name in ("misfit.weighted_misfit", "misfit.predictions", "response_prediction")
+    )
+    monkeypatch.setitem(EFFECTS, "smooth_friction", SmoothFriction)
+    model, data = predictions[0].model, predictions[1]
+    fresh = own.predictions_of(model, data)
+    misfit = weighted.weighted_misfit(fresh)
+    assert np.isfinite(misfit.base).all()
+    for kind in ("smooth_friction", "cubic_damping"):
+        change = misfit.first_change(candidate(kind, own.scales_of(fresh)))
+        assert np.isfinite(change).all()
+        assert np.any(change != 0)
+    # Without strength it counts for nothing: a linear mode at resonance.
+    found = SmoothFriction(jnp.array(0.01), jnp.array(3e-4))
+    completed = dataclasses.replace(model, effects=(found,))
+    before = simulation.level_simulations(model, completed, {}, data, 0).before
+    for force, curves in zip(simulation.level_forces(data).values(), before, strict=True):
+        largest = max(np.max(np.abs(curve.velocity[:, 1, 0])) for curve in curves)
+        assert largest == pytest.approx(2.0 * 3.0 * force / (2 * ZETA * OMEGA), rel=1e-2)
 
 
 def moderate(kind, scales):
