@@ -115,7 +115,7 @@ def closed_form(
     (500.0, 0.01)
     """
     return _from_polar(
-        modal_constant, frequency, jnp.abs(mode_velocity), *_direction(mode_velocity)
+        modal_constant, frequency, _length(mode_velocity), *_direction(mode_velocity)
     )
 
 
@@ -236,7 +236,8 @@ def _is_known(phasor: Complex[Array, "*batch"]) -> Bool[Array, "*batch"]:
 def _from_polar(
     modal_constant: Array, frequency: Array, length: Array, cosine: Array, sine: Array
 ) -> tuple[Array, Array]:
-    ratio = frequency * modal_constant / length
+    moving = (length > 0) & jnp.isfinite(length)
+    ratio = jnp.where(moving, frequency * modal_constant / jnp.where(moving, length, 1.0), jnp.nan)
     squared = frequency**2 + ratio * sine
     real = squared > 0
     natural_frequency = jnp.sqrt(jnp.where(real, squared, 1.0))

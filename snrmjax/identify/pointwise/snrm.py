@@ -55,6 +55,13 @@ def snrm_velocity(
 
 
 def reference_sensor(modes: LinearModes) -> int:
-    """The sensor that sees the mode of interest best: amplitudes are given there."""
-    shape = np.asarray(jax.lax.stop_gradient(modes.mode_shape))
-    return int(np.argmax(np.abs(shape[:, modes.mode_of_interest])))
+    """The sensor at which the mode of interest moves most: amplitudes are given there.
+
+    Within `jax.jit` mode shapes of several sensors must be known while compiling (not arguments).
+    """
+    if modes.mode_shape.shape[0] == 1:
+        return 0
+    shape = modes.mode_shape
+    if isinstance(shape, jax.core.Tracer):  # of a derivative: it still has its value
+        shape = jax.lax.stop_gradient(shape)
+    return int(np.argmax(np.abs(np.asarray(shape)[:, modes.mode_of_interest])))
