@@ -1,18 +1,33 @@
 """The commands as a user runs them: files out, exit codes, one sentence for wrong input."""
 
 import csv
+import inspect
+import io
 import json
 import math
 import os
 import re
 import subprocess
 import sys
+from contextlib import redirect_stderr
 from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
 
+import numpy as np
 import pytest
+import typer
+from matplotlib.figure import Figure
+from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
-from snrmjax.cli import main
+import snrmjax as sj
+from snrmjax.cli import app, main
+from snrmjax.io import tables
+from snrmjax.io.units import HERTZ
+from snrmjax.report.style import png_bytes
 
+COMMANDS = ("demo", "simulate", "nnm", "identify", "diagnose")
+FAMILIES = f"{TRUE['backbone']},{TRUE['damping']}"
 MODEL = """name = "test mode"
 [[mode]]
 frequency_hz = 64.78
@@ -41,16 +56,46 @@ ROWS = "".join(
 )
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    """One command in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-c", "from snrmjax.cli import main; main()", *arguments],
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    stderr: str
+
+
+def run(*arguments: object) -> Ended:
+    """A command in this process, which saves the import."""
+    words = ["snrmjax", *map(str, arguments)]
+    with (
+        redirect_stderr(io.StringIO()) as stderr,
+        mock.patch.object(sys, "argv", words),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return Ended(ended.value.code or 0, stderr.getvalue())
+
+
+def run_in_a_process(*arguments: object) -> Ended:
+    """A command as a shell starts it."""
+    done = subprocess.run(
+        [sys.executable, "-m", "snrmjax", *map(str, arguments)],
         env=os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
         capture_output=True,
         text=True,
         timeout=600,
         check=False,
     )
+    return Ended(done.returncode, done.stderr)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def drawn():
+    """Figures are drawn in the tests of figures: here every file is the same small one."""
+    dot = png_bytes(Figure(figsize=(1, 1)))
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("figures", "html"):
+            patch.setattr(f"snrmjax.report.{module}.png_bytes", lambda *_, **__: dot)
+        yield
 
 
 @pytest.fixture
@@ -72,7 +117,7 @@ def test_identify_writes_what_the_contract_says(files, tmp_path):
     done = run(
         "identify", str(data), "--model", str(model), "--out", str(out), "--predict-force", "1e-5"
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert columns(out / "points.csv") == [
         "level",
         "frequency_hz",
@@ -118,7 +163,7 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
         *("simulate", str(model), "--force", "1e-4", "--from-hz", "50", "--to-hz", "80"),
         *("--harmonics", "3", "--out", str(out)),
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert columns(out / "response.csv") == [
         "force_n",
         "point",
@@ -132,7 +177,7 @@ def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
     done = run(
         *("nnm", str(model), "--to-hz", "60", "--harmonics", "3", "--out", str(out)),
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert columns(out / "nnm.csv") == [
         "point",
         "frequency_hz",
@@ -151,26 +196,13 @@ BAD_DATA = {
 }
 
 
-@pytest.fixture
-def run_here(monkeypatch, capsys):
-    """A command in this process, which saves the import: exit code and stderr."""
-
-    def call(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["snrmjax", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, capsys.readouterr().err
-
-    return call
-
-
 @pytest.mark.parametrize("name", BAD_DATA)
-def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, run_here, name):
+def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, name):
     model, data = files
     text, named = BAD_DATA[name]
     data.write_text(text)
     out = tmp_path / "out"
-    code, stderr = run_here("identify", str(data), "--model", str(model), "--out", str(out))
+    code, stderr = run("identify", str(data), "--model", str(model), "--out", str(out))
     assert code == 2
     assert "Traceback" not in stderr
     (line,) = [one for one in stderr.splitlines() if one.startswith("error: ")]
@@ -179,11 +211,11 @@ def test_wrong_data_ends_with_two_and_one_sentence(files, tmp_path, run_here, na
     assert not out.exists()
 
 
-def test_a_wrong_model_ends_with_two(files, tmp_path, run_here):
+def test_a_wrong_model_ends_with_two(files, tmp_path):
     model, data = files
     model.write_text(MODEL.replace("damping_ratio", "dampng_ratio"))
     out = tmp_path / "out"
-    code, stderr = run_here("identify", str(data), "--model", str(model), "--out", str(out))
+    code, stderr = run("identify", str(data), "--model", str(model), "--out", str(out))
     assert code == 2
     assert re.search(r"dampng_ratio.*damping_ratio", stderr)
     assert not out.exists()
@@ -196,7 +228,7 @@ def test_a_wrong_range_ends_with_two(files, tmp_path):
         *("simulate", str(model), "--force", "1e-4", "--from-hz", "80", "--to-hz", "50"),
         *("--out", str(out)),
     )
-    assert done.returncode == 2
+    assert done.code == 2
     assert "Traceback" not in done.stderr
     assert not out.exists()
 
@@ -208,7 +240,7 @@ def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
         *("identify", str(data), "--model", str(model), "--out", str(out)),
         *("--fit", "polynomial:1,constant", "--next", "2", "--predict-force", "1.5e-5"),
     )
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert columns(out / "next.csv") == [
         "rank",
         "force_n",
@@ -231,7 +263,7 @@ def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
     assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
     assert (out / "fit.json").exists()
     for name in ("joint_fit", "residuals", "contributions", "next"):
-        assert (out / f"{name}.png").stat().st_size > 10_000
+        assert (out / f"{name}.png").exists()
     for share in ("frequency_share", "damping_share"):
         assert sum(row[share] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
     html = (out / "report.html").read_text()
@@ -250,27 +282,22 @@ def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
         (("--free", "force_gain,phase"), "'phase'"),
     ],
 )
-def test_a_wrong_joint_fit_ends_with_two(files, tmp_path, run_here, option, named):
+def test_a_wrong_joint_fit_ends_with_two(files, tmp_path, option, named):
     model, data = files
     out = tmp_path / "out"
-    code, stderr = run_here(
-        "identify", str(data), "--model", str(model), "--out", str(out), *option
-    )
+    code, stderr = run("identify", str(data), "--model", str(model), "--out", str(out), *option)
     assert code == 2
     assert "Traceback" not in stderr
     assert named in stderr
     assert not out.exists()
 
 
-def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path, monkeypatch, capsys):
+def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path):
     blind = Path(__file__).parent / "diagnose" / "blind" / "blind_03"
     out = tmp_path / "out"
     table, model = (str(blind.with_suffix(suffix)) for suffix in (".csv", ".toml"))
-    command = ["snrmjax", "diagnose", table, "--model", model, "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", command)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
+    done = run("diagnose", table, "--model", model, "--out", out)
+    assert done.code == 0
     told = json.loads((out / "diagnosis.json").read_text())
     assert told["verdict"] == "none"
     assert told["effects"] == told["candidates"] == []
@@ -285,26 +312,304 @@ def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path, monkeypa
     assert (out / "model.toml").read_text().startswith("name")
     assert (out / "report.html").stat().st_size > 1000
     assert list(out.glob("*.png"))
-    assert "blind_03.csv: none\n" in capsys.readouterr().err
+    assert "blind_03.csv: none\n" in done.stderr
 
 
-def test_diagnose_refuses_too_few_states(files, tmp_path, run_here):
+def test_diagnose_refuses_too_few_states(files, tmp_path):
     model, data = files
     data.write_text(HEADER + "".join(ROWS.splitlines(keepends=True)[:4]))
     out = tmp_path / "out"
-    code, stderr = run_here("diagnose", str(data), "--model", str(model), "--out", str(out))
+    code, stderr = run("diagnose", str(data), "--model", str(model), "--out", str(out))
     assert code == 2
     assert "at least 6" in stderr
 
 
-def test_identify_refuses_amplitudes_alone(files, tmp_path, run_here):
+def test_identify_refuses_amplitudes_alone(files, tmp_path):
     model, data = files
     data.write_text("level,frequency_hz,force_n,velocity_m_s\n1,62,1e-5,0.01\n1,63,1e-5,0.02\n")
     out = tmp_path / "out"
     for options in ((), ("--fit", "auto")):
         command = ("identify", str(data), "--model", str(model), "--out", str(out), *options)
-        code, stderr = run_here(*command)
+        code, stderr = run(*command)
         assert code == 2
         assert "needs the phases" in stderr
         assert "velocity_m_s" in stderr
         assert not out.exists()
+
+
+# ------------------------------------------------------------------------------ smoke
+
+
+@pytest.mark.parametrize(
+    ("command", "written"),
+    [
+        (("simulate", "--force", "1e-4", "--from-hz", "60", "--to-hz", "70"), "response.csv"),
+        (("nnm", "--to-hz", "64"), "nnm.csv"),
+        (("identify",), "backbone.csv"),
+        (("diagnose",), None),
+        (("demo", "--help"), None),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_each_command_starts_in_a_process_of_its_own(files, tmp_path, command, written):
+    model, data = files
+    name, *options = command
+    out = tmp_path / "out"
+    if name in ("simulate", "nnm"):
+        options = [model, *options, "--harmonics", "1", "--out", out]
+    elif name != "demo":
+        options = [data, "--model", model, "--out", out]
+    if name == "diagnose":  # whose whole run is a test of its own: here it refuses
+        data.write_text(HEADER + "".join(ROWS.splitlines(keepends=True)[:4]))
+    done = run_in_a_process(name, *options)
+    assert done.code == (2 if name == "diagnose" else 0), done.stderr
+    assert "Traceback" not in done.stderr
+    assert written is None or (out / written).stat().st_size > 100
+
+
+# ------------------------------------------------------------------------------ options
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--robust",), ("--robust", "--fit auto")),
+        (("--fit", "auto", "--anchor"), ("--anchor", "--fit")),
+        (("--fit", "auto", "--knots", "5"), ("--knots", "--fit spline:5")),
+        (("--free", "force_gain", "--curve", "spline"), ("--curve", "--free", "--fit spline")),
+        (("--next", "2", "--amplitude", "velocity"), ("--amplitude", "--next", "@velocity")),
+        (("--fit", "auto", "--measure", "peak"), ("--measure", "--fit", "fundamental")),
+        (("--extrapolate", "2"), ("--extrapolate", "--predict-force")),
+        (("--predict-drive", "0.1"), ("--predict-drive", "--predict-force", "force_n")),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_an_option_without_effect_is_refused(files, tmp_path, options, named):
+    model, data = files
+    done = run("identify", data, "--model", model, "--out", tmp_path / "out", *options)
+    assert done.code == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    for word in named:
+        assert word in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, tmp_path):
+    """A new option must be said to belong to one way of identifying, or to both."""
+    command = typer.main.get_command(app).commands["identify"]
+    both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help"}
+    points = {"amplitude", "measure", "curve", "knots", "anchor"}
+    joint = {"fit", "free", "robust", "further"}
+    assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("width", [80, 120])
+def test_help_explains_every_option(command, width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert run(command, "--help").code == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= width
+    assert "Example" in text
+    for one in typer.main.get_command(app).commands[command].params:
+        assert one.name == "help" or len(one.help) > 15, one.name
+        if one.name.endswith(("_hz", "force")):
+            assert re.search(r"\bHz\b|\bN\b", one.help), one.name
+    assert "[" not in re.sub(r"\[(default|required|x|1<=|OPTIONS|,DAMPING|,NAME|Path)", "", text)
+
+
+# ------------------------------------------------------------------------------ joint fits
+
+
+@pytest.fixture(scope="module")
+def beam(tmp_path_factory) -> tuple[Path, Path, Path]:
+    """A model, states on its known curves, and the same with the drive voltage alone."""
+    folder = tmp_path_factory.mktemp("beam")
+    files = folder / "model.toml", folder / "data.csv", folder / "driven.csv"
+    sj.io.write_model(files[0], sj.model.structure(modes()))
+    sj.io.write_steady_states(files[1], noisy())
+    level, omega, force, velocity = exact()
+    driven = sj.measure.steady_states(
+        *(level, omega, np.full(len(level), np.nan), velocity),
+        velocity_std=0.01 * np.abs(velocity),
+        phase_std=np.full((len(level), 1), 0.012),
+        drive=force / GAIN,
+    )
+    sj.io.write_steady_states(files[2], driven)
+    return files
+
+
+GAIN = 0.4  # N/V
+
+
+@pytest.fixture(scope="module")
+def fitted(beam, tmp_path_factory):
+    """A joint fit with all that it writes, how often each file was written, and the notes."""
+    model, data, _ = beam
+    out = tmp_path_factory.mktemp("fitted")
+    written = []
+    with pytest.MonkeyPatch.context() as patch:
+        kept = tables.write_atomically
+
+        def counted(path, content):
+            written.append(Path(path).name)
+            kept(path, content)
+
+        patch.setattr(tables, "write_atomically", counted)
+        options = ("--fit", FAMILIES, "--predict-force", "1", "--predict-force", "4")
+        done = run("identify", data, "--model", model, "--out", out, *options)
+    assert done.code == 0, done.stderr
+    return out, written, done
+
+
+def rows(path: Path) -> dict[str, np.ndarray]:
+    """Columns of numbers of a table."""
+    with path.open() as file:
+        table = list(csv.DictReader(file))
+    names = [name for name in table[0] if name not in ("status", "reason")]
+    return {name: np.array([float(row[name]) for row in table]) for name in names}
+
+
+def test_each_table_of_a_joint_fit_is_written_once(fitted):
+    _, written, _ = fitted
+    assert sorted(written) == ["backbone.csv", "points.csv", "prediction.csv"]
+
+
+def test_predictions_of_a_joint_fit_lie_on_its_own_curves(fitted):
+    out, _, _ = fitted
+    found = rows(out / "prediction.csv")
+    omega, force = HERTZ * found["frequency_hz"], found["force_n"]
+    velocity = found["velocity_re_m_s"] + 1j * found["velocity_im_m_s"]
+    x = np.abs(velocity) / omega
+    needed = squared(x) - omega**2 + 1j * omega * damping(np.abs(velocity))
+    left = np.abs(needed * velocity / (1j * omega * CONSTANT) - force) / force
+    # The states are exact, and the table has 12 digits; curves drawn anew through knots miss by
+    # a hundred times as much. Relative to a force at resonance ω̃²/(Ωδ) is about 40.
+    assert set(force) == {1.0, 4.0}
+    assert left.max() < 1e-6
+    summary = json.loads((out / "summary.json").read_text())
+    for one, with_band in zip(
+        summary["resonances"], summary["joint_fit"]["resonances"], strict=True
+    ):
+        assert one["frequency_hz"] == with_band["frequency_hz"]
+        omega = HERTZ * one["frequency_hz"]
+        x = one["velocity_m_s"] / omega
+        assert omega**2 == pytest.approx(squared(x), rel=1e-8)
+        ratio = damping(one["velocity_m_s"]) / (2 * omega)
+        assert one["damping_ratio"] == pytest.approx(ratio, rel=1e-7)
+    backbone = summary["backbone"]
+    x = 2e-3 * np.array([0, 1])
+    largest = np.sqrt(squared(x[1])) / HERTZ
+    assert backbone["natural_frequency_hz"][1] == pytest.approx(largest, rel=1e-9)
+
+
+def test_curves_that_nobody_sees_are_not_fitted(beam, tmp_path, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("curves through points beside a joint fit")
+
+    monkeypatch.setattr("snrmjax.identify.pointwise.identification.fit_backbone", never)
+    model, data, _ = beam
+    done = run("identify", data, "--model", model, "--out", tmp_path, "--fit", FAMILIES)
+    assert done.code == 0, done.stderr
+
+
+def test_notes_on_single_states_reach_the_reader_of_a_joint_fit(files, tmp_path):
+    model, data = files
+    # Far above resonance a degree of phase makes damping negative: that state has no point.
+    level, *others = linear_row(2, 2e-5, 100.0).split(",")
+    omega, force, real, imaginary = map(float, others)
+    turned = complex(complex(real, imaginary) * np.exp(-0.2j))
+    data.write_text(HEADER + ROWS + f"{level},{omega},{force},{turned.real!r},{turned.imag!r}\n")
+    out = tmp_path / "out"
+    done = run("identify", data, "--model", model, "--out", out, "--fit", "polynomial:1,constant")
+    assert done.code == 0, done.stderr
+    told = json.loads((out / "summary.json").read_text())["notes"]
+    for text in (done.stderr, " ".join(told), (out / "report.html").read_text()):
+        assert "1 of 11 steady states have no point of their own" in text
+
+
+def test_a_fit_without_a_state_to_advise_is_written_all_the_same(files, tmp_path):
+    model, data = files
+    # 80° from resonance on either side: what lies nearer has amplitudes that nobody measured.
+    data.write_text(
+        HEADER
+        + "".join(
+            linear_row(level, 1e-5, hertz) for level in (1, 2) for hertz in (48, 49, 50, 80, 82, 84)
+        )
+    )
+    out = tmp_path / "out"
+    options = ("--fit", "polynomial:1,constant", "--next", "2")
+    done = run("identify", data, "--model", model, "--out", out, *options)
+    assert done.code == 0, done.stderr
+    assert (out / "next.csv").read_text().splitlines() == [
+        "rank,force_n,frequency_hz,expected_band_ratio,reason"
+    ]
+    assert "0 of 2 further measurements" in done.stderr
+    assert "0 of 2 further measurements" in (out / "report.html").read_text()
+    assert rows(out / "backbone.csv")["natural_frequency_hz"][-1] == pytest.approx(64.78, rel=1e-5)
+
+
+# ------------------------------------------------------------------------------ drive voltage
+
+
+def test_without_a_joint_fit_a_drive_voltage_is_refused_with_the_remedy(beam, tmp_path):
+    model, _, driven = beam
+    done = run("identify", driven, "--model", model, "--out", tmp_path / "out")
+    assert done.code == 2
+    assert "--free force_gain" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path):
+    model, _, driven = beam
+    options = ("--fit", FAMILIES, "--next", "2", "--predict-drive", "4", "--predict-force", "2")
+    done = run("identify", driven, "--model", model, "--out", tmp_path, *options)
+    assert done.code == 0, done.stderr
+    found = rows(tmp_path / "prediction.csv")
+    assert set(found["drive_v"].round(5)) == {2 / GAIN, 4.0}
+    np.testing.assert_allclose(found["force_n"], GAIN * found["drive_v"], rtol=1e-6)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    for one in summary["resonances"]:
+        speed = one["velocity_m_s"]
+        # At resonance the force is the damping's: F = 2ζ̃ω̃ v/A.
+        assert GAIN * one["drive_v"] == pytest.approx(damping(speed) * speed / CONSTANT, rel=1e-6)
+    advised = rows(tmp_path / "next.csv")
+    np.testing.assert_allclose(advised["force_n"], GAIN * advised["drive_v"], rtol=1e-6)
+    advice = [line for line in done.stderr.splitlines() if re.match(r"\d\. ", line)]
+    assert len(advice) == 2
+    assert all(re.match(r"\d\. \S+ V at \S+ Hz: ", line) for line in advice)
+    assert "0.4 N/V" in done.stderr
+
+
+# ------------------------------------------------------------------------------ extrapolation
+
+
+@pytest.mark.parametrize("options", [(), ("--fit", "polynomial:1,constant")], ids=["points", "fit"])
+def test_predictions_go_as_far_as_asked(files, tmp_path, options):
+    model, data = files
+    command = ("identify", data, "--model", model, "--out", tmp_path, *options)
+    asked = ("--predict-force", "8e-5")  # four times the largest: so is a linear resonance
+    done = run(*command, *asked)
+    assert done.code == 0, done.stderr
+    assert json.loads((tmp_path / "summary.json").read_text())["resonances"] == []
+    assert "--extrapolate" in done.stderr
+    done = run(*command, *asked, "--extrapolate", "5")
+    (one,) = json.loads((tmp_path / "summary.json").read_text())["resonances"]
+    assert one["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
+    assert one["beyond_the_data"]
+    assert "extrapolate" in done.stderr
+
+
+# ------------------------------------------------------------------------------ writers
+
+
+def test_every_writer_takes_the_path_first():
+    writers = [getattr(sj.io, name) for name in sj.io.__all__ if name.startswith("write_")]
+    assert len(writers) >= 10
+    for writer in writers:
+        first, second, *others = inspect.signature(writer).parameters.values()
+        assert first.name == "path", writer
+        assert second.default is inspect.Parameter.empty
+        assert all(other.kind is inspect.Parameter.KEYWORD_ONLY for other in others), writer

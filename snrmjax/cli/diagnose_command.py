@@ -17,7 +17,7 @@ def diagnose(
         typer.Argument(
             help="Measured steady states (CSV), one file or more. A file with `velocity_m_s` in "
             "place of real and imaginary part has amplitudes without phases.",
-            metavar="DATA...",
+            metavar="DATA",
             show_default=False,
         ),
     ],

@@ -231,6 +231,7 @@ def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> lis
             )
         elif any(each.continued for each in one.resonances):
             notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")
+        notes += [f"response at {one.load}: {each.note}" for each in one.responses if each.note]
         if len(one.resonances) > 1:
             notes.append(
                 f"{len(one.resonances)} resonances at {one.load}: the damping allows several."

@@ -26,8 +26,8 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
     """Each steady state's own point beside the curves of a joint fit.
 
     Points come from the inverse method, as those of `identify_backbone` do; no curves are fitted
-    to them. Where no noise is stated their 1σ is the noise that the joint fit found, and what it
-    found levels to differ by.
+    to them. Where no noise is stated their 1σ is what the joint fit found: its noise, and errors
+    of gain, phase, natural frequency and damping that the states of a level share.
 
     Arguments: `data` are the steady states of the fit, with forces in newtons.
     Returns an `Identification` whose `notes` are those of the fit and of the points.
@@ -44,7 +44,11 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
         anchor=None,
     )
     if not fit.noise_stated:
-        points = errors_from_scatter(points, curves)
+        gain, phase = map(float, fit.level_std[:2])
+        wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        points = errors_from_scatter(
+            points, curves, level_gain=gain, level_phase=phase, frequency_std=wandering
+        )
     consequence = "have no point of their own (the joint fit uses them)"
     notes = (
         *fit.notes,

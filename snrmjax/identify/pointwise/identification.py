@@ -55,22 +55,36 @@ def identify_backbone(
     return Identification(points, fit, _notes(points, fit, modes))
 
 
-def errors_from_scatter(points: BackbonePoints, fit: BackboneFit) -> BackbonePoints:
-    """Points whose standard deviations come from the scatter, shared by level or not."""
+def errors_from_scatter(
+    points: BackbonePoints,
+    fit: BackboneFit,
+    *,
+    level_gain: float = 0.0,
+    level_phase: float = 0.0,
+    frequency_std: float = 0.0,
+) -> BackbonePoints:
+    """Points whose standard deviations come from the scatter, shared by level or not.
+
+    Arguments: `level_gain` (relative) and `level_phase` (rad), where known, are 1σ of the errors of
+    velocity and phase that all states of a level share; `frequency_std` (rad/s) is how far the
+    natural frequency wanders from state to state.
+    """
     sensitivity = np.asarray(points.sensitivity)
     scale = off_resonance_error_factor(np.asarray(points.mode_velocity))[:, None] * np.array(
         fit.noise_scale
     )
-    spread = scale[:, :, None] * np.array([0.0, 1.0, 1.0])
+    shared = np.array([0.0, level_gain, level_phase])
+    spread = np.hypot(scale[:, :, None] * np.array([0.0, 1.0, 1.0]), shared)
     own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
     natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
-    frequency_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), fit.level_frequency_std)
+    moving = np.hypot(fit.level_frequency_std, frequency_std)
+    natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), moving)
     damping_std = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), fit.level_damping_std)
-    damping_std = np.hypot(damping_std, damping * frequency_std / natural)
+    damping_std = np.hypot(damping_std, damping * natural_std / natural)
     return eqx.tree_at(
         lambda p: (p.natural_frequency_std, p.damping_ratio_std),
         points,
-        (jnp.asarray(frequency_std), jnp.asarray(damping_std)),
+        (jnp.asarray(natural_std), jnp.asarray(damping_std)),
     )
 
 
