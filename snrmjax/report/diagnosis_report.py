@@ -19,7 +19,7 @@ from snrmjax.diagnose.response_prediction import (
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import Row
 from snrmjax.io.diagnosis_results import summarise_diagnosis
-from snrmjax.io.files import write_atomically, write_summary
+from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS
@@ -33,6 +33,7 @@ from snrmjax.report.diagnosis_figures import (
     found_effects,
     misfit_figure,
 )
+from snrmjax.report.figures import save_figures
 from snrmjax.report.html import (
     Report,
     ReportFigure,
@@ -42,7 +43,7 @@ from snrmjax.report.html import (
     with_error,
     write_report,
 )
-from snrmjax.report.style import png_bytes, unit_for, with_unit
+from snrmjax.report.style import PrintedFigure, unit_for, with_unit
 
 _SHOWN = 10  # candidates
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
@@ -107,15 +108,11 @@ def write_diagnosis(
         predicted, figures["responses"] = with_responses(found, model, data)
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, predicted))
     write_model(folder / "model.toml", found.completed)
-    drawn = {name: png_bytes(figure) for name, figure in figures.items()}
-    for name, png in drawn.items():
-        write_atomically(folder / f"{name}.png", png)
     report = diagnosis_report(
         found,
         f"Diagnosis of {title.replace('_', ' ')}",
-        figures,
+        save_figures(folder, figures),
         predicted,
-        drawn,
         done={"data": f"{title}.csv", "model": model.name},
         response_held=holds_response(data, predicted),
     )
@@ -152,9 +149,8 @@ def diagnosis_figures(diagnosis: Diagnosis, data: SteadyStates) -> dict[str, Fig
 def diagnosis_report(
     diagnosis: Diagnosis,
     title: str,
-    figures: Mapping[str, Figure],
+    figures: Mapping[str, Figure | PrintedFigure],
     predicted: Sequence[LevelResponse] = (),
-    drawn: Mapping[str, bytes] | None = None,
     *,
     done: Mapping[str, str] | None = None,
     response_held: bool = False,
@@ -162,17 +158,13 @@ def diagnosis_report(
     """The report of a diagnosis.
 
     Arguments: `figures` by the names that `diagnosis_figures` gives them, and `responses`;
-    `predicted` resonances of the levels; `drawn` the figures as PNG, where they are drawn already;
-    `done` names the inputs; `response_held` says that the levels hold the response and not the
-    force, as `holds_response` finds.
+    `predicted` resonances of the levels; `done` names the inputs; `response_held` says that the
+    levels hold the response and not the force, as `holds_response` finds.
     """
     captions = {**_CAPTIONS}
     if response_held:
         captions["responses"] += _HELD_RESPONSE
-    shown = {
-        name: ReportFigure(figure, captions[name], (drawn or {}).get(name))
-        for name, figure in figures.items()
-    }
+    shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
@@ -350,22 +342,16 @@ def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[st
 
 def _description(kind: str) -> str:
     """What an effect is physically, as its class states it."""
-    return str(getattr(EFFECTS[kind], "description", ""))
+    return EFFECTS[kind].description
 
 
 def _unit(kind: str, name: str) -> str:
-    unit = _stated(kind, name, "unit").replace("kg^1/2", "√kg")
+    unit = EFFECTS[kind].parameters()[name].unit.replace("kg^1/2", "√kg")
     return "" if unit == "1" else unit
 
 
 def _meaning(kind: str, name: str) -> str:
-    return _stated(kind, name, "meaning") or _words(name)
-
-
-def _stated(kind: str, name: str, what: str) -> str:
-    """Unit or meaning of a parameter, as the effect's class states it."""
-    parameters: dict[str, object] = getattr(EFFECTS[kind], "parameters", dict)()
-    return str(getattr(parameters.get(name), what, ""))
+    return EFFECTS[kind].parameters()[name].meaning or _words(name)
 
 
 def _readable(text: str) -> str:

@@ -6,7 +6,8 @@ are in Hz, degrees and per cent of critical damping. Figures need no display and
 matplotlib's settings.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -52,6 +53,7 @@ from snrmjax.report.style import (
     SERIES,
     SIMULATED,
     STAR,
+    PrintedFigure,
     dress,
     explain_lines,
     fit_axis,
@@ -62,6 +64,7 @@ from snrmjax.report.style import (
     phase_axis,
     plain,
     png_bytes,
+    printed,
     response_line,
     share_frequencies,
     stars,
@@ -88,6 +91,14 @@ def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 220.0)
     if not file_name(path).lower().endswith(".png"):
         raise ValueError(f"`path` must end in .png, but is {file_name(path)}.")
     write_atomically(path, png_bytes(figure, dots_per_inch=dots_per_inch))
+
+
+def save_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, PrintedFigure]:
+    """Write figures as PNG files into a folder, each under its name; as printed, for a report."""
+    drawn = {name: printed(figure) for name, figure in figures.items()}
+    for name, one in drawn.items():
+        write_atomically(folder / f"{name}.png", one.png)
+    return drawn
 
 
 def backbone_figure(

@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from snrmjax.io.files import FilePath, write_atomically
-from snrmjax.report.style import COLUMN, png_bytes
+from snrmjax.report.style import COLUMN, PrintedFigure, printed
 
 Rows = Sequence[tuple[str, str]]
 
@@ -17,11 +17,10 @@ _REM_PER_INCH = 8.0  # of figures on the page: their letters are then as large a
 
 
 class ReportFigure(NamedTuple):
-    """A figure with the words that explain how to read it."""
+    """A figure, drawn already or not, with the words that explain how to read it."""
 
-    figure: Figure
+    figure: Figure | PrintedFigure
     caption: str
-    png: bytes | None = None  # the file to show, where it is drawn already
 
 
 class ReportTable(NamedTuple):
@@ -80,10 +79,9 @@ def report_html(report: Report) -> str:
 
 
 def _embedded(one: ReportFigure) -> dict[str, str | bool]:
-    png = base64.b64encode(one.png or png_bytes(one.figure)).decode("ascii")
-    width = one.figure.get_figwidth()
+    png, width = one.figure if isinstance(one.figure, PrintedFigure) else printed(one.figure)
     return {
-        "png": png,
+        "png": base64.b64encode(png).decode("ascii"),
         "width": f"{_REM_PER_INCH * width:g}",
         "wide": width > COLUMN,
         "alt": one.caption.split(". ")[0],

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.identification import Identification
@@ -14,28 +16,25 @@ from snrmjax.identify.pointwise.prediction import (
     Resonance,
 )
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
-from snrmjax.report.figures import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Rows, Section, minus, with_error
 from snrmjax.report.sampling import sample_backbone, velocity_of
-from snrmjax.report.style import Unit, unit_for
+from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
-from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 BACKBONE_CAPTION = (
-    "Backbone. Every blue dot is a measured steady state, and every star what the method makes of "
-    "one: (a) the natural frequency at the amplitude it belongs to, (b) the phase resonance at 0°, "
-    "(c) the damping ratio. The line is the curve through the stars, the band its 95 % range. "
-    "Stars that lie on one line, whatever the phase of their dots, speak for the method; stars "
-    "that spread with the phase at one amplitude speak against it. Grey crosses are steady states "
-    "left out of the curves."
+    "Backbone. Blue dots are measured steady states. Each gives one star: (a) the natural "
+    "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. The line is "
+    "the curve through the stars, the band its 95 % range. Check that the stars lie on one line "
+    "whatever the phase of their dots: stars that spread with phase at one amplitude mean that the "
+    "method's assumptions do not hold. Grey crosses are steady states left out of the curves."
 )
 RESPONSE_CAPTION = (
     "Predicted responses, one row a force. Thin dashed parts are unstable: a test without control "
     "jumps before it gets there. Pale parts lie beyond the measured amplitudes, where the curves "
-    "are continued on trust. The star is the phase resonance. Black lines are harmonic balance, "
-    "blue dots measured steady states under the same force, where there are any."
+    "are extrapolated. The star is the phase resonance. Broad grey lines are harmonic balance with "
+    "the true model, blue dots measured steady states under the same force, where there are any: "
+    "both should coincide with the prediction."
 )
 TRUTH_CAPTION = (
     " The dashed black line is the true nonlinear mode of the model. Where it leaves the backbone "
@@ -59,102 +58,180 @@ VALIDITY = (
 )
 
 
+class ComparedResponses(NamedTuple):
+    """Responses that identified curves predict, and those of harmonic balance beside them."""
+
+    predicted: Sequence[PredictedResponse] = ()
+    resonances: Sequence[Resonance] = ()
+    simulated: Sequence[ResponseCurve] = ()
+
+
 def identification_report(
     identification: Identification,
     modes: LinearModes,
+    figures: Mapping[str, Figure | PrintedFigure],
     *,
     title: str,
     done: Mapping[str, str] | None = None,
     notes: Iterable[str] = (),
-    predicted: Sequence[PredictedResponse] = (),
-    resonances: Sequence[Resonance] = (),
-    simulated: Sequence[ResponseCurve] = (),
-    truth: NormalModeBranch | None = None,
-    measured: SteadyStates | None = None,
+    responses: ComparedResponses | None = None,
     further: Sequence[Section] = (),
 ) -> Report:
     """The report of an identification: numbers, notes, backbone, predictions, validity.
 
-    Arguments: `done` names what was done (data file, model, options); `notes` come before those
-    of the identification; `predicted` and `resonances` of the forces that were asked for, with
-    `simulated` responses and steady states `measured` under them beside; `truth` the nonlinear
-    mode of a model; `further` sections before the last one.
+    Arguments: `figures` by name: `backbone`, `prediction` where there are responses, and `nnm`
+    where the backbone is drawn beside the true nonlinear mode; `done` names what was done (data
+    file, model, options); `notes` come before those of the identification; `responses` under the
+    forces that were asked for; `further` sections before the last one.
     Returns a `Report` for `write_report`.
     """
-    points, backbone = identification.points, identification.fit.backbone
-    figure = backbone_figure(points, backbone, truth=truth, modes=modes)
-    caption = BACKBONE_CAPTION + (TRUTH_CAPTION if truth is not None else "")
-    sections = [Section("Backbone and damping", (), [ReportFigure(figure, caption)])]
-    if predicted or simulated:
-        figure = response_figure(
-            backbone, predicted, resonances, simulated=simulated, measured=measured
-        )
+    backbone = identification.fit.backbone
+    caption = BACKBONE_CAPTION + (TRUTH_CAPTION if "nnm" in figures else "")
+    shown = [ReportFigure(figures["backbone"], caption)]
+    sections = [Section("Backbone and damping", (), shown)]
+    if responses is not None and "prediction" in figures:
+        predicted, resonances, simulated = responses
         table = resonance_table(backbone, resonances, simulated, [c.force for c in predicted])
-        sections.append(
-            Section("Predicted responses", (), [ReportFigure(figure, RESPONSE_CAPTION)], [table])
-        )
+        shown = [ReportFigure(figures["prediction"], RESPONSE_CAPTION)]
+        sections.append(Section("Predicted responses", (), shown, [table]))
     return Report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
+        result=identification_sentence(identification, modes),
         summary=identification_summary(identification, modes),
         notes=list(dict.fromkeys([*notes, *identification.notes])),
         sections=[*sections, *further, Section("How to read this, and when to trust it", VALIDITY)],
     )
 
 
+class _Course(NamedTuple):
+    """How a curve runs over the amplitudes, with 95 % errors."""
+
+    velocity: np.ndarray  # m/s
+    values: np.ndarray
+    errors: np.ndarray
+    unit: str
+
+    def extreme(self) -> tuple[int, int]:
+        """Where it is lowest and highest."""
+        return int(np.nanargmin(self.values)), int(np.nanargmax(self.values))
+
+    def turns(self) -> bool:
+        """Whether its lowest or highest value lies between the ends, beyond the errors."""
+        ends = self.values[[0, -1]]
+        low, high = self.extreme()
+        return bool(
+            self.values[low] + self.errors[low] < ends.min()
+            or self.values[high] - self.errors[high] > ends.max()
+        )
+
+    def words(self) -> str:
+        """Its course in words."""
+        first, last = self.values[[0, -1]]
+        if self.turns():
+            low, high = self.extreme()
+            at = [with_unit(self.velocity[k], "m/s", 3) for k in (low, high)]
+            return (
+                f"lies between {self.values[low]:.4g} {self.unit} (at {at[0]}) and "
+                f"{self.values[high]:.4g} {self.unit} (at {at[1]})"
+            )
+        if abs(last - first) <= np.hypot(self.errors[0], self.errors[-1]):
+            return f"stays at {0.5 * (first + last):.4g} {self.unit} within its error"
+        verb = "rises" if last > first else "falls"
+        return f"{verb} from {first:.4g} to {last:.4g} {self.unit}"
+
+
+def _courses(identification: Identification) -> tuple[_Course, _Course]:
+    """Natural frequency and damping ratio over the amplitudes."""
+    curve = sample_backbone(identification.fit.backbone)
+    return (
+        _Course(curve.velocity, curve.frequency, curve.frequency_error, "Hz"),
+        _Course(curve.velocity, curve.damping, curve.damping_error, "%"),
+    )
+
+
+def identification_sentence(identification: Identification, modes: LinearModes) -> str:
+    """What an identification found, in one plain sentence."""
+    frequency, damping = _courses(identification)
+    low, high = (with_unit(one, "m/s", 3) for one in frequency.velocity[[0, -1]])
+    return (
+        f"From {low} to {high} at {identification.points.sensor}, the natural frequency of mode "
+        f"{modes.mode_of_interest + 1} {frequency.words()} and its damping ratio {damping.words()}."
+    )
+
+
 def identification_summary(identification: Identification, modes: LinearModes) -> Rows:
     """The headline numbers of an identification as names and texts, ± being 95 %."""
-    points, fit, _ = identification
-    backbone, status = fit.backbone, np.asarray(points.status)
-    curve = sample_backbone(backbone)
-    unit = unit_for(curve.velocity, "m/s")
-    at = [f"at {one / unit.size:.3g} {unit.name}" for one in curve.velocity]
+    points = identification.points
+    frequency, damping = _courses(identification)
+    unit = unit_for(frequency.velocity, "m/s")
 
-    def ends(values: np.ndarray, spread: np.ndarray, name: str) -> str:
-        first, last = (f"{with_error(values[k], spread[k])} {name} {at[k]}" for k in (0, -1))
-        return f"{first}, {last}"
+    def at(course: _Course, k: int) -> str:
+        return f"{course.unit} at {course.velocity[k] / unit.size:.3g} {unit.name}"
 
-    def extremes(values: np.ndarray, name: str) -> str:
-        low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
-        return f"{values[low]:.4g} {name} {at[low]} to {values[high]:.4g} {name} {at[high]}"
+    def ends(course: _Course) -> str:
+        pairs = [(with_error(course.values[k], course.errors[k]), at(course, k)) for k in (0, -1)]
+        return ", ".join(f"{value} {place}" for value, place in pairs)
+
+    def extremes(course: _Course) -> str:
+        return " to ".join(f"{course.values[k]:.4g} {at(course, k)}" for k in course.extreme())
 
     j = modes.mode_of_interest
     linear = float(modes.natural_frequency[j]) / HERTZ
-    change = curve.frequency[-1] - curve.frequency[0]
-    used = int(np.sum(np.asarray(points.usable)))
-    left_out = [
+    change = frequency.values[-1] - frequency.values[0]
+    used, every = int(np.sum(np.asarray(points.usable))), len(np.asarray(points.status))
+    rows = [
+        ("linear mode", f"{linear:.5g} Hz, {100 * float(modes.damping_ratio[j]):.3g} % damping"),
+        ("natural frequency (± 95 %)", ends(frequency)),
+        ("change over the range", minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
+        ("damping ratio (± 95 %)", ends(damping)),
+        ("steady states used", f"{used} of {every} at sensor {points.sensor}"),
+        ("left out", _left_out(identification)),
+        ("phases measured", _phases(identification)),
+        ("noise", _noise(identification)),
+        ("scatter from level to level", _level_scatter(identification)),
+        ("argument of the curves", f"{points.argument} amplitude"),
+    ]
+    if frequency.turns():
+        rows.insert(2, ("lowest to highest frequency", extremes(frequency)))
+    if damping.turns():
+        at_damping = [name for name, _ in rows].index("damping ratio (± 95 %)")
+        rows.insert(at_damping + 1, ("lowest to highest damping", extremes(damping)))
+    return [(name, text) for name, text in rows if text]
+
+
+def _left_out(identification: Identification) -> str:
+    """How many points the curves leave out and why; nothing where all are used."""
+    status = np.asarray(identification.points.status)
+    return ", ".join(
         f"{int(np.sum(status == kind))} ({STATUS_MESSAGE[kind]})"
         for kind in PointStatus
         if kind is not PointStatus.OK and np.any(status == kind)
-    ]
-    phase = np.angle(np.asarray(points.mode_velocity) * np.sign(float(backbone.modal_constant)))
-    phase = phase[np.isfinite(phase)] / DEGREE
-    level_hz, level_damping = fit.level_frequency_std / HERTZ, 100 * fit.level_damping_std
-    levels = f"{level_hz:.2g} Hz and {level_damping:.2g} % of critical damping (1σ)"
-    if not level_hz > 0 and not level_damping > 0:
-        levels = "none found beyond the noise"
-    scale = fit.noise_scale
-    noise = (
-        f"stated; the points scatter {scale[0]:.2g} (frequency) and {scale[1]:.2g} (damping) times "
-        "as much"
-        if fit.noise_stated
-        else f"not stated; from the scatter {100 * scale[0]:.2g} % (frequency) and "
-        f"{100 * scale[1]:.2g} % (damping) of the measured phasor"
     )
-    return [
-        ("linear mode", f"{linear:.5g} Hz, {100 * float(modes.damping_ratio[j]):.3g} % damping"),
-        ("natural frequency (± 95 %)", ends(curve.frequency, curve.frequency_error, "Hz")),
-        ("lowest to highest frequency", extremes(curve.frequency, "Hz")),
-        ("change over the range", minus(f"{change:+.3g} Hz ({100 * change / linear:+.3g} %)")),
-        ("damping ratio (± 95 %)", ends(curve.damping, curve.damping_error, "%")),
-        ("lowest to highest damping", extremes(curve.damping, "%")),
-        ("points used", f"{used} of {len(status)} at sensor {points.sensor}"),
-        ("left out", ", ".join(left_out) or "none"),
-        ("phases measured", minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")),
-        ("noise", noise),
-        ("scatter from level to level", levels),
-        ("argument of the curves", f"{points.argument} amplitude"),
-    ]
+
+
+def _phases(identification: Identification) -> str:
+    sign = np.sign(float(identification.fit.backbone.modal_constant))
+    phase = np.angle(np.asarray(identification.points.mode_velocity) * sign)
+    phase = phase[np.isfinite(phase)] / DEGREE
+    return minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")
+
+
+def _noise(identification: Identification) -> str:
+    fit, scale = identification.fit, identification.fit.noise_scale
+    if fit.noise_stated:
+        both = f"{scale[0]:.2g} (frequency) and {scale[1]:.2g} (damping)"
+        return f"stated; the points scatter {both} times as much"
+    both = f"{100 * scale[0]:.2g} % (frequency) and {100 * scale[1]:.2g} % (damping)"
+    return f"not stated; from the scatter {both} of the measured phasor"
+
+
+def _level_scatter(identification: Identification) -> str:
+    fit = identification.fit
+    hertz, damping = fit.level_frequency_std / HERTZ, 100 * fit.level_damping_std
+    if not hertz > 0 and not damping > 0:
+        return "none found beyond the noise"
+    return f"{hertz:.2g} Hz and {damping:.2g} % of critical damping (1σ)"
 
 
 def resonance_table(

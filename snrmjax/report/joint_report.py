@@ -1,6 +1,6 @@
 """What a report tells of a joint fit: its parameters, errors and residuals, and its advice."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,21 +21,22 @@ from snrmjax.report.joint_figures import (
     fitted_curves_figure,
     residuals_figure,
 )
-from snrmjax.report.style import unit_for
+from snrmjax.report.style import PrintedFigure, unit_for
 
 _LISTED = 12  # contributions by name; the rest stands in one row
 
 CURVES_CAPTION = (
-    "The joint fit. Lines are the fitted curves, fitted to all states at once; darker bands hold "
-    "the true curve with 95 %. Where levels differ from one another, the paler band holds the "
-    "curve of one further level. Dots are what single states give on their own, shared errors of "
-    "their level included."
+    "The joint fit. Lines are the curves fitted to all states at once; the darker band contains "
+    "the true curve with a probability of 95 %. Where levels differ from one another, the paler "
+    "band contains the curve of one further level. Dots are what single states give on their own, "
+    "with the errors that their level shares: dots beside the line on a vertical streak are such "
+    "errors, a line beside all dots is not."
 )
 RESIDUALS_CAPTION = (
-    "Whitened residuals: what the fit leaves of every state's force balance, in units of its "
-    "noise and made independent. Two a state. Where curves and noise are right they are a cloud "
-    "without shape, and one in twenty lies outside the dashed lines. A bend says that the curves, "
-    "the phase or the linear modes are not right; a funnel says that the noise is not."
+    "Whitened residuals: what the fit leaves of the force balance, two values a state, made "
+    "independent and in standard deviations of the noise. Where curves and noise are right they "
+    "are a cloud without shape, and one in twenty lies outside the dashed lines. A bend means that "
+    "the curves, the phase or the linear modes are wrong; a funnel, that the noise is."
 )
 SHARES_CAPTION = (
     "Where the width of the bands comes from: shares of the variance, mean over the measured "
@@ -43,13 +44,13 @@ SHARES_CAPTION = (
     "of levels only with more levels."
 )
 ADVICE_CAPTION = (
-    "Where the advised states lie on the fitted responses, numbered in the order of the table. "
-    "Dashed parts are unstable."
+    "Where to measure next: the states of the table, numbered in its order, on the responses that "
+    "the fit predicts. Dashed parts are unstable."
 )
 
 
-class ToldFit(NamedTuple):
-    """A joint fit with what its report needs."""
+class ReportedFit(NamedTuple):
+    """A joint fit with what its report shows beside its curves."""
 
     fit: JointFit
     shares: tuple[Contribution, ...]
@@ -57,14 +58,14 @@ class ToldFit(NamedTuple):
     responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
 
 
-def tell_fit(fit: JointFit, advice: Sequence[NextMeasurement] = ()) -> ToldFit:
+def reported_fit(fit: JointFit, advice: Sequence[NextMeasurement] = ()) -> ReportedFit:
     """What contributes to the bands of a fit, and the responses on which its advice lies."""
     forces = sorted({one.force for one in advice})
     responses = [fitted_response(fit, force)[0] for force in forces]
-    return ToldFit(fit, tuple(contributions(fit)), tuple(advice), tuple(responses))
+    return ReportedFit(fit, tuple(contributions(fit)), tuple(advice), tuple(responses))
 
 
-def joint_figures(told: ToldFit, points: BackbonePoints) -> dict[str, Figure]:
+def joint_figures(told: ReportedFit, points: BackbonePoints) -> dict[str, Figure]:
     """Figures of a joint fit by the names of their files; `points` of single states."""
     figures = {
         "joint_fit": fitted_curves_figure([FitSeries("joint fit", told.fit, points)]),
@@ -77,7 +78,9 @@ def joint_figures(told: ToldFit, points: BackbonePoints) -> dict[str, Figure]:
     return figures
 
 
-def joint_sections(told: ToldFit, figures: dict[str, Figure]) -> list[Section]:
+def joint_sections(
+    told: ReportedFit, figures: Mapping[str, Figure | PrintedFigure]
+) -> list[Section]:
     """The sections of a report that tell a joint fit, with its figures."""
     fit = told.fit
     summary = summarise_fit(fit, ())
@@ -229,10 +232,9 @@ def family_table(summary: dict) -> ReportTable:
     caption = (
         "How well levels are predicted that were left out. Score: log predictive density relative "
         "to the best, ± 1σ of the difference; a family within 2 of the best is as good. Error of "
-        "prediction: left-out residuals over what was foretold, 1 if the bands are right. Weight: "
-        "how far a family is to be believed by its score; where another one says something else "
-        "than the one taken, the bands are wider by that. The curve taken may have one term more "
-        "than the best score asks for, so that its band does not rest on the shape of too small a "
-        "family."
+        "prediction: left-out residuals over their predicted size, 1 if the bands are right. "
+        "Weight: the stacking weight that the scores give a family; where families disagree, the "
+        "bands are wider by that. The curve taken may have one term more than the best score asks "
+        "for, so that its band does not rest on the shape of too small a family."
     )
     return ReportTable(header, rows, caption)

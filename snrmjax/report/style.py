@@ -78,6 +78,18 @@ def png_bytes(figure: Figure, *, dots_per_inch: float = 220.0) -> bytes:
     return buffer.getvalue()
 
 
+class PrintedFigure(NamedTuple):
+    """A figure as the content of a PNG file, with its width on paper."""
+
+    png: bytes
+    width: float  # inches
+
+
+def printed(figure: Figure) -> PrintedFigure:
+    """A figure drawn once, for a file and for a report."""
+    return PrintedFigure(png_bytes(figure), figure.get_figwidth())
+
+
 def panels(width: float, height: float, rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     """A figure, width and height in inches, and its panels as an array of rows."""
     figure = Figure(figsize=(width, height), layout="constrained")

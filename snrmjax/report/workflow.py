@@ -1,6 +1,6 @@
 """What the commands do with a table of steady states: identify, predict, and write all of it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -37,8 +37,9 @@ from snrmjax.measure.states import SteadyStates, check_force
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
-from snrmjax.report.identification_report import identification_report
-from snrmjax.report.joint_report import ToldFit, joint_figures, joint_sections, tell_fit
+from snrmjax.report.identification_report import ComparedResponses, identification_report
+from snrmjax.report.joint_report import ReportedFit, joint_figures, joint_sections, reported_fit
+from snrmjax.report.style import PrintedFigure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
@@ -97,7 +98,7 @@ class Findings(NamedTuple):
     predictions: tuple[Prediction, ...]
     notes: tuple[str, ...]
     settings: dict[str, str]  # in words, for the summary and the report
-    fitted: ToldFit | None = None
+    fitted: ReportedFit | None = None
     advice: NextMeasurements | None = None  # none where nobody asked
     truth: NormalModeBranch | None = None
     simulated: tuple[ResponseCurve, ...] = ()
@@ -208,7 +209,7 @@ def identify_jointly(
         "amplitude": "displacement, fundamental",
         "curves": " and ".join(joint_results.described(curve) for curve in pair),
     }
-    fitted = tell_fit(fit, tuple(advice or ()))
+    fitted = reported_fit(fit, tuple(advice or ()))
     return Findings(*(data, model, found, tuple(predictions), tuple(notes), words), fitted, advice)
 
 
@@ -340,7 +341,7 @@ MODE_CAPTION = (
 
 
 def findings_report(
-    found: Findings, title: str, done: dict[str, str], figures: dict[str, Figure]
+    found: Findings, title: str, done: dict[str, str], figures: Mapping[str, Figure | PrintedFigure]
 ) -> Report:
     """The report of an identification; `done` says what was done with which files."""
     further = [] if found.fitted is None else joint_sections(found.fitted, figures)
@@ -360,14 +361,11 @@ def findings_report(
     return identification_report(
         found.identification,
         found.model.modes,
+        figures,
         title=title,
         done=done,
         notes=found.notes,
-        predicted=found.responses,
-        resonances=found.resonances,
-        simulated=found.simulated,
-        truth=found.truth,
-        measured=found.data,
+        responses=ComparedResponses(found.responses, found.resonances, found.simulated),
         further=further,
     )
 
@@ -395,13 +393,11 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     ]
     summary["notes"] = list(found.notes)
     write_summary(folder / "summary.json", summary)
-    figures = identification_figures(found)
-    for name, figure in figures.items():
-        plot.save_figure(figure, folder / f"{name}.png")
+    figures = plot.save_figures(folder, identification_figures(found))
     write_report(folder / "report.html", findings_report(found, title, done, figures))
 
 
-def _write_fit(folder: Path, found: Findings, fitted: ToldFit) -> dict[str, object]:
+def _write_fit(folder: Path, found: Findings, fitted: ReportedFit) -> dict[str, object]:
     """Write what a joint fit adds; its part of the summary."""
     fit, backbone = fitted.fit, found.identification.fit.backbone
     joint_results.write_fitted_backbone(folder / "backbone.csv", fit)

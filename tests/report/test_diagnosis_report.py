@@ -147,8 +147,8 @@ def pictures(drag):
 
 def html_of(found, pictures, **settings):
     predicted, figures = pictures
-    pixels = dict.fromkeys(figures, b"PNG")  # words are tested here
-    return report_html(told.diagnosis_report(found, "One", figures, predicted, pixels, **settings))
+    pixels = dict.fromkeys(figures, drawing.PrintedFigure(b"PNG", 7.0))  # words are tested here
+    return report_html(told.diagnosis_report(found, "One", pixels, predicted, **settings))
 
 
 def test_the_report_begins_with_the_verdict_in_a_sentence(drag, pictures):

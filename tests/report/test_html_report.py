@@ -14,9 +14,12 @@ from matplotlib.figure import Figure
 import snrmjax as sj
 from snrmjax.io.units import HERTZ
 from snrmjax.report import html as reports
+from snrmjax.report.figures import backbone_figure, response_figure
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, write_report
 from snrmjax.report.identification_report import (
+    ComparedResponses,
     identification_report,
+    identification_sentence,
     identification_summary,
     resonance_table,
 )
@@ -88,14 +91,19 @@ def simulated(force, velocities, frequencies_hz, events):
 
 @pytest.fixture(scope="module")
 def report(identification, modes):
+    curves = [simulated(0.05, [0.05, 0.11, 0.05], [79, 80, 81], ["", "phase_resonance", ""])]
+    figures = {
+        "backbone": backbone_figure(identification.points, identification.fit.backbone),
+        "prediction": response_figure(identification.fit.backbone, [], simulated=curves),
+    }
     return identification_report(
         identification,
         modes,
+        figures,
         title=f"Beam {NASTY}",
         done={"data": f"{NASTY}.csv"},
         notes=[f"the column {NASTY} was not used", "all is well", "all is well"],
-        resonances=[resonance(0.05, 0.1, 80.2)],
-        simulated=[simulated(0.05, [0.05, 0.11, 0.05], [79, 80, 81], ["", "phase_resonance", ""])],
+        responses=ComparedResponses([], [resonance(0.05, 0.1, 80.2)], curves),
         further=[Section(f"More {NASTY}", [NASTY], (), [ReportTable([NASTY], [[NASTY]], NASTY)])],
     )
 
@@ -224,17 +232,45 @@ def test_headline_numbers_are_those_of_the_curves(identification, modes, data):
     assert change == pytest.approx(expected[1] - expected[0], abs=0.05)
     damping = float(rows["damping ratio (± 95 %)"].split(" ±")[0])
     assert damping == pytest.approx(2.0, rel=5e-3)
-    for name, unit in (("frequency", "Hz"), ("damping", "%")):
-        ends = re.fullmatch(
-            rf"(\S+) {unit} at \S+ m/s to (\S+) {unit} at \S+ m/s",
-            rows[f"lowest to highest {name}"],
-        )
-        assert float(ends[1]) < float(ends[2])
-    assert rows["points used"] == f"32 of 32 at sensor tip {NASTY}"
-    assert rows["left out"] == "none"
+    # Curves without a turn have nothing lower or higher than their ends, and nothing is left out.
+    assert not {"lowest to highest frequency", "lowest to highest damping", "left out"} & set(rows)
+    assert rows["steady states used"] == f"32 of 32 at sensor tip {NASTY}"
     assert rows["phases measured"] == "−40° to 40°, 0° is resonance"
     assert rows["noise"].startswith("stated; the points scatter")
     assert rows["argument of the curves"] == "displacement amplitude"
+
+
+def test_the_result_is_one_sentence(identification, modes):
+    sentence = identification_sentence(identification, modes)
+    hertz, displacement = frequency_at(np.array([1e-4, 1e-3])) / HERTZ, np.array([1e-4, 1e-3])
+    said = re.fullmatch(
+        rf"From (\S+) mm/s to (\S+) m/s at {re.escape(f'tip {NASTY}')}, "
+        r"the natural frequency of mode 1 rises from "
+        r"(\S+) to (\S+) Hz and its damping ratio falls from (\S+) to (\S+) %\.",
+        sentence,
+    )
+    speed = displacement * hertz * HERTZ
+    # Three and four digits are printed; the curve is exact to 0.05 %.
+    assert float(said[1]) == pytest.approx(1e3 * speed[0], rel=6e-3)
+    assert float(said[2]) == pytest.approx(speed[1], rel=6e-3)
+    np.testing.assert_allclose([float(said[3]), float(said[4])], hertz, rtol=1e-3)
+    # Constant modal damping: the ratio falls as the frequency rises.
+    np.testing.assert_allclose([float(said[5]), float(said[6])], 160 / hertz, rtol=1e-2)
+
+
+def test_a_curve_that_turns_tells_its_lowest_and_highest_value(identification, modes):
+    squared = identification.fit.backbone.squared_frequency
+    values = squared.values.at[1].set((70.0 * HERTZ) ** 2)
+    dipped = eqx.tree_at(lambda b: b.squared_frequency.values, identification.fit.backbone, values)
+    fit = identification.fit._replace(backbone=dipped)
+    turned = identification._replace(fit=fit)
+    rows = dict(identification_summary(turned, modes))
+    ends = re.fullmatch(
+        r"(\S+) Hz at \S+ m/s to (\S+) Hz at \S+ m/s", rows["lowest to highest frequency"]
+    )
+    assert float(ends[1]) == pytest.approx(70.0, abs=0.2)  # between two of 200 samples
+    assert float(ends[2]) == pytest.approx(84.0, abs=0.1)
+    assert "natural frequency of mode 1 lies between 70" in identification_sentence(turned, modes)
 
 
 def test_points_left_out_are_counted_with_the_reason(identification, modes):
@@ -247,7 +283,7 @@ def test_points_left_out_are_counted_with_the_reason(identification, modes):
     )
     doubted = identification._replace(points=eqx.tree_at(lambda p: p.status, points, status))
     rows = dict(identification_summary(doubted, modes))
-    assert rows["points used"].startswith("29 of 32")
+    assert rows["steady states used"].startswith("29 of 32")
     assert rows["left out"] == (
         "2 (negative damping: phase beyond 90° of resonance), "
         "1 (no root: amplitude and phase contradict the residual modes)"

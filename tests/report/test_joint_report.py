@@ -27,7 +27,7 @@ def fit():
 
 @pytest.fixture(scope="module")
 def told(fit):
-    return joint_report.tell_fit(fit, sj.next_measurements(fit, 3))
+    return joint_report.reported_fit(fit, sj.next_measurements(fit, 3))
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_states_that_lie_together_share_a_label(told):
 def test_families_are_listed_best_first():
     tried = sj.fit_jointly(noisy(1), modes(), backbone="polynomial", damping="constant")
     table = joint_report.joint_sections(
-        joint_report.tell_fit(tried),
+        joint_report.reported_fit(tried),
         dict.fromkeys(("joint_fit", "residuals", "contributions"), drawing.panels(1, 1, 1, 1)[0]),
     )[-1].tables[0]
     scores = [c.score for c in tried.candidates if c.curve == "backbone"]
