@@ -64,7 +64,8 @@ def exact_test(
     """The states as they are."""
     return sj.phase_resonance_test(
         beam, FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0),
-        points_per_level=points, harmonic_order=9, keep_harmonics=harmonics,
+        points_per_level=points,
+        recording=sj.simulate.Recording(keep_harmonics=harmonics),
     ).steady_states  # fmt: skip
 
 

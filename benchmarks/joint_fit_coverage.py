@@ -95,7 +95,8 @@ def truth_of(case: Case) -> Truth:
     else:
         test = sj.phase_resonance_test(
             case.model, case.forces, *ends, points_per_level=case.points_per_level,
-            appropriation=(0.5, 1.0), harmonic_order=HARMONICS,
+            appropriation=(0.5, 1.0),
+            simulation=sj.simulate.SweepSimulation(harmonic_order=HARMONICS),
         ).steady_states  # fmt: skip
     modes = case.model.modes
     constant = float(modes.mode_shape[0, 0] * modes.participation[0])

@@ -55,7 +55,7 @@ def closure(n_points: int) -> None:
     """Motions against one period in time, by harmonics."""
     for beam, (model, _, _) in CURVES.items():
         for order in (9, 15, 31, 45, 63):
-            for curve in responses(beam, harmonic_order=order, max_points=2000):
+            for curve in responses(beam, harmonic_order=order):
                 rows = np.linspace(0, len(curve.frequency) - 1, n_points).round().astype(int)
                 rows = [k for k in rows if "fold" not in curve.event[k]]
                 misses = []
@@ -83,8 +83,8 @@ def events() -> None:
     for beam, (model, _, _) in CURVES.items():
         known: dict[float, dict[str, int]] = {}
         for step in (0.003, 0.01, 0.03, 0.05, 0.1, 0.3):
-            control = sj.simulate.StepControl(first=step, largest=step)
-            for curve in responses(beam, steps=control, stability=False, max_points=8000):
+            control = sj.simulate.StepControl(first=step, largest=step, max_points=8000)
+            for curve in responses(beam, steps=control, stability=False):
                 counts = {kind: int(curve.at_events(kind).size) for kind in KINDS}
                 known.setdefault(curve.force, counts)
                 scale = float(np.abs(curve.coefficients).max())
@@ -116,14 +116,17 @@ def events() -> None:
 
 def stability(n_each: int) -> None:
     """Verdicts against multipliers of the map over one period."""
-    settings = {"harmonic_order": 31, "steps": sj.simulate.StepControl(largest=0.01, angle=0.02)}
+    settings = {
+        "harmonic_order": 31,
+        "steps": sj.simulate.StepControl(largest=0.01, angle=0.02, max_points=8000),
+    }
     chosen = []
     for beam, (model, _, _) in CURVES.items():
-        for curve in responses(beam, max_points=8000, **settings):
+        for curve in responses(beam, **settings):
             chosen += [(beam, model, curve, k) for k, e in enumerate(curve.event) if not e]
     rng = np.random.default_rng(0)
     for verdict in (True, False):
-        rows = [row for row in chosen if bool(row[2].stable[row[3]]) is verdict]
+        rows = [row for row in chosen if bool(row[2].is_stable[row[3]]) is verdict]
         picks = rng.permutation(len(rows))[:n_each]
         wrong, distances, near, begin = [], [], 0, time.perf_counter()
         for row in picks:

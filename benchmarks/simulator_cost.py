@@ -73,15 +73,15 @@ def lu_seconds(size: int, count: int) -> float:
 
 def one_size(harmonics: int, n_modes: int) -> dict:
     """Cost of the curve of one size."""
-    from snrmjax.simulate.continuation.continuation import StepControl, traced
-    from snrmjax.simulate.continuation.curve_tracing import follow_from_rest, response_balances
+    from snrmjax.simulate.continuation.continuation import StepControl
+    from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
 
     model, force, before = chain(n_modes), 1.0, peak_memory()
     balances = response_balances([model], np.array([force]), harmonics, None)
-    ends, steps = jnp.asarray([60.0, 110.0]) * HZ, traced(StepControl())
+    ends, steps = jnp.asarray([60.0, 110.0]) * HZ, StepControl()
 
-    def follow() -> list:
-        return follow_from_rest(balances, np.arange(1), ends, steps, 4000, downward=False)
+    def trace() -> list:
+        return trace_from_rest(balances, np.arange(1), ends, steps, downward=False)
 
     def respond() -> sj.simulate.ResponseCurve:
         return sj.forced_response(
@@ -89,10 +89,10 @@ def one_size(harmonics: int, n_modes: int) -> dict:
         )[0]
 
     begin = time.perf_counter()
-    curve = follow()[0]
+    curve = trace()[0]
     compile_seconds = time.perf_counter() - begin
     points, size = len(curve.points), n_modes * (2 * harmonics + 1)
-    bare = median_of(follow)
+    bare = median_of(trace)
     respond()
     whole = median_of(respond)
     limit = lu_seconds(size + 1, curve.n_solves)
@@ -125,7 +125,10 @@ def many_curves(members: int) -> dict:
 
     models = [with_coefficient(value) for value in coefficient]
     forces = rng.uniform(0.2, 2.0, members)
-    settings = {"stability": False, "keep_curves": False, "harmonic_order": 5}
+    settings = {
+        "settings": sj.simulate.ResponseSettings(harmonic_order=5, stability=False),
+        "keep_curves": False,
+    }
     sj.simulate.forced_response_batch(models[:64], forces[:64], 60 * HZ, 140 * HZ, **settings)
     before, begin = peak_memory(), time.perf_counter()
     batch = sj.simulate.forced_response_batch(models, forces, 60 * HZ, 140 * HZ, **settings)

@@ -110,8 +110,8 @@ def midspan(curves: list[sj.simulate.ResponseCurve]) -> tuple[np.ndarray, np.nda
 
 def reference(case: Case, harmonics: int) -> tuple[np.ndarray, np.ndarray]:
     """The curve in fine steps, and between them by a spline: its chords do not matter."""
-    fine = sj.simulate.StepControl(largest=0.01, angle=0.02, tolerance=1e-10)
-    curves = respond(case, harmonic_order=harmonics, steps=fine, max_points=8000)
+    fine = sj.simulate.StepControl(largest=0.01, angle=0.02, tolerance=1e-10, max_points=8000)
+    curves = respond(case, harmonic_order=harmonics, steps=fine)
     frequency, velocity = midspan(curves)
     # The spline runs along the arc of all unknowns: in the plane alone the curve may have cusps.
     x = np.concatenate([np.asarray(c.coefficients).reshape(len(c.frequency), -1) for c in curves])
@@ -491,7 +491,9 @@ def batch(n_forces: int = 64) -> None:
         def together(
             case: Case = case, forces: list = forces, ends: tuple = ends, settings: dict = settings
         ) -> object:
-            return sj.simulate.forced_response_batch(case.model, forces, *ends, **settings)
+            return sj.simulate.forced_response_batch(
+                case.model, forces, *ends, settings=sj.simulate.ResponseSettings(**settings)
+            )
 
         first = {f.__name__: timed(f)[0] for f in (one_by_one, together)}
         runs = [(timed(one_by_one)[0], timed(together)[0]) for _ in range(3)]

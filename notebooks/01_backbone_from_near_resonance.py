@@ -184,7 +184,7 @@ for forces, (nearest, farthest) in WINDOWS:
         140 * HERTZ,
         appropriation=(np.cos(np.radians(farthest)) ** 2, np.cos(np.radians(nearest)) ** 2),
         points_per_level=4,
-        keep_harmonics=(2, 3, 4, 5, 6, 7, 8, 9),
+        recording=sj.simulate.Recording(keep_harmonics=(2, 3, 4, 5, 6, 7, 8, 9)),
     )
     parts.append(part.steady_states.renumbered(len(recorded)))
     recorded += list(forces)
@@ -281,7 +281,7 @@ show(
 # %%
 (large,) = sj.forced_response(curved, [8e-3], 40 * HERTZ, 400 * HERTZ)
 size = np.abs(large.velocity[:, 1, 0])
-near = np.flatnonzero(large.stable & (size > 0.6 * size.max()) & (size < 0.95 * size.max()))[::3]
+near = np.flatnonzero(large.is_stable & (size > 0.6 * size.max()) & (size < 0.95 * size.max()))[::3]
 frequency, orbits = jnp.asarray(large.frequency[near]), jnp.asarray(large.coefficients[near])
 for factor in np.geomspace(3, 1, 13)[1:]:
     between = sj.model.structure(

@@ -73,7 +73,7 @@ def level(curve):
 def draw(axes, curve, colour, name, events=tuple(EVENTS)):
     """One response, dashed where unstable, and its events."""
     x, y = curve.frequency / HERTZ, level(curve)
-    drawing.response_line(axes, x, y, curve.stable, name, colour, 1.8)
+    drawing.response_line(axes, x, y, curve.stability, name, colour, 1.8)
     for event in events:
         at = curve.at_events(event)
         drawing.marks(axes, x[at], y[at], EVENTS[event], event.replace("_", " "))
@@ -476,7 +476,8 @@ rng = np.random.default_rng(7)
 scatter = 3.0 * rng.normal(size=(200, len(names)))  # %
 scatter[:, len(keys) : len(keys) + 4] = 0.0  # the frequencies are known well
 batch = sj.simulate.forced_response_batch(
-    *([changed(row) for row in scatter], strongest.force, 60 * HERTZ, 120 * HERTZ), stability=False
+    *([changed(row) for row in scatter], strongest.force, 60 * HERTZ, 120 * HERTZ),
+    settings=sj.simulate.ResponseSettings(stability=False),
 )
 jumps = np.array([c[0].frequency[c[0].at_events("fold")].max() for c in batch.curves])
 computed = 100 * (np.stack([batch.peak_velocity, jumps], axis=1) / nominal - 1)

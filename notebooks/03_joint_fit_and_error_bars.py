@@ -88,13 +88,16 @@ truth = sj.simulate.damped_normal_mode(flat, 0.85, steps=sj.simulate.StepControl
 errors = sj.simulate.MeasurementErrors(amplitude=0.01, phase=np.radians(0.7), force=0.003)
 ends = (60 * HERTZ, 120 * HERTZ)
 forces = np.geomspace(6e-4, 1.334e-2, 8).tolist()
-near = sj.phase_resonance_test(flat, forces, *ends, points_per_level=4, errors=errors, seed=3)
+near = sj.phase_resonance_test(
+    *(flat, forces, *ends),
+    points_per_level=4,
+    recording=sj.simulate.Recording(errors, seed=3),
+)
 along = sj.phase_resonance_test(
     *(flat, forces[-1:], *ends),
     appropriation=(0.02, 0.999),
     points_per_level=85,
-    errors=errors,
-    seed=4,
+    recording=sj.simulate.Recording(errors, seed=4),
 )
 tests = {"32 near resonance": near, "85 along one response": along}
 fits = {name: sj.fit_jointly(t.steady_states, flat.modes) for name, t in tests.items()}

@@ -108,9 +108,7 @@ test = sj.phase_resonance_test(
     *(74 * HERTZ, 86 * HERTZ),
     appropriation=(0.02, 0.99),
     points_per_level=8,
-    errors=errors,
-    keep_harmonics=(2, 3),
-    seed=1,
+    recording=sj.simulate.Recording(errors, seed=1, keep_harmonics=(2, 3)),
 )
 found = sj.diagnose_model(model, test.steady_states)
 report(found)

@@ -191,8 +191,7 @@ motions = {
         102 * HERTZ,
         appropriation=(0.2, 1.0),
         points_per_level=100,
-        by="time_integration",
-        steps_per_sweep=110,
+        simulation=sj.simulate.SweepSimulation(by="time_integration", steps_per_sweep=110),
     ).steady_states
     for name, one in (("beam", truth), ("beam with friction", rubbing))
 }
@@ -463,9 +462,11 @@ full = {
         160 * HERTZ,
         appropriation=(np.cos(np.radians(34)) ** 2, np.cos(np.radians(3)) ** 2),
         points_per_level=5,
-        errors=sj.simulate.MeasurementErrors(amplitude=AMPLITUDE, phase=PHASE, force=FORCE),
-        keep_harmonics=HARMONICS,
-        seed=3,
+        recording=sj.simulate.Recording(
+            sj.simulate.MeasurementErrors(amplitude=AMPLITUDE, phase=PHASE, force=FORCE),
+            seed=3,
+            keep_harmonics=HARMONICS,
+        ),
     ).steady_states
     for name, newtons in LEVELS.items()
 }

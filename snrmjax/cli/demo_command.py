@@ -44,11 +44,13 @@ def demo(out: Out) -> None:
             np.linspace(1.0e-3, 1.45e-2, 12).tolist(),
             60 * HERTZ,
             110 * HERTZ,
-            errors=sj.simulate.MeasurementErrors(
-                amplitude=0.005, phase=np.radians(0.3), force=0.002
+            recording=sj.simulate.Recording(
+                errors=sj.simulate.MeasurementErrors(
+                    amplitude=0.005, phase=np.radians(0.3), force=0.002
+                ),
+                seed=1,
+                keep_harmonics=(3, 5),
             ),
-            seed=1,
-            keep_harmonics=(3, 5),
         )
         data = test.steady_states
         write_steady_states(folder / "steady_states.csv", data)

@@ -70,13 +70,23 @@ def simulate(
             curves += main_curves
             if isolated:
                 further = sj.simulate.isolated_responses(
-                    structure, one, *ends, known=main_curves, harmonic_order=harmonics
+                    *(structure, one, *ends),
+                    known=main_curves,
+                    settings=sj.simulate.ResponseSettings(harmonic_order=harmonics),
                 )
-                say(f"  {len(further)} further branches found")
+                say(f"  {len(further)} further branches found; {further.summary()[-1]}")
                 curves += further
         for curve in curves:
             if curve.branch == "main" and curve.status != sj.simulate.CurveStatus.UPPER_END:
                 warn(f"force {curve.force:g} N: {STATUS_MESSAGE[curve.status]}.")
+            if curve.not_located:
+                warn(f"force {curve.force:g} N: not located: {', '.join(curve.not_located)}.")
+            unknown = int(np.sum(curve.stability == sj.simulate.Stability.NOT_COMPUTED))
+            if unknown:
+                warn(
+                    f"force {curve.force:g} N: the stability of {unknown} points could not be"
+                    " computed; response.csv has 0 there and says so in `event`."
+                )
         _report_truncation(curves, harmonics)
         if not any(len(curve.frequency) for curve in curves):
             raise ValueError("no response was found in this range; start farther from resonance.")

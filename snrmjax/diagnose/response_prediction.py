@@ -9,7 +9,7 @@ from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
-from snrmjax.simulate.solutions.forced_response import forced_response_batch
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
 ORDER = 5  # harmonics of the responses
@@ -70,7 +70,8 @@ def responses(
     ends = (float(frequency.min() - reach), float(frequency.max() + reach))
     each = [models] * len(forces) if isinstance(models, Structure) else list(models)
     loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
-    batch = forced_response_batch(models, loads, *ends, harmonic_order=ORDER, stability=False)
+    settings = ResponseSettings(harmonic_order=ORDER, stability=False)
+    batch = forced_response_batch(models, loads, *ends, settings=settings)
     return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 

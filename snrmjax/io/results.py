@@ -14,7 +14,8 @@ from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.simulate.solutions.forced_response import ResponseCurve
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.continuation.stability import Stability
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
 BACKBONE_POINTS = 200
@@ -24,6 +25,9 @@ def write_response(
     path: FilePath, curves: Sequence[ResponseCurve], *, sensor: str | None = None
 ) -> None:
     """Write simulated responses: frequency, velocity at one sensor, stability and events.
+
+    `stable` is 1 where a motion is known to be stable and else 0; where stability was not
+    computed, `event` says so with "stability_not_computed".
 
     Arguments: `sensor` is the name of one, by default the first.
     Raises `ValueError` when there is no such sensor or the file cannot be written.
@@ -40,10 +44,19 @@ def write_response(
             "velocity_h1_re_m_s": fundamental.real,
             "velocity_h1_im_m_s": fundamental.imag,
             "velocity_peak_m_s": _peaks(np.concatenate([c.velocity[:, :, r] for c in curves])),
-            "stable": np.concatenate([c.stable for c in curves]),
-            "event": [event for c in curves for event in c.event],
+            "stable": np.concatenate([c.is_stable for c in curves]),
+            "event": [event for c in curves for event in _events(c)],
         },
     )
+
+
+def _events(curve: ResponseCurve) -> list[str]:
+    """What happens at every point, unknown stability included."""
+    unknown = curve.stability == int(Stability.NOT_COMPUTED)
+    return [
+        "+".join(filter(None, [event, "stability_not_computed" if missing else ""]))
+        for event, missing in zip(curve.event, unknown.tolist(), strict=True)
+    ]
 
 
 def write_normal_mode(

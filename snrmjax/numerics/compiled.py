@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 R = TypeVar("R")
+T = TypeVar("T")
 
 _LEVEL = "xla_backend_optimization_level"
 _OPTIONS: dict[str, str | bool | int] = {
@@ -21,10 +22,11 @@ _OPTIONS: dict[str, str | bool | int] = {
 
 
 def compiled(function: Callable[..., R]) -> Callable[..., R]:
-    """A function of arrays and settings as one program; half as slow again as `jax.jit` gives it.
+    """A function of arrays and settings as one program, compiled with the options above.
 
-    Arrays anywhere in the arguments, NumPy's too, are arguments of the program; everything else,
-    numbers included, is compiled into it. All results are arrays. Inside another program that
+    Arrays and floating-point numbers anywhere in the arguments, NumPy's too, are arguments of the
+    program, so that other values do not compile anew; everything else (whole numbers, truth
+    values, text, None) is compiled into it. All results are arrays. Inside another program that
     one's order of steps rules.
     """
 
@@ -44,6 +46,7 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
         leaves, structure = jax.tree.flatten((arguments, named))
+        leaves = [_number(a) for a in leaves]
         is_array = [isinstance(a, (jax.Array, np.ndarray, np.generic)) for a in leaves]
         fixed = tuple(_Array if known else a for a, known in zip(leaves, is_array, strict=True))
         arrays = [a for a, known in zip(leaves, is_array, strict=True) if known]
@@ -52,6 +55,19 @@ def compiled(function: Callable[..., R]) -> Callable[..., R]:
         return (inside if traced else outermost(hurried))(structure, fixed, arrays)
 
     return call
+
+
+def numbers_as_arrays(tree: T) -> T:
+    """A tree whose floating-point and complex numbers of Python are NumPy's.
+
+    `compiled` and `eqx.filter_jit` take those as arguments of a program; they would compile
+    Python's numbers into it.
+    """
+    return jax.tree.map(_number, tree)
+
+
+def _number(leaf: Any) -> Any:
+    return np.asarray(leaf)[()] if isinstance(leaf, float | complex) else leaf
 
 
 class _Array:

@@ -229,7 +229,8 @@ def response_figure(
                     name, colour, width, beyond = "predicted", IDENTIFIED, LINE, curve.continued
                 else:
                     name, colour, width, beyond = "harmonic balance", BACKGROUND, 3.5 * LINE, None
-                response_line(axes, x, y, curve.stable, name, colour, width, beyond)
+                pieces = curve.stability if isinstance(curve, ResponseCurve) else curve.stable
+                response_line(axes, x, y, pieces, name, colour, width, beyond)
         for axes, y in ((speeds, np.abs(states) / unit.size), (phases, phase_of(states, backbone))):
             marks(axes, omega, y, DOT, "measured")
         found = [(one.frequency / HERTZ, one.velocity) for one in resonances if one.force == force]
@@ -256,7 +257,8 @@ def simulated_response_figure(
 ) -> Figure:
     """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
 
-    Unstable parts are dashed; triangles mark peaks, squares folds, dots phase resonances.
+    Unstable parts are dashed, parts whose stability was not computed dash-dotted; triangles mark
+    peaks, squares folds, dots phase resonances.
 
     Arguments: `sensor` by default the first of the curves.
     Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
@@ -277,7 +279,7 @@ def simulated_response_figure(
             for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
                 if event is None:
                     label, colour = with_unit(curve.force, "N"), colours[curve.force]
-                    response_line(axes, x, y, curve.stable, label, colour, LINE)
+                    response_line(axes, x, y, curve.stability, label, colour, LINE)
                     continue
                 at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
                 if event == "phase_resonance":

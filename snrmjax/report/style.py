@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from snrmjax.simulate.continuation.stability import Stability
+
 PAGE, COLUMN = 7.2, 4.8  # inches: a figure of several panels, and of one
 TEXT, SMALL = 9.0, 8.5  # points: of titles and labels, and of ticks, legends and notes
 
@@ -167,38 +169,48 @@ def stars(axes: Axes, x: Any, y: Any, name: str | None = None, **bars: Any) -> N
     marks(axes, x, y, {**STAR, **crowded, "zorder": 3}, name)
 
 
+_LINES = {Stability.STABLE: "-", Stability.UNSTABLE: "--", Stability.NOT_COMPUTED: "-."}
+
+
 def response_line(
     axes: Axes,
     x: np.ndarray,
     y: np.ndarray,
-    stable: np.ndarray,
+    stability: np.ndarray,
     name: str,
     colour: Any,
     width: float,
     beyond: np.ndarray | None = None,
 ) -> None:
-    """A response curve in pieces: unstable ones dashed and thin, ones `beyond` the data pale."""
+    """A response curve in pieces: unstable ones dashed and thin, ones `beyond` the data pale.
+
+    `stability` has a `Stability` for every point, or whether it is stable; pieces whose stability
+    was not computed are dash-dotted.
+    """
+    known = np.asarray(stability).astype(int)
     axes.plot([], [], color=colour, linewidth=width, label=name)  # for the legend
     pale = np.zeros(len(x), dtype=bool) if beyond is None else beyond
-    starts = [0, *(np.flatnonzero(np.diff(2 * pale.astype(int) + stable)) + 1)]
+    starts = [0, *(np.flatnonzero(np.diff(4 * pale.astype(int) + known)) + 1)]
     for start, stop in zip(starts, [*starts[1:], len(x) - 1], strict=True):
         piece = slice(start, stop + 1)  # up to the next piece's first point: no gaps
         axes.plot(
             x[piece],
             y[piece],
-            "-" if stable[start] else "--",
+            _LINES[known[start]],
             color=colour,
-            linewidth=width * (1.0 if stable[start] else 0.6),
+            linewidth=width * (0.6 if known[start] == Stability.UNSTABLE else 1.0),
             alpha=0.4 if pale[start] else 1.0,
         )
 
 
 def explain_lines(figure: Figure) -> None:
-    """Name dashed and pale lines in the legend to come, if there are any."""
+    """Name dashed, dash-dotted and pale lines in the legend to come, if there are any."""
     lines = [line for axes in figure.axes for line in axes.lines]
     style: Style = {"color": "0.3", "linewidth": 0.8}
     if any(line.get_linestyle() == "--" for line in lines):
         figure.axes[-1].plot([], [], "--", **style, label="unstable")
+    if any(line.get_linestyle() == "-." for line in lines):
+        figure.axes[-1].plot([], [], "-.", **style, label="stability not computed")
     if any((line.get_alpha() or 1.0) < 1.0 for line in lines):
         figure.axes[-1].plot([], [], **style, alpha=0.4, label="beyond the data")
 

@@ -1,7 +1,7 @@
 from .balance.harmonics import velocity_phasors
 from .continuation.continuation import CurveStatus, StepControl
 from .continuation.response_curve import ResponseCurve
-from .continuation.stability import StabilityLoss, floquet_multipliers
+from .continuation.stability import Stability, StabilityLoss, floquet_multipliers
 from .solutions.controlled import (
     ControlledCurve,
     DampedModeBranch,
@@ -11,11 +11,12 @@ from .solutions.controlled import (
 )
 from .solutions.forced_response import (
     ResponseBatch,
+    ResponseSettings,
     forced_response,
     forced_response_batch,
     solve_at_frequency,
 )
-from .solutions.isolated_responses import isolated_responses
+from .solutions.isolated_responses import IsolatedResponses, IsolatedSearch, isolated_responses
 from .solutions.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
 from .solutions.periodic_motion import (
     PeriodicMotion,
@@ -23,23 +24,37 @@ from .solutions.periodic_motion import (
     periodic_motion,
     response_at_velocities,
 )
-from .solutions.time_integration import IntegratedMotion, MotionStatus, settled_motion, stepped_sine
+from .solutions.time_integration import (
+    IntegratedMotion,
+    IntegrationAccuracy,
+    MotionStatus,
+    settled_motion,
+    stepped_sine,
+)
 from .virtual_test.controlled_test import phase_controlled_test, response_controlled_test
-from .virtual_test.phase_resonance_test import MeasurementErrors, VirtualTest, phase_resonance_test
+from .virtual_test.phase_resonance_test import SweepSimulation, VirtualTest, phase_resonance_test
+from .virtual_test.recording import MeasurementErrors, Recording
 
 __all__ = [
     "ControlledCurve",
     "CurveStatus",
     "DampedModeBranch",
     "IntegratedMotion",
+    "IntegrationAccuracy",
+    "IsolatedResponses",
+    "IsolatedSearch",
     "MeasurementErrors",
     "MotionStatus",
     "NormalModeBranch",
     "PeriodicMotion",
+    "Recording",
     "ResponseBatch",
     "ResponseCurve",
+    "ResponseSettings",
+    "Stability",
     "StabilityLoss",
     "StepControl",
+    "SweepSimulation",
     "Tongue",
     "VirtualTest",
     "damped_normal_mode",

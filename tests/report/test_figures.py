@@ -34,9 +34,8 @@ def virtual(model):
         45 * HERTZ,
         85 * HERTZ,
         appropriation=(0.5, 0.98),
-        errors=errors,
-        harmonic_order=3,
-        keep_harmonics=(2, 3),
+        recording=sj.simulate.Recording(errors, keep_harmonics=(2, 3)),
+        simulation=sj.simulate.SweepSimulation(harmonic_order=3),
     )
 
 
@@ -254,7 +253,7 @@ ARRAYS = [
 
 def test_names_of_sensors_are_shown_as_they_are(virtual):
     odd = r"$\frac{1_$"
-    curves = [curve._replace(sensors=(odd,)) for curve in virtual.curves]
+    curves = [dataclasses.replace(curve, sensors=(odd,)) for curve in virtual.curves]
     figure = plot.simulated_response_figure(curves, sensor=odd)
     assert png_bytes(figure, dots_per_inch=40)
     assert figure.axes[0].get_title(loc="left") == r"(a) amplitude at \$\frac{1_\$"
@@ -319,7 +318,7 @@ def test_responses_have_a_row_a_force_and_simulation_behind(backbone, predicted,
         lines = pieces(axes, drawing.BACKGROUND)
         x = np.concatenate([line.get_xdata()[:-1] for line in lines])
         np.testing.assert_array_equal(x, curve.frequency[:-1] / HERTZ)
-    assert not curve.stable.all()
+    assert not curve.is_stable.all()
     assert {line.get_linestyle() for line in lines} == {"-", "--"}
     # Only the last force was predicted, and only the lowest row names the frequency.
     solid = [
@@ -363,7 +362,7 @@ def test_simulated_responses_mark_folds_peaks_and_resonances(virtual):
     dashed = [
         line for line in speeds.lines if line.get_linestyle() == "--" and len(line.get_xdata())
     ]
-    unstable = sum(int(np.sum(~c.stable)) for c in virtual.curves)
+    unstable = sum(int(np.sum(c.is_unstable)) for c in virtual.curves)
     # A dashed piece ends on the first stable point.
     assert sum(len(line.get_xdata()) - 1 for line in dashed) == unstable
 
@@ -392,7 +391,7 @@ def test_normal_mode_against_frequency_and_energy(mode):
     assert small.any()
     np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
     with pytest.raises(ValueError, match="the branch has no point"):
-        plot.normal_mode_figure(mode._replace(frequency=np.zeros(0)))
+        plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
 
 
 def test_loops_of_force_and_velocity(virtual):

@@ -82,7 +82,7 @@ def simulated(force, velocities, frequencies_hz, events):
         frequency=HERTZ * np.asarray(frequencies_hz),
         coefficients=np.zeros((n, 3, 1)),
         velocity=velocity,
-        stable=np.ones(n, dtype=bool),
+        multipliers=np.full((n, 2), 0.5 + 0j),
         event=tuple(events),
         status=sj.simulate.CurveStatus.UPPER_END,
         sensors=(f"tip {NASTY}",),

@@ -32,7 +32,7 @@ def simulated():
         frequency=FREQUENCY,
         coefficients=np.zeros((5, 5, 1)),
         velocity=velocity,
-        stable=np.ones(5, dtype=bool),
+        multipliers=np.full((5, 2), 0.5 + 0j),
         event=("",) * 5,
         status=sj.simulate.CurveStatus.UPPER_END,
         sensors=("tip", "root"),

@@ -13,7 +13,7 @@ from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-from snrmjax.simulate.balance.prescribed_motion import HeldMotion, held_motion
+from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, prescribed_motion
 
 
 class InverseForce(eqx.Module):
@@ -60,9 +60,9 @@ def state_motion(
     velocity: Complex[Array, ""],
     sensor: int,
     harmonic_order: int,
-) -> HeldMotion:
+) -> PrescribedMotion:
     """The equations of one state with a velocity (m/s) of the reference sensor."""
-    return held_motion(
+    return prescribed_motion(
         eqx.tree_at(lambda m: m.test_order, model, state.order),
         *(state.frequency, state.force, velocity),
         sensor=sensor,
@@ -84,14 +84,14 @@ class StateWithErrors(NamedTuple):
         own = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
         return state.velocity * own, state.harmonics * own[:, None]
 
-    def motion(self, model: Structure, sensor: int, harmonic_order: int) -> HeldMotion:
+    def motion(self, model: Structure, sensor: int, harmonic_order: int) -> PrescribedMotion:
         """The equations of its motion."""
         return state_motion(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
 
 
 def residual_columns(
     erring: StateWithErrors,
-    motion: HeldMotion,
+    motion: PrescribedMotion,
     point: Float[Array, " entry"],
     sensors: tuple[int, ...],
     orders: tuple[int, ...],

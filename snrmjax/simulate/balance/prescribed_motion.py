@@ -1,4 +1,4 @@
-"""Motions whose fundamental is held at one sensor, and the force that they need.
+"""Prescribed motion: the fundamental at one sensor is given, and the force is solved for.
 
 At a given frequency a force may have several motions or, beyond a fold, none; a motion has one
 force. So a measured motion is put into the harmonic balance, and the force is solved for.
@@ -59,8 +59,8 @@ def nothing_of(point: Float[Array, " unknown"]) -> Float[Array, ""]:
     return jnp.where(point[0] == 0, 0.0, 0.0)
 
 
-class HeldMotion(eqx.Module):
-    """The equations of one state: its balance, and the fundamental held at what was measured.
+class PrescribedMotion(eqx.Module):
+    """The equations of one state: its balance, and the fundamental prescribed at what was measured.
 
     A point holds the balance's scaled displacements and the cosine and the sine of the force over
     `force`; phases are relative to the measured force.
@@ -189,8 +189,8 @@ class HeldMotion(eqx.Module):
         def larger(state: tuple) -> tuple:
             before, share, step = state
             aim = jnp.minimum(share + step, 1.0)
-            held = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
-            after = held._solved(before[0] * (aim / share))
+            smaller = eqx.tree_at(lambda h: h.velocity, fixed, fixed.velocity * aim)
+            after = smaller._solved(before[0] * (aim / share))
             good = jnp.all(jnp.isfinite(after[0]))
             now, share = jax.tree.map(
                 lambda a, b: jnp.where(good, a, b), (after, aim), (before, share)
@@ -228,7 +228,7 @@ class HeldMotion(eqx.Module):
         return jnp.stack([miss.real, miss.imag])
 
 
-def held_motion(
+def prescribed_motion(
     model: Structure,
     frequency: Float[Array, ""],
     force: Float[Array, ""],
@@ -237,7 +237,7 @@ def held_motion(
     sensor: int,
     harmonic_order: int,
     scale: Float[Array, ""],
-) -> HeldMotion:
+) -> PrescribedMotion:
     """The equations of a motion with a given fundamental at one sensor.
 
     Arguments: `frequency` in rad/s; `force` in N only scales; `velocity` as it is recorded, in
@@ -247,4 +247,4 @@ def held_motion(
     displacement = jax.lax.stop_gradient(jnp.abs(scale / (frequency * shape)))
     simulated = simulated_structure(model)
     balance = harmonic_balance(simulated, 0.0, displacement, harmonic_order=harmonic_order)
-    return HeldMotion(balance, model, frequency, force, velocity, sensor)
+    return PrescribedMotion(balance, model, frequency, force, velocity, sensor)

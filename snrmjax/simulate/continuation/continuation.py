@@ -4,11 +4,13 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+_FARTHEST = 3.0  # steps over the last one, beyond which the cubic is no guess
 Point = Float[Array, " unknown"]
 Number = float | Array | np.ndarray
 Linearised = Callable[[Point], tuple[Float[Array, " equation"], Float[Array, "equation unknown"]]]
@@ -28,7 +30,7 @@ class CurveStatus(IntEnum):
 
 
 STATUS_MESSAGE: dict[CurveStatus, str] = {
-    CurveStatus.UPPER_END: "followed to the upper end of the frequency range",
+    CurveStatus.UPPER_END: "traced to the upper end of the frequency range",
     CurveStatus.LOWER_END: "came back to the lower end of the frequency range",
     CurveStatus.POINT_LIMIT: "stopped at the largest number of points; raise `max_points`",
     CurveStatus.STEP_TOO_SMALL: (
@@ -39,27 +41,46 @@ STATUS_MESSAGE: dict[CurveStatus, str] = {
     ),
     CurveStatus.AMPLITUDE_LIMIT: "stopped at the largest amplitude asked for",
     CurveStatus.INVALID: (
-        "not followed: the force or a parameter of the model is not finite, or the force is zero"
+        "not traced: the force or a parameter of the model is not finite, or the force is zero"
     ),
     CurveStatus.CLOSED: "came back to where it started: an isolated loop",
 }
 
 
-class StepControl(NamedTuple):
-    """Step sizes along the curve, in the scaled unknowns (order one)."""
+class StepControl(eqx.Module):
+    """How a curve is traced: step sizes in the scaled unknowns (order one), and what they pass.
+
+    A step is accepted when Newton's method converges to a point near the guess, where the curve
+    has turned little; it is halved otherwise. All but the two whole numbers may change without
+    another compilation.
+    """
 
     first: Number = 0.01
     smallest: Number = 1e-7
     largest: Number = 0.05
     angle: Number = 0.1  # rad, aimed at between neighbouring tangents
     tolerance: Number = 1e-9  # on the error that is left after the last Newton step
-    iterations: Number = 8
     kink: Number = 2e-4  # steps below it may turn sharply: a kinked force bends the curve
+    # Guesses are cubic, so a solution farther from one than a third of the step is on another
+    # part of the curve, or on another curve.
+    largest_miss: Number = 0.3  # distance of the solution from the guess, over the step
+    kink_miss: Number = 2.0  # the same for steps below `kink`, where the cubic says nothing
+    largest_turn: Number = 3.0  # between neighbouring tangents, over `angle`
+    # A harmonic that turns its sign within a step has jumped from one flank of a light damped
+    # resonance to the other: it changes by twice its norm, on a smooth curve by less than one.
+    largest_change: Number = 0.9  # of one harmonic in a step, over its norm
+    slight: Number = 0.05  # harmonics below this share of the motion may change as they like
+    closing: Number = 0.2  # a closed curve passes its first point nearer than this share of a step
+    iterations: int = eqx.field(static=True, default=8)  # of Newton's method, at most
+    max_points: int = eqx.field(static=True, default=4000)
 
 
-def traced(control: StepControl) -> StepControl:
-    """The same settings as arrays, so that other numbers do not compile anew."""
-    return StepControl(*(np.asarray(value) for value in control))
+class CurveRange(NamedTuple):
+    """Where a curve ends: the range of its last unknown, and the largest of the others."""
+
+    lower: Number
+    upper: Number
+    largest_amplitude: Number = np.inf
 
 
 class Curve(NamedTuple):
@@ -123,33 +144,35 @@ def correct(
     return Correction(point, tangent / jnp.linalg.norm(tangent), count, done & finite)
 
 
-def follow_curve(
+def trace_curve(
     linearised: Linearised,
     start: Point,
     direction: Point,
-    lower: Float[Array, ""],
-    upper: Float[Array, ""],
-    largest_amplitude: Float[Array, ""],
+    within: CurveRange,
     control: StepControl,
-    max_points: int,
+    *,
     start_across: Point | None = None,
     groups: tuple[int, int] | None = None,
 ) -> Curve:
-    """Follow a curve of solutions of R(x, λ) = 0 from `start` until λ leaves [lower, upper].
+    """Trace the curve R(x, λ) = 0 from `start` until λ leaves its range.
 
     Arguments: `linearised` gives R and its Jacobian; `start` is a guess of the first point,
-    corrected at its own λ, or across `start_across`; `direction` says which way to go. The next
-    point is guessed by the cubic through the last two points and their tangents. A step is
-    halved when Newton's method fails, when it ends far from the guess, or when the tangent turns
-    by more than three times `control.angle` (but for a kink, which steps below `control.kink`
+    corrected at its own λ, or across `start_across`; `direction` says which way to go; `within`
+    says where the curve ends. The next point is guessed by the cubic through the last two points
+    and their tangents. A step is halved when Newton's method fails, when it ends far from the
+    guess, or when the tangent turns by too much (but for a kink, which steps below `control.kink`
     may pass); otherwise it is chosen so that the next turn comes near `control.angle`.
     With `groups` = (rows, columns), into which the first unknowns unfold, no column may change by
-    more than nine tenths of its norm in a step: across a light damped resonance the response turns
-    its sign, and on the scale of the peak the two flanks far below it are neighbours.
+    more than `control.largest_change` of its norm in a step: across a light damped resonance the
+    response turns its sign, and on the scale of the peak the two flanks far below it are
+    neighbours.
     The last point of a curve that left the range lies on its end; that of a closed one is the
     first again.
-    Raises `ValueError` when `max_points` is below 2.
+    Raises `ValueError` when `control.max_points` is below 2.
+    Reference: Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 4,
+    doi:10.1007/978-1-4419-1740-9.
     """
+    max_points, (lower, upper, largest_amplitude) = control.max_points, within
     if max_points < 2:
         raise ValueError(f"`max_points` must be 2 or more, but is {max_points}.")
     size = start.shape[0]
@@ -173,9 +196,11 @@ def follow_curve(
 
         turn = jnp.arccos(jnp.clip(new_tangent @ tangent, -1.0, 1.0))
         miss = jnp.linalg.norm(new - guess)
-        smooth = (miss < 0.3 * state.step) & (turn < 3 * control.angle)
-        kinked = (state.step < control.kink) & (miss < 2 * state.step) & (turn < 0.5 * jnp.pi)
-        near = (smooth | kinked) & _steady(here, new, groups)
+        smooth = miss < control.largest_miss * state.step
+        smooth &= turn < control.largest_turn * control.angle
+        kinked = (state.step < control.kink) & (turn < 0.5 * jnp.pi)
+        kinked &= miss < control.kink_miss * state.step
+        near = (smooth | kinked) & _steady(here, new, groups, control)
         good = found.converged & (is_first | is_end | near)
         beyond_upper, beyond_lower = new[-1] > upper, new[-1] < lower
         leaving = good & (beyond_upper | beyond_lower) & (state.aim == ordinary)
@@ -189,7 +214,8 @@ def follow_curve(
         closed &= new_tangent @ state.origin_tangent > 0.5
         # A point that only happens to lie on the way has others where the curve passes it.
         passed = here + on_the_way / jnp.maximum(tangent @ (new - here), 1e-300) * (new - here)
-        closed &= jnp.linalg.norm(passed - origin) < 0.2 * jnp.linalg.norm(new - here)
+        gap = jnp.linalg.norm(passed - origin)
+        closed &= gap < control.closing * jnp.linalg.norm(new - here)
         new = jnp.where(closed, origin, new)
         keep = good & ~leaving
         place = jnp.where(is_first, 0, n)
@@ -257,7 +283,9 @@ def follow_curve(
     return Curve(walk.points, walk.tangents, n_points, walk.status, walk.n_solves)
 
 
-def _steady(here: Point, new: Point, groups: tuple[int, int] | None) -> Bool[Array, ""]:
+def _steady(
+    here: Point, new: Point, groups: tuple[int, int] | None, control: StepControl
+) -> Bool[Array, ""]:
     """Whether no column of the unknowns changes by most of itself."""
     if groups is None:
         return jnp.array(True)
@@ -265,13 +293,12 @@ def _steady(here: Point, new: Point, groups: tuple[int, int] | None) -> Bool[Arr
     old, now = (point[: rows * columns].reshape(rows, columns) for point in (here, new))
     norms = [jnp.linalg.norm(part, axis=0) for part in (old, now, now - old)]
     largest = jnp.maximum(norms[0], norms[1])
-    # What is small beside the motion as a whole may turn as it likes.
-    slight = 0.05 * jnp.linalg.norm(largest)
-    return jnp.all((norms[2] <= 0.9 * largest) | (largest <= slight))
+    slight = control.slight * jnp.linalg.norm(largest)
+    return jnp.all((norms[2] <= control.largest_change * largest) | (largest <= slight))
 
 
 class _Walk(NamedTuple):
-    """The state of a curve that is being followed."""
+    """The state of a curve that is being traced."""
 
     points: Array
     tangents: Array
@@ -300,92 +327,5 @@ def _extrapolated(
     second = (tangent - chord) / gap
     third = (tangent - 2 * chord + back_tangent) / gap**2
     bend = step**2 * (second + (step + gap) * third)
-    trusted = known & (share < 3.0)
+    trusted = known & (share < _FARTHEST)
     return here + step * tangent + jnp.where(trusted, bend, 0.0)
-
-
-def locate_event(
-    linearised: Linearised,
-    test: Callable[[Point, Point], Float[Array, ""]],
-    here: Point,
-    tangent: Point,
-    there: Point,
-    control: StepControl,
-    wanted: Bool[Array, ""] | bool = True,
-) -> tuple[Point, Point, Bool[Array, ""]]:
-    """The point between two neighbours where `test(point, tangent)` changes sign.
-
-    Illinois' variant of the secant method in the arclength, each trial corrected across the
-    tangent. Returns the point, its tangent and whether the sign change was resolved between the
-    neighbours, or beside them by less than the tangents of a curve are late. Where it is not
-    `wanted` nothing is computed.
-    """
-    length = tangent @ (there - here)
-    trials = 40
-
-    def trial(share: Array, guess: Point) -> tuple[_Known, Bool[Array, ""]]:
-        guess = guess + (share * length - tangent @ (guess - here)) * tangent
-        found = correct(
-            linearised, guess, tangent, 1e-3 * control.tolerance, 2 * control.iterations
-        )
-        # With the slope against the share of the way the curve between two trials is a cubic.
-        slope = found.tangent * (length / (tangent @ found.tangent))
-        value = test(found.point, found.tangent)
-        return _Known(share, value, found.point, found.tangent, slope), found.converged
-
-    def body(state: tuple) -> tuple:
-        count, low, high, side, share, _, _, _ = state
-        is_low, is_high = count == 0, count == 1
-        guess = jnp.where(is_low, here, jnp.where(is_high, there, _cubic(low, high, share)))
-        found, converged = trial(share, guess)
-        inner = ~is_low & ~is_high
-        in_upper = inner & (jnp.sign(found.value) == jnp.sign(low.value))
-        in_lower = inner & ~in_upper
-        halved = jnp.where(in_lower & (side == -1), 0.5, 1.0)
-        low = low._replace(value=low.value * halved)
-        halved = jnp.where(in_upper & (side == 1), 0.5, 1.0)
-        high = high._replace(value=high.value * halved)
-        low = _chosen(in_upper | is_low, found, low)
-        high = _chosen(in_lower | is_high, found, high)
-        side = jnp.where(in_upper, 1, jnp.where(in_lower, -1, 0))
-        secant = (low.share * high.value - high.share * low.value) / (high.value - low.value)
-        secant = jnp.where(jnp.isfinite(secant), secant, 0.5 * (low.share + high.share))
-        next_share = jnp.where(is_low, 1.0, secant)
-        settled = (inner & (jnp.abs(next_share - share) < 1e-12)) | (inner & (found.value == 0))
-        share = jnp.where(settled, share, next_share)
-        return count + 1, low, high, side, share, found, converged, settled
-
-    zero = jnp.array(0.0)
-    nothing = _Known(zero, zero, here, tangent, tangent)
-    state = (
-        *(jnp.array(0), nothing, nothing, jnp.array(0), zero, nothing),
-        *(jnp.array(True), ~jnp.asarray(wanted)),
-    )
-    state = jax.lax.while_loop(lambda s: ~s[-1] & (s[0] < trials), body, state)
-    _, low, high, _, share, last, converged, _ = state
-    inside = jnp.abs(share - 0.5) < 0.51
-    resolved = converged & inside & (low.value * high.value <= 0) & jnp.asarray(wanted)
-    return last.point, last.tangent, resolved
-
-
-class _Known(NamedTuple):
-    """What a trial between two neighbours found."""
-
-    share: Array  # of the way
-    value: Array  # of the test function, halved where the other end keeps moving
-    point: Array
-    tangent: Array  # of unit length
-    slope: Array  # dpoint/dshare
-
-
-def _chosen(first: Bool[Array, ""], yes: _Known, no: _Known) -> _Known:
-    return _Known(*(jnp.where(first, a, b) for a, b in zip(yes, no, strict=True)))
-
-
-def _cubic(low: _Known, high: _Known, share: Array) -> Point:
-    """Where the cubic through two trials and their tangents is."""
-    width = high.share - low.share
-    s = (share - low.share) / width
-    chord = high.point - low.point
-    bend_low, bend_high = low.slope * width - chord, high.slope * width - chord
-    return low.point + s * chord + s * (1 - s) * ((1 - s) * bend_low - s * bend_high)

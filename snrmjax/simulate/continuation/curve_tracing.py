@@ -1,4 +1,4 @@
-"""Following many response curves of one kind: stacked balances, starts, blocks over the cores."""
+"""Many response curves of one kind: stacked balances, starts, blocks over the cores."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,10 +17,16 @@ from snrmjax.simulate.balance.harmonic_balance import (
     resonance_displacement,
     samples_for,
 )
-from snrmjax.simulate.continuation.continuation import Curve, CurveStatus, StepControl, follow_curve
-from snrmjax.simulate.continuation.response_curve import FollowedCurve
+from snrmjax.simulate.continuation.continuation import (
+    Curve,
+    CurveRange,
+    CurveStatus,
+    StepControl,
+    trace_curve,
+)
+from snrmjax.simulate.continuation.response_curve import TracedCurve
 
-_BLOCK = 8  # curves that one program follows
+_BLOCK = 8  # curves that one program traces
 
 
 def response_balances(
@@ -47,16 +53,15 @@ def response_balances(
     )
 
 
-def follow_from_rest(
+def trace_from_rest(
     balances: HarmonicBalance,
     index: np.ndarray,
     ends: Float[np.ndarray, " end"],
     steps: StepControl,
-    max_points: int,
     *,
     downward: bool,
     ramp: bool = False,
-) -> list[FollowedCurve]:
+) -> list[TracedCurve]:
     """The curves of the members `index`, in blocks over the cores.
 
     From the linear response at an end of the range (rad/s), or with `ramp` from the response to a
@@ -66,43 +71,41 @@ def follow_from_rest(
     size = 1 if np.size(balances.force) == 1 else _BLOCK
     jobs = [index[b : b + size] for b in range(0, len(index), size)]
 
-    def follow(job: np.ndarray) -> list[FollowedCurve]:
+    def trace(job: np.ndarray) -> list[TracedCurve]:
         rows = job[np.minimum(np.arange(size), len(job) - 1)]
         mine = taken(balances, rows)
         wanted = np.arange(size) < len(job)
         if ramp:
-            starts, ready = _ramped(mine, ends, steps, max_points)
-            curve = _follow(
-                *(mine, ends, steps, max_points),
-                *(np.array(downward), wanted & ready, starts),
+            starts, ready = _ramped(mine, ends, steps)
+            curve = _trace(
+                *(mine, ends, steps, np.array(downward)), wanted=wanted & ready, starts=starts
             )
         else:
-            curve = _follow(mine, ends, steps, max_points, np.array(downward), wanted)
+            curve = _trace(mine, ends, steps, np.array(downward), wanted)
         return _trimmed(curve, len(job))
 
-    return [curve for block in over_cores(follow, jobs) for curve in block]
+    return [curve for block in over_cores(trace, jobs) for curve in block]
 
 
-def follow_responses(
+def trace_through(
     balances: HarmonicBalance,
     ends: Float[Array, " end"],
     steps: StepControl,
-    max_points: int,
     *,
     downward: bool,
     starts: Float[Array, "member unknown"],
-) -> list[FollowedCurve]:
+) -> list[TracedCurve]:
     """Curves through given scaled points, towards one end of the range (rad/s)."""
     wanted = np.ones(len(starts), dtype=bool)
-    curve = _follow(*(balances, ends, steps, max_points, np.array(downward), wanted, starts))
+    curve = _trace(balances, ends, steps, np.array(downward), wanted, starts)
     return _trimmed(curve, len(starts))
 
 
-def _trimmed(curve: Curve, count: int) -> list[FollowedCurve]:
+def _trimmed(curve: Curve, count: int) -> list[TracedCurve]:
     """The first `count` curves without their unused rows, on the host."""
     points, tangents, n_points, status, n_solves = (np.asarray(a) for a in curve)
     return [
-        FollowedCurve(
+        TracedCurve(
             points[k, : n_points[k]].copy(),
             tangents[k, : n_points[k]].copy(),
             CurveStatus(int(status[k])),
@@ -114,9 +117,9 @@ def _trimmed(curve: Curve, count: int) -> list[FollowedCurve]:
 
 @compiled
 def _ramped(
-    balances: HarmonicBalance, ends: Array, steps: StepControl, max_points: int
+    balances: HarmonicBalance, ends: Array, steps: StepControl
 ) -> tuple[Float[Array, "member unknown"], Bool[Array, " member"]]:
-    """Starts found by following the response at the lower frequency to a rising force."""
+    """Starts from the response at the lower frequency to a force that rises from zero."""
 
     def one(balance: HarmonicBalance) -> tuple[Array, Array]:
         load = balance.force * balance.load()
@@ -128,9 +131,8 @@ def _ramped(
             return residual, jacobian.at[:, -1].set(-load)
 
         rest = jnp.zeros(balance.size + 1)
-        curve = follow_curve(
-            *(rising, rest, rest.at[-1].set(1.0), jnp.array(-1.0), jnp.array(1.0)),
-            *(jnp.array(jnp.inf), steps, max_points),
+        curve = trace_curve(
+            rising, rest, rest.at[-1].set(1.0), CurveRange(lower=-1.0, upper=1.0), steps
         )
         last = curve.points[jnp.maximum(curve.n_points - 1, 0)]
         return last.at[-1].set(frequency), curve.status == int(CurveStatus.UPPER_END)
@@ -139,11 +141,10 @@ def _ramped(
 
 
 @compiled
-def _follow(
+def _trace(
     balances: HarmonicBalance,
     ends: Float[Array, " end"],
     steps: StepControl,
-    max_points: int,
     downward: Bool[Array, ""],
     wanted: Bool[Array, " member"],
     starts: Float[Array, "member unknown"] | None = None,
@@ -160,15 +161,13 @@ def _follow(
             linear = linear_coefficients(balance.model, balance.force, begin, order)
             start = balance.point(linear, begin)
         direction = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
-        return follow_curve(
+        lower, upper = ends / balance.frequency_scale
+        return trace_curve(
             balance.linearised,
             jnp.where(wanted, start, jnp.nan),
             direction,
-            ends[0] / balance.frequency_scale,
-            ends[1] / balance.frequency_scale,
-            jnp.array(jnp.inf),
+            CurveRange(lower, upper),
             steps,
-            max_points,
             groups=(balance.n_coefficients, balance.model.n_modes),
         )
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Complex, Float
 from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
-from snrmjax.simulate.continuation.continuation import StepControl, correct, locate_event
+from snrmjax.simulate.continuation.continuation import StepControl, correct
+from snrmjax.simulate.continuation.event_location import Located, locate_event
 from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
@@ -22,12 +23,14 @@ _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _INSIDE = 7  # points inside an interval that is looked at more closely
 
 
-class Walked(NamedTuple):
+class CurvePoints(NamedTuple):
     """Points along one curve and what was found at them, on the host."""
 
     points: Float[np.ndarray, "point unknown"]
     tangents: Float[np.ndarray, "point unknown"]
     labels: tuple[str, ...]
+    not_located: tuple[str, ...] = ()  # kinds of the events whose place was not found
+    multipliers: Complex[np.ndarray, "point multiplier"] | None = None
 
 
 def mode_velocity(balance: HarmonicBalance, point: Array) -> Complex[Array, ""]:
@@ -61,8 +64,8 @@ def _locate(
     there: Array,
     wanted: Array,
     steps: StepControl,
-) -> tuple:
-    def one(balance: HarmonicBalance, *row: Array) -> tuple:
+) -> Located:
+    def one(balance: HarmonicBalance, *row: Array) -> Located:
         kind, here, tangent, there, wanted = row
 
         def test(point: Array, direction: Array) -> Array:
@@ -104,7 +107,7 @@ def _in_blocks(
     rows: tuple[np.ndarray, ...],
     steps: StepControl,
 ) -> list[np.ndarray]:
-    """A jitted function of rows, called with blocks of one size."""
+    """A compiled function of rows, called with blocks of one size."""
     n = len(owner)
     parts = []
     for begin in range(0, n, _BLOCK):
@@ -118,9 +121,11 @@ def _in_blocks(
 
 
 def with_events(
-    balances: HarmonicBalance, curves: list[Walked], steps: StepControl
-) -> list[Walked]:
+    balances: HarmonicBalance, curves: list[CurvePoints], steps: StepControl
+) -> list[CurvePoints]:
     """The curves with their folds, peaks and phase resonances inserted.
+
+    Those that could not be located are named in `not_located`.
 
     Arguments: `balances` stacked, one for every curve. Between neighbours every change of sign
     is located; where the cubic through both hints at two changes, the interval is divided first.
@@ -150,13 +155,18 @@ def with_events(
     ahead = np.stack([divided[o].tangents[k] for o, k in zip(owner, position, strict=True)])
     there = np.stack([divided[o].points[k + 1] for o, k in zip(owner, position, strict=True)])
     rows = (np.array(kind), here, ahead, there)
-    found, tangents, resolved = _in_blocks(_locate, balances, np.array(owner), rows, steps)
-    labels = [EVENT_KINDS[k] if ok else "" for k, ok in zip(kind, resolved, strict=True)]
-    return _inserted(divided, owner, position, found, tangents, labels)
+    found, tangents, resolved, missed = _in_blocks(_locate, balances, np.array(owner), rows, steps)
+    for e in np.flatnonzero(missed).tolist():
+        divided[owner[e]] = _with_missed(divided[owner[e]], EVENT_KINDS[kind[e]])
+    new = [
+        _New(owner[e], position[e], found[e], tangents[e], EVENT_KINDS[kind[e]])
+        for e in np.flatnonzero(resolved).tolist()
+    ]
+    return _inserted(divided, new)
 
 
 def _heights(
-    balances: HarmonicBalance, number: int, curve: Walked
+    balances: HarmonicBalance, number: int, curve: CurvePoints
 ) -> tuple[np.ndarray, np.ndarray]:
     """λ, sensor velocity and both parts of the mode's velocity, and their slopes in arclength.
 
@@ -184,8 +194,8 @@ def _heights(
 
 
 def _divided(
-    balances: HarmonicBalance, curves: list[Walked], known: list[tuple], steps: StepControl
-) -> list[Walked]:
+    balances: HarmonicBalance, curves: list[CurvePoints], known: list[tuple], steps: StepControl
+) -> list[CurvePoints]:
     """The curves with points added where two events may lie between neighbours."""
     owner, position, share = [], [], []
     for number, curve in enumerate(curves):
@@ -202,23 +212,15 @@ def _divided(
             position += [int(k)] * _INSIDE
             share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
     if not owner:
-        return curves
+        return list(curves)
     found, tangents, ok = _points_between(balances, curves, owner, position, share, steps)
-    keep = np.flatnonzero(ok)
-    return _inserted(
-        curves,
-        [owner[k] for k in keep],
-        [position[k] for k in keep],
-        found[keep],
-        tangents[keep],
-        [""] * len(keep),
-        always=True,
-    )
+    keep = np.flatnonzero(ok).tolist()
+    return _inserted(curves, [_New(owner[k], position[k], found[k], tangents[k], "") for k in keep])
 
 
 def _points_between(
     balances: HarmonicBalance,
-    curves: list[Walked],
+    curves: list[CurvePoints],
     owner: list,
     position: list,
     share: list,
@@ -266,53 +268,61 @@ def _may_vanish_twice(
     return same & towards & (bound < 0)
 
 
-def _inserted(
-    curves: list[Walked],
-    owner: list,
-    position: list,
-    points: np.ndarray,
-    tangents: np.ndarray,
-    labels: list[str],
-    *,
-    always: bool = False,
-) -> list[Walked]:
-    """The curves with labelled points put in their places, in order along each step."""
-    result = []
-    for number, curve in enumerate(curves):
-        mine = [e for e, o in enumerate(owner) if o == number and (always or labels[e])]
-        if not mine:
-            result.append(curve)
-            continue
-        where = np.array([position[e] for e in mine])
+class _New(NamedTuple):
+    """A point to be put between two neighbours of a curve."""
+
+    owner: int  # which curve
+    position: int  # the neighbour before it
+    point: np.ndarray
+    tangent: np.ndarray
+    label: str
+    multipliers: np.ndarray | None = None
+
+
+def _inserted(curves: list[CurvePoints], new: list[_New]) -> list[CurvePoints]:
+    """The curves with new points put in their places, in order along each step."""
+    result = list(curves)
+    for number in sorted({e.owner for e in new}):
+        curve, mine = curves[number], [e for e in new if e.owner == number]
+        where = np.array([e.position for e in mine])
         ahead = curve.tangents[where]
-        new, turn = points[mine], tangents[mine]
-        along = np.einsum("ku,ku->k", new - curve.points[where], ahead)
+        points = np.stack([e.point for e in mine])
+        turn = np.stack([e.tangent for e in mine])
+        along = np.einsum("ku,ku->k", points - curve.points[where], ahead)
         turn = np.where((np.einsum("ku,ku->k", turn, ahead) < 0)[:, None], -turn, turn)
         n = len(curve.points)
         order = np.lexsort((np.append(np.zeros(n), along), np.append(np.arange(n), where)))
-        names = list(curve.labels) + [labels[e] for e in mine]
-        result.append(
-            Walked(
-                np.concatenate([curve.points, new])[order],
-                np.concatenate([curve.tangents, turn])[order],
-                tuple(names[k] for k in order),
-            )
+        names = [*curve.labels, *(e.label for e in mine)]
+        multipliers = curve.multipliers
+        if multipliers is not None:
+            multipliers = np.concatenate([multipliers, [e.multipliers for e in mine]])[order]
+        result[number] = curve._replace(
+            points=np.concatenate([curve.points, points])[order],
+            tangents=np.concatenate([curve.tangents, turn])[order],
+            labels=tuple(names[k] for k in order),
+            multipliers=multipliers,
         )
     return result
 
 
+def _with_missed(curve: CurvePoints, kind: str) -> CurvePoints:
+    return curve._replace(not_located=(*curve.not_located, kind))
+
+
 def with_bifurcations(
     balance: HarmonicBalance,
-    curve: Walked,
+    curve: CurvePoints,
     multipliers: Complex[np.ndarray, "point multiplier"],
     steps: StepControl,
-) -> tuple[Walked, Complex[np.ndarray, "point multiplier"]]:
+) -> CurvePoints:
     """The curve with the points inserted where a multiplier crosses the unit circle.
 
     A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
-    bifurcation, and +1 away from a fold a branch point. Returns the curve and the multipliers
-    with the rows of the new points. `balance` is stacked, of one member.
+    bifurcation, and +1 away from a fold a branch point; "bifurcation" in `not_located` stands for
+    one that could not be located. Returns the curve with the multipliers of all its points.
+    `balance` is stacked, of one member.
     """
+    curve = curve._replace(multipliers=multipliers)
     regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
     outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
     rest = outside - beyond_one
@@ -337,9 +347,9 @@ def with_bifurcations(
         if near:
             crossings.remove(min(near, key=lambda k: abs(k - fold)))
     if not crossings:
-        return curve, multipliers
+        return curve
     without_one = np.isin(crossings, beside_fold)
-    return _located_bifurcations(balance, curve, multipliers, crossings, without_one, steps)
+    return _located_bifurcations(balance, curve, crossings, without_one, steps)
 
 
 def _real_plus(multipliers: np.ndarray, k: int) -> bool:
@@ -352,12 +362,11 @@ def _real_plus(multipliers: np.ndarray, k: int) -> bool:
 
 def _located_bifurcations(
     balance: HarmonicBalance,
-    curve: Walked,
-    multipliers: np.ndarray,
+    curve: CurvePoints,
     crossings: list[int],
     without_one: Bool[np.ndarray, " crossing"],
     steps: StepControl,
-) -> tuple[Walked, np.ndarray]:
+) -> CurvePoints:
     """Divide the intervals until the crossing is known to a millionth of a step.
 
     Where it is to be found `without_one`, crossings of +1 do not count.
@@ -368,7 +377,7 @@ def _located_bifurcations(
     def counted(rows: np.ndarray, without: np.ndarray) -> np.ndarray:
         return _outside(rows) - np.where(without, _beyond_one(rows), 0)
 
-    first = counted(multipliers[crossings], without_one)
+    first = counted(np.asarray(curve.multipliers)[crossings], without_one)
     for _ in range(7):
         shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
         owner = [0] * shares.size
@@ -387,14 +396,13 @@ def _located_bifurcations(
     owner, share = [0] * len(crossings), (0.5 * (low + high)).tolist()
     found, tangents, ok = _points_between(balance, [curve], owner, list(crossings), share, steps)
     rows = _multipliers_of(member, found)
-    labels = [_crossing_kind(row) if good else "" for row, good in zip(rows, ok, strict=True)]
-    new = _inserted([curve], owner, list(crossings), found, tangents, labels)[0]
-    merged = np.full((len(new.points), multipliers.shape[1]), np.nan, dtype=np.complex128)
-    added = {tuple(point): row for point, row in zip(found, rows, strict=True)}
-    old = iter(multipliers)
-    for k, point in enumerate(new.points):
-        merged[k] = added[tuple(point)] if tuple(point) in added else next(old)
-    return new, merged
+    for _ in np.flatnonzero(~ok):
+        curve = _with_missed(curve, "bifurcation")
+    new = [
+        _New(0, crossings[k], found[k], tangents[k], _crossing_kind(rows[k]), rows[k])
+        for k in np.flatnonzero(ok).tolist()
+    ]
+    return _inserted([curve], new)[0]
 
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Stability of periodic motions from the monodromy matrix of the linearised equations."""
 
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import NamedTuple
 
 import jax
@@ -21,9 +21,18 @@ _SEGMENT = 32  # steps whose propagators are computed side by side
 _GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
 
 
+class Stability(IntEnum):
+    """Whether a periodic motion is stable: what a small disturbance does to it."""
+
+    NOT_COMPUTED = -1  # not asked for, or the multipliers could not be computed
+    UNSTABLE = 0
+    STABLE = 1
+
+
 class StabilityLoss(Enum):
     """How the multiplier farthest outside the unit circle leaves it."""
 
+    NOT_COMPUTED = "not_computed"
     STABLE = "stable"
     REAL = "real"  # through +1: a fold or a branch point
     PERIOD_DOUBLING = "period_doubling"  # through −1
@@ -75,11 +84,16 @@ def floquet_multipliers(
     return np.concatenate(over_cores(block, range(0, len(values), _BLOCK)))
 
 
-def is_stable(
+def stability_of(
     multipliers: Complex[np.ndarray, "*batch multiplier"],
-) -> Bool[np.ndarray, "*batch"]:
-    """Whether every multiplier lies inside the unit circle, or on it but for rounding."""
-    return np.max(np.abs(multipliers), axis=-1) < 1.0 + MARGIN
+) -> Int[np.ndarray, "*batch"]:
+    """A `Stability` for every motion: stable when all its multipliers are inside the unit circle.
+
+    On the circle but for rounding counts as inside; multipliers of NaN were not computed.
+    """
+    largest = np.max(np.abs(multipliers), axis=-1)
+    known = np.where(largest < 1.0 + MARGIN, int(Stability.STABLE), int(Stability.UNSTABLE))
+    return np.where(np.isnan(largest), int(Stability.NOT_COMPUTED), known)
 
 
 def stability_loss(
@@ -87,12 +101,13 @@ def stability_loss(
 ) -> tuple[StabilityLoss, ...]:
     """By which kind of multiplier each point is unstable, the largest one deciding."""
     kinds = []
-    for row in multipliers:
-        if np.any(np.isnan(row)) or np.max(np.abs(row)) < 1.0 + MARGIN:
-            kinds.append(StabilityLoss.STABLE)
-            continue
+    for row, stability in zip(multipliers, stability_of(multipliers).tolist(), strict=True):
         largest = row[np.argmax(np.abs(row))]
-        if abs(largest.imag) > 1e-9 * abs(largest):
+        if stability == Stability.NOT_COMPUTED:
+            kinds.append(StabilityLoss.NOT_COMPUTED)
+        elif stability == Stability.STABLE:
+            kinds.append(StabilityLoss.STABLE)
+        elif abs(largest.imag) > 1e-9 * abs(largest):
             kinds.append(StabilityLoss.NEIMARK_SACKER)
         else:
             real = StabilityLoss.REAL if largest.real > 0 else StabilityLoss.PERIOD_DOUBLING

@@ -1,6 +1,6 @@
 """Damped backbones: extended periodic motions, and tests with controlled phase or response."""
 
-from typing import NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from snrmjax.model.averaging import averaged_effect
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
@@ -19,19 +20,23 @@ from snrmjax.simulate.balance.harmonic_balance import (
     resonance_displacement,
 )
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
+from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
+    STATUS_MESSAGE,
     Curve,
+    CurveRange,
     CurveStatus,
     StepControl,
-    follow_curve,
-    traced,
+    trace_curve,
 )
 
-DEFAULT_STEPS = StepControl()
+DEFAULT_STEPS = StepControl(max_points=2000)
 
 
-class DampedModeBranch(NamedTuple):
+class DampedModeBranch(AbstractResult):
     """A damped nonlinear mode as a curve of extended periodic motions."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor")
 
     frequency: Float[np.ndarray, " point"]  # rad/s
     damping_ratio: Float[np.ndarray, " point"]
@@ -40,9 +45,34 @@ class DampedModeBranch(NamedTuple):
     status: CurveStatus
     sensors: tuple[str, ...]
 
+    def summary(self) -> tuple[str, ...]:
+        """How many points, the ranges and the status."""
+        velocity = np.abs(self.velocity[:, 1, 0])
+        return (
+            f"damped nonlinear normal mode: {len(self.frequency)} points",
+            f"natural frequency {range_text(self.frequency, 'Hz', HERTZ)}",
+            f"damping ratio {range_text(self.damping_ratio, 'of critical')}",
+            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
+            f"status: {STATUS_MESSAGE[self.status]}",
+        )
 
-class ControlledCurve(NamedTuple):
+    def variables(self) -> dict[str, Variable]:
+        """Natural frequency, damping ratio and velocities."""
+        named = motion_variables(self.frequency, self.velocity, self.sensors)
+        frequency = named.pop("frequency_hz")._replace(meaning="natural frequency")
+        text = "damping ratio, as a fraction of critical"
+        damping = Variable(("point",), self.damping_ratio, "1", text)
+        return {"natural_frequency_hz": frequency, "damping_ratio": damping, **named}
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """How the curve ended."""
+        return {"status": self.status.name.lower()}
+
+
+class ControlledCurve(AbstractResult):
     """Steady states under a controller: the force is an unknown."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor", "frequency_hz")
 
     force: Float[np.ndarray, " point"]  # N
     frequency: Float[np.ndarray, " point"]  # rad/s
@@ -51,6 +81,27 @@ class ControlledCurve(NamedTuple):
     status: CurveStatus
     sensors: tuple[str, ...]
 
+    def summary(self) -> tuple[str, ...]:
+        """How many points, the ranges and the status."""
+        velocity = np.abs(self.velocity[:, 1, 0])
+        return (
+            f"steady states under a controller: {len(self.frequency)} points",
+            f"force {range_text(self.force, 'N')}",
+            f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
+            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
+            f"status: {STATUS_MESSAGE[self.status]}",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Force, frequency and velocities."""
+        force = Variable(("point",), self.force, "N", "force amplitude")
+        named = motion_variables(self.frequency, self.velocity, self.sensors)
+        return {"force_n": force, **named}
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """How the curve ended."""
+        return {"status": self.status.name.lower()}
+
 
 def damped_normal_mode(
     model: Structure,
@@ -58,7 +109,6 @@ def damped_normal_mode(
     *,
     harmonic_order: int = 9,
     steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 2000,
     n_samples: int | None = None,
 ) -> DampedModeBranch:
     """The damped nonlinear mode by the extended periodic motion concept.
@@ -81,9 +131,9 @@ def damped_normal_mode(
     balance = harmonic_balance(
         model, 0.0, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    curve = _follow_damped(balance, traced(steps), max_points)
+    curve = _trace_damped(balance, steps)
     n = int(curve.n_points)
-    points, excitation = np.asarray(curve.points)[:n], None
+    points = np.asarray(curve.points)[:n]
     motion = np.delete(points, -2, axis=1)
     frequency, coefficients, velocity = _motion(balance, motion)
     excitation = points[:, -2] * float(balance.frequency_scale)
@@ -98,7 +148,7 @@ def damped_normal_mode(
 
 
 @compiled
-def _follow_damped(balance: HarmonicBalance, steps: StepControl, max_points: int) -> Curve:
+def _trace_damped(balance: HarmonicBalance, steps: StepControl) -> Curve:
     model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
     terms, fs = model.linear_terms(), balance.frequency_scale
     basis = harmonic_basis(balance.harmonic_order, balance.n_samples)
@@ -128,11 +178,8 @@ def _follow_damped(balance: HarmonicBalance, steps: StepControl, max_points: int
     start = jnp.zeros(balance.size + 2).at[n + j].set(small)
     start = start.at[-2].set(damping / (terms.mass[j] * fs)).at[-1].set(begin)
     outward = jnp.zeros_like(start).at[n + j].set(1.0)
-    return follow_curve(
-        *(linearised, start, outward, jnp.array(0.0), jnp.array(jnp.inf), jnp.array(1.0)),
-        *(steps, max_points),
-        start_across=outward,
-    )
+    within = CurveRange(lower=0.0, upper=np.inf, largest_amplitude=1.0)
+    return trace_curve(linearised, start, outward, within, steps, start_across=outward)
 
 
 def phase_controlled(
@@ -142,14 +189,13 @@ def phase_controlled(
     phase: float = 0.0,
     harmonic_order: int = 9,
     steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 2000,
     n_samples: int | None = None,
 ) -> ControlledCurve:
     """Steady states at a fixed phase of the mode of interest, under a rising force.
 
     With `phase` = 0 (velocity in phase with the force) this is the force-appropriated backbone:
     what a phase-locked loop tracks, unstable states of the open loop included. Solves the
-    harmonic balance with Im(V₁ e^{−iφ}) = 0, following the force.
+    harmonic balance with Im(V₁ e^{−iφ}) = 0 and the force as an unknown.
 
     Arguments: `largest_force` in N; the curve starts at a hundredth of it. `phase` φ in rad.
     Returns a `ControlledCurve`; its `status` is UPPER_END when the largest force was reached.
@@ -168,15 +214,15 @@ def phase_controlled(
         harmonic_order=harmonic_order,
         n_samples=n_samples,
     )
-    curve = _follow_phase(balance, jnp.asarray(float(phase)), traced(steps), max_points)
+    curve = _trace_phase(balance, float(phase), steps)
     n = int(curve.n_points)
     points = np.asarray(curve.points)[:n]
     return _controlled(balance, points[:, :-1], points[:, -1] * largest_force, curve)
 
 
 @compiled
-def _follow_phase(
-    balance: HarmonicBalance, phase: Array, steps: StepControl, max_points: int
+def _trace_phase(
+    balance: HarmonicBalance, phase: Float[Array, ""] | float, steps: StepControl
 ) -> Curve:
     model, j, n = balance.model, balance.model.modes.mode_of_interest, balance.model.n_modes
     # Velocity phasor ∝ i(a − ib) = b + ia: in phase with the force turned by φ.
@@ -199,10 +245,7 @@ def _follow_phase(
     x = linear_coefficients(model, share * balance.force, begin, balance.harmonic_order)
     start = jnp.append(balance.point(x, begin), share)
     rising = jnp.zeros_like(start).at[-1].set(1.0)
-    return follow_curve(
-        *(linearised, start, rising, jnp.array(0.0), jnp.array(1.0), jnp.array(jnp.inf)),
-        *(steps, max_points),
-    )
+    return trace_curve(linearised, start, rising, CurveRange(lower=0.0, upper=1.0), steps)
 
 
 def response_controlled(
@@ -213,16 +256,15 @@ def response_controlled(
     *,
     harmonic_order: int = 9,
     steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 2000,
     n_samples: int | None = None,
 ) -> ControlledCurve:
     """Steady states of a given velocity amplitude through a frequency range.
 
-    The controller holds |V₁| at the first sensor and lets the force follow; such curves have no
+    The controller holds |V₁| at the first sensor and adjusts the force; such curves have no
     folds where the open loop has them. Solves the harmonic balance with |V₁| = `velocity`.
 
     Arguments: `velocity` in m/s, frequencies in rad/s.
-    Returns a `ControlledCurve` from the lower to the upper frequency, followed from the upper one
+    Returns a `ControlledCurve` from the lower to the upper frequency, traced from the upper one
     where the lower one gives no start; its `status` is UPPER_END when it spans the range.
     Raises `ValueError` for a velocity that is not positive and an empty range.
     Reference: Karaağaçlı & Özgüven, Mech. Syst. Signal Process. 144 (2020) 107023,
@@ -232,7 +274,7 @@ def response_controlled(
     if not 0 < from_frequency < to_frequency < np.inf:
         raise ValueError(
             "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{from_frequency:g} and {to_frequency:g} rad/s."
+            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
         )
     model = simulated_structure(model)
     shape = np.asarray(model.modes.mode_shape[0])
@@ -247,14 +289,12 @@ def response_controlled(
     balance = harmonic_balance(
         model, unit, scale, harmonic_order=harmonic_order, n_samples=n_samples
     )
-    ends = jnp.asarray([from_frequency, to_frequency])
-    held = jnp.asarray(float(velocity))
-    settings = (traced(steps), max_points)
-    curve = _follow_response(balance, held, ends, jnp.array(False), *settings)
+    ends = np.array([from_frequency, to_frequency], dtype=np.float64)
+    curve = _trace_response(balance, float(velocity), ends, np.array(False), steps)
     points = np.asarray(curve.points)[: int(curve.n_points)]
     if int(curve.status) == CurveStatus.NO_START:
         # Far below a resonance the linear response may be no start where far above it is one.
-        curve = _follow_response(balance, held, ends, jnp.array(True), *settings)
+        curve = _trace_response(balance, float(velocity), ends, np.array(True), steps)
         points = np.asarray(curve.points)[: int(curve.n_points)][::-1]
         if int(curve.status) == CurveStatus.LOWER_END:
             curve = curve._replace(status=jnp.array(int(CurveStatus.UPPER_END)))
@@ -262,13 +302,12 @@ def response_controlled(
 
 
 @compiled
-def _follow_response(
+def _trace_response(
     balance: HarmonicBalance,
-    velocity: Array,
+    velocity: Float[Array, ""] | float,
     ends: Array,
     downward: Array,
     steps: StepControl,
-    max_points: int,
 ) -> Curve:
     model, n = balance.model, balance.model.n_modes
     shape = model.modes.mode_shape[0]
@@ -292,10 +331,8 @@ def _follow_response(
     start = balance.point(share * one, begin)
     start = jnp.concatenate([start[:-1], jnp.stack([share, start[-1]])])
     onward = jnp.zeros_like(start).at[-1].set(jnp.where(downward, -1.0, 1.0))
-    return follow_curve(
-        *(linearised, start, onward, ends[0] / balance.frequency_scale),
-        *(ends[1] / balance.frequency_scale, jnp.array(jnp.inf), steps, max_points),
-    )
+    lower, upper = ends / balance.frequency_scale
+    return trace_curve(linearised, start, onward, CurveRange(lower, upper), steps)
 
 
 def _with_force(

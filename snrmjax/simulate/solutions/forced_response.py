@@ -1,61 +1,79 @@
 """Forced responses by harmonic balance: whole curves, folds and resonances included."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped, over_cores, taken
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import (
     HarmonicBalance,
     harmonic_balance,
 )
+from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.continuation import (
     CurveStatus,
     StepControl,
     correct,
-    traced,
 )
-from snrmjax.simulate.continuation.curve_tracing import follow_from_rest, response_balances
+from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
 from snrmjax.simulate.continuation.response_curve import (
-    FollowedCurve,
     ResponseCurve,
+    TracedCurve,
     assembled,
 )
 
 DEFAULT_STEPS = StepControl()
 _BLOCK = 8  # curves that one job completes
+_WHOLE = (CurveStatus.UPPER_END, CurveStatus.LOWER_END, CurveStatus.CLOSED)
+
+
+class ResponseSettings(eqx.Module):
+    """How forced responses are computed: as `forced_response` has them one by one."""
+
+    harmonic_order: int = eqx.field(static=True, default=9)
+    n_samples: int | None = eqx.field(static=True, default=None)  # over a period; None: as needed
+    steps: StepControl = DEFAULT_STEPS
+    stability: bool = eqx.field(static=True, default=True)  # Floquet multipliers and bifurcations
+
+
+DEFAULT_SETTINGS = ResponseSettings()
 
 
 def forced_response(
     model: Structure,
-    forces: Iterable[float],
+    forces: float | Sequence[float] | Float[ArrayLike, " force"],
     from_frequency: float,
     to_frequency: float,
     *,
     harmonic_order: int = 9,
-    steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 4000,
     n_samples: int | None = None,
+    steps: StepControl = DEFAULT_STEPS,
     stability: bool = True,
 ) -> list[ResponseCurve]:
-    """Follow the response to a cosine force through a frequency range, once for every force.
+    """Trace the response to a cosine force through a frequency range, once for every force.
 
-    Starts from the linear response at `from_frequency`, or where that leads nowhere from the
-    response to a force that rises from zero, and follows the curve around its folds by
+    Solves m q̈ + d q̇ + k q + ∂V/∂q + Σ effects = Φᵀb F Σ s_h cos hΩt by harmonic balance. Starts
+    from the linear response at `from_frequency`, or where that leads nowhere from the
+    response to a force that rises from zero, and traces the curve around its folds by
     pseudo-arclength continuation until it leaves the range. Located between the steps and
     inserted with a name in `event` are folds ("fold"), peaks of the velocity fundamental at the
     first sensor ("peak"), phase resonances of the mode of interest ("phase_resonance") and, with
     `stability`, bifurcations ("branch_point", "period_doubling", "neimark_sacker").
 
-    Arguments: `forces` in N, frequencies in rad/s.
-    Returns one `ResponseCurve` for every force; its `status` says how it ended. When the curve
-    from the lower end does not reach the upper one, it is followed from the upper end instead,
+    Arguments: `forces` in N, one or many; frequencies in rad/s; `n_samples` over a period, by
+    default as many as the forces of the model need.
+    Returns one `ResponseCurve` for every force; its `status` says how it ended, and
+    `not_located` names events that are there but were not located. When the curve
+    from the lower end does not reach the upper one, it is traced from the upper end instead,
     and when that does not reach the lower end either, both parts are returned, a part without a
     start being empty. Where a resonance reaches beyond `to_frequency`, the branch that comes in
     there from the linear response is returned too. Isolated branches and second wells:
@@ -68,26 +86,28 @@ def forced_response(
     >>> curve.status.name, curve.at_events("phase_resonance").size
     ('UPPER_END', 1)
     """
-    forces = list(forces)
-    for force in forces:
-        if not force > 0 or not np.isfinite(force):
-            raise ValueError(f"every force must be positive, but one is {force!r} N.")
-    batch = forced_response_batch(
-        [model] * len(forces),
-        forces,
-        from_frequency,
-        to_frequency,
-        harmonic_order=harmonic_order,
-        steps=steps,
-        max_points=max_points,
-        n_samples=n_samples,
-        stability=stability,
-    )
+    loads = positive_values("force", forces, "N")
+    settings = ResponseSettings(harmonic_order, n_samples, steps, stability)
+    ends = (from_frequency, to_frequency)
+    batch = forced_response_batch([model] * len(loads), loads, *ends, settings=settings)
     return [part for parts in batch.curves for part in parts]
 
 
-class ResponseBatch(NamedTuple):
+def positive_values(
+    name: str, values: float | Sequence[float] | Float[ArrayLike, "..."], unit: str
+) -> Float[np.ndarray, " value"]:
+    """One or many values as a vector. Raises `ValueError` for one that is not positive."""
+    vector = np.atleast_1d(np.asarray(values, dtype=np.float64)).ravel()
+    for value in vector.tolist():
+        if not 0 < value < np.inf:
+            raise ValueError(f"every {name} must be positive, but one is {value!r} {unit}.")
+    return vector
+
+
+class ResponseBatch(AbstractResult):
     """Forced responses of many members; NaN where a member has no such point."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("member",)
 
     status: Int[np.ndarray, " member"]  # a `CurveStatus` for every member
     n_points: Int[np.ndarray, " member"]
@@ -96,27 +116,57 @@ class ResponseBatch(NamedTuple):
     resonance_frequency: Float[np.ndarray, " member"]  # rad/s, of the strongest phase resonance
     resonance_velocity: Float[np.ndarray, " member"]  # m/s
     n_folds: Int[np.ndarray, " member"]
+    n_not_located: Int[np.ndarray, " member"]  # events that are there but were not located
     curves: tuple[tuple[ResponseCurve, ...], ...]  # empty without `keep_curves`
+
+    def summary(self) -> tuple[str, ...]:
+        """How many members, where their peaks are and how they ended."""
+        kinds, counts = np.unique(np.asarray(self.status, dtype=int), return_counts=True)
+        each = zip(kinds.tolist(), counts.tolist(), strict=True)
+        ends = ", ".join(f"{n} {CurveStatus(k).name.lower()}" for k, n in each)
+        lines = [
+            f"forced responses of {len(self.status)} members",
+            f"highest peaks: {range_text(self.peak_frequency, 'Hz', HERTZ)},"
+            f" {range_text(self.peak_velocity, 'm/s')}",
+            f"folds: {int(np.sum(self.n_folds))} in all",
+            f"status: {ends or 'none'}",
+        ]
+        missed = int(np.sum(self.n_not_located))
+        return (*lines, f"events not located: {missed}") if missed else tuple(lines)
+
+    def variables(self) -> dict[str, Variable]:
+        """Peaks and phase resonances of every member, and how its curve ended."""
+        at, names = ("member",), [CurveStatus(int(k)).name.lower() for k in self.status]
+        resonance = "strongest phase resonance"
+        return {
+            "member": Variable(at, np.arange(len(self.status)), "1", "number of the member"),
+            "status": Variable(at, np.array(names, dtype=str), "", "how the curve ended"),
+            "n_points": Variable(at, self.n_points, "1", "points of the curve"),
+            "peak_frequency_hz": Variable(at, self.peak_frequency / HERTZ, "Hz", "highest peak"),
+            "peak_velocity_m_s": Variable(at, self.peak_velocity, "m/s", "highest peak"),
+            "resonance_frequency_hz": Variable(
+                at, self.resonance_frequency / HERTZ, "Hz", resonance
+            ),
+            "resonance_velocity_m_s": Variable(at, self.resonance_velocity, "m/s", resonance),
+            "n_folds": Variable(at, self.n_folds, "1", "folds"),
+            "n_not_located": Variable(at, self.n_not_located, "1", "events not located"),
+        }
 
 
 def forced_response_batch(
     models: Structure | Sequence[Structure],
-    forces: float | Sequence[float] | Float[np.ndarray, " member"],
+    forces: float | Sequence[float] | Float[ArrayLike, " member"],
     from_frequency: float,
     to_frequency: float,
     *,
-    harmonic_order: int = 9,
-    steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 4000,
-    n_samples: int | None = None,
-    stability: bool = True,
+    settings: ResponseSettings = DEFAULT_SETTINGS,
     keep_curves: bool = True,
     chunk: int = 256,
     progress: Callable[[int, int], None] | None = None,
 ) -> ResponseBatch:
     """Forced responses of many models, forces or both, over all cores or on an accelerator.
 
-    Every member is what `forced_response` gives. Members are followed in blocks of one size: on a
+    Every member is what `forced_response` gives. Members are traced in blocks of one size: on a
     CPU one after the other, with a block on every core; on an accelerator side by side. Other
     numbers, or more members, do not compile anew. Memory is bounded by `chunk`, the members at
     work at a time, beside the curves that are kept.
@@ -127,16 +177,10 @@ def forced_response_batch(
     others are untouched. Raises `ValueError` when the numbers of models and forces disagree, for
     models of different kinds and for an empty or endless frequency range.
     """
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{from_frequency:g} and {to_frequency:g} rad/s."
-        )
+    ends = frequency_range(from_frequency, to_frequency)
     members, loads = _paired(models, forces)
     # Which rows of one object are many times the same model is known before it is expanded.
     expanded = {id(m): simulated_structure(m) for m in members}
-    ends = np.array([from_frequency, to_frequency])
-    settings = _Settings(harmonic_order, n_samples, max_points, traced(steps), stability)
     rows: list[tuple[ResponseCurve, ...]] = []
     summaries = []
     for begin in range(0, len(members), chunk):
@@ -146,21 +190,23 @@ def forced_response_batch(
         rows += found if keep_curves else []
         if progress is not None:
             progress(min(begin + chunk, len(members)), len(members))
-    columns = [np.array(column) for column in zip(*summaries, strict=True)] or [np.zeros(0)] * 7
-    named = dict(zip(ResponseBatch._fields[:-1], columns, strict=True))
-    return ResponseBatch(**named, curves=tuple(rows))
+    names = [one.name for one in dataclasses.fields(ResponseBatch)][:-1]
+    columns = {name: np.array([one[name] for one in summaries]) for name in names}
+    return ResponseBatch(**columns, curves=tuple(rows))
 
 
-class _Settings(NamedTuple):
-    harmonic_order: int
-    n_samples: int | None
-    max_points: int
-    steps: StepControl
-    stability: bool
+def frequency_range(from_frequency: float, to_frequency: float) -> Float[np.ndarray, " end"]:
+    """Both ends in rad/s. Raises `ValueError` when they are no range."""
+    if not 0 < from_frequency < to_frequency < np.inf:
+        raise ValueError(
+            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
+            f"{float(from_frequency):g} and {float(to_frequency):g} rad/s."
+        )
+    return np.array([from_frequency, to_frequency], dtype=np.float64)
 
 
 def _paired(
-    models: Structure | Sequence[Structure], forces: float | Sequence[float] | np.ndarray
+    models: Structure | Sequence[Structure], forces: ArrayLike | Sequence[float]
 ) -> tuple[list[Structure], np.ndarray]:
     loads = np.atleast_1d(np.asarray(forces, dtype=np.float64))
     members = [models] if isinstance(models, Structure) else list(models)
@@ -176,8 +222,8 @@ def _paired(
     return members, loads
 
 
-def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
-    """The numbers of one member in the order of `ResponseBatch`."""
+def _summary(parts: tuple[ResponseCurve, ...]) -> dict[str, float]:
+    """The numbers of one member, named as in `ResponseBatch`."""
     best = {"peak": (np.nan, np.nan), "phase_resonance": (np.nan, np.nan)}
     for part in parts:
         for kind, (_, height) in list(best.items()):
@@ -185,14 +231,22 @@ def _summary(parts: tuple[ResponseCurve, ...]) -> tuple:
                 velocity = float(np.abs(part.velocity[k, 1, 0]))
                 if not velocity <= height:
                     best[kind], height = (float(part.frequency[k]), velocity), velocity
-    status = parts[0].status
-    folds = sum(part.at_events("fold").size for part in parts)
-    points = sum(len(part.frequency) for part in parts)
-    return (int(status), points, *best["peak"], *best["phase_resonance"], folds)
+    # A second branch that stopped early is the member's failure too.
+    stopped = [part.status for part in parts if part.status not in _WHOLE]
+    return {
+        "status": int(stopped[0] if stopped else parts[0].status),
+        "n_points": sum(len(part.frequency) for part in parts),
+        "peak_frequency": best["peak"][0],
+        "peak_velocity": best["peak"][1],
+        "resonance_frequency": best["phase_resonance"][0],
+        "resonance_velocity": best["phase_resonance"][1],
+        "n_folds": sum(part.at_events("fold").size for part in parts),
+        "n_not_located": sum(len(part.not_located) for part in parts),
+    }
 
 
 def _chunk_of_curves(
-    models: list[Structure], forces: np.ndarray, ends: np.ndarray, settings: _Settings
+    models: list[Structure], forces: np.ndarray, ends: np.ndarray, settings: ResponseSettings
 ) -> list[tuple[ResponseCurve, ...]]:
     leaves = {id(m): jax.tree.leaves(m) for m in models}
     finite = {k: all(np.all(np.isfinite(np.asarray(a))) for a in v) for k, v in leaves.items()}
@@ -206,12 +260,12 @@ def _chunk_of_curves(
     balances = response_balances(
         [models[k] for k in good], forces[good], settings.harmonic_order, settings.n_samples
     )
-    walk = (ends, settings.steps, settings.max_points)
-    upward = follow_from_rest(balances, np.arange(len(good)), *walk, downward=False)
+    walk = (ends, settings.steps)
+    upward = trace_from_rest(balances, np.arange(len(good)), *walk, downward=False)
     # Beside a superharmonic resonance the linear response is no start: let the force rise.
     lost = [k for k, c in enumerate(upward) if c.status == CurveStatus.NO_START]
     if lost:
-        again = follow_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
+        again = trace_from_rest(balances, np.array(lost), *walk, downward=False, ramp=True)
         for k, curve in zip(lost, again, strict=True):
             upward[k] = curve
     # Below a strong softening the lower end has several solutions and the upper end has one; and
@@ -219,9 +273,9 @@ def _chunk_of_curves(
     reached = [c.status == CurveStatus.UPPER_END for c in upward]
     alone = [r and _ends_near_rest(balances, k, upward[k]) for k, r in enumerate(reached)]
     doubtful = [k for k, known in enumerate(alone) if not known]
-    downward = follow_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
+    downward = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
     owner: list[int] = []
-    parts: list[FollowedCurve] = []
+    parts: list[TracedCurve] = []
     for k, curve in enumerate(upward):
         pieces = [curve]
         if k in doubtful:
@@ -247,7 +301,7 @@ def _chunk_of_curves(
     return [tuple(curves) for curves in results]
 
 
-def _ends_near_rest(balances: HarmonicBalance, member: int, curve: FollowedCurve) -> bool:
+def _ends_near_rest(balances: HarmonicBalance, member: int, curve: TracedCurve) -> bool:
     """Whether a curve's last point is about the linear response there: then it is alone."""
     model, j = balances.model, balances.model.modes.mode_of_interest
     omega = float(curve.points[-1, -1])  # over the natural frequency
@@ -264,36 +318,42 @@ def _same_point(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(np.max(np.abs(first - second)) < 1e-5)
 
 
-def _no_curve(model: Structure, force: float, settings: _Settings) -> ResponseCurve:
+def _no_curve(model: Structure, force: float, settings: ResponseSettings) -> ResponseCurve:
     order = settings.harmonic_order
     sensors = model.modes.sensors
     return ResponseCurve(
-        force,
-        np.zeros(0),
-        np.zeros((0, 2 * order + 1, model.n_modes)),
-        np.zeros((0, order + 1, len(sensors)), dtype=np.complex128),
-        np.zeros(0, dtype=bool),
-        (),
-        CurveStatus.INVALID,
-        sensors,
+        force=force,
+        frequency=np.zeros(0),
+        coefficients=np.zeros((0, 2 * order + 1, model.n_modes)),
+        velocity=np.zeros((0, order + 1, len(sensors)), dtype=np.complex128),
+        event=(),
+        status=CurveStatus.INVALID,
+        sensors=sensors,
     )
 
 
 def solve_at_frequency(
     model: Structure,
-    force: Float[Array, " state"],
-    frequency: Float[Array, " state"],
-    start: Float[Array, "state coefficient mode"],
+    force: float | Float[ArrayLike, "*state"],
+    frequency: float | Float[ArrayLike, "*state"],
+    start: Float[ArrayLike, "state coefficient mode"],
     *,
     n_samples: int | None = None,
 ) -> tuple[Float[Array, "state coefficient mode"], Bool[Array, " state"]]:
     """Periodic motions at given forces (N) and frequencies (rad/s), each from its own guess.
 
+    Arguments: `force` and `frequency` of each state, or one of all states; `start` the Fourier
+    coefficients of the guesses in kg^1/2 m.
     Returns the Fourier coefficients (kg^1/2 m), NaN where Newton's method did not converge, and
     whether it did.
     """
+    guesses = jnp.asarray(start, dtype=jnp.float64)
+    loads, speeds = (
+        jnp.broadcast_to(jnp.asarray(part, dtype=jnp.float64), guesses.shape[:1])
+        for part in (force, frequency)
+    )
     coefficients, converged = _solve_batch(
-        simulated_structure(model), force, frequency, start, n_samples
+        simulated_structure(model), loads, speeds, guesses, n_samples
     )
     return jnp.where(converged[:, None, None], coefficients, jnp.nan), converged
 

@@ -1,26 +1,108 @@
 """Responses that no curve from rest reaches: isolated loops and motions in other wells."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.model.structures import Structure, equilibria, simulated_structure
 from snrmjax.numerics.blocks import as_arrays, padded, taken
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, linear_coefficients
-from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl, traced
-from snrmjax.simulate.continuation.curve_tracing import follow_responses, response_balances
-from snrmjax.simulate.continuation.response_curve import FollowedCurve, ResponseCurve, assembled
+from snrmjax.simulate.balance.labelled import HERTZ, range_text
+from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE, CurveStatus, StepControl
+from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_through
+from snrmjax.simulate.continuation.response_curve import ResponseCurve, TracedCurve, assembled
 from snrmjax.simulate.solutions.controlled import phase_controlled
 from snrmjax.simulate.solutions.forced_response import (
-    DEFAULT_STEPS,
-    forced_response,
+    DEFAULT_SETTINGS,
+    ResponseSettings,
+    forced_response_batch,
+    frequency_range,
+    positive_values,
     solve_at_frequency,
 )
 
 _NEAR = 5e-3  # distance in scaled unknowns below which a motion lies on a known curve
 Start = tuple[Float[np.ndarray, "coefficient mode"], float]
+
+
+class IsolatedSearch(eqx.Module):
+    """Where `isolated_responses` starts from, beside phase resonances and equilibria."""
+
+    starts: Sequence[Start] = ()  # (coefficients in kg^1/2 m, frequency in rad/s)
+    n_starts: int = 128  # random amplitudes and phases of the mode of interest
+    seed: int = 0  # of the random starts
+
+
+DEFAULT_SEARCH = IsolatedSearch()
+
+
+class IsolatedResponses(AbstractResult):
+    """Response curves apart from the one from rest, and what became of every start.
+
+    A sequence of the curves: it has a length, and indices and loops give its curves.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("curve",)
+
+    curves: tuple[ResponseCurve, ...]
+    force: float  # N
+    n_starts: int
+    n_failed: int  # starts from which Newton's method did not converge
+    n_known: int  # motions outside the frequency range, or on a curve that is known already
+    n_not_traced: int  # motions apart from known curves through which no curve was traced
+
+    def __len__(self) -> int:
+        return len(self.curves)
+
+    def __iter__(self) -> Iterator[ResponseCurve]:
+        return iter(self.curves)
+
+    def __getitem__(self, k: int) -> ResponseCurve:
+        return self.curves[k]
+
+    def summary(self) -> tuple[str, ...]:
+        """How many curves, each with its status, and what became of the starts."""
+        lines = [f"isolated responses at {self.force:.4g} N: {len(self.curves)} curves"]
+        for curve in self.curves:
+            span = range_text(curve.frequency, "Hz", HERTZ)
+            points = f"{len(curve.frequency)} points, {span}"
+            lines.append(f"{curve.branch}: {points}, {STATUS_MESSAGE[curve.status]}")
+        lines.append(
+            f"starts: {self.n_starts}, of which {self.n_failed} did not converge, {self.n_known}"
+            f" led to known motions or out of the range, {self.n_not_traced} to motions through"
+            " which no curve was traced"
+        )
+        return tuple(lines)
+
+    def variables(self) -> dict[str, Variable]:
+        """One row a curve: how it was found, its range and status."""
+        at, every = ("curve",), self.curves
+        ends = [(c.frequency.min(), c.frequency.max()) for c in every]
+        low, high = np.array(ends, dtype=np.float64).reshape(-1, 2).T / HERTZ
+        height = np.array([np.abs(c.velocity[:, 1, 0]).max() for c in every], dtype=np.float64)
+        text = {
+            "branch": (np.array([c.branch for c in every], dtype=str), "how the curve was found"),
+            "status": (np.array([c.status.name.lower() for c in every], dtype=str), "how it ended"),
+        }
+        return {
+            "curve": Variable(at, np.arange(len(every)), "1", "number of the curve"),
+            **{name: Variable(at, values, "", meaning) for name, (values, meaning) in text.items()},
+            "n_points": Variable(at, np.array([len(c.frequency) for c in every]), "1", "points"),
+            "lowest_frequency_hz": Variable(at, low, "Hz", "lowest frequency"),
+            "highest_frequency_hz": Variable(at, high, "Hz", "highest frequency"),
+            "velocity_m_s": Variable(at, height, "m/s", "largest velocity, at the first sensor"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """Force and what became of the starts."""
+        counts = {name: getattr(self, name) for name in ("n_starts", "n_failed", "n_known")}
+        return {"force_n": self.force, **counts, "n_not_traced": self.n_not_traced}
 
 
 def isolated_responses(
@@ -30,69 +112,70 @@ def isolated_responses(
     to_frequency: float,
     *,
     known: Sequence[ResponseCurve] | None = None,
-    starts: Sequence[Start] = (),
-    n_starts: int = 128,
-    seed: int = 0,
-    harmonic_order: int = 9,
-    steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 4000,
-    n_samples: int | None = None,
-    stability: bool = True,
-) -> list[ResponseCurve]:
-    """Search for response curves that are not connected to the one from rest, and follow them.
+    search: IsolatedSearch = DEFAULT_SEARCH,
+    settings: ResponseSettings = DEFAULT_SETTINGS,
+) -> IsolatedResponses:
+    """Search for response curves that are not connected to the one from rest, and trace them.
 
     Newton's method starts from the motions given (such as settled motions of a time integration,
     from other initial states), from every phase resonance that the force-appropriated backbone has
-    at this force (followed to twice the force: the tips of loops are among them), from vibrations
+    at this force (traced to twice the force: the tips of loops are among them), from vibrations
     about every stable equilibrium, and from random amplitudes and phases of the mode of interest
-    across the frequency range. Each motion that lies on no known curve is followed both ways,
-    around if its curve is closed.
+    across the frequency range. Through each motion that lies on no known curve a curve is traced
+    both ways, around if it is closed.
 
-    Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, `forced_response`
-    if not given; `starts` as (coefficients in kg^1/2 m, frequency in rad/s).
-    Returns one `ResponseCurve` for every further curve; `branch` says how it was found and
-    `status` is CLOSED for an isolated loop. A search, not a proof: none found is none found by
-    `n_starts` starts.
-    Raises `ValueError` for starts of other harmonics than `harmonic_order`.
+    Arguments: `force` in N, frequencies in rad/s; `known` curves of this force, those of
+    `forced_response` if not given; `search` says where to start; `settings` as in
+    `forced_response_batch`.
+    Returns `IsolatedResponses`: one `ResponseCurve` for every further curve, whose `branch` says
+    how it was found and whose `status` is CLOSED for an isolated loop, and how many starts failed.
+    A search, not a proof: none found is none found by `n_starts` starts.
+    Raises `ValueError` for a force that is not positive, an empty frequency range and starts of
+    other harmonics than `harmonic_order`.
     """
     model = simulated_structure(model)
+    (load,) = positive_values("force", force, "N").tolist()
+    ends = frequency_range(from_frequency, to_frequency)
     if known is None:
-        known = forced_response(
-            model,
-            [force],
-            from_frequency,
-            to_frequency,
-            harmonic_order=harmonic_order,
-            steps=steps,
-            max_points=max_points,
-            n_samples=n_samples,
-            stability=False,
-        )
-    balances = response_balances([model], np.array([float(force)]), harmonic_order, n_samples)
+        plain = dataclasses.replace(settings, stability=False)
+        (known,) = forced_response_batch(model, load, *ends, settings=plain).curves
+    balances = response_balances(
+        [model], np.array([load]), settings.harmonic_order, settings.n_samples
+    )
     balance = as_arrays(taken(balances, 0))
-    ends = np.array([from_frequency, to_frequency])
-    named = _starts(balance, ends, starts, n_starts, seed)
-    points, origins = _solutions(balance, named, ends)
+    named = _starts(balance, ends, search)
+    solved = _solutions(balance, named, ends)
     curves = [_scaled(balance, curve) for curve in known if len(curve.frequency) > 1]
-    found = []
-    for point, origin in zip(points, origins, strict=True):
+    found: list[ResponseCurve] = []
+    n_known, n_not_traced = solved.n_outside, 0
+    for point, origin in zip(solved.points, solved.origins, strict=True):
         if any(_distance(point, curve) < _NEAR for curve in curves):
+            n_known += 1
             continue
-        followed = _both_ways(balances, point, ends, traced(steps), max_points)
-        if len(followed.points) < 2:
+        traced = _both_ways(balances, point, ends, settings.steps)
+        if len(traced.points) < 2:
+            n_not_traced += 1
             continue
-        curves.append(followed.points)
-        found += assembled(balances, [followed], traced(steps), stability=stability, branch=origin)
-    return found
+        curves.append(traced.points)
+        stability = settings.stability
+        found += assembled(balances, [traced], settings.steps, stability=stability, branch=origin)
+    return IsolatedResponses(
+        curves=tuple(found),
+        force=load,
+        n_starts=len(named),
+        n_failed=solved.n_failed,
+        n_known=n_known,
+        n_not_traced=n_not_traced,
+    )
 
 
 def _starts(
-    balance: HarmonicBalance, ends: np.ndarray, given: Sequence[Start], n_starts: int, seed: int
+    balance: HarmonicBalance, ends: np.ndarray, search: IsolatedSearch
 ) -> list[tuple[np.ndarray, float, str]]:
     """Coefficients, frequency and origin of every start."""
     model, n = balance.model, balance.n_coefficients
     rows: list[tuple[np.ndarray, float, str]] = []
-    for coefficients, frequency in given:
+    for coefficients, frequency in search.starts:
         x = np.asarray(coefficients, dtype=np.float64)
         if x.shape != (n, model.n_modes):
             raise ValueError(
@@ -102,7 +185,7 @@ def _starts(
         rows.append((x, float(frequency), "isolated, from a given start"))
     rows += [(x, w, "isolated, from a phase resonance") for x, w in _phase_resonances(balance)]
     wells = [e for e in equilibria(model) if e.stable]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(search.seed)
     j, scale = model.modes.mode_of_interest, float(balance.displacement_scale)
     for frequency in np.linspace(ends[0], ends[1], 9)[1:-1]:
         for well in wells:
@@ -113,7 +196,7 @@ def _starts(
                 model, balance.force, jnp.asarray(frequency), balance.harmonic_order
             )
             rows.append((x + np.asarray(linear), float(frequency), "about another equilibrium"))
-    for k in range(n_starts):
+    for k in range(search.n_starts):
         frequency = rng.uniform(ends[0], ends[1])
         amplitude = scale * 10 ** rng.uniform(-1.5, 0.5)
         # Isolated loops surround the backbone: half of the starts are in phase resonance.
@@ -143,24 +226,38 @@ def _phase_resonances(balance: HarmonicBalance) -> list[Start]:
     return list(zip(between, frequency.tolist(), strict=True))
 
 
+class _Solutions(NamedTuple):
+    """Motions that Newton's method reached inside the range, and how many it did not."""
+
+    points: list[np.ndarray]  # scaled
+    origins: list[str]
+    n_failed: int
+    n_outside: int
+
+
 def _solutions(
     balance: HarmonicBalance, named: list[tuple[np.ndarray, float, str]], ends: np.ndarray
-) -> tuple[list[np.ndarray], list[str]]:
-    """Scaled points of the motions that Newton's method reaches inside the range."""
+) -> _Solutions:
+    """Newton's method from every start."""
     count = len(named)
     starts = padded(np.stack([row[0] for row in named]))
     frequency = padded(np.array([row[1] for row in named]))
     force = np.full(len(frequency), float(balance.force))
     found, ok = solve_at_frequency(
-        *(balance.model, jnp.asarray(force), jnp.asarray(frequency), jnp.asarray(starts)),
-        n_samples=balance.n_samples,
+        balance.model, force, frequency, starts, n_samples=balance.n_samples
     )
-    inside = (frequency >= ends[0]) & (frequency <= ends[1])
-    good = np.flatnonzero(np.asarray(ok)[:count] & inside[:count])
+    inside = ((frequency >= ends[0]) & (frequency <= ends[1]))[:count]
+    converged = np.asarray(ok)[:count]
+    good = np.flatnonzero(converged & inside)
     x = np.asarray(found)[good].reshape(len(good), -1) / float(balance.displacement_scale)
     omega = frequency[good] / float(balance.frequency_scale)
     points = np.concatenate([x, omega[:, None]], axis=1)
-    return list(points), [named[k][2] for k in good]
+    return _Solutions(
+        points=list(points),
+        origins=[named[k][2] for k in good],
+        n_failed=int(np.sum(~converged)),
+        n_outside=int(np.sum(converged & ~inside)),
+    )
 
 
 def _scaled(balance: HarmonicBalance, curve: ResponseCurve) -> np.ndarray:
@@ -182,15 +279,12 @@ def _both_ways(
     point: np.ndarray,
     ends: np.ndarray,
     steps: StepControl,
-    max_points: int,
-) -> FollowedCurve:
+) -> TracedCurve:
     """The curve through a point: once around, or from one end to the other."""
     start: Array = jnp.asarray(point)[None]
     ways = []
     for downward in (False, True):
-        way = follow_responses(
-            balances, jnp.asarray(ends), steps, max_points, downward=downward, starts=start
-        )[0]
+        way = trace_through(balances, jnp.asarray(ends), steps, downward=downward, starts=start)[0]
         ways.append(way)
         if way.status == CurveStatus.CLOSED:
             return way
@@ -201,7 +295,7 @@ def _both_ways(
         whole = up if len(up.points) else back
         return whole._replace(n_solves=solves)
     status = up.status if up.status != CurveStatus.UPPER_END else back.status
-    return FollowedCurve(
+    return TracedCurve(
         np.concatenate([back.points[:-1], up.points]),
         np.concatenate([back.tangents[:-1], up.tangents]),
         status,

@@ -1,7 +1,7 @@
 """Nonlinear normal modes: periodic motions of the conservative structure."""
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +12,17 @@ from snrmjax.model.effect_base import AbstractHysteresis
 from snrmjax.model.structures import Structure, displacement_scale, simulated_structure
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
+from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
+    STATUS_MESSAGE,
     Curve,
+    CurveRange,
     CurveStatus,
     StepControl,
-    follow_curve,
-    traced,
+    trace_curve,
 )
 
 DEFAULT_STEPS = StepControl(first=1e-3, largest=0.02, angle=0.06)
@@ -40,8 +43,10 @@ class Tongue(NamedTuple):
     last: int  # index of its last point; with "skip", of the last one before it
 
 
-class NormalModeBranch(NamedTuple):
+class NormalModeBranch(AbstractResult):
     """A nonlinear normal mode as a curve of periodic motions, from small amplitude on."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("point", "sensor", "frequency_hz")
 
     frequency: Float[np.ndarray, " point"]  # rad/s
     coefficients: Float[np.ndarray, "point coefficient mode"]  # mean and cosines, kg^1/2 m
@@ -51,6 +56,32 @@ class NormalModeBranch(NamedTuple):
     sensors: tuple[str, ...]
     tongues: tuple[Tongue, ...] = ()
 
+    def summary(self) -> tuple[str, ...]:
+        """How many points, the ranges, internal resonances and the status."""
+        velocity = np.abs(self.velocity[:, 1, 0])
+        return (
+            f"nonlinear normal mode: {len(self.frequency)} points",
+            f"frequency {range_text(self.frequency, 'Hz', HERTZ)}",
+            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {self.sensors[0]}",
+            f"energy {range_text(self.energy, 'J')}",
+            *(
+                f"1:{one.harmonic} internal resonance with mode {one.mode + 1} from"
+                f" {one.from_frequency / HERTZ:.4g} to {one.to_frequency / HERTZ:.4g} Hz"
+                for one in self.tongues
+            ),
+            f"status: {STATUS_MESSAGE[self.status]}",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Frequency, velocities and energy."""
+        energy = Variable(("point",), self.energy, "J", "energy of the motion")
+        named = motion_variables(self.frequency, self.velocity, self.sensors)
+        return {**named, "energy_j": energy}
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """How the curve ended, and how many internal resonances it has."""
+        return {"status": self.status.name.lower(), "internal_resonances": len(self.tongues)}
+
 
 def nonlinear_normal_mode(
     model: Structure,
@@ -58,21 +89,20 @@ def nonlinear_normal_mode(
     *,
     harmonic_order: int = 9,
     steps: StepControl = DEFAULT_STEPS,
-    max_points: int = 4000,
     largest_amplitude: float | None = None,
     n_samples: int | None = None,
     tongues: Literal["follow", "skip"] = "follow",
 ) -> NormalModeBranch:
-    """Follow the nonlinear normal mode that starts at the linear mode of interest.
+    """Trace the nonlinear normal mode that starts at the linear mode of interest.
 
     Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
     for motions q = Σ a_h cos hΩt, which covers every motion that starts from rest; the
-    curve is followed by arclength through folds and internal-resonance tongues.
+    curve is traced by arclength through folds and internal-resonance tongues.
 
     Arguments: `to_frequency` in rad/s, on either side of the linear frequency: the curve ends
     when it crosses it. `largest_amplitude` (kg^1/2 m; by default 30 times the displacement at
     which the mode's own nonlinearity matters) ends a curve that never does. A curve that first
-    moves away from `to_frequency` is followed as long as it stays above a tenth and below ten
+    moves away from `to_frequency` is traced as long as it stays above a tenth and below ten
     times the linear frequency.
     Where a harmonic of the mode meets another mode, the curve runs out on a tongue and back: more
     than a twentieth of the energy is then in that harmonic of that mode. Tongues are reported;
@@ -101,32 +131,25 @@ def nonlinear_normal_mode(
     lower, upper = (omega / 10, to_frequency) if upward else (to_frequency, omega * 10)
     limit = 30.0 if largest_amplitude is None else largest_amplitude / scale
     ends = jnp.asarray([lower, upper, limit])
-    branch = _assemble(balance, _follow(balance, ends, traced(steps), max_points))
+    branch = _assemble(balance, _trace(balance, ends, steps))
     return _without_tongues(branch) if tongues == "skip" else branch
 
 
 @compiled
-def _follow(
-    balance: HarmonicBalance,
-    ends: Array,
-    steps: StepControl,
-    max_points: int,
-) -> Curve:
+def _trace(balance: HarmonicBalance, ends: Array, steps: StepControl) -> Curve:
     j = balance.model.modes.mode_of_interest
     modes, n = balance.model.modes, balance.model.n_modes
     # Start a little up the mode, where Newton's method at fixed amplitude is well posed.
     size = balance.size + 1
     linear = jnp.zeros(size).at[-1].set(modes.natural_frequency[j] / balance.frequency_scale)
     direction = jnp.zeros(size).at[n + j].set(1.0)
-    return follow_curve(
+    lower, upper = ends[:2] / balance.frequency_scale
+    return trace_curve(
         balance.linearised,
         linear + 1e-3 * direction,
         direction,
-        ends[0] / balance.frequency_scale,
-        ends[1] / balance.frequency_scale,
-        ends[2],
+        CurveRange(lower, upper, largest_amplitude=ends[2]),
         steps,
-        max_points,
         start_across=direction,
     )
 
@@ -185,7 +208,8 @@ def _without_tongues(branch: NormalModeBranch) -> NormalModeBranch:
     for tongue in branch.tongues:
         keep[tongue.first : tongue.last + 1] = False
     place = np.cumsum(keep)  # points that are kept up to and with each
-    return branch._replace(
+    return dataclasses.replace(
+        branch,
         frequency=branch.frequency[keep],
         coefficients=branch.coefficients[keep],
         velocity=branch.velocity[keep],

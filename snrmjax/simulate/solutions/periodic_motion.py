@@ -1,17 +1,21 @@
 """Single periodic motions as differentiable functions of the model and the force."""
 
-from typing import Literal, get_args
+from collections.abc import Callable, Sequence
+from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import numbers_as_arrays
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
+from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.continuation import Linearised, Point
 from snrmjax.simulate.continuation.events import mode_velocity, sensor_velocity
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -19,28 +23,55 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 Condition = Literal["frequency", "velocity", "fold", "peak", "phase_resonance"]
 
 
-class PeriodicMotion(eqx.Module):
-    """A periodic motion; NaN where none was found."""
+class PeriodicMotion(AbstractResult):
+    """A periodic motion, or a batch of them; NaN where none was found."""
 
-    frequency: Float[Array, ""]  # rad/s
-    coefficients: Float[Array, "coefficient mode"]  # kg^1/2 m
-    velocity: Complex[Array, "harmonic sensor"]  # m/s, h = 0…H
-    converged: Bool[Array, ""]
+    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz",)
+
+    frequency: Float[Array, "*batch"]  # rad/s
+    coefficients: Float[Array, "*batch coefficient mode"]  # kg^1/2 m
+    velocity: Complex[Array, "*batch harmonic sensor"]  # m/s, h = 0…H
+    converged: Bool[Array, "*batch"]
 
     @property
-    def amplitude(self) -> Float[Array, ""]:
+    def amplitude(self) -> Float[Array, "*batch"]:
         """|velocity fundamental| at the first sensor, in m/s."""
-        return jnp.abs(self.velocity[..., 1, 0])
+        # The derivative of |NaN| would be NaN for all that share a parameter with it.
+        phasor = jnp.where(self.converged, self.velocity[..., 1, 0], 1.0)
+        return jnp.where(self.converged, jnp.abs(phasor), jnp.nan)
+
+    def summary(self) -> tuple[str, ...]:
+        """How many motions were found, where, and how large they are."""
+        found = np.asarray(self.converged)
+        return (
+            f"periodic motions: {found.size}, of which {int(np.sum(~found))} were not found",
+            f"frequency {range_text(np.asarray(self.frequency), 'Hz', HERTZ)}",
+            f"velocity fundamental {range_text(np.asarray(self.amplitude), 'm/s')}, first sensor",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Frequency and velocities of every motion."""
+        at = {0: (), 1: ("motion",)}.get(
+            np.ndim(self.frequency), tuple(f"batch_{k}" for k in range(np.ndim(self.frequency)))
+        )
+        velocity, axes = np.asarray(self.velocity), (*at, "harmonic", "sensor_number")
+        return {
+            "frequency_hz": Variable(at, np.asarray(self.frequency) / HERTZ, "Hz", "frequency"),
+            "velocity_re_m_s": Variable(axes, velocity.real, "m/s", "in phase with the force"),
+            "velocity_im_m_s": Variable(
+                axes, velocity.imag, "m/s", "a quarter period ahead of the force"
+            ),
+            "converged": Variable(at, self.converged, "1", "whether the motion was found"),
+        }
 
 
-@eqx.filter_jit
 def periodic_motion(
     model: Structure,
-    force: Float[Array, ""] | float,
-    start: tuple[Float[Array, "coefficient mode"], Float[Array, ""]],
+    force: float | Float[ArrayLike, ""],
+    start: tuple[Float[ArrayLike, "coefficient mode"], float | Float[ArrayLike, ""]],
     *,
     condition: Condition = "frequency",
-    value: Float[Array, ""] | float | None = None,
+    value: float | Float[ArrayLike, ""] | None = None,
     iterations: int = 30,
 ) -> PeriodicMotion:
     """The periodic motion near `start` that meets one condition, differentiable.
@@ -55,7 +86,9 @@ def periodic_motion(
 
     Arguments: `force` in N; `value` in rad/s or m/s.
     Returns a `PeriodicMotion` whose values are NaN where Newton's method did not converge: start
-    nearer. Raises `ValueError` for an unknown condition and for a missing or needless `value`.
+    nearer. The derivatives of a motion that was not found are zero, so that under `jax.vmap`
+    those of the others are what they are. Raises `ValueError` for an unknown condition and for a
+    missing or needless `value`.
 
     >>> from snrmjax import forced_response
     >>> from snrmjax.model import flat_beam
@@ -71,21 +104,42 @@ def periodic_motion(
     if (value is None) == (condition in ("frequency", "velocity")):
         verb = "needs a" if value is None else "takes no"
         raise ValueError(f'`condition="{condition}"` {verb} `value`.')
+    target = None if value is None else jnp.asarray(value, dtype=jnp.float64)
+    near = tuple(jnp.asarray(part, dtype=jnp.float64) for part in start)
+    load = jnp.asarray(force, dtype=jnp.float64)
+    return _periodic_motion(numbers_as_arrays(model), load, near, condition, target, iterations)
+
+
+@eqx.filter_jit
+def _periodic_motion(
+    model: Structure,
+    force: Float[Array, ""],
+    start: tuple[Array, ...],
+    condition: Condition,
+    value: Float[Array, ""] | None,
+    iterations: int,
+) -> PeriodicMotion:
     model = simulated_structure(model)
-    coefficients, frequency = (jax.lax.stop_gradient(jnp.asarray(part)) for part in start)
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
+    coefficients, frequency = (jax.lax.stop_gradient(part) for part in start)
+    largest = jnp.max(jnp.abs(coefficients))
+    target = jnp.zeros(()) if value is None else value
+    # What is not finite is computed with harmless numbers and counts as not found: in a
+    # derivative `where` does not stop a NaN that was computed.
+    usable = jnp.isfinite(force) & jnp.isfinite(target) & jnp.isfinite(largest) & (largest > 0)
+    force, target, scale = (jnp.where(usable, part, 1.0) for part in (force, target, largest))
     order = (coefficients.shape[0] - 1) // 2
     balance = harmonic_balance(model, force, scale, harmonic_order=order)
-    target = jnp.zeros(()) if value is None else jnp.asarray(value, dtype=jnp.float64)
-    guess = jax.lax.stop_gradient(balance.point(coefficients, frequency))
+    guess = jnp.where(usable, balance.point(coefficients, frequency), jnp.nan)
+    guess = jax.lax.stop_gradient(guess)
     point, converged = _solved(balance, guess, condition, target, iterations)
-    point = jnp.where(converged, point, jnp.nan)
     found = balance.coefficients(point)
     omega = point[-1] * balance.frequency_scale
+    velocity = velocity_phasors(found, omega, model.modes.mode_shape)
+    # Masked last: a NaN within would make the derivatives of a whole batch NaN.
     return PeriodicMotion(
-        frequency=omega,
-        coefficients=found,
-        velocity=velocity_phasors(found, omega, model.modes.mode_shape),
+        frequency=jnp.where(converged, omega, jnp.nan),
+        coefficients=jnp.where(converged, found, jnp.nan),
+        velocity=jnp.where(converged, velocity, jnp.nan),
         converged=converged,
     )
 
@@ -93,7 +147,7 @@ def periodic_motion(
 def response_at_velocities(
     model: Structure,
     curve: ResponseCurve,
-    velocities: Float[np.ndarray, " value"],
+    velocities: float | Sequence[float] | Float[ArrayLike, " value"],
 ) -> tuple[PeriodicMotion, np.ndarray]:
     """Every place where a response curve has a given velocity amplitude, differentiable.
 
@@ -103,26 +157,32 @@ def response_at_velocities(
     Their frequencies are differentiable functions of the model: the whole curve at fixed
     amplitudes. Call it once; then `motions_at_velocities` with other models.
     """
-    starts, passed, which = _crossings(curve, np.asarray(velocities, dtype=np.float64))
-    coefficients, frequency = (jnp.asarray(part) for part in starts)
-    values = jnp.asarray(passed)
-    motions = motions_at_velocities(model, curve.force, (coefficients, frequency), values)
-    return motions, which
+    asked = np.atleast_1d(np.asarray(velocities, dtype=np.float64))
+    starts, passed, which = _crossings(curve, asked)
+    return motions_at_velocities(model, curve.force, starts, passed), which
 
 
 def motions_at_velocities(
     model: Structure,
-    force: Float[Array, ""] | float,
-    starts: tuple[Float[Array, "motion coefficient mode"], Float[Array, " motion"]],
-    velocities: Float[Array, " motion"],
+    force: float | Float[ArrayLike, ""],
+    starts: tuple[Float[ArrayLike, "motion coefficient mode"], Float[ArrayLike, " motion"]],
+    velocities: float | Float[ArrayLike, " motion"],
 ) -> PeriodicMotion:
-    """The motions near `starts` with given velocity amplitudes (m/s); see `periodic_motion`."""
+    """The motions near `starts` with given velocity amplitudes, differentiable.
+
+    Arguments: `force` in N; `starts` as coefficients (kg^1/2 m) and frequencies (rad/s);
+    `velocities` |V₁| at the first sensor in m/s, of each motion or one of all. Returns the
+    motions, stacked; those that were not found are NaN with derivatives of zero, the others
+    differentiable as `periodic_motion` is.
+    """
 
     def one(coefficients: Array, frequency: Array, value: Array) -> PeriodicMotion:
         start = (coefficients, frequency)
         return periodic_motion(model, force, start, condition="velocity", value=value)
 
-    return mapped(one, *(jnp.asarray(a) for a in (*starts, velocities)))
+    coefficients, frequency = (jnp.asarray(part, dtype=jnp.float64) for part in starts)
+    values = jnp.broadcast_to(jnp.asarray(velocities, dtype=jnp.float64), frequency.shape)
+    return mapped(one, coefficients, frequency, values)
 
 
 def _crossings(
@@ -143,11 +203,14 @@ def _crossings(
 def _solved(
     balance: HarmonicBalance, guess: Point, condition: Condition, target: Array, iterations: int
 ) -> tuple[Point, Array]:
-    """The root of the balance and the condition, and whether it was found."""
+    """The root of the balance and the condition, and whether it was found.
+
+    Where it was not found the point is the guess, and the derivatives are zero.
+    """
     border = _tangent_near(balance.linearised, guess, _generic(guess.shape[0]))
     border = jax.lax.stop_gradient(border)
 
-    def test(point: Point) -> Array:
+    def test(balance: HarmonicBalance, target: Array, point: Point) -> Array:
         if condition == "frequency":
             return point[-1] - target / balance.frequency_scale
         if condition == "velocity":
@@ -162,33 +225,36 @@ def _solved(
             return tangent[-1]
         return jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
 
+    fixed, aim = jax.lax.stop_gradient((balance, target))
+
+    def body(state: tuple) -> tuple:
+        point, count, _, _ = state
+        residual, jacobian = fixed.linearised(point)
+        value, slope = jax.value_and_grad(lambda p: test(fixed, aim, p))(point)
+        matrix = jnp.concatenate([jacobian, slope[None]])
+        step = jnp.linalg.solve(matrix, jnp.append(residual, value))
+        size = jnp.max(jnp.abs(step))
+        return point - step, count + 1, size, jnp.isfinite(size)
+
+    def going(state: tuple) -> Array:
+        _, count, size, finite = state
+        return finite & (count < iterations) & (size > 1e-12)
+
+    state = (guess, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
+    point, _, size, finite = jax.lax.while_loop(going, body, state)
+    converged = finite & (size < 1e-8)
+    harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
+    root = jax.lax.stop_gradient(jnp.where(converged, point, harmless))
+
     def equations(point: Point) -> Array:
-        return jnp.append(balance.residual(point), test(point))
+        left = jnp.append(balance.residual(point), test(balance, target, point))
+        return jnp.where(converged, left, point - harmless)
 
-    def newton(_: object, start: Point) -> Point:
-        def body(state: tuple) -> tuple:
-            point, count, _, _ = state
-            residual, jacobian = balance.linearised(point)
-            value, slope = jax.value_and_grad(test)(point)
-            matrix = jnp.concatenate([jacobian, slope[None]])
-            step = jnp.linalg.solve(matrix, jnp.append(residual, value))
-            size = jnp.max(jnp.abs(step))
-            return point - step, count + 1, size, jnp.isfinite(size)
+    def tangent_solve(linear: Callable[[Array], Array], right: Array) -> Array:
+        return jnp.linalg.solve(jax.jacfwd(linear)(right), right)
 
-        def going(state: tuple) -> Array:
-            _, count, size, finite = state
-            return finite & (count < iterations) & (size > 1e-12)
-
-        state = (start, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
-        point, _, size, finite = jax.lax.while_loop(going, body, state)
-        return jnp.where(finite & (size < 1e-8), point, jnp.nan)
-
-    def tangent_solve(linear: object, right: Array) -> Array:
-        matrix = jax.jacfwd(linear)(right)  # type: ignore[arg-type]
-        return jnp.linalg.solve(matrix, right)
-
-    point = jax.lax.custom_root(equations, guess, newton, tangent_solve)
-    return point, jnp.all(jnp.isfinite(jax.lax.stop_gradient(point)))
+    # The root is known: this gives it the derivatives of the implicit function theorem.
+    return jax.lax.custom_root(equations, root, lambda _, known: known, tangent_solve), converged
 
 
 def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:

@@ -4,7 +4,7 @@ Needs diffrax: pip install 'snrmjax[integrate]'.
 """
 
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
+from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.solutions.hysteresis_cycles import (
     CyclePoint,
     integrated_cycle,
@@ -48,8 +50,10 @@ MOTION_MESSAGE: dict[MotionStatus, str] = {
 }
 
 
-class IntegratedMotion(NamedTuple):
+class IntegratedMotion(AbstractResult):
     """Motions at the end of an integration in time, over the last cycle of the force."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "harmonic", "sensor_number")
 
     force: Float[Array, "*batch"]  # N
     frequency: Float[Array, "*batch"]  # rad/s
@@ -60,10 +64,56 @@ class IntegratedMotion(NamedTuple):
     distance: Float[Array, "*batch"]  # estimated, from the settled motion, relative
     n_cycles: Int[Array, "*batch"]
 
+    def summary(self) -> tuple[str, ...]:
+        """How many motions, their ranges and how they ended."""
+        status = np.ravel(self.status)
+        ends = [(kind, int(np.sum(status == int(kind)))) for kind in MotionStatus]
+        velocity = np.abs(np.asarray(self.velocity)[..., 1, 0])
+        return (
+            f"motions by time integration: {status.size}",
+            f"force {range_text(np.asarray(self.force), 'N')}",
+            f"frequency {range_text(np.asarray(self.frequency), 'Hz', HERTZ)}",
+            f"velocity fundamental {range_text(velocity, 'm/s')}, first sensor",
+            f"cycles {range_text(np.asarray(self.n_cycles), 'of the force')}",
+            *(f"status: {n} {MOTION_MESSAGE[kind]}" for kind, n in ends if n),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Force, frequency, velocities and how every motion ended."""
+        at = tuple(f"batch_{k}" for k in range(np.ndim(self.status)))
+        at = ("motion",) if len(at) == 1 else at
+        names = [MotionStatus(int(k)).name.lower() for k in np.ravel(self.status)]
+        status = np.array(names, dtype=str).reshape(np.shape(self.status))
+        velocity = np.asarray(self.velocity)
+        axes = (*at, "harmonic", "sensor_number")
+        orders, sensors = np.arange(velocity.shape[-2]), np.arange(velocity.shape[-1])
+        return {
+            "force_n": Variable(at, self.force, "N", "force amplitude"),
+            "frequency_hz": Variable(at, np.asarray(self.frequency) / HERTZ, "Hz", "frequency"),
+            "harmonic": Variable(("harmonic",), orders, "1", "harmonic order"),
+            "sensor_number": Variable(("sensor_number",), sensors, "1", "sensor, from zero"),
+            "velocity_re_m_s": Variable(axes, velocity.real, "m/s", "in phase with the force"),
+            "velocity_im_m_s": Variable(axes, velocity.imag, "m/s", "ahead of the force"),
+            "status": Variable(at, status, "", "how the integration ended"),
+            "distance": Variable(at, self.distance, "1", "estimated, from the settled motion"),
+            "n_cycles": Variable(at, self.n_cycles, "1", "cycles of the force"),
+        }
+
     @property
     def converged(self) -> Bool[Array, "*batch"]:
         """Whether the motion settled: repeats from cycle to cycle."""
         return self.status == int(MotionStatus.SETTLED)
+
+
+class IntegrationAccuracy(NamedTuple):
+    """How accurately motions are integrated, and when they count as settled."""
+
+    settled: float = 1e-5  # estimated distance from the settled motion, relative
+    step: float = 1e-8  # error of a step, relative to the size of the motion
+
+
+SETTLED_ACCURACY = IntegrationAccuracy()
+STEPPED_ACCURACY = IntegrationAccuracy(settled=1e-4)
 
 
 def settled_motion(
@@ -74,8 +124,7 @@ def settled_motion(
     start: Float[Array, "..."] | np.ndarray | None = None,
     harmonic_order: int = 9,
     max_cycles: int = 2000,
-    tolerance: float = 1e-5,
-    rtol: float = 1e-8,
+    accuracy: IntegrationAccuracy = SETTLED_ACCURACY,
 ) -> IntegratedMotion:
     """Integrate the equations of motion under a cosine force until the motion repeats.
 
@@ -86,10 +135,9 @@ def settled_motion(
 
     Arguments: `force` in N, `frequency` Ω in rad/s; `start` is q (kg^1/2 m) at rest, with shape
     (mode,), or q and q̇ (kg^1/2 m/s), with shape (2, mode), of the model's modes or of those of
-    `simulated_structure`; from rest where it is missing. `tolerance` is on the estimated
-    relative distance of the Fourier coefficients from those of the settled motion; `rtol` on
-    the error of a step, relative to the motion's size. Traceable: `jit` and `vmap` over forces,
-    frequencies and starts; other numbers do not compile anew.
+    `simulated_structure`; from rest where it is missing. `accuracy` says which distance of the
+    Fourier coefficients from those of the settled motion is small enough. Traceable: `jit` and
+    `vmap` over forces, frequencies and starts; other numbers do not compile anew.
     Returns an `IntegratedMotion`: where `converged`, a stable periodic motion, which is a start
     for other solvers and a seed of isolated branches. Its `status` says why not: see
     `MOTION_MESSAGE`. Which of several stable motions is found depends on `start`.
@@ -115,7 +163,7 @@ def settled_motion(
         jnp.asarray(model.test_order)[None],
         _start_state(model, start),
         harmonic_order,
-        _settings(max_cycles, tolerance, rtol),
+        _settings(max_cycles, accuracy),
     )
     return jax.tree.map(lambda part: part[0], motions)
 
@@ -129,8 +177,7 @@ def stepped_sine(
     start: Float[Array, "..."] | np.ndarray | None = None,
     test_orders: Float[Array, " step"] | np.ndarray | None = None,
     harmonic_order: int = 9,
-    tolerance: float = 1e-4,
-    rtol: float = 1e-8,
+    accuracy: IntegrationAccuracy = STEPPED_ACCURACY,
 ) -> IntegratedMotion:
     """Step the frequency of a cosine force, up or down, without ever stopping the motion.
 
@@ -165,7 +212,7 @@ def stepped_sine(
         test_orders,
         _start_state(model, start),
         harmonic_order,
-        _settings(cycles_per_step, tolerance, rtol),
+        _settings(cycles_per_step, accuracy),
     )
 
 
@@ -175,12 +222,12 @@ class _Settings(NamedTuple):
     rtol: Float[Array, ""]
 
 
-def _settings(max_cycles: int, tolerance: float, rtol: float) -> _Settings:
+def _settings(max_cycles: int, accuracy: IntegrationAccuracy) -> _Settings:
     if max_cycles < LEAST_CYCLES:
         raise ValueError(
             f"a motion needs {LEAST_CYCLES} cycles or more to settle, but gets {max_cycles}."
         )
-    return _Settings(jnp.asarray(max_cycles), jnp.asarray(tolerance), jnp.asarray(rtol))
+    return _Settings(jnp.asarray(max_cycles), *(jnp.asarray(part) for part in accuracy))
 
 
 def _require_positive(name: str, value: Any) -> None:

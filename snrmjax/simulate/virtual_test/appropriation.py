@@ -126,13 +126,13 @@ def _at_phases(
         now = eqx.tree_at(lambda m: m.test_order, model, order)
         scale = jnp.max(jnp.abs(start))
         balance = harmonic_balance(now, force, scale, harmonic_order=harmonic_order)
-        held = jnp.isfinite(velocity)
-        unit = jnp.where(held, velocity, 1.0) / (balance.frequency_scale * scale)
+        prescribed = jnp.isfinite(velocity)
+        unit = jnp.where(prescribed, velocity, 1.0) / (balance.frequency_scale * scale)
 
         def condition(point: Array) -> Array:
             seen = point[n : 3 * n].reshape(2, n) @ model.modes.mode_shape[0]
             miss = point[-2] ** 2 * (seen @ seen) / unit**2 - 1.0
-            return jnp.where(held, miss, point[-1] - 1.0)
+            return jnp.where(prescribed, miss, point[-1] - 1.0)
 
         def linearised(point: Array) -> tuple[Array, Array]:
             """Unknowns x, Ω/ω₀ and the force over the one given."""

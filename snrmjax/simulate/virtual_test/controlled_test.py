@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike, Float
 
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.solutions.controlled import (
@@ -12,6 +13,7 @@ from snrmjax.simulate.solutions.controlled import (
     phase_controlled,
     response_controlled,
 )
+from snrmjax.simulate.solutions.forced_response import positive_values
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
     between,
@@ -22,8 +24,8 @@ from snrmjax.simulate.virtual_test.appropriation import (
 )
 from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
 from snrmjax.simulate.virtual_test.recording import (
-    NO_ERRORS,
-    MeasurementErrors,
+    EXACT,
+    Recording,
     VisitedStates,
     check_recording,
     recorded_states,
@@ -32,19 +34,17 @@ from snrmjax.simulate.virtual_test.recording import (
 
 def phase_controlled_test(
     model: Structure,
-    forces: Sequence[float],
-    phases: Sequence[float],
+    forces: float | Sequence[float] | Float[ArrayLike, " level"],
+    phases: float | Sequence[float] | Float[ArrayLike, " phase"],
     *,
-    errors: MeasurementErrors = NO_ERRORS,
-    seed: int = 0,
     harmonic_order: int = 9,
-    keep_harmonics: tuple[int, ...] = (),
+    recording: Recording = EXACT,
 ) -> VirtualTest:
     """Hold the phase of the mode of interest by a phase-locked loop and raise the force.
 
     At each force level the states at all `phases` are recorded, those that are unstable without
     the controller included: there are no jumps. Where a curve of one phase turns back before it
-    reaches a force, that state is missing.
+    reaches a force, that state is missing, which `n_missing` counts.
 
     Arguments: `forces` in N, `phases` of the velocity relative to the force in rad, 0 for phase
     resonance, positive below it; the others as in `phase_resonance_test`. Assumes a controller
@@ -55,18 +55,19 @@ def phase_controlled_test(
     Reference: Peter & Leine, Mech. Syst. Signal Process. 96 (2017) 139,
     doi:10.1016/j.ymssp.2017.04.011.
     """
-    check_recording(errors, keep_harmonics, harmonic_order)
-    forces, phases = _positive("force", forces, "N"), list(phases)
-    if not phases:
+    check_recording(recording, harmonic_order)
+    loads = _positive("force", forces, "N")
+    angles = np.atleast_1d(np.asarray(phases, dtype=np.float64)).tolist()
+    if not angles:
         raise ValueError("`phases` must name at least one phase, but is empty.")
     middle = dataclasses.replace(model, test_order=jnp.asarray(0.5))
     curves = tuple(
-        phase_controlled(middle, 1.02 * max(forces), phase=p, harmonic_order=harmonic_order)
-        for p in phases
+        phase_controlled(middle, 1.02 * max(loads), phase=angle, harmonic_order=harmonic_order)
+        for angle in angles
     )
     rows = []
-    for level, force in enumerate(forces, start=1):
-        for phase, curve in zip(phases, curves, strict=True):
+    for level, force in enumerate(loads, start=1):
+        for phase, curve in zip(angles, curves, strict=True):
             near = _at_force(curve, force)
             if near is not None:
                 rows.append((level, force, *near, phase))
@@ -75,23 +76,20 @@ def phase_controlled_test(
     number, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
     order = np.linspace(0.0, 1.0, len(rows))
     states = VisitedStates(number, order, load, frequency, motion)
-    return _recorded(
-        model, states_at_phases(model, states, wanted), curves, errors, seed, keep_harmonics
-    )
+    found = states_at_phases(model, states, wanted)
+    return _recorded(model, found, curves, recording, aimed=len(loads) * len(angles))
 
 
 def response_controlled_test(
     model: Structure,
-    velocities: Sequence[float],
+    velocities: float | Sequence[float] | Float[ArrayLike, " level"],
     from_frequency: float,
     to_frequency: float,
     *,
     appropriation: tuple[float, float] = (0.5, 1.0),
     points_per_level: int = 5,
-    errors: MeasurementErrors = NO_ERRORS,
-    seed: int = 0,
     harmonic_order: int = 9,
-    keep_harmonics: tuple[int, ...] = (),
+    recording: Recording = EXACT,
 ) -> VirtualTest:
     """Hold the velocity amplitude at the first sensor and step the frequency through resonance.
 
@@ -111,13 +109,13 @@ def response_controlled_test(
     limits = phase_limits(appropriation)
     if points_per_level < 1:
         raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
-    check_recording(errors, keep_harmonics, harmonic_order)
-    velocities = _positive("velocity", velocities, "m/s")
+    check_recording(recording, harmonic_order)
+    speeds = _positive("velocity", velocities, "m/s")
     rows: list[tuple] = []
     curves = []
-    for level, velocity in enumerate(velocities, start=1):
+    for level, velocity in enumerate(speeds, start=1):
         # A drifting structure as it is in the middle of the level.
-        order = jnp.asarray((level - 0.5) / len(velocities))
+        order = jnp.asarray((level - 0.5) / len(speeds))
         now = dataclasses.replace(model, test_order=order)
         ends = (from_frequency, to_frequency)
         curve = response_controlled(now, velocity, *ends, harmonic_order=harmonic_order)
@@ -134,20 +132,20 @@ def response_controlled_test(
             "no state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range."
         )
-    number, held, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
+    number, speed, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
     states = VisitedStates(number, np.linspace(0.0, 1.0, len(rows)), load, frequency, motion)
-    found = states_at_phases(model, states, wanted, held)
-    return _recorded(model, found, tuple(curves), errors, seed, keep_harmonics)
+    found = states_at_phases(model, states, wanted, speed)
+    aimed = points_per_level * len(speeds)
+    return _recorded(model, found, tuple(curves), recording, aimed=aimed)
 
 
-def _positive(name: str, values: Sequence[float], unit: str) -> list[float]:
-    values = list(values)
-    for value in values:
-        if not value > 0 or not np.isfinite(value):
-            raise ValueError(f"every {name} must be positive, but one is {value!r} {unit}.")
-    if not values:
+def _positive(
+    name: str, values: float | Sequence[float] | Float[ArrayLike, " value"], unit: str
+) -> list[float]:
+    vector = positive_values(name, values, unit).tolist()
+    if not vector:
         raise ValueError(f"a test needs at least one {name}.")
-    return values
+    return vector
 
 
 def _at_force(curve: ControlledCurve, force: float) -> tuple[float, np.ndarray] | None:
@@ -170,9 +168,10 @@ def _recorded(
     model: Structure,
     states: VisitedStates,
     curves: tuple[ControlledCurve, ...],
-    errors: MeasurementErrors,
-    seed: int,
-    keep_harmonics: tuple[int, ...],
+    recording: Recording,
+    *,
+    aimed: int,
 ) -> VirtualTest:
-    recorded = recorded_states(model, states, errors, seed, keep_harmonics)
-    return VirtualTest(recorded, (), curves)
+    """The states found, of so many aimed at, as the instruments record them."""
+    recorded = recorded_states(model, states, recording)
+    return VirtualTest(recorded, (), curves, aimed - len(states.level))

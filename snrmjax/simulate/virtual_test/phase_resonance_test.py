@@ -2,16 +2,24 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike, Float
 
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.simulate.balance.labelled import HERTZ, range_text
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve
-from snrmjax.simulate.solutions.forced_response import forced_response_batch
+from snrmjax.simulate.solutions.forced_response import (
+    ResponseSettings,
+    forced_response_batch,
+    frequency_range,
+    positive_values,
+)
 from snrmjax.simulate.virtual_test.appropriation import (
     around,
     between,
@@ -22,41 +30,89 @@ from snrmjax.simulate.virtual_test.appropriation import (
 )
 from snrmjax.simulate.virtual_test.integrated_test import stepped_states
 from snrmjax.simulate.virtual_test.recording import (
-    NO_ERRORS,
-    MeasurementErrors,
+    EXACT,
+    Recording,
     VisitedStates,
     check_recording,
     recorded_states,
 )
 
-__all__ = ["NO_ERRORS", "MeasurementErrors", "VirtualTest", "phase_resonance_test"]
-
 Means = Literal["harmonic_balance", "time_integration"]
 
 
-class VirtualTest(NamedTuple):
+class SweepSimulation(NamedTuple):
+    """How the motions of a phase-resonance test are computed.
+
+    By harmonic balance the frequency is stepped infinitely slowly; by time integration each sweep
+    has `steps_per_sweep` equal steps of at most `cycles_per_step` cycles.
+    """
+
+    by: Means = "harmonic_balance"
+    harmonic_order: int = 9
+    steps_per_sweep: int = 100  # of a time integration
+    cycles_per_step: int = 200  # of a time integration
+
+
+BY_HARMONIC_BALANCE = SweepSimulation()
+
+
+class VirtualTest(AbstractResult):
     """What a virtual test recorded."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor")
 
     steady_states: SteadyStates
     jumps: tuple[tuple[int, float], ...]  # (level, frequency in rad/s) where a branch ended
     curves: tuple[ResponseCurve | ControlledCurve, ...]  # the exact responses behind the test
+    n_missing: int = 0  # states aimed at that the test did not reach, or that were not found
+
+    def summary(self) -> tuple[str, ...]:
+        """How many states, levels and jumps, and the ranges."""
+        states = self.steady_states
+        levels = len(np.unique(np.asarray(states.level)))
+        velocity = np.abs(np.asarray(states.velocity)[:, 0])
+        lines = [
+            f"virtual test: {states.n_states} steady states on {levels} levels",
+            f"force {range_text(np.asarray(states.force), 'N')}",
+            f"frequency {range_text(np.asarray(states.frequency), 'Hz', HERTZ)}",
+            f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {states.sensors[0]}",
+            f"jumps: {len(self.jumps)}; exact responses: {len(self.curves)}",
+        ]
+        return (*lines, f"states not reached: {self.n_missing}") if self.n_missing else tuple(lines)
+
+    def variables(self) -> dict[str, Variable]:
+        """The steady states, by the names of their file's columns."""
+        states = self.steady_states
+        at, wide = ("state",), ("state", "sensor")
+        velocity = np.asarray(states.velocity)
+        frequency = np.asarray(states.frequency) / HERTZ
+        return {
+            "state": Variable(at, np.arange(states.n_states), "1", "number of the state"),
+            "sensor": Variable(("sensor",), np.array(states.sensors), "", "sensor"),
+            "level": Variable(at, np.asarray(states.level), "1", "level"),
+            "frequency_hz": Variable(at, frequency, "Hz", "frequency"),
+            "force_n": Variable(at, np.asarray(states.force), "N", "force amplitude"),
+            "velocity_re_m_s": Variable(wide, velocity.real, "m/s", "in phase with the force"),
+            "velocity_im_m_s": Variable(
+                wide, velocity.imag, "m/s", "a quarter period ahead of the force"
+            ),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """How often the test jumped, and how many states it missed."""
+        return {"jumps": len(self.jumps), "states_not_reached": self.n_missing}
 
 
 def phase_resonance_test(
     model: Structure,
-    forces: Sequence[float],
+    forces: float | Sequence[float] | Float[ArrayLike, " level"],
     from_frequency: float,
     to_frequency: float,
     *,
     appropriation: tuple[float, float] = (0.5, 0.7),
     points_per_level: int = 5,
-    errors: MeasurementErrors = NO_ERRORS,
-    seed: int = 0,
-    harmonic_order: int = 9,
-    keep_harmonics: tuple[int, ...] = (),
-    by: Means = "harmonic_balance",
-    steps_per_sweep: int = 100,
-    cycles_per_step: int = 200,
+    recording: Recording = EXACT,
+    simulation: SweepSimulation = BY_HARMONIC_BALANCE,
 ) -> VirtualTest:
     """Step the frequency towards resonance at rising force levels and record near, not at, it.
 
@@ -64,20 +120,21 @@ def phase_resonance_test(
     range; states whose appropriation indicator (Eq. 20, of the fundamental) lies inside
     `appropriation` are recorded, `points_per_level` of them, evenly spread in phase over what a
     test can reach of both sides. Where a stable branch ends, the test jumps to the next one,
-    which is noted in `jumps`, and follows that one both ways; states between the two are not
+    which is noted in `jumps`, and records along that one both ways; states between the two are not
     reached.
 
-    `by="harmonic_balance"` steps infinitely slowly and records exact states, at `order` from 0
-    to 1 in the order of the rows. `by="time_integration"` is `stepped_sine`: each level starts
+    By harmonic balance it steps infinitely slowly and records exact states, at `order` from 0
+    to 1 in the order of the rows. By time integration it is `stepped_sine`: each level starts
     from rest, goes up in `steps_per_sweep` equal steps of at most `cycles_per_step` cycles and
     down again, jumps where a step's transient throws it off, and records of its own steps the
     settled ones, at their time in the test; fewer than `points_per_level` where a coarse
     sweep has no more, and no curves. Both record through the measurement effects of the model,
     and drift makes its way through the test.
 
-    Arguments: `forces` in N, frequencies in rad/s, `errors` 1σ, drawn from `seed`;
-    `keep_harmonics` are recorded beside the fundamental.
-    Returns a `VirtualTest`; its steady states carry the stated standard deviations.
+    Arguments: `forces` in N, frequencies in rad/s; `recording` has the random errors and the
+    harmonics recorded beside the fundamental; `simulation` how the motions are computed.
+    Returns a `VirtualTest`; its steady states carry the stated standard deviations, and
+    `n_missing` counts states aimed at that could not be computed.
     Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
     into, and for harmonics, errors or steps that make no sense.
     Reference: Kwarta & Allen, sections 1.2 and 3.1.
@@ -85,39 +142,40 @@ def phase_resonance_test(
     limits = phase_limits(appropriation)
     if points_per_level < 1:
         raise ValueError(f"`points_per_level` must be 1 or more, but is {points_per_level}.")
-    check_recording(errors, keep_harmonics, harmonic_order)
+    by, harmonic_order, steps_per_sweep, cycles_per_step = simulation
+    check_recording(recording, harmonic_order)
     if by not in get_args(Means):
         raise ValueError(f"`by` must be one of {get_args(Means)}, but is {by!r}.")
     if steps_per_sweep < 2:
         raise ValueError(f"`steps_per_sweep` must be 2 or more, but is {steps_per_sweep}.")
-    forces = list(forces)
-    for force in forces:
-        if not force > 0 or not np.isfinite(force):
-            raise ValueError(f"every force must be positive, but one is {force!r} N.")
-    if not 0 < from_frequency < to_frequency < np.inf:
-        raise ValueError(
-            "`from_frequency` must be positive and below a finite `to_frequency`, but they are "
-            f"{from_frequency:g} and {to_frequency:g} rad/s."
-        )
-    ends = (from_frequency, to_frequency)
-    curves: tuple[ResponseCurve, ...] = ()
+    loads = positive_values("force", forces, "N").tolist()
+    low, high = frequency_range(from_frequency, to_frequency).tolist()
     if by == "harmonic_balance":
-        found = _along_curves(model, forces, ends, limits, points_per_level, harmonic_order)
-        states, jumps, curves = found
+        found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
     else:
-        up = np.linspace(*ends, steps_per_sweep)
+        up = np.linspace(low, high, steps_per_sweep)
         states, jumps = stepped_states(
-            *(model, forces, up, limits, points_per_level),
+            *(model, loads, up, limits, points_per_level),
             cycles_per_step=cycles_per_step,
             harmonic_order=harmonic_order,
         )
-    if not len(states.level):
+        found = _Visited(states, jumps, (), 0)
+    if not len(found.states.level):
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range, or take more steps."
         )
-    recorded = recorded_states(model, states, errors, seed, keep_harmonics)
-    return VirtualTest(recorded, tuple(jumps), curves)
+    recorded = recorded_states(model, found.states, recording)
+    return VirtualTest(recorded, tuple(found.jumps), found.curves, found.n_missing)
+
+
+class _Visited(NamedTuple):
+    """States that a test visits, its jumps, the exact curves and how many states it missed."""
+
+    states: VisitedStates
+    jumps: list[tuple[int, float]]
+    curves: tuple[ResponseCurve, ...]
+    n_missing: int
 
 
 def _along_curves(
@@ -127,12 +185,13 @@ def _along_curves(
     limits: tuple[float, float],
     points_per_level: int,
     harmonic_order: int,
-) -> tuple[VisitedStates, list[tuple[int, float]], tuple[ResponseCurve, ...]]:
-    """States along the stable parts of the exact curves, jumps and the curves."""
+) -> _Visited:
+    """States along the stable parts of the exact curves."""
     # A drifting structure as it is in the middle of each level.
     middles = (np.arange(len(forces)) + 0.5) / max(len(forces), 1)
     models = [dataclasses.replace(model, test_order=jnp.asarray(middle)) for middle in middles]
-    batch = forced_response_batch(models, forces, *ends, harmonic_order=harmonic_order)
+    settings = ResponseSettings(harmonic_order=harmonic_order)
+    batch = forced_response_batch(models, forces, *ends, settings=settings)
     rows: list[tuple] = []
     jumps: list[tuple[int, float]] = []
     for level, parts in enumerate(batch.curves, start=1):
@@ -148,11 +207,12 @@ def _along_curves(
     curves = tuple(curve for parts in batch.curves for curve in parts)
     if not rows:
         nothing = VisitedStates(*(np.zeros(0),) * 4, np.zeros((0, 2 * harmonic_order + 1, 1)))
-        return nothing, jumps, curves
+        return _Visited(nothing, jumps, curves, 0)
     number, load, frequency, motion, wanted = (np.array(c) for c in zip(*rows, strict=True))
     order = np.linspace(0.0, 1.0, len(rows))
     states = VisitedStates(number, order, load, frequency, motion)
-    return states_at_phases(model, states, wanted), jumps, curves
+    exact = states_at_phases(model, states, wanted)
+    return _Visited(exact, jumps, curves, len(rows) - len(exact.level))
 
 
 def _around_resonance(curve: ResponseCurve, phase: np.ndarray, largest: float) -> np.ndarray:
@@ -167,13 +227,13 @@ def _around_resonance(curve: ResponseCurve, phase: np.ndarray, largest: float) -
 def _swept(curve: ResponseCurve) -> tuple[np.ndarray, list[float]]:
     """Points that stepping the frequency up and down visits, and where it jumps.
 
-    A sweep follows a stable branch until it ends, then goes on with the next stable points of
+    A sweep stays on a stable branch until it ends, then goes on with the next stable points of
     the same curve at that frequency or, beyond a window of period doubling, the next frequency.
     From where it lands it is also turned round: a resonance can lie behind it.
     """
     n = len(curve.frequency)
     visited = np.zeros(n, dtype=bool)
-    stays = curve.stable.copy()
+    stays = curve.is_stable.copy()
     stays[curve.at_events("fold")] = False  # there a multiplier is 1, give or take a rounding
     jumps: list[float] = []
     for direction in (1, -1):

@@ -1,5 +1,6 @@
 """What instruments make of the states that a test visits: the measurement chain and its errors."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -31,6 +32,17 @@ class MeasurementErrors(NamedTuple):
 NO_ERRORS = MeasurementErrors()
 
 
+class Recording(NamedTuple):
+    """What a test writes down of the states it visits: random errors, and further harmonics."""
+
+    errors: MeasurementErrors = NO_ERRORS
+    seed: int = 0  # of the random errors
+    keep_harmonics: tuple[int, ...] = ()  # recorded beside the fundamental
+
+
+EXACT = Recording()
+
+
 class VisitedStates(NamedTuple):
     """The states that a test visits, as they are, in the order of the test."""
 
@@ -45,10 +57,9 @@ class VisitedStates(NamedTuple):
         return VisitedStates(*(part[rows] for part in self))
 
 
-def check_recording(
-    errors: MeasurementErrors, keep_harmonics: Sequence[int], harmonic_order: int
-) -> None:
+def check_recording(recording: Recording, harmonic_order: int) -> None:
     """Raise `ValueError` for harmonics that are not simulated and errors that make no sense."""
+    errors, _, keep_harmonics = recording
     if not all(2 <= h <= harmonic_order for h in keep_harmonics):
         raise ValueError(
             f"`keep_harmonics` must lie between 2 and `harmonic_order` = {harmonic_order}, "
@@ -62,17 +73,15 @@ def check_recording(
 def recorded_states(
     model: Structure,
     states: VisitedStates,
-    errors: MeasurementErrors,
-    seed: int,
-    keep_harmonics: tuple[int, ...] = (),
+    recording: Recording,
 ) -> SteadyStates:
     """The states as they are written down, with their place in the test as `order`.
 
     What the sensors see (the flexible modes and the rigid-body ones) goes through the model's
-    measurement effects in their order; random errors come last, drawn from `seed`.
+    measurement effects in their order; random errors come last.
     """
     force, velocity = _through_the_chain(model, states)
-    return _with_errors(states, force, velocity, model.modes.sensors, keep_harmonics, errors, seed)
+    return _with_errors(states, force, velocity, model.modes.sensors, recording)
 
 
 def recorded_curves(model: Structure, curves: Sequence[ResponseCurve]) -> list[ResponseCurve]:
@@ -96,7 +105,7 @@ def _recorded(model: Structure, curve: ResponseCurve) -> ResponseCurve:
     )
     force = jnp.full(len(fill), curve.force)
     force, velocity = _behind_instruments(model, frequency, force, velocity, displacement)
-    return curve._replace(force=float(force[0]), velocity=np.asarray(velocity)[:n])
+    return dataclasses.replace(curve, force=float(force[0]), velocity=np.asarray(velocity)[:n])
 
 
 def acting_force(model: Structure, recorded: float) -> float:
@@ -153,11 +162,11 @@ def _with_errors(
     force: np.ndarray,
     velocity: np.ndarray,
     sensors: tuple[str, ...],
-    keep_harmonics: tuple[int, ...],
-    errors: MeasurementErrors,
-    seed: int,
+    recording: Recording,
 ) -> SteadyStates:
     """Measured values: the exact ones with errors drawn from a seeded key."""
+    errors, seed, keep_harmonics = recording
+    keep_harmonics = tuple(int(h) for h in keep_harmonics)
     n, n_sensors = len(force), velocity.shape[2]
     keys = jax.random.split(jax.random.key(seed), 6)
 

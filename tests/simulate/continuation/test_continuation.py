@@ -1,6 +1,6 @@
 """Continuation on curves whose points, folds and ends are known exactly."""
 
-from functools import partial
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +9,13 @@ import pytest
 
 from snrmjax.simulate.continuation.continuation import (
     STATUS_MESSAGE,
+    CurveRange,
     CurveStatus,
     StepControl,
     correct,
-    follow_curve,
-    locate_event,
+    trace_curve,
 )
+from snrmjax.simulate.continuation.event_location import locate_event
 
 STEPS = StepControl()
 
@@ -66,14 +67,14 @@ def kink(point):
 PROBLEMS = (s_curve, circle, pole, broken, nothing, isola, kink)
 
 
-@partial(jax.jit, static_argnames=("steps", "max_points"))
-def compiled(which, start, direction, ends, limit, across, steps, max_points):
+@jax.jit
+def compiled(which, start, direction, within, across, steps):
     """All problems in one: which of them is a number, so that this compiles once."""
 
     def problem(point):
         return jax.lax.switch(which, PROBLEMS, point)
 
-    return follow_curve(problem, start, direction, *ends, limit, steps, max_points, across)
+    return trace_curve(problem, start, direction, within, steps, start_across=across)
 
 
 def followed(
@@ -87,8 +88,10 @@ def followed(
     max_points=800,
     across=(0.0, 1.0),
 ):
-    numbers = (jnp.asarray(part, dtype=float) for part in (start, direction, ends, limit, across))
-    curve = compiled(PROBLEMS.index(problem), *numbers, steps=steps, max_points=max_points)
+    start, direction, across = (jnp.asarray(part) for part in (start, direction, across))
+    within = CurveRange(*ends, limit)
+    steps = dataclasses.replace(steps, max_points=max_points)
+    curve = compiled(PROBLEMS.index(problem), start, direction, within, across, steps)
     n = int(curve.n_points)
     followed.n_solves = int(curve.n_solves)
     assert np.all(np.isfinite(curve.points[:n]))
@@ -149,14 +152,16 @@ def test_folds_are_located(s_points, sign):
     points, tangents, _ = s_points
     fold = sign / np.sqrt(3)
     k = int(np.searchsorted(points[:, 0], fold)) - 1
-    found, tangent, resolved = located_fold(points[k], tangents[k], points[k + 1])
+    found, tangent, resolved, missed = located_fold(points[k], tangents[k], points[k + 1])
     assert bool(resolved)
+    assert not bool(missed)
     # Newton to 1e-11; the tangent's share along λ is then 6x·δx/(3x²−1…) of that order.
     np.testing.assert_allclose(found, [fold, fold**3 - fold], atol=1e-10)
     assert abs(float(tangent[-1])) < 1e-10
-    # An event that is not there is not resolved.
-    *_, resolved = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
+    # An event that is not there is not resolved, and not missed either.
+    *_, resolved, missed = located_fold(points[k + 5], tangents[k + 5], points[k + 6])
     assert not bool(resolved)
+    assert not bool(missed)
 
 
 def test_a_coarse_curve_and_a_fine_one_agree(s_points):
@@ -244,8 +249,7 @@ def test_solves_are_counted():
 
     @jax.jit
     def run(start):
-        ends = (jnp.array(-2.0), jnp.array(2.0), jnp.array(jnp.inf))
-        return follow_curve(counted, start, jnp.array([0.0, 1.0]), *ends, STEPS, 800)
+        return trace_curve(counted, start, jnp.array([0.0, 1.0]), CurveRange(-2.0, 2.0), STEPS)
 
     curve = run(jnp.array([-0.8, -0.6]))
     jax.effects_barrier()

@@ -10,8 +10,15 @@ from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_bea
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
+from snrmjax.simulate.continuation import events
 from snrmjax.simulate.continuation.continuation import StepControl
-from snrmjax.simulate.continuation.events import BIFURCATIONS, EVENT_KINDS
+from snrmjax.simulate.continuation.curve_tracing import response_balances
+from snrmjax.simulate.continuation.events import (
+    BIFURCATIONS,
+    EVENT_KINDS,
+    CurvePoints,
+    with_bifurcations,
+)
 from snrmjax.simulate.solutions.forced_response import forced_response
 
 HZ = 2 * np.pi
@@ -237,7 +244,7 @@ def test_bifurcations_lie_where_multipliers_cross(kind, numpy_balance, time_doma
         assert abs(error) < 1e-6, (kind, k)
         assert abs(share) < 1  # and it is this crossing, not another one far away
     # The stability changes there and at folds, and nowhere else.
-    change = np.flatnonzero(curve.stable[1:] != curve.stable[:-1])
+    change = np.flatnonzero(curve.stability[1:] != curve.stability[:-1])
     labelled = np.concatenate([where, curve.at_events("fold")])
     assert all(np.min(np.abs(labelled - k)) <= 1 for k in change)
 
@@ -263,3 +270,69 @@ def test_flat_beam_folds_at_all_forces_are_as_many_as_its_turns():
     assert [counts(curve)["fold"] for curve in curves] == [0, 0, 2, 2]
     for curve in curves:
         assert counts(curve)["peak"] == counts(curve)["phase_resonance"] == 1
+
+
+# ------------------------------------------------------------- rows of multipliers, failed searches
+
+
+def line_with_a_crossing(monkeypatch, between):
+    """A curve of six points whose one multiplier leaves the circle just behind the third.
+
+    `between` are the points that are found between neighbours, from the exact ones.
+    """
+    model = structure(linear_modes([1.0], [0.1], [[1.0]], [1.0]))
+    balance = response_balances([model], np.array([1.0]), 1, None)
+    points = np.outer(np.arange(6.0), [0, 0, 0, 1.0])
+
+    def multipliers_at(_, __, frequency):
+        crossed = 0.5 + 1.0 * (frequency > 2.0)
+        return (-crossed - 1e-3 * frequency)[:, None].astype(complex)
+
+    def points_between(_, curves, owner, position, share, __):
+        here = np.array(position) + np.array(share)
+        found, ok = between(here)
+        along = np.outer(np.ones(len(here)), [0, 0, 0, 1.0])
+        return np.outer(found, [0, 0, 0, 1.0]), along, ok
+
+    monkeypatch.setattr(events, "floquet_multipliers", multipliers_at)
+    monkeypatch.setattr(events, "_points_between", points_between)
+    curve = CurvePoints(points, np.outer(np.ones(6), [0, 0, 0, 1.0]), ("",) * 6)
+    multipliers = multipliers_at(None, None, points[:, -1])
+    return with_bifurcations(balance, curve, multipliers, StepControl()), multipliers_at
+
+
+def test_multipliers_stay_with_their_points_where_two_points_are_one(monkeypatch):
+    # The crossing lies so near to the third point that both are the same numbers.
+    found, multipliers_at = line_with_a_crossing(
+        monkeypatch, lambda exact: (np.floor(1e5 * exact) / 1e5, np.ones(len(exact), dtype=bool))
+    )
+    assert found.points[:, -1].tolist() == [0, 1, 2, 2, 3, 4, 5]
+    assert found.labels.index("period_doubling") in (2, 3)
+    wanted = multipliers_at(None, None, found.points[:, -1])
+    np.testing.assert_array_equal(found.multipliers, wanted)
+
+
+def test_a_bifurcation_that_is_not_located_is_named(monkeypatch):
+    found, _ = line_with_a_crossing(
+        monkeypatch, lambda exact: (exact, np.zeros(len(exact), dtype=bool))
+    )
+    assert found.not_located == ("bifurcation",)
+    assert len(found.points) == 6
+
+
+def test_a_fold_that_is_not_located_is_named():
+    # Newton's method is given no step: it converges nowhere, so that no sign change is resolved.
+    model = curved_beam()
+    (curve,) = forced_response(model, CURVED_BEAM_FORCES[:1], 20 * HZ, 150 * HZ, stability=False)
+    assert curve.not_located == ()
+    balances = response_balances([model], np.array([curve.force]), 9, None)
+    x = curve.coefficients.reshape(len(curve.frequency), -1)
+    scales = float(balances.displacement_scale[0]), float(balances.frequency_scale[0])
+    points = np.concatenate([x / scales[0], curve.frequency[:, None] / scales[1]], axis=1)
+    steps = np.diff(points, axis=0)
+    tangents = np.concatenate([steps, steps[-1:]])
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    bare = CurvePoints(points, tangents, ("",) * len(points))
+    (found,) = events.with_events(balances, [bare], StepControl(iterations=0))
+    assert len(found.points) == len(points)
+    assert {"fold", "peak", "phase_resonance"} == set(found.not_located)

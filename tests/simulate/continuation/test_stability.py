@@ -11,10 +11,11 @@ from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.stability import (
+    Stability,
     StabilityLoss,
     floquet_multipliers,
-    is_stable,
     stability_loss,
+    stability_of,
 )
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 
@@ -42,7 +43,7 @@ def test_linear_modes_have_their_decay_as_multipliers(distance_between):
         # Constant matrices: each step is exact, and rounding of 25 cycles of the faster mode is
         # left.
         assert distance_between(one, other) < 1e-12
-    assert np.all(is_stable(found))
+    assert np.all(stability_of(found) == Stability.STABLE)
     assert stability_loss(found) == (StabilityLoss.STABLE,) * 4
 
 
@@ -53,11 +54,11 @@ def test_undamped_growth_and_decay_are_told_apart():
         effect = make_effect("van_der_pol_damping", {"coefficient": slope})
         model = one_mode(2.0, effects=(effect,))
         found = floquet_multipliers(model, cosine([1.0]), frequency)
-        assert bool(is_stable(found)[0]) is stable
+        assert stability_of(found)[0] == stable
     saddle = floquet_multipliers(one_mode(1.0, potential={"11": -1.0}), at_rest, frequency)
     # q̈ = q: multipliers e^{±T}, T = π.
     np.testing.assert_allclose(sorted(np.abs(saddle[0])), np.exp([-np.pi, np.pi]), rtol=1e-12)
-    assert not is_stable(saddle)[0]
+    assert stability_of(saddle)[0] == Stability.UNSTABLE
     assert stability_loss(saddle) == (StabilityLoss.REAL,)
 
 
@@ -66,7 +67,10 @@ def test_points_that_are_not_finite_have_no_multipliers():
         one_mode(2.0, 0.1), cosine([1.0, np.nan, 1.0]), np.array([1.0, 1.0, np.inf])
     )
     assert np.isfinite(found).all(axis=1).tolist() == [True, False, False]
-    assert is_stable(found).tolist() == [True, False, False]
+    assert stability_of(found).tolist() == [
+        *(Stability.STABLE, Stability.NOT_COMPUTED, Stability.NOT_COMPUTED)
+    ]
+    assert stability_loss(found)[1:] == (StabilityLoss.NOT_COMPUTED,) * 2
     assert floquet_multipliers(one_mode(2.0), cosine([]), np.zeros(0)).shape == (0, 2)
 
 
@@ -104,7 +108,7 @@ def test_mathieu_tongue_of_first_order_is_unstable_inside(shift, stable):
     model = one_mode(np.sqrt(squared), ratio=1e-4, potential={"1111": quartic})
     amplitude = frequency * np.sqrt(parameter / (3 * quartic))
     found = floquet_multipliers(model, cosine([amplitude]), np.array([frequency]))
-    assert bool(is_stable(found)[0]) is stable
+    assert stability_of(found)[0] == stable
 
 
 def test_product_of_multipliers_is_the_mean_damping():
@@ -153,7 +157,7 @@ def test_multipliers_along_a_response_are_those_of_the_integrated_map(
         model, curve = request.getfixturevalue("flat_curve")
     else:
         model, (_, curve) = request.getfixturevalue("curved_curves")
-    kinds = [np.flatnonzero(curve.stable), np.flatnonzero(~curve.stable)]
+    kinds = [np.flatnonzero(curve.is_stable), np.flatnonzero(curve.is_unstable)]
     assert all(len(kind) >= 16 for kind in kinds)
     for k in np.concatenate([kind[:: len(kind) // 5] for kind in kinds]):
         if "fold" in curve.event[k]:  # there the largest multiplier is 1
@@ -165,7 +169,7 @@ def test_multipliers_along_a_response_are_those_of_the_integrated_map(
         tolerance = 1e-3 if which == "flat" else 2e-2
         distance = distance_between(curve.multipliers[k], truth)
         assert distance < tolerance * max(np.abs(truth).max(), 1.0), k
-        assert curve.stable[k] == (np.abs(truth).max() < 1), k
+        assert curve.is_stable[k] == (np.abs(truth).max() < 1), k
 
 
 def test_light_damping_is_not_lost(time_domain, state_of, distance_between):
@@ -180,7 +184,7 @@ def test_light_damping_is_not_lost(time_domain, state_of, distance_between):
     np.testing.assert_allclose(product, np.exp(-2e-5 * w.sum() * period), rtol=1e-11)
     # Both pairs are complex here, the faster one within 1e-4 of the circle.
     radius = np.abs(curve.multipliers)
-    assert np.all(curve.stable)
+    assert np.all(curve.is_stable)
     assert np.all(1 - radius > 1e-5)
     k = len(curve.frequency) // 2
     truth = time_domain(model, 0.01, curve.frequency[k]).multipliers(

@@ -12,10 +12,14 @@ from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded, stacked, taken
 from snrmjax.simulate.continuation.continuation import CurveStatus
-from snrmjax.simulate.solutions.forced_response import forced_response, forced_response_batch
+from snrmjax.simulate.solutions.forced_response import (
+    ResponseSettings,
+    forced_response,
+    forced_response_batch,
+)
 
 RANGE = (1.0, 3.5)
-SETTINGS = {"harmonic_order": 3}
+SETTINGS = ResponseSettings(harmonic_order=3)
 
 
 def one_mode(quartic=0.3, ratio=0.02):
@@ -32,7 +36,7 @@ def members(count):
 @pytest.fixture(scope="module")
 def batch():
     models, forces = members(11)  # more than the eight that one program follows
-    return forced_response_batch(models, forces, *RANGE, **SETTINGS)
+    return forced_response_batch(models, forces, *RANGE, settings=SETTINGS)
 
 
 @pytest.fixture
@@ -57,7 +61,7 @@ def assert_same_curve(one, other):
     np.testing.assert_allclose(one.frequency, other.frequency, rtol=1e-9)
     scale = np.abs(other.coefficients).max()
     np.testing.assert_allclose(one.coefficients, other.coefficients, rtol=0, atol=1e-8 * scale)
-    np.testing.assert_array_equal(one.stable, other.stable)
+    np.testing.assert_array_equal(one.stability, other.stability)
     np.testing.assert_allclose(one.multipliers, other.multipliers, rtol=0, atol=1e-6)
 
 
@@ -65,7 +69,7 @@ def test_every_member_is_the_response_alone(batch):
     models, forces = members(11)
     assert len(batch.curves) == 11
     for k in (0, 4, 10):
-        alone = forced_response(models[k], [forces[k]], *RANGE, **SETTINGS)
+        alone = forced_response(models[k], [forces[k]], *RANGE, harmonic_order=3)
         assert len(alone) == len(batch.curves[k]) == 1
         assert_same_curve(batch.curves[k][0], alone[0])
 
@@ -92,7 +96,7 @@ def test_members_that_fail_leave_the_others_untouched(batch):
     models[1] = broken
     forces[[2, 3, 4, 5]] = 0.0, -1.0, np.nan, np.inf
     forces[6] = 1e30  # Newton's method finds nothing
-    mixed = forced_response_batch(models, forces, *RANGE, **SETTINGS)
+    mixed = forced_response_batch(models, forces, *RANGE, settings=SETTINGS)
     assert mixed.status[1:6].tolist() == [CurveStatus.INVALID] * 5
     assert mixed.status[6] == CurveStatus.NO_START
     for k in range(1, 7):
@@ -111,16 +115,16 @@ def test_members_that_fail_leave_the_others_untouched(batch):
 
 
 def test_a_batch_of_failures_alone_and_an_empty_one():
-    failed = forced_response_batch(one_mode(), [0.0, np.nan], *RANGE, **SETTINGS)
+    failed = forced_response_batch(one_mode(), [0.0, np.nan], *RANGE, settings=SETTINGS)
     assert failed.status.tolist() == [CurveStatus.INVALID] * 2
-    empty = forced_response_batch(one_mode(), [], *RANGE, **SETTINGS)
+    empty = forced_response_batch(one_mode(), [], *RANGE, settings=SETTINGS)
     assert len(empty.status) == len(empty.peak_frequency) == len(empty.curves) == 0
 
 
 def test_other_numbers_and_more_members_compile_nothing(batch, compilations):
     models, forces = members(19)
     assert len(compilations) == 0
-    more = forced_response_batch(models, 1.1 * forces, 1.05, 3.4, **SETTINGS)
+    more = forced_response_batch(models, 1.1 * forces, 1.05, 3.4, settings=SETTINGS)
     assert len(compilations) == 0
     assert more.status.tolist() == [CurveStatus.UPPER_END] * 19
     assert len(batch.status) == 11
@@ -133,7 +137,7 @@ def test_chunks_give_the_same_and_tell_their_progress(batch):
     told = []
     chunked = forced_response_batch(
         *(models, forces, *RANGE),
-        **SETTINGS,
+        settings=SETTINGS,
         chunk=4,
         keep_curves=False,
         progress=lambda done, of: told.append((done, of)),

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.structures import simulated_structure, structure
-from snrmjax.simulate.continuation.stability import floquet_multipliers, is_stable
+from snrmjax.simulate.continuation.stability import Stability, floquet_multipliers, stability_of
 from snrmjax.simulate.solutions.forced_response import solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import settled_motion
 
@@ -350,7 +350,7 @@ def test_harmonic_balance_is_the_settled_motion(group, kind):
     assert change.max() > 0.05
     # What a motion settles to is stable.
     multipliers = floquet_multipliers(simulated_structure(model), coefficients, FREQUENCIES)
-    assert np.all(is_stable(multipliers))
+    assert np.all(stability_of(multipliers) == Stability.STABLE)
 
 
 @pytest.mark.parametrize("kind", ["gap_stiffness", *FRICTION])

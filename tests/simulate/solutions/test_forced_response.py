@@ -12,7 +12,7 @@ from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
-from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.continuation.continuation import CurveStatus, StepControl
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.periodic_motion import periodic_motion
 
@@ -81,7 +81,7 @@ def test_a_linear_structure_gives_its_linear_response(small_curves):
     scale = np.abs(wanted).max()
     np.testing.assert_allclose(curve.velocity[:, 1], wanted, rtol=0, atol=5e-8 * scale)
     np.testing.assert_allclose(curve.velocity[:, [0, 2, 3]], 0.0, atol=1e-12 * scale)
-    assert np.all(curve.stable)
+    assert np.all(curve.is_stable)
     # Events: the mode of interest is in phase at its own natural frequency.
     (resonance,) = curve.at_events("phase_resonance")
     assert curve.frequency[resonance] == pytest.approx(2.0, rel=1e-12)
@@ -138,7 +138,7 @@ def test_orbits_close_in_time(which, start, every, request, time_domain, state_o
         model, curve.force, curve.frequency[rows], padded(curve.coefficients[rows], 21)
     )
     assert all(converged)
-    assert {False, True} == set(curve.stable[rows].tolist())
+    assert {False, True} == set(curve.is_stable[rows].tolist())
     worst = [0.0, 0.0]
     for k, x in zip(rows, exact, strict=True):
         truth = time_domain(model, curve.force, curve.frequency[k])
@@ -387,7 +387,7 @@ def test_a_structure_of_nan_has_no_curve():
     parts = forced_response(broken, [0.2], 1.0, 3.0, harmonic_order=3)
     assert [part.status for part in parts] == [CurveStatus.INVALID]
     for part in parts:
-        assert len(part.frequency) == len(part.event) == len(part.stable) == 0
+        assert len(part.frequency) == len(part.event) == len(part.stability) == 0
         assert part.velocity.shape == (0, 4, 1)
         assert part.coefficients.shape == (0, 7, 1)
 
@@ -395,7 +395,9 @@ def test_a_structure_of_nan_has_no_curve():
 def test_an_undamped_resonance_is_not_crossed():
     """Both ends climb it until their points are used up, and both parts come back."""
     # From 1.1 on: at 1.0 the second harmonic would stand at the undamped resonance itself.
-    parts = forced_response(with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3, max_points=400)
+    parts = forced_response(
+        with_drag(0.0), [0.2], 1.1, 3.0, harmonic_order=3, steps=StepControl(max_points=400)
+    )
     assert [part.status for part in parts] == [CurveStatus.POINT_LIMIT] * 2
     # A step that may hide two events is divided by seven points.
     assert all(len(part.frequency) in (400, 407) for part in parts)
@@ -409,7 +411,9 @@ def test_an_undamped_resonance_is_not_crossed():
         wanted = linear_response(modes, jnp.asarray(part.frequency), jnp.array(0.2))
         np.testing.assert_allclose(part.velocity[:, 1], wanted, rtol=1e-6)
     with pytest.raises(ValueError, match="`max_points` must be 2 or more, but is 1"):
-        forced_response(with_drag(0.0), [0.2], 1.0, 3.0, harmonic_order=3, max_points=1)
+        forced_response(
+            with_drag(0.0), [0.2], 1.0, 3.0, harmonic_order=3, steps=StepControl(max_points=1)
+        )
 
 
 def test_damping_by_an_effect_alone_limits_a_resonance():

@@ -9,8 +9,10 @@ from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
-from snrmjax.simulate.solutions.forced_response import forced_response
-from snrmjax.simulate.solutions.isolated_responses import isolated_responses
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response
+from snrmjax.simulate.solutions.isolated_responses import IsolatedSearch, isolated_responses
+
+ORDER_3 = ResponseSettings(harmonic_order=3)
 
 HZ = 2 * np.pi
 OMEGA, RATIO, UNIT = 80 * HZ, 0.01, 1e-3
@@ -45,7 +47,9 @@ def loops():
     model, _ = damped_oddly()
     ends = (70 * HZ, 90 * HZ)
     known = forced_response(model, [FORCE], *ends, harmonic_order=5, stability=False)
-    return known, isolated_responses(model, FORCE, *ends, known=known, harmonic_order=5)
+    return known, isolated_responses(
+        model, FORCE, *ends, known=known, settings=ResponseSettings(harmonic_order=5)
+    )
 
 
 def test_an_isolated_loop_is_found_once_and_followed_around(loops):
@@ -76,8 +80,8 @@ def test_the_loops_stable_half_is_a_motion_in_time(loops, time_domain, state_of)
     model, (quadratic, cubic) = damped_oddly()
     loop = loops[1][0]
     k = int(np.argmax(np.abs(loop.velocity[:, 1, 0])))
-    assert loop.stable[k]
-    assert 0.2 < np.mean(loop.stable) < 0.8
+    assert loop.is_stable[k]
+    assert 0.2 < np.mean(loop.is_stable) < 0.8
 
     def extra(q, v):
         return quadratic * np.abs(v) * v + cubic * v**3
@@ -87,12 +91,12 @@ def test_the_loops_stable_half_is_a_motion_in_time(loops, time_domain, state_of)
     # Seventh and higher harmonics are left out: the damping of 2 % over their order squared.
     assert domain.closure(state[None]) < 3e-5
     low = int(np.argmin(np.abs(loop.velocity[:, 1, 0])))
-    assert not loop.stable[low]
+    assert not loop.is_stable[low]
 
 
 def test_the_second_well_vibrates_with_its_own_stiffness():
     model, force = curved_beam("as_printed"), 1e-6
-    found = isolated_responses(model, force, 40 * HZ, 120 * HZ, harmonic_order=3)
+    found = isolated_responses(model, force, 40 * HZ, 120 * HZ, settings=ORDER_3)
     wells = [curve for curve in found if curve.branch == "about another equilibrium"]
     assert len(wells) == 1
     curve = wells[0]
@@ -112,7 +116,7 @@ def test_the_second_well_vibrates_with_its_own_stiffness():
     # A force so small that the motion, 1e-4 of the well's depth, is linear to that share squared.
     np.testing.assert_allclose(phasor, linear, rtol=1e-4)
     np.testing.assert_allclose(curve.coefficients[:, 0, 0], well, rtol=1e-4)
-    assert np.all(curve.stable)
+    assert np.all(curve.is_stable)
 
 
 def test_starts_that_are_given_are_used_and_checked():
@@ -121,15 +125,23 @@ def test_starts_that_are_given_are_used_and_checked():
     x[0] = 5e-4
     ends = (60 * HZ, 80 * HZ)
     found = isolated_responses(
-        model, 1e-6, *ends, starts=[(x, 70 * HZ)], n_starts=0, harmonic_order=3, stability=False
+        *(model, 1e-6, *ends),
+        search=IsolatedSearch(starts=[(x, 70 * HZ)], n_starts=0),
+        settings=ResponseSettings(harmonic_order=3, stability=False),
     )
     assert [curve.branch for curve in found] == ["isolated, from a given start"]
     with pytest.raises(ValueError, match=r"every start must have coefficients of shape \(7, 1\)"):
-        isolated_responses(model, 1e-6, *ends, starts=[(x[:5], 70 * HZ)], harmonic_order=3)
+        isolated_responses(
+            model, 1e-6, *ends, search=IsolatedSearch([(x[:5], 70 * HZ)]), settings=ORDER_3
+        )
 
 
 def test_nothing_is_found_where_there_is_nothing():
     modes = linear_modes([OMEGA], [RATIO], [[2.0]], [PARTICIPATION])
     stiffening = structure(modes, polynomial_potential({"1111": 1e9}, 1))
     ends = (70 * HZ, 95 * HZ)
-    assert isolated_responses(stiffening, 0.5, *ends, harmonic_order=3, stability=False) == []
+    settings = ResponseSettings(harmonic_order=3, stability=False)
+    found = isolated_responses(stiffening, 0.5, *ends, settings=settings)
+    assert len(found) == 0
+    assert found.n_starts == 128 + 2 * 7 + 1  # random ones, at rest and beside it, one resonance
+    assert found.n_failed + found.n_known == found.n_starts

@@ -1,5 +1,7 @@
 """Normal modes against elliptic integrals, quadrature and integrated motions."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +46,9 @@ def exact_frequency(amplitude, quartic=QUARTIC):
 @pytest.fixture(scope="module")
 def duffing_branch():
     # To rounding, so that only the harmonics that are left out make a difference.
-    return nonlinear_normal_mode(duffing(), 9.0, steps=DEFAULT_STEPS._replace(tolerance=1e-13))
+    return nonlinear_normal_mode(
+        duffing(), 9.0, steps=dataclasses.replace(DEFAULT_STEPS, tolerance=1e-13)
+    )
 
 
 def test_duffing_oscillator_has_its_exact_frequency_and_energy(duffing_branch):
@@ -263,7 +267,7 @@ def test_the_tongue_is_reported_and_can_be_skipped(flat_branch):
 def test_friction_is_left_out_of_a_conservative_mode(duffing_branch):
     sliders = make_effect("jenkins_slider", {"stiffness": 1.0, "slip_displacement": 0.1})
     rubbing = make_effect("coulomb_friction", {"force": 0.1})
-    fine = DEFAULT_STEPS._replace(tolerance=1e-13)
+    fine = dataclasses.replace(DEFAULT_STEPS, tolerance=1e-13)
     branch = nonlinear_normal_mode(duffing(effects=(sliders, rubbing)), 9.0, steps=fine)
     np.testing.assert_array_equal(branch.frequency, duffing_branch.frequency)
     np.testing.assert_array_equal(branch.energy, duffing_branch.energy)

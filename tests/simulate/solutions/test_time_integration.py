@@ -16,6 +16,7 @@ from snrmjax.simulate.solutions import time_integration
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import (
     MOTION_MESSAGE,
+    IntegrationAccuracy,
     MotionStatus,
     settled_motion,
     stepped_sine,
@@ -53,7 +54,9 @@ def fundamental(motion):
 @pytest.mark.parametrize("frequency", [300.0, 495.0, 2700.0])
 def test_a_small_motion_is_the_linear_response(frequency):
     beam = flat_beam()
-    motion = settled_motion(beam, 1e-7, frequency, tolerance=1e-6, max_cycles=4000)
+    motion = settled_motion(
+        beam, 1e-7, frequency, accuracy=IntegrationAccuracy(settled=1e-6), max_cycles=4000
+    )
     exact = linear_response(beam.modes, frequency, 1e-7)
     assert motion.converged
     # The tolerance is on an estimate of the distance: three of them.
@@ -63,7 +66,9 @@ def test_a_small_motion_is_the_linear_response(frequency):
 def test_a_transient_is_the_closed_form():
     """From rest, q = q_p − e^{−ζωt}(…): the state after eight cycles, not settled."""
     omega, force = 480.0, 0.7
-    motion = settled_motion(oscillator(), force, omega, max_cycles=8, tolerance=0.0)
+    motion = settled_motion(
+        oscillator(), force, omega, max_cycles=8, accuracy=IntegrationAccuracy(settled=0.0)
+    )
     time = 8 * 2 * np.pi / omega
     steady = force * PARTICIPATION / (OMEGA**2 - omega**2 + 2j * RATIO * OMEGA * omega)
     roots = OMEGA * (-RATIO + np.array([1j, -1j]) * np.sqrt(1 - RATIO**2))
@@ -74,7 +79,8 @@ def test_a_transient_is_the_closed_form():
     # 8 · 128 steps, each of them right to 1e-8 of the motion.
     scale = abs(steady) * np.array([1.0, omega])
     np.testing.assert_allclose(motion.state[:, 0] / scale, exact / scale, atol=1e-5)
-    tight = settled_motion(oscillator(), force, omega, max_cycles=8, tolerance=0.0, rtol=1e-12)
+    exact = IntegrationAccuracy(settled=0.0, step=1e-12)
+    tight = settled_motion(oscillator(), force, omega, max_cycles=8, accuracy=exact)
     np.testing.assert_allclose(tight.state[:, 0] / scale, exact / scale, atol=1e-9)
     assert motion.n_cycles == 8
     assert not motion.converged
@@ -82,7 +88,7 @@ def test_a_transient_is_the_closed_form():
 
 def test_a_strong_motion_is_what_scipy_finds(time_domain):
     model, force, omega = curved_beam(), 1.779e-3, 60 * HZ
-    motion = settled_motion(model, force, omega, tolerance=1e-6)
+    motion = settled_motion(model, force, omega, accuracy=IntegrationAccuracy(settled=1e-6))
     assert motion.converged
     truth = time_domain(model, force, omega)
     period = 2 * np.pi / omega
@@ -118,7 +124,7 @@ def test_the_start_decides_between_stable_motions(stiffening):
         )
         k = np.argmin(near)
         assert near[k] < 0.05
-        assert curve.stable[k]
+        assert curve.is_stable[k]
         exact, _ = solve_at_frequency(
             model, jnp.array([1.0]), jnp.array([omega]), jnp.asarray(curve.coefficients[k])[None]
         )
@@ -167,7 +173,7 @@ def test_a_coarse_sweep_jumps_early_as_scipy_says(stiffening, time_domain):
     for n_steps in (16, 31):
         grid = np.linspace(0.95, 1.35, n_steps)
         steps[n_steps] = grid[grid < 1.17] * OMEGA
-        options = {"cycles_per_step": 40, "tolerance": 0.0, "rtol": 1e-10}
+        options = {"cycles_per_step": 40, "accuracy": IntegrationAccuracy(0.0, 1e-10)}
         sweep = stepped_sine(model, 1.0, steps[n_steps], **options)
         assert np.all(sweep.n_cycles == 40)
         height[n_steps] = np.abs(fundamental(sweep))

@@ -16,12 +16,17 @@ from snrmjax.simulate.virtual_test.controlled_test import (
     response_controlled_test,
 )
 from snrmjax.simulate.virtual_test.phase_resonance_test import (
-    NO_ERRORS,
-    MeasurementErrors,
+    SweepSimulation,
     _swept,
     phase_resonance_test,
 )
-from snrmjax.simulate.virtual_test.recording import VisitedStates, recorded_states
+from snrmjax.simulate.virtual_test.recording import (
+    EXACT,
+    MeasurementErrors,
+    Recording,
+    VisitedStates,
+    recorded_states,
+)
 
 HZ = 2 * np.pi
 RANGE = (30 * HZ, 110 * HZ)
@@ -37,7 +42,7 @@ def run(forces=FORCES, **options):
 
 @pytest.fixture(scope="module")
 def exact():
-    return run(keep_harmonics=(2, 3))
+    return run(recording=Recording(keep_harmonics=(2, 3)))
 
 
 def phases(states):
@@ -72,7 +77,7 @@ def test_a_superharmonic_resonance_is_passed_over():
     test = phase_resonance_test(curved_beam(), [1.8e-3], 8 * HZ, 140 * HZ)
     (curve,) = test.curves
     phase = np.angle(curve.velocity[:, 1, 0])
-    below = curve.stable & (curve.frequency < 40 * HZ)
+    below = curve.is_stable & (curve.frequency < 40 * HZ)
     assert np.any(below & (np.cos(phase) ** 2 > 0.5)), "there is nothing to pass over"
     assert np.all(test.steady_states.frequency > 80 * HZ)
     assert len(test.steady_states.frequency) == 5
@@ -125,7 +130,7 @@ def test_states_between_two_branches_are_not_reached(exact):
     for level, frequency in exact.jumps:
         curve = exact.curves[level - 1]
         folds = curve.frequency[curve.at_events("fold")]
-        unstable = curve.frequency[~curve.stable]
+        unstable = curve.frequency[curve.is_unstable]
         ends = np.concatenate([folds, unstable])
         assert np.abs(ends / frequency - 1).min() < 0.03
     assert {level for level, _ in exact.jumps} == {1, 2}
@@ -140,7 +145,7 @@ def test_states_between_two_branches_are_not_reached(exact):
             # The two neighbours on the curve that enclose the state are both stable.
             between = (phase[:-1] - p) * (phase[1:] - p) <= 1e-12
             between &= (curve.frequency[:-1] - f) * (curve.frequency[1:] - f) <= 1e-6
-            assert np.any(between & curve.stable[:-1] & curve.stable[1:])
+            assert np.any(between & curve.is_stable[:-1] & curve.is_stable[1:])
 
 
 # ------------------------------------------------------------------------------------- errors
@@ -159,7 +164,9 @@ def test_without_errors_nothing_is_stated(exact):
 
 def test_errors_are_drawn_from_the_seed():
     errors = MeasurementErrors(amplitude=0.01, phase=0.01, force=0.01, level_gain=0.01)
-    first, again, other = (run(errors=errors, seed=seed).steady_states for seed in (3, 3, 4))
+    first, again, other = (
+        run(recording=Recording(errors, seed)).steady_states for seed in (3, 3, 4)
+    )
     np.testing.assert_array_equal(first.velocity, again.velocity)
     np.testing.assert_array_equal(first.force, again.force)
     assert not np.any(first.velocity == other.velocity)
@@ -168,10 +175,13 @@ def test_errors_are_drawn_from_the_seed():
 
 
 def test_errors_have_the_stated_sizes():
-    many = {"points_per_level": 40, "keep_harmonics": (2, 3)}
+    kept = (2, 3)
     errors = MeasurementErrors(amplitude=0.02, phase=0.03, force=0.015, harmonic=1e-4)
-    truth = run(TINY, **many).steady_states
-    tests = [run(TINY, errors=errors, seed=seed, **many).steady_states for seed in range(10)]
+    truth = run(TINY, points_per_level=40, recording=Recording(keep_harmonics=kept)).steady_states
+    tests = [
+        run(TINY, points_per_level=40, recording=Recording(errors, seed, kept)).steady_states
+        for seed in range(10)
+    ]
     noisy = jax.tree.map(lambda *parts: np.concatenate(parts), *tests)
     truth = jax.tree.map(lambda part: np.concatenate([part] * 10), truth)
     ratio = (noisy.velocity / truth.velocity)[:, 0]
@@ -207,9 +217,9 @@ def test_errors_have_the_stated_sizes():
 def test_level_errors_are_shared_within_a_level():
     forces = tuple(np.linspace(1e-9, 5e-9, 20))
     errors = MeasurementErrors(level_gain=0.1, level_phase=0.2)
-    options = {"points_per_level": 4, "keep_harmonics": (2,)}
-    truth = run(forces, **options).steady_states
-    noisy = run(forces, errors=errors, seed=5, **options).steady_states
+    exact, drawn = (Recording(one, seed=5, keep_harmonics=(2,)) for one in (EXACT.errors, errors))
+    truth = run(forces, points_per_level=4, recording=exact).steady_states
+    noisy = run(forces, points_per_level=4, recording=drawn).steady_states
     ratio = np.asarray(noisy.velocity / truth.velocity)[:, 0].reshape(20, 4)
     np.testing.assert_allclose(ratio, ratio[:, :1] * np.ones(4), rtol=1e-12)  # rounding
     assert len(np.unique(np.abs(ratio[:, 0]).round(9))) == 20
@@ -242,7 +252,7 @@ def test_what_is_recorded_went_through_the_chain_in_order():
     omega, force = np.array([490.0, 505.0, 510.0]), np.array([0.1, 0.2, 0.2])
     x = np.random.default_rng(3).normal(size=(3, 5, 1)) * 1e-5
     states = VisitedStates(np.array([1, 2, 2]), np.array([0.0, 0.4, 1.0]), force, omega, x)
-    found = recorded_states(model, states, NO_ERRORS, 0, (2,))
+    found = recorded_states(model, states, Recording(keep_harmonics=(2,)))
     one, two = (x[:, h, 0] - 1j * x[:, h + 1, 0] for h in (1, 3))
     stretch = 1 + 1e9 * np.abs(one) ** 2
     turn = np.exp(1j * np.deg2rad(4.0))
@@ -270,7 +280,7 @@ def test_sensors_see_the_rigid_body_motion_too():
     receptance = 3.0 / (500.0**2 - omega**2 + 20j * omega)
     x = np.stack([0 * omega, receptance.real, -receptance.imag], axis=1)[:, :, None]
     states = VisitedStates(np.ones(2, dtype=int), np.zeros(2), np.ones(2), omega, x)
-    found = recorded_states(structure(modes), states, NO_ERRORS, 0)
+    found = recorded_states(structure(modes), states, EXACT)
     wanted = linear_response(modes, omega, np.ones(2))
     np.testing.assert_allclose(found.velocity, wanted, rtol=1e-12)  # rounding
 
@@ -313,8 +323,7 @@ def test_a_drifting_structure_is_stepped_through_in_time():
         [1.0, 2.0],
         470.0,
         540.0,
-        by="time_integration",
-        steps_per_sweep=71,
+        simulation=SweepSimulation(by="time_integration", steps_per_sweep=71),
     )
     states = test.steady_states
     assert test.jumps == ()
@@ -331,8 +340,8 @@ def test_a_drifting_structure_is_stepped_through_in_time():
 
 @pytest.mark.long
 def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
-    options = {"by": "time_integration", "steps_per_sweep": 81, "appropriation": (0.4, 0.8)}
-    test = run(**options)
+    in_time = SweepSimulation(by="time_integration", steps_per_sweep=81)
+    test = run(simulation=in_time, appropriation=(0.4, 0.8))
     states = test.steady_states
     assert 10 <= states.n_states <= 16
     # Every state lies on the exact curve, on a stable part, by interpolation to about 1e-2.
@@ -342,14 +351,14 @@ def test_in_time_a_test_jumps_and_records_what_is_settled(exact):
             curve.velocity[:, 1, 0] / states.velocity[k, 0] - 1
         )
         assert away.min() < 0.06
-        assert curve.stable[int(np.argmin(away))]
+        assert curve.is_stable[int(np.argmin(away))]
     # Finite steps and transients: jumps are within two steps of the folds, or earlier.
     step = 80 * HZ / 80
     assert {level for level, _ in test.jumps} == {1, 2}
     for level, frequency in test.jumps:
         curve = exact.curves[level - 1]
         left = np.concatenate(
-            [curve.frequency[curve.at_events("fold")], curve.frequency[~curve.stable]]
+            [curve.frequency[curve.at_events("fold")], curve.frequency[curve.is_unstable]]
         )
         assert np.abs(left - frequency).min() < 2 * step
 
@@ -395,7 +404,7 @@ def test_a_phase_locked_loop_records_what_jumps_leave_out(exact):
         place = passed[np.argmin(np.abs(on - states.frequency[k]))]
         # Linear interpolation over a step.
         assert np.abs(on / states.frequency[k] - 1).min() < 2e-3
-        unstable += not curve.stable[place]
+        unstable += not curve.is_stable[place]
     assert unstable >= 1
     assert test.jumps == ()
     assert len(test.curves) == 3
@@ -405,7 +414,9 @@ NARROW = (55 * HZ, 80 * HZ)
 
 
 def test_response_control_holds_the_velocity():
-    test = response_controlled_test(curved_beam(), [1e-3, 0.1], *NARROW, keep_harmonics=(2,))
+    test = response_controlled_test(
+        curved_beam(), [1e-3, 0.1], *NARROW, recording=Recording(keep_harmonics=(2,))
+    )
     states, modes = test.steady_states, curved_beam().modes
     assert states.level.tolist() == [1] * 5 + [2] * 5
     np.testing.assert_allclose(
@@ -426,12 +437,12 @@ def test_response_control_holds_the_velocity():
 
 def test_errors_and_chain_are_the_same_for_every_test():
     errors = MeasurementErrors(amplitude=0.01, phase=0.02, force=0.03)
-    options = {"errors": errors, "seed": 3}
+    noisy, plain = Recording(errors, seed=3), Recording(seed=3)
     exact_one = phase_controlled_test(curved_beam(), TINY, [0.0]).steady_states
-    drawn = phase_controlled_test(curved_beam(), TINY, [0.0], **options).steady_states
+    drawn = phase_controlled_test(curved_beam(), TINY, [0.0], recording=noisy).steady_states
     same = VisitedStates(np.array([1, 2]), np.zeros(2), np.ones(2), np.ones(2), np.ones((2, 3, 1)))
-    by_hand = recorded_states(curved_beam(), same, errors, 3)
-    plain = recorded_states(curved_beam(), same, NO_ERRORS, 3)
+    by_hand = recorded_states(curved_beam(), same, noisy)
+    plain = recorded_states(curved_beam(), same, plain)
     np.testing.assert_allclose(
         drawn.velocity / exact_one.velocity, by_hand.velocity / plain.velocity, rtol=1e-12
     )
@@ -453,14 +464,26 @@ def test_errors_and_chain_are_the_same_for_every_test():
         ({"appropriation": (0.5, 1.1)}, "`appropriation`"),
         ({"appropriation": (np.nan, 0.5)}, "`appropriation`"),
         ({"points_per_level": 0}, "`points_per_level` must be 1 or more, but is 0"),
-        ({"keep_harmonics": (10,)}, "`keep_harmonics` must lie between 2 and `harmonic_order` = 9"),
-        ({"keep_harmonics": (1,)}, "`keep_harmonics`"),
-        ({"errors": MeasurementErrors(phase=-0.1)}, "the error `phase` must be zero or positive"),
-        ({"errors": MeasurementErrors(force=np.nan)}, "the error `force`"),
+        (
+            {"recording": Recording(keep_harmonics=(10,))},
+            "`keep_harmonics` must lie between 2 and `harmonic_order` = 9",
+        ),
+        ({"recording": Recording(keep_harmonics=(1,))}, "`keep_harmonics`"),
+        (
+            {"recording": Recording(MeasurementErrors(phase=-0.1))},
+            "the error `phase` must be zero or positive",
+        ),
+        ({"recording": Recording(MeasurementErrors(force=np.nan))}, "the error `force`"),
         ({"forces": [0.0]}, "every force must be positive"),
-        ({"by": "magic"}, "`by` must be one of .*'time_integration'.*, but is 'magic'"),
-        ({"steps_per_sweep": 1}, "`steps_per_sweep` must be 2 or more, but is 1"),
-        ({"by": "time_integration", "cycles_per_step": 3}, "needs 8 cycles"),
+        (
+            {"simulation": SweepSimulation(by="magic")},
+            "`by` must be one of .*'time_integration'.*, but is 'magic'",
+        ),
+        (
+            {"simulation": SweepSimulation(steps_per_sweep=1)},
+            "`steps_per_sweep` must be 2 or more, but is 1",
+        ),
+        ({"simulation": SweepSimulation("time_integration", cycles_per_step=3)}, "needs 8 cycles"),
     ],
 )
 def test_wrong_settings_are_named(options, message):
@@ -488,7 +511,7 @@ def test_wrong_settings_of_a_phase_locked_loop_are_named(forces, phases, message
         ({"velocities": [-1.0]}, "every velocity must be positive, but one is -1.0 m/s"),
         ({"appropriation": (1.0, 1.0)}, "`appropriation`"),
         ({"points_per_level": 0}, "`points_per_level`"),
-        ({"keep_harmonics": (1,)}, "`keep_harmonics`"),
+        ({"recording": Recording(keep_harmonics=(1,))}, "`keep_harmonics`"),
         ({"from_frequency": 1e4}, "`from_frequency` must be positive and below"),
     ],
 )
@@ -519,7 +542,7 @@ def test_a_sweep_turns_round_where_it_lands():
     frequency = np.array([1.0, 5, 10, 6, 2, 2.5, 4, 5.5, 7, 8, 7.5, 6.5, 9, 12])
     stable = np.array([1, 1, 1, 0, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1], dtype=bool)
     curve = SimpleNamespace(
-        frequency=frequency, stable=stable, at_events=lambda _: np.array([], dtype=int)
+        frequency=frequency, is_stable=stable, at_events=lambda _: np.array([], dtype=int)
     )
     visited, jumps = _swept(curve)
     np.testing.assert_array_equal(visited, stable)

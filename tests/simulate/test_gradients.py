@@ -1,0 +1,188 @@
+"""Derivatives that are promised: forward and reverse agree, differences agree, failures spread not.
+
+Every function of a batch has a member that cannot be solved: its value is NaN, its derivatives are
+zero, and those of the others are what they are.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from snrmjax.model.effects import make_effect
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.potential import polynomial_potential
+from snrmjax.model.structures import structure
+from snrmjax.simulate.balance.prescribed_motion import prescribed_motion
+from snrmjax.simulate.solutions.forced_response import forced_response
+from snrmjax.simulate.solutions.periodic_motion import (
+    motions_at_velocities,
+    periodic_motion,
+    response_at_velocities,
+)
+
+FORCE = 0.12
+NAMES = ("force", "cubic", "quartic", "natural frequency", "damping ratio", "drag")
+
+
+def oscillator():
+    drag = make_effect("quadratic_damping", {"coefficient": 0.002})
+    potential = polynomial_potential({"111": 0.05, "1111": 0.3}, 1)
+    return structure(linear_modes([2.0], [0.02], [[1.0]], [1.5]), potential, effects=(drag,))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation():
+    """Derivatives take long to compile and nothing here runs long."""
+    before = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+@pytest.fixture(scope="module")
+def curve():
+    (found,) = forced_response(oscillator(), FORCE, 1.0, 4.0, harmonic_order=3, stability=False)
+    return found
+
+
+def changed(shifts):
+    """The force and the oscillator, every number times one plus its shift."""
+    model, share = oscillator(), 1 + shifts
+    return FORCE * share[0], eqx.tree_at(
+        lambda m: (
+            *(m.potential.coefficient, m.modes.natural_frequency),
+            *(m.modes.damping_ratio, m.effects[0].coefficient),
+        ),
+        model,
+        (
+            *(model.potential.coefficient * share[1:3], model.modes.natural_frequency * share[3]),
+            *(model.modes.damping_ratio * share[4], model.effects[0].coefficient * share[5]),
+        ),
+    )
+
+
+def numbers_of(motions):
+    """Frequency, velocity amplitude and both parts of the fundamental of every motion."""
+    phasor = motions.velocity[..., 1, 0]
+    parts = (motions.frequency, motions.amplitude, phasor.real, phasor.imag)
+    return jnp.stack(parts, axis=-1)
+
+
+def by_differences(function, step=2e-3):
+    """Central differences of fourth order: the step to the fourth power, 2e-11, is left."""
+    columns = []
+    for k in range(len(NAMES)):
+        at = [np.eye(len(NAMES))[k] * step * m for m in (-2, -1, 1, 2)]
+        low, left, right, high = (np.asarray(function(shift)) for shift in at)
+        columns.append((8 * (right - left) - (high - low)) / (12 * step))
+    return np.stack(columns, axis=-1)
+
+
+def assert_gradients(function, failed):
+    """Forward, reverse and differences agree; failed members are NaN with zero derivatives."""
+    zero = np.zeros(len(NAMES))
+    value = np.asarray(function(zero))
+    good = ~np.isin(np.arange(len(value)), failed)
+    assert np.isfinite(value).all(axis=1).tolist() == good.tolist()
+    forward = np.asarray(jax.jit(jax.jacfwd(function))(zero))
+    reverse = np.asarray(jax.jit(jax.jacrev(function))(zero))
+    size = np.abs(value[good]).max() + np.abs(forward[good]).max()
+    # One linear solve each, of the same matrix and of its transpose: rounding.
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-9 * size)
+    np.testing.assert_allclose(
+        forward[good], by_differences(function)[good], rtol=0, atol=1e-6 * size
+    )
+    assert np.all(forward[~good] == 0)
+    assert np.all(reverse[~good] == 0)
+
+
+def start_and_value(curve, condition):
+    """A start for a condition on the curve, and the value that it needs."""
+    if condition in ("fold", "peak", "phase_resonance"):
+        return curve.point(int(curve.at_events(condition)[0])), None
+    k = len(curve.frequency) // 5
+    height = np.abs(curve.velocity[k, 1, 0])
+    return curve.point(k), (curve.frequency[k] if condition == "frequency" else height)
+
+
+@pytest.mark.parametrize("condition", ["frequency", "velocity", "fold", "peak", "phase_resonance"])
+def test_periodic_motion(curve, condition):
+    (coefficients, frequency), value = start_and_value(curve, condition)
+    # A start that is not finite, between two that are: nothing is found from it.
+    starts = np.stack([coefficients, np.full_like(coefficients, np.nan), 1.001 * coefficients])
+
+    @jax.jit
+    def motions(shifts):
+        force, model = changed(shifts)
+
+        def one(start):
+            return periodic_motion(
+                model, force, (start, frequency), condition=condition, value=value
+            )
+
+        return numbers_of(jax.vmap(one)(jnp.asarray(starts)))
+
+    assert_gradients(motions, failed=[1])
+
+
+def test_periodic_motion_with_a_force_that_is_not_finite(curve):
+    start = curve.point(len(curve.frequency) // 5)
+
+    @jax.jit
+    def motions(shifts):
+        force, model = changed(shifts)
+
+        def one(load):
+            return periodic_motion(model, load, start, value=start[1])
+
+        return numbers_of(jax.vmap(one)(force * jnp.array([1.0, np.nan, 1.01])))
+
+    assert_gradients(motions, failed=[1])
+
+
+def test_motions_at_velocities(curve):
+    heights = np.array([0.2, 30.0, 0.7]) * np.abs(curve.velocity[:, 1, 0]).max()
+    found, which = response_at_velocities(oscillator(), curve, heights)
+    assert which.tolist() == [0, 2, 2, 0]  # the one that is never reached is not on the curve
+    rows = [0, 1, 2]
+    starts = (found.coefficients[jnp.array(rows)], found.frequency[jnp.array(rows)])
+
+    @jax.jit
+    def motions(shifts):
+        force, model = changed(shifts)
+        return numbers_of(motions_at_velocities(model, force, starts, heights))
+
+    # Heights in the order of the starts: 0.2, one never reached, 0.7.
+    assert_gradients(motions, failed=[1])
+
+
+def test_response_at_velocities(curve):
+    heights = [0.3 * np.abs(curve.velocity[:, 1, 0]).max()]
+
+    @jax.jit
+    def motions(shifts):
+        # The force is the curve's; the model's numbers move the frequencies at this height.
+        return numbers_of(response_at_velocities(changed(shifts)[1], curve, heights)[0])
+
+    assert_gradients(motions, failed=[])
+
+
+def test_prescribed_motion():
+    velocity = 0.4 * np.exp(0.3j)
+
+    @jax.jit
+    def force_needed(shifts):
+        force, model = changed(shifts)
+        equations = prescribed_motion(
+            *(model, jnp.asarray(2.1), force, jnp.asarray(velocity)),
+            sensor=0,
+            harmonic_order=3,
+            scale=jnp.asarray(0.4),
+        )
+        point = equations.solved(jax.lax.stop_gradient(equations.grown()))
+        needed, seen = equations.recorded(point)
+        return jnp.stack([needed.real, needed.imag, seen[3, 0].real, seen[3, 0].imag])[None]
+
+    assert_gradients(force_needed, failed=[])
