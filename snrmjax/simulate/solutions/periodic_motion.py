@@ -207,7 +207,8 @@ def _solved(
 
     Where it was not found the point is the guess, and the derivatives are zero.
     """
-    border = _tangent_near(balance.linearised, guess, _generic(guess.shape[0]))
+    harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
+    border = _tangent_near(balance.linearised, harmless, _generic(guess.shape[0]))
     border = jax.lax.stop_gradient(border)
 
     def test(balance: HarmonicBalance, target: Array, point: Point) -> Array:
@@ -243,7 +244,6 @@ def _solved(
     state = (guess, jnp.array(0), jnp.array(jnp.inf), jnp.array(True))
     point, _, size, finite = jax.lax.while_loop(going, body, state)
     converged = finite & (size < 1e-8)
-    harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     root = jax.lax.stop_gradient(jnp.where(converged, point, harmless))
 
     def equations(point: Point) -> Array:
