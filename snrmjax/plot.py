@@ -23,20 +23,24 @@ from snrmjax.report.joint_figures import (
     fitted_curves_figure,
     residuals_figure,
 )
+from snrmjax.report.simulation_figures import batch_figure, damped_mode_figure, motions_figure
 
 __all__ = [
     "DampingSeries",
     "FitSeries",
     "advice_figure",
     "backbone_figure",
+    "batch_figure",
     "candidates_figure",
     "comparison_figure",
     "contributions_figure",
+    "damped_mode_figure",
     "effect_laws_figure",
     "fitted_curves_figure",
     "force_velocity_figure",
     "misfit_figure",
     "modal_damping_figure",
+    "motions_figure",
     "normal_mode_figure",
     "residuals_figure",
     "response_figure",

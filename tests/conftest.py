@@ -82,3 +82,19 @@ def pytest_collection_modifyitems(items):
     # What runs longest starts first: no worker then waits at the end for the other's last file.
     long = ("test_notebooks.py", "test_cli.py", "test_calibration.py")
     items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(long))
+
+
+@pytest.fixture
+def compilations():
+    """The seconds of everything that JAX compiles from now on."""
+    import jax
+
+    found = []
+
+    def listen(event: str, seconds: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            found.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(listen)

@@ -113,8 +113,8 @@ def over_cores(
 def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
     """A function whose linear algebra on the host does not spread over the cores.
 
-    Of matrices of a hundred rows threads cost more than they save, and where `over_cores` is at
-    work they take the cores from it: a diagnosis takes half as long again.
+    For matrices of a hundred rows threads cost more than they save, and where `over_cores` is at
+    work they take the cores from it: a diagnosis with them takes 1.5 times as long.
     """
 
     @wraps(function)
@@ -127,7 +127,6 @@ def on_one_core(function: Callable[P, R]) -> Callable[P, R]:
 
 def as_arrays(tree: T) -> T:
     """Arrays of the host as arrays of the device."""
-    # All at once: one by one they take longer than the programs that use them. A number of the
-    # host that stayed one would be compiled into the program.
-    held, fixed = eqx.partition(tree, lambda a: isinstance(a, (np.ndarray, np.generic)))
-    return eqx.combine(jax.device_put(held), fixed)
+    # All at once: one by one they take longer than the programs that use them.
+    on_host, fixed = eqx.partition(tree, lambda a: isinstance(a, (np.ndarray, np.generic)))
+    return eqx.combine(jax.device_put(on_host), fixed)

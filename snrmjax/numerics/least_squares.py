@@ -22,7 +22,7 @@ def penalised_least_squares(
     penalty: Float[np.ndarray, "row parameter"],
     penalty_target: Float[np.ndarray, " row"],
 ) -> LeastSquares:
-    """Fit target = design · values + error with a roughness penalty and an honest covariance.
+    """Fit target = design · values + error with a roughness penalty and a sandwich covariance.
 
     Minimises Σ((target − design·values)/std)² + Σ(penalty·values − penalty_target)². Points are
     weighted by 1/std² alone: errors shared by a level would otherwise push all weight on the
@@ -35,7 +35,7 @@ def penalised_least_squares(
     """
     x, y = design / std[:, None], target / std
     shared = members / std[:, None]
-    # By singular values, not normal equations: a strong penalty would drown what points say.
+    # By singular values, not normal equations: with a strong penalty those lose the points' part.
     inverse = np.linalg.pinv(np.concatenate([x, penalty]), rcond=1e-15)
     of_points = inverse[:, : len(x)]
     arms = of_points @ shared

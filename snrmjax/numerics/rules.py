@@ -1,4 +1,4 @@
-"""Rules that a number must keep: what is expected, and whether a number is it."""
+"""Rules for numbers that are read in: the words for what is expected, and the test for it."""
 
 from collections.abc import Callable
 from typing import NamedTuple

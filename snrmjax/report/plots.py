@@ -3,10 +3,19 @@
 import functools
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.report import joint_figures
+from snrmjax.report import figures, joint_figures, simulation_figures
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
+from snrmjax.simulate.solutions.forced_response import ResponseBatch
+from snrmjax.simulate.solutions.isolated_responses import IsolatedResponses
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion
+from snrmjax.simulate.solutions.time_integration import IntegratedMotion
+from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
 
 
 @functools.singledispatch
@@ -23,3 +32,49 @@ def _(result: NextMeasurements, **settings: Any) -> Figure:
     return joint_figures.advice_figure(
         result.responses, result.measurements, result.sensor, **settings
     )
+
+
+@plot_result.register
+def _(result: ResponseCurve, **settings: Any) -> Figure:
+    return figures.simulated_response_figure([result], **settings)
+
+
+@plot_result.register
+def _(result: IsolatedResponses, **settings: Any) -> Figure:
+    return figures.simulated_response_figure(result.curves, **settings)
+
+
+@plot_result.register
+def _(result: ResponseBatch, **settings: Any) -> Figure:
+    return simulation_figures.batch_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: NormalModeBranch, **settings: Any) -> Figure:
+    return figures.normal_mode_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: DampedModeBranch, **settings: Any) -> Figure:
+    return simulation_figures.damped_mode_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: ControlledCurve) -> Figure:
+    velocity, sensor = result.velocity[:, 1, 0], result.sensors[0]
+    return simulation_figures.motions_figure(result.frequency, velocity, sensor=sensor, joined=True)
+
+
+@plot_result.register(PeriodicMotion)
+@plot_result.register(IntegratedMotion)
+def _(result: PeriodicMotion | IntegratedMotion) -> Figure:
+    frequency, velocity = np.ravel(result.frequency), np.ravel(result.velocity[..., 1, 0])
+    return simulation_figures.motions_figure(frequency, velocity, joined=False)
+
+
+@plot_result.register
+def _(result: VirtualTest) -> Figure:
+    states = result.steady_states
+    frequency, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
+    sensor = states.sensors[0]
+    return simulation_figures.motions_figure(frequency, velocity, sensor=sensor, joined=False)

@@ -127,3 +127,17 @@ def velocity_phasors(
     order = jnp.arange(displacement.shape[-2])
     rate = 1j * order * jnp.asarray(frequency)[..., None]
     return jnp.einsum("...h,...hm,sm->...hs", rate, displacement, mode_shape)
+
+
+def velocity_along(
+    coefficients: Float[np.ndarray, "point coefficient mode"],
+    frequency: Float[np.ndarray, " point"],
+    mode_shape: Float[np.ndarray, "sensor mode"],
+) -> Complex[np.ndarray, "point harmonic sensor"]:
+    """`velocity_phasors` along a curve, on the host.
+
+    There a curve is done before a program has its arguments, and no number of points compiles.
+    """
+    mean, pairs = coefficients[:, :1] + 0j, coefficients[:, 1::2] - 1j * coefficients[:, 2::2]
+    phasors = np.concatenate([mean, pairs], axis=1) @ mode_shape.T
+    return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors

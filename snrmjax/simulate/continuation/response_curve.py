@@ -12,6 +12,7 @@ from snrmjax.numerics.blocks import by_blocks, over_cores, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncation_error
+from snrmjax.simulate.balance.harmonics import velocity_along
 from snrmjax.simulate.balance.labelled import HERTZ, counted, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE, CurveStatus, StepControl
 from snrmjax.simulate.continuation.events import (
@@ -202,7 +203,7 @@ def _response(
         force=float(balance.force),
         frequency=frequency,
         coefficients=coefficients,
-        velocity=_velocity(coefficients, frequency, np.asarray(model.modes.mode_shape)),
+        velocity=velocity_along(coefficients, frequency, np.asarray(model.modes.mode_shape)),
         event=curve.labels,
         status=traced.status,
         sensors=model.modes.sensors,
@@ -212,15 +213,6 @@ def _response(
         branch=branch,
         n_solves=traced.n_solves,
     )
-
-
-def _velocity(
-    coefficients: np.ndarray, frequency: np.ndarray, mode_shape: np.ndarray
-) -> np.ndarray:
-    """`velocity_phasors` on the host, where a curve is done before a program has its arguments."""
-    mean, pairs = coefficients[:, :1] + 0j, coefficients[:, 1::2] - 1j * coefficients[:, 2::2]
-    phasors = np.concatenate([mean, pairs], axis=1) @ mode_shape.T
-    return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors
 
 
 @compiled

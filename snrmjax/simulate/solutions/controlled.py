@@ -19,7 +19,7 @@ from snrmjax.simulate.balance.harmonic_balance import (
     linear_coefficients,
     resonance_displacement,
 )
-from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
+from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_along, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
     STATUS_MESSAGE,
@@ -361,10 +361,8 @@ def _motion(
     shape = (len(points), balance.n_coefficients, balance.model.n_modes)
     coefficients = points[:, :-1].reshape(shape) * float(balance.displacement_scale)
     frequency = points[:, -1] * float(balance.frequency_scale)
-    velocity = velocity_phasors(
-        jnp.asarray(coefficients), jnp.asarray(frequency), balance.model.modes.mode_shape
-    )
-    return frequency, coefficients, np.asarray(velocity)
+    velocity = velocity_along(coefficients, frequency, np.asarray(balance.model.modes.mode_shape))
+    return frequency, coefficients, velocity
 
 
 def _require_positive(name: str, value: float) -> None:

@@ -68,7 +68,8 @@ class IsolatedResponses(AbstractResult):
 
     def summary(self) -> tuple[str, ...]:
         """How many curves, each with its status, and what became of the starts."""
-        lines = [f"isolated responses at {self.force:.4g} N: {len(self.curves)} curves"]
+        number = f"{len(self.curves)} curve{'' if len(self.curves) == 1 else 's'}"
+        lines = [f"isolated responses at {self.force:.4g} N: {number}"]
         for curve in self.curves:
             span = range_text(curve.frequency, "Hz", HERTZ)
             points = f"{len(curve.frequency)} points, {span}"

@@ -39,20 +39,6 @@ def batch():
     return forced_response_batch(models, forces, *RANGE, settings=SETTINGS)
 
 
-@pytest.fixture
-def compilations():
-    """What JAX compiles from now on."""
-    names = []
-
-    def listen(event, seconds, **_):
-        if event.endswith("backend_compile_duration"):
-            names.append(seconds)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 def assert_same_curve(one, other):
     assert one.status == other.status
     assert one.event == other.event

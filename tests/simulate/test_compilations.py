@@ -1,0 +1,63 @@
+"""Public verbs do not compile anew for other floating-point numbers."""
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+
+CONTROL = sj.simulate.StepControl
+
+
+def oscillator(ratio):
+    modes = sj.model.linear_modes([2.0], [ratio], [[1.0]], [1.5])
+    potential = sj.model.polynomial_potential({"111": 0.05, "1111": 0.3 + ratio}, 1)
+    return sj.model.structure(modes, potential)
+
+
+def motion(k):
+    x = np.zeros((7, 1))
+    x[1] = 0.01 + 0.001 * k
+    return x, 1.5 + 0.01 * k
+
+
+# Each is called with 0.0, 1.0 and 2.0: no two calls have a number in common.
+VERBS = {
+    "forced_response": lambda k: sj.forced_response(
+        *(oscillator(0.02 + 0.001 * k), 0.1 + 0.01 * k, 1.0 + 0.1 * k, 3.0 + 0.1 * k),
+        harmonic_order=3,
+        steps=CONTROL(largest=0.05 + 0.01 * k, largest_miss=0.3 + 0.01 * k),
+    ),
+    "nonlinear_normal_mode": lambda k: sj.nonlinear_normal_mode(
+        oscillator(0.02 + 0.001 * k), 2.4 + 0.1 * k, harmonic_order=3
+    ),
+    "damped_normal_mode": lambda k: sj.simulate.damped_normal_mode(
+        oscillator(0.02 + 0.001 * k), 1.0 + 0.1 * k, harmonic_order=3
+    ),
+    "phase_controlled": lambda k: sj.simulate.phase_controlled(
+        oscillator(0.02 + 0.001 * k), 0.1 + 0.01 * k, phase=0.1 * k, harmonic_order=3
+    ),
+    "response_controlled": lambda k: sj.simulate.response_controlled(
+        oscillator(0.02 + 0.001 * k), 0.5 + 0.1 * k, 1.7 + 0.1 * k, 2.5 + 0.1 * k, harmonic_order=3
+    ),
+    "periodic_motion": lambda k: sj.simulate.periodic_motion(
+        oscillator(0.02 + 0.001 * k), 0.02 + 0.001 * k, motion(k), value=1.5 + 0.01 * k
+    ),
+    "solve_at_frequency": lambda k: sj.simulate.solve_at_frequency(
+        oscillator(0.02 + 0.001 * k), 0.02 + 0.001 * k, 1.5 + 0.01 * k, motion(k)[0][None]
+    ),
+    "settled_motion": lambda k: sj.simulate.settled_motion(
+        *(oscillator(0.2 + 0.01 * k), 0.02 + 0.001 * k, 1.5 + 0.01 * k),
+        harmonic_order=3,
+        accuracy=sj.simulate.IntegrationAccuracy(1e-3 * (1 + k), 1e-6 * (1 + k)),
+    ),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_other_numbers_compile_nothing(verb, compilations):
+    VERBS[verb](0.0)
+    assert len(compilations) > 0  # and the count does count
+    del compilations[:]
+    VERBS[verb](1.0)
+    VERBS[verb](2.0)
+    assert len(compilations) == 0

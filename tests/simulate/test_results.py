@@ -1,0 +1,176 @@
+"""Every result of a simulation says itself on one screen, is labelled and is drawn."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import snrmjax as sj
+from snrmjax.io.units import HERTZ
+from snrmjax.simulate.solutions import forced_response
+
+FORCE, ENDS = 0.12, (1.0, 4.0)
+
+
+def oscillator():
+    potential = sj.model.polynomial_potential({"111": 0.05, "1111": 0.3}, 1)
+    modes = sj.model.linear_modes([2.0], [0.02], [[1.0]], [1.5], sensors=("tip",))
+    return sj.model.structure(modes, potential)
+
+
+@pytest.fixture(scope="module")
+def curve():
+    (found,) = sj.forced_response(oscillator(), FORCE, *ENDS, harmonic_order=3)
+    return found
+
+
+SETTINGS = sj.simulate.ResponseSettings(harmonic_order=3, stability=False)
+# What computes a result, what its first line says, and a variable with its unit.
+RESULTS = {
+    "forced response": (
+        lambda: sj.forced_response(oscillator(), [FORCE], *ENDS, harmonic_order=3)[0],
+        ("forced response at 0.12 N: ", "stability", "1"),
+    ),
+    "isolated responses": (
+        lambda: sj.simulate.isolated_responses(
+            oscillator(), FORCE, *ENDS, known=[], settings=SETTINGS
+        ),
+        ("isolated responses at 0.12 N: 1 curve", "velocity_m_s", "m/s"),
+    ),
+    "batch": (
+        lambda: sj.simulate.forced_response_batch(
+            oscillator(), [0.1, 0.12], *ENDS, settings=SETTINGS, keep_curves=False
+        ),
+        ("forced responses of 2 members", "peak_frequency_hz", "Hz"),
+    ),
+    "normal mode": (
+        lambda: sj.nonlinear_normal_mode(oscillator(), 3.0, harmonic_order=3),
+        ("nonlinear normal mode: ", "energy_j", "J"),
+    ),
+    "damped mode": (
+        lambda: sj.simulate.damped_normal_mode(oscillator(), 2.0, harmonic_order=3),
+        ("damped nonlinear normal mode: ", "natural_frequency_hz", "Hz"),
+    ),
+    "phase control": (
+        lambda: sj.simulate.phase_controlled(oscillator(), FORCE, harmonic_order=3),
+        ("steady states under a controller: ", "force_n", "N"),
+    ),
+    "virtual test": (
+        lambda: sj.phase_resonance_test(
+            *(oscillator(), np.array([0.05, FORCE]), *ENDS),
+            simulation=sj.simulate.SweepSimulation(harmonic_order=3),
+        ),
+        ("virtual test: 10 steady states on 2 levels", "force_n", "N"),
+    ),
+    "settled motion": (
+        lambda: sj.simulate.settled_motion(oscillator(), FORCE, 1.5, harmonic_order=3),
+        ("motions by time integration: 1", "velocity_re_m_s", "m/s"),
+    ),
+    "stepped sine": (
+        lambda: sj.simulate.stepped_sine(
+            oscillator(), FORCE, (1.4, 1.5), cycles_per_step=20, harmonic_order=3
+        ),
+        ("motions by time integration: 2", "frequency_hz", "Hz"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_results_say_themselves_and_are_drawn(name):
+    compute, (first, variable, unit) = RESULTS[name]
+    result = compute()
+    lines = repr(result).splitlines()
+    assert lines[0].startswith(first)
+    assert 3 <= len(lines) <= 12
+    assert max(map(len, lines)) < 160
+    data = result.to_xarray()
+    assert data[variable].attrs["units"] == unit
+    for each in data.variables.values():
+        assert each.attrs["long_name"]
+        assert not np.iscomplexobj(each.values)  # files cannot hold them
+    assert isinstance(result.plot(), Figure)
+
+
+def test_motions_say_what_was_not_found(curve):
+    heights = np.array([0.2, 30.0]) * np.abs(curve.velocity[:, 1, 0]).max()
+    starts = (curve.coefficients[[40, 40]], curve.frequency[[40, 40]])
+    found = sj.simulate.motions_at_velocities(oscillator(), FORCE, starts, heights)
+    assert repr(found).startswith("periodic motions: 2, of which 1 were not found")
+    data = found.to_xarray()
+    assert data["converged"].values.tolist() == [True, False]
+    assert isinstance(found.plot(), Figure)
+    one = sj.simulate.periodic_motion(oscillator(), FORCE, curve.point(40), value=1.5)
+    assert one.to_xarray()["frequency_hz"].values == pytest.approx(1.5 / HERTZ)
+    assert isinstance(one.plot(), Figure)
+
+
+def test_a_response_is_labelled_as_its_file_is(curve):
+    data = curve.to_xarray()
+    np.testing.assert_allclose(data["frequency_hz"], curve.frequency / HERTZ)
+    fundamental = data["velocity_h1_re_m_s"] + 1j * data["velocity_h1_im_m_s"]
+    np.testing.assert_array_equal(fundamental.sel(sensor="tip"), curve.velocity[:, 1, 0])
+    # The peak of a signal with harmonics is above none of its samples and below their sum.
+    size = np.abs(curve.velocity[:, 1:, 0])
+    peak = data["velocity_peak_m_s"].sel(sensor="tip").values
+    assert np.all(peak <= size.sum(axis=1) * (1 + 1e-12))
+    assert np.all(peak >= 0.99 * size[:, 0])
+    assert set(data["event"].values) == {"", "fold", "peak", "phase_resonance"}
+
+
+def test_stability_that_was_not_computed_is_neither_stable_nor_unstable(curve):
+    kind = sj.simulate.Stability
+    assert {kind(k) for k in curve.stability} == {kind.STABLE, kind.UNSTABLE}
+    np.testing.assert_array_equal(curve.is_stable, ~curve.is_unstable)
+    (bare,) = sj.forced_response(oscillator(), FORCE, *ENDS, harmonic_order=3, stability=False)
+    assert set(bare.stability) == {kind.NOT_COMPUTED}
+    assert not np.any(bare.is_stable | bare.is_unstable)
+    assert set(bare.stability_loss) == {sj.simulate.StabilityLoss.NOT_COMPUTED}
+    assert f"stability: {len(bare.frequency)} not computed" in repr(bare)
+    styles = {line.get_linestyle() for line in bare.plot().axes[0].lines}
+    assert "--" not in styles  # no part is drawn as unstable
+    # One point whose multipliers could not be computed, on a curve that has the others.
+    multipliers = curve.multipliers.copy()
+    multipliers[3] = np.nan
+    holed = dataclasses.replace(curve, multipliers=multipliers)
+    assert holed.stability[3] == kind.NOT_COMPUTED
+    assert np.sum(holed.stability == kind.NOT_COMPUTED) == 1
+
+
+def test_files_say_where_stability_was_not_computed(curve, tmp_path):
+    multipliers = curve.multipliers.copy()
+    multipliers[3] = np.nan
+    fold = int(curve.at_events("fold")[0])
+    multipliers[fold] = np.nan
+    holed = dataclasses.replace(curve, multipliers=multipliers)
+    sj.io.write_response(tmp_path / "response.csv", [holed])
+    rows = [line.split(",") for line in (tmp_path / "response.csv").read_text().splitlines()]
+    stable, event = rows[0].index("stable"), rows[0].index("event")
+    body = rows[1:]
+    assert {row[stable] for row in body} == {"0", "1"}  # what readers may rely on
+    assert (body[3][stable], body[3][event]) == ("0", "stability_not_computed")
+    assert body[fold][event] == "fold+stability_not_computed"
+    assert sum("stability_not_computed" in row[event] for row in body) == 2
+
+
+def test_one_many_and_arrays_of_forces_are_the_same():
+    ways = (FORCE, [FORCE], (FORCE,), np.array([FORCE]), np.float64(FORCE))
+    settings = {"harmonic_order": 1, "stability": False}
+    found = [sj.forced_response(oscillator(), way, *ENDS, **settings) for way in ways]
+    for curves in found:
+        assert len(curves) == 1
+        np.testing.assert_array_equal(curves[0].frequency, found[0][0].frequency)
+    with pytest.raises(ValueError, match=r"every force must be positive, but one is -1.0 N"):
+        sj.forced_response(oscillator(), np.array([FORCE, -1.0]), *ENDS)
+
+
+def test_a_second_branch_that_stops_early_is_the_status_of_its_member(curve):
+    kind = sj.simulate.CurveStatus
+    assert curve.status == kind.UPPER_END
+    stopped = dataclasses.replace(curve, status=kind.POINT_LIMIT)
+    for parts, status in (
+        ((curve,), kind.UPPER_END),
+        ((curve, stopped), kind.POINT_LIMIT),
+        ((stopped, curve), kind.POINT_LIMIT),
+    ):
+        assert forced_response._summary(parts)["status"] == status
