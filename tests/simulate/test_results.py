@@ -110,11 +110,12 @@ def test_a_response_is_labelled_as_its_file_is(curve):
     np.testing.assert_allclose(data["frequency_hz"], curve.frequency / HERTZ)
     fundamental = data["velocity_h1_re_m_s"] + 1j * data["velocity_h1_im_m_s"]
     np.testing.assert_array_equal(fundamental.sel(sensor="tip"), curve.velocity[:, 1, 0])
-    # The largest of many samples is below the peak by at most (3π/4096)²/2 of it.
+    # Of two peaks of nearly one height the one with the higher of 96 samples is taken: by them
+    # heights are known to (3π/96)²/2.
     angle = np.outer(np.arange(1, 4), np.linspace(0, 2 * np.pi, 4097))
     samples = (curve.velocity[:, 1:, 0] @ np.exp(1j * angle)).real
     peak = data["velocity_peak_m_s"].sel(sensor="tip")
-    np.testing.assert_allclose(peak, np.abs(samples).max(axis=1), rtol=4e-6)
+    np.testing.assert_allclose(peak, np.abs(samples).max(axis=1), rtol=5e-3)
     assert set(data["event"].values) == {"", "fold", "peak", "phase_resonance"}
 
 
