@@ -154,6 +154,8 @@ def test_identify_writes_what_the_contract_says(files, tmp_path):
     assert resonance["damping_ratio"] == pytest.approx(0.05, rel=1e-8)
     assert (out / "report.html").exists()
     assert (out / "backbone.png").read_bytes()[:4] == b"\x89PNG"
+    assert "backbone: 64.78 Hz and 5 % of critical damping at " in done.stderr
+    assert "resonance at 1e-05 N: 64.78 Hz, " in done.stderr
 
 
 def test_simulate_and_nnm_write_what_the_contract_says(files, tmp_path):
@@ -324,17 +326,18 @@ def test_diagnose_refuses_too_few_states(files, tmp_path):
     assert "at least 6" in stderr
 
 
-def test_identify_refuses_amplitudes_alone(files, tmp_path):
+@pytest.mark.parametrize("load", ["force_n", "drive_v"])
+@pytest.mark.parametrize("options", [(), ("--fit", "auto"), ("--free", "force_gain")])
+def test_identify_sends_amplitudes_alone_to_diagnose(files, tmp_path, load, options):
     model, data = files
-    data.write_text("level,frequency_hz,force_n,velocity_m_s\n1,62,1e-5,0.01\n1,63,1e-5,0.02\n")
+    data.write_text(f"level,frequency_hz,{load},velocity_m_s\n1,62,1e-5,0.01\n1,63,1e-5,0.02\n")
     out = tmp_path / "out"
-    for options in ((), ("--fit", "auto")):
-        command = ("identify", str(data), "--model", str(model), "--out", str(out), *options)
-        code, stderr = run(*command)
-        assert code == 2
-        assert "needs the phases" in stderr
-        assert "velocity_m_s" in stderr
-        assert not out.exists()
+    code, stderr = run("identify", data, "--model", model, "--out", out, *options)
+    assert code == 2
+    assert "needs the phases" in stderr
+    assert "velocity_m_s" in stderr
+    assert "snrmjax diagnose" in stderr
+    assert not out.exists()
 
 
 # ------------------------------------------------------------------------------ smoke
@@ -577,9 +580,9 @@ def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path
         assert GAIN * one["drive_v"] == pytest.approx(damping(speed) * speed / CONSTANT, rel=1e-6)
     advised = rows(tmp_path / "next.csv")
     np.testing.assert_allclose(advised["force_n"], GAIN * advised["drive_v"], rtol=1e-6)
-    advice = [line for line in done.stderr.splitlines() if re.match(r"\d\. ", line)]
+    advice = [line for line in done.stderr.splitlines() if line.startswith("measure next, ")]
     assert len(advice) == 2
-    assert all(re.match(r"\d\. \S+ V at \S+ Hz: ", line) for line in advice)
+    assert all(re.match(r"measure next, \d: \S+ V at \S+ Hz: ", line) for line in advice)
     assert "0.4 N/V" in done.stderr
 
 

@@ -192,10 +192,11 @@ def identify(
             found = workflow.identify_by_points(measured, structure, curves, loads)
         for note in found.notes:
             warn(note)
-        for line in workflow.advice_lines(found):
-            say(line)
         files = {"data": data.name, "model": f"{structure.name} ({model.name})"}
         workflow.write_findings(folder, found, data.stem.replace("_", " "), files)
+    for line in workflow.headline(found):
+        say(line)
+    say(f"written to {out}: open {out / 'report.html'}")
 
 
 _ASK_FOR_FIT = {"fit", "free", "further"}

@@ -154,16 +154,18 @@ def write_prediction(
     )
 
 
-def summarise(identification: Identification, values: BackboneValues | None = None) -> dict:
+def values_in_range(identification: Identification) -> BackboneValues:
+    """The backbone from the smallest to the largest measured amplitude."""
+    backbone = identification.fit.backbone
+    return _sampled(backbone, float(backbone.smallest))
+
+
+def summarise(identification: Identification, values: BackboneValues) -> dict:
     """The headline numbers of an identification, by name, in the units of the files.
 
-    Arguments: `values` of the curves between the smallest and the largest measured amplitude, by
-    default those of the identification's backbone.
+    Arguments: `values` of the curves from the smallest to the largest measured amplitude.
     """
     points, fit = identification.points, identification.fit
-    backbone = fit.backbone
-    if values is None:
-        values = _sampled(backbone, float(backbone.smallest))
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)

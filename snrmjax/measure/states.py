@@ -153,8 +153,8 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
             f"{purpose} needs the phases of all velocities relative to the force, but those of "
             f"{int(unknown.sum())} of {data.n_states} steady states are unknown (`velocity_m_s` "
             f"in place of real and imaginary part, or `phase_std_deg` of "
-            f"{np.degrees(PHASE_UNKNOWN):.0f} or more): leave these out; a diagnosis works with "
-            "amplitudes alone."
+            f"{np.degrees(PHASE_UNKNOWN):.0f} or more): leave these out, or ask `snrmjax diagnose` "
+            "(`diagnose_model`) what the model lacks, which works with amplitudes alone."
         )
 
 

@@ -20,7 +20,7 @@ from snrmjax.identify.inference.optimal_design import (
 )
 from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
 from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
-from snrmjax.identify.pointwise.backbone import CurveFamily
+from snrmjax.identify.pointwise.backbone import BackboneValues, CurveFamily
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.prediction import (
@@ -33,7 +33,7 @@ from snrmjax.identify.pointwise.prediction import (
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
 from snrmjax.io.units import HERTZ
-from snrmjax.measure.states import SteadyStates, check_force
+from snrmjax.measure.states import SteadyStates, check_force, check_phases
 from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
@@ -97,6 +97,7 @@ class Findings(NamedTuple):
     identification: Identification
     predictions: tuple[Prediction, ...]
     notes: tuple[str, ...]
+    values: BackboneValues  # of the curves, from the smallest to the largest measured amplitude
     settings: dict[str, str]  # in words, for the summary and the report
     fitted: ReportedFit | None = None
     advice: NextMeasurements | None = None  # none where nobody asked
@@ -124,6 +125,7 @@ def identify_by_points(
     """
     if loads.drives:
         _require_drive(data)
+    check_phases(data, "an identification")
     check_force(data, "an identification state by state")
     found = identify_backbone(
         data,
@@ -148,7 +150,8 @@ def identify_by_points(
         "amplitude": f"{settings.amplitude}, {settings.measure}",
         "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
     }
-    return Findings(data, model, found, predictions, notes, words)
+    values = results.values_in_range(found)
+    return Findings(data, model, found, predictions, notes, values, words)
 
 
 def identify_jointly(
@@ -210,7 +213,10 @@ def identify_jointly(
         "curves": " and ".join(joint_results.described(curve) for curve in pair),
     }
     fitted = reported_fit(fit, tuple(advice or ()))
-    return Findings(*(data, model, found, tuple(predictions), tuple(notes), words), fitted, advice)
+    ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
+    values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
+    told = (data, model, found, tuple(predictions), tuple(notes), values, words)
+    return Findings(*told, fitted, advice)
 
 
 def _require_drive(data: SteadyStates) -> None:
@@ -227,8 +233,8 @@ def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> lis
     for one in predictions:
         if not one.resonances:
             notes.append(
-                f"no resonance at {one.load} up to {ratio:g} times the largest measured amplitude "
-                "(--extrapolate)."
+                f"no resonance at {one.load} up to {ratio:g} times the largest measured amplitude: "
+                "`--extrapolate` looks farther, on curves that no measurement supports there."
             )
         elif any(each.continued for each in one.resonances):
             notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")
@@ -240,12 +246,26 @@ def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> lis
     return notes
 
 
-def advice_lines(found: Findings) -> list[str]:
-    """One line for each measurement that is advised: rank, force, frequency and reason."""
-    lines = []
-    for one in found.advice or ():
-        load = f"{one.force:.4g} N" if one.drive is None else f"{one.drive:.4g} V"
-        lines.append(f"{one.rank}. {load} at {one.frequency / HERTZ:.6g} Hz: {one.reason}")
+def headline(found: Findings) -> list[str]:
+    """What was found, in lines to be read as soon as the command ends."""
+    values = found.values
+    speed, ratio = np.asarray(values.velocity), 100 * np.asarray(values.damping_ratio)
+    hertz = np.asarray(values.natural_frequency) / HERTZ
+    ends = [
+        f"{hertz[k]:.5g} Hz and {ratio[k]:.3g} % of critical damping at {speed[k]:.3g} m/s"
+        for k in (0, -1)
+    ]
+    lines = [f"backbone: {ends[0]}, {ends[1]}"]
+    for one in found.predictions:
+        for each in one.resonances:
+            place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
+            damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
+            lines.append(f"resonance at {one.load}: {place}, {damped}")
+    for advised in found.advice or ():
+        force, drive = advised.force, advised.drive
+        load = f"{force:.4g} N" if drive is None else f"{drive:.4g} V"
+        place = f"{load} at {advised.frequency / HERTZ:.6g} Hz"
+        lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
     return lines
 
 
@@ -383,9 +403,12 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.fitted is None:
         results.write_backbone(folder / "backbone.csv", found.identification)
-        summary |= results.summarise(found.identification)
     else:
-        summary |= _write_fit(folder, found, found.fitted)
+        _write_fit(folder, found, found.fitted)
+        banded = [response for one in found.predictions for response in one.banded]
+        fit = joint_results.summarise_fit(found.fitted.fit, banded, found.fitted.shares)
+        summary["joint_fit"] = fit
+    summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
         for one in found.predictions
@@ -397,17 +420,9 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     write_report(folder / "report.html", findings_report(found, title, done, figures))
 
 
-def _write_fit(folder: Path, found: Findings, fitted: ReportedFit) -> dict[str, object]:
-    """Write what a joint fit adds; its part of the summary."""
-    fit, backbone = fitted.fit, found.identification.fit.backbone
-    joint_results.write_fitted_backbone(folder / "backbone.csv", fit)
-    joint_results.write_joint_fit(folder / "fit.json", fit)
+def _write_fit(folder: Path, found: Findings, fitted: ReportedFit) -> None:
+    """Write the files that a joint fit adds, and its curves."""
+    joint_results.write_fitted_backbone(folder / "backbone.csv", fitted.fit)
+    joint_results.write_joint_fit(folder / "fit.json", fitted.fit)
     if found.advice is not None:
         joint_results.write_next(folder / "next.csv", found.advice)
-    ends = float(backbone.smallest), float(backbone.largest)
-    values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
-    banded = [response for one in found.predictions for response in one.banded]
-    return {
-        **results.summarise(found.identification, values),
-        "joint_fit": joint_results.summarise_fit(fit, banded, fitted.shares),
-    }
