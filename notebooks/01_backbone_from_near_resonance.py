@@ -32,8 +32,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
+from snrmjax import plot
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
-from snrmjax.report import figures as plot
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None

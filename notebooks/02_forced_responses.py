@@ -38,8 +38,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
+from snrmjax import plot
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
-from snrmjax.report import figures as plot
 from snrmjax.report import style as drawing
 
 HERTZ = 2 * np.pi

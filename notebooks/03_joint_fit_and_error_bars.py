@@ -37,10 +37,9 @@ import jax
 import numpy as np
 
 import snrmjax as sj
+from snrmjax import plot
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
-from snrmjax.report import figures as plot
-from snrmjax.report import joint_figures as joint_plot
 from snrmjax.report import style as drawing
 from snrmjax.report.sampling import contributions_by_kind
 from snrmjax.report.workflow import corrected
@@ -112,8 +111,8 @@ for name, fit in fits.items():
 
 # %%
 show(
-    joint_plot.fitted_curves_figure(
-        [joint_plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth
+    plot.fitted_curves_figure(
+        [plot.FitSeries(name, fit) for name, fit in fits.items()], truth=truth
     ),
     "few_and_many",
 )
@@ -227,7 +226,7 @@ for name, fit in fits.items():
 shares = sj.identify.contributions(with_levels)
 for row in contributions_by_kind(shares):
     print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
-show(joint_plot.contributions_figure(shares), "contributions")
+show(plot.contributions_figure(shares), "contributions")
 
 # %% [markdown]
 # Three ways to the same band, as 1σ in rad/s and 1/s: from the fit's covariance; from the exact
@@ -257,7 +256,7 @@ for one in advice:
 responses = [
     sj.identify.fitted_response(with_levels, f)[0] for f in sorted({a.force for a in advice})
 ]
-show(joint_plot.advice_figure(responses, advice, "midspan"), "next_measurements")
+show(plot.advice_figure(responses, advice, "midspan"), "next_measurements")
 
 # %%
 headline |= {
@@ -305,9 +304,9 @@ else:
     print(f"{' and '.join(taken(hung))}; gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
     remarks(hung)
     points = sj.identify.identify_points(corrected(data, hung), model.modes)
-    series = [joint_plot.FitSeries("fit", hung, points)]
-    show(joint_plot.fitted_curves_figure(series), "suspended_beam")
-    show(joint_plot.residuals_figure(hung), "suspended_residuals")
+    series = [plot.FitSeries("fit", hung, points)]
+    show(plot.fitted_curves_figure(series), "suspended_beam")
+    show(plot.residuals_figure(hung), "suspended_residuals")
 
 # %% [markdown]
 # ## 4. The Brake–Reuss beam
@@ -327,9 +326,9 @@ else:
     print(" and ".join(taken(bolted)))
     remarks(bolted)
     points = sj.identify.identify_points(data, model.modes)
-    series = [joint_plot.FitSeries("fit", bolted, points)]
-    show(joint_plot.fitted_curves_figure(series), "brake_reuss_beam")
-    show(joint_plot.residuals_figure(bolted), "brake_reuss_residuals")
+    series = [plot.FitSeries("fit", bolted, points)]
+    show(plot.fitted_curves_figure(series), "brake_reuss_beam")
+    show(plot.residuals_figure(bolted), "brake_reuss_residuals")
 
 # %% [markdown]
 # Levels 4 and 7 are now left out, and foretold by the other six. Dots are their single states.
@@ -346,8 +345,8 @@ else:
     out = np.isin(np.asarray(data.level), (4, 7))
     six = sj.fit_jointly(jax.tree.map(lambda column: column[~out], data), model.modes)
     unseen = jax.tree.map(lambda column: column[out], points)
-    series = [joint_plot.FitSeries("fit of the other six levels", six, unseen)]
-    show(joint_plot.fitted_curves_figure(series), "levels_held_out")
+    series = [plot.FitSeries("fit of the other six levels", six, unseen)]
+    show(plot.fitted_curves_figure(series), "levels_held_out")
     close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
     at = np.asarray(unseen.backbone_velocity)
     foretold = sj.identify.fitted_values(six, at)

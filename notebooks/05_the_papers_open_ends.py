@@ -32,11 +32,11 @@ import numpy as np
 from scipy.stats import t as student
 
 import snrmjax as sj
+from snrmjax import plot
 from snrmjax.measure.force_calibration import calibrate_force
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.model.beams import FLAT_BEAM_FORCES
 from snrmjax.report import diagnosis_report
-from snrmjax.report import figures as plot
 from snrmjax.report import style as drawing
 
 HERTZ = 2 * np.pi

@@ -11,10 +11,8 @@ from snrmjax.report.figures import (
     backbone_figure,
     force_velocity_figure,
     modal_damping_figure,
-    normal_mode_figure,
     response_figure,
     save_figure,
-    simulated_response_figure,
 )
 from snrmjax.report.joint_figures import (
     FitSeries,
@@ -23,7 +21,13 @@ from snrmjax.report.joint_figures import (
     fitted_curves_figure,
     residuals_figure,
 )
-from snrmjax.report.simulation_figures import batch_figure, damped_mode_figure, motions_figure
+from snrmjax.report.simulation_figures import (
+    batch_figure,
+    damped_mode_figure,
+    motions_figure,
+    normal_mode_figure,
+    simulated_response_figure,
+)
 
 __all__ = [
     "DampingSeries",

@@ -19,7 +19,8 @@ def demo(out: Out) -> None:
     """
     from snrmjax.io import results
     from snrmjax.report import workflow
-    from snrmjax.report.figures import save_figure, simulated_response_figure
+    from snrmjax.report.figures import save_figure
+    from snrmjax.report.simulation_figures import simulated_response_figure
 
     with staged(out) as folder:
         model = sj.model.flat_beam()

@@ -57,7 +57,8 @@ def simulate(
     Harmonic balance with arclength continuation. Writes response.csv and response.png.
     """
     from snrmjax.io import results
-    from snrmjax.report.figures import save_figure, simulated_response_figure
+    from snrmjax.report.figures import save_figure
+    from snrmjax.report.simulation_figures import simulated_response_figure
 
     with staged(out) as folder:
         structure = read_model(model)
@@ -121,7 +122,8 @@ def nnm(
     Writes nnm.csv (frequency, velocity, energy) and nnm.png.
     """
     from snrmjax.io import results
-    from snrmjax.report.figures import normal_mode_figure, save_figure
+    from snrmjax.report.figures import save_figure
+    from snrmjax.report.simulation_figures import normal_mode_figure
 
     with staged(out) as folder:
         structure = read_model(model)

@@ -1,4 +1,4 @@
-"""Figures in the manner of the method paper: measured, identified, predicted and simulated.
+"""Figures of an identification in the manner of the method paper: measured and identified.
 
 Blue is measured, vermilion identified or predicted, black simulated (broad and grey behind a
 prediction); dashed thin lines are unstable and pale ones lie beyond the measured amplitudes. Axes
@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from snrmjax.identify.pointwise.backbone import Backbone
@@ -25,7 +24,7 @@ from snrmjax.identify.pointwise.prediction import (
 from snrmjax.io.files import FilePath, file_name, write_atomically
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.indicators import appropriation_of
-from snrmjax.measure.signals import force_velocity_loop, peak_amplitude
+from snrmjax.measure.signals import force_velocity_loop
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.report.sampling import (
@@ -248,81 +247,6 @@ def response_figure(
         name_axes(speeds, f"{title}amplitude at {plain(sensor)}", bottom, level)
         name_axes(phases, f"{title}phase", bottom, "Velocity phase (°)")
     explain_lines(figure)
-    legend(figure)
-    return figure
-
-
-def simulated_response_figure(
-    curves: Sequence[ResponseCurve], *, sensor: str | None = None
-) -> Figure:
-    """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
-
-    Unstable parts are dashed, parts whose stability was not computed dash-dotted; triangles mark
-    peaks, squares folds, dots phase resonances.
-
-    Arguments: `sensor` by default the first of the curves.
-    Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
-    """
-    drawn = sorted((c for c in curves if len(c.frequency)), key=lambda c: c.force)
-    if not drawn:
-        raise ValueError("there is no response to show: no curve has a point.")
-    name = sensor or drawn[0].sensors[0]
-    forces = sorted({c.force for c in drawn})
-    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
-    colours = dict(zip(forces, shades, strict=True))
-    unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
-    figure, ((speeds,), (phases,)) = panels(PAGE, 5.4, 2, 1)
-    markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
-    for event in (None, *markers):
-        for curve in drawn:
-            v, x = velocity_of(curve, name), curve.frequency / HERTZ
-            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
-                if event is None:
-                    label, colour = with_unit(curve.force, "N"), colours[curve.force]
-                    response_line(axes, x, y, curve.stability, label, colour, LINE)
-                    continue
-                at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
-                if event == "phase_resonance":
-                    style |= {"color": "black", "markersize": 2.0}
-                marks(axes, x[at], y[at], style, event.replace("_", " "))
-    speeds.set_ylim(bottom=0.0)
-    share_frequencies(speeds, phases)
-    phase_axis(phases)
-    name_axes(speeds, f"(a) amplitude at {plain(name)}", "", f"Velocity amplitude ({unit.name})")
-    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
-    explain_lines(figure)
-    legend(figure)
-    return figure
-
-
-def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
-    """A nonlinear normal mode: velocity against frequency, and frequency against energy.
-
-    The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
-    part where an internal resonance puts energy into higher harmonics. The energy axis shows the
-    last five decades.
-
-    Arguments: `sensor` by default the branch's first.
-    Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
-    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
-    doi:10.1016/j.ymssp.2008.04.002, for the frequency-energy plot.
-    """
-    if not len(branch.frequency):
-        raise ValueError("there is no normal mode to show: the branch has no point.")
-    name = sensor or branch.sensors[0]
-    fundamental = np.abs(velocity_of(branch, name))
-    signal = branch.velocity[:, 1:, branch.sensors.index(name)]
-    peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
-    unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
-    figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
-    speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")
-    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, **CURVE, label="fundamental")
-    energies.semilogx(branch.energy, omega, color=SIMULATED, **CURVE)
-    energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
-    speeds.set_ylim(bottom=0.0)
-    title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
-    name_axes(speeds, title, "Frequency (Hz)", level)
-    name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
     legend(figure)
     return figure
 

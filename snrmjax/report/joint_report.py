@@ -179,7 +179,8 @@ def contribution_table(shares: Sequence[Contribution]) -> ReportTable:
         pairs.append((f"{len(others)} further ones together", *rest))
     rows = [(name, f"{100 * a:.1f}", f"{100 * b:.1f}") for name, a, b in pairs]
     header = ("source of error", "natural frequency (%)", "damping (%)")
-    return ReportTable(header, rows, "Shares of the variance of both bands, largest first.")
+    caption = "Shares of the variance of both bands, largest first."
+    return ReportTable(header, rows, caption, "Every source of error by name")
 
 
 def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
@@ -237,4 +238,4 @@ def family_table(summary: dict) -> ReportTable:
         "bands are wider by that. The curve taken may have one term more than the best score asks "
         "for, so that its band does not rest on the shape of too small a family."
     )
-    return ReportTable(header, rows, caption)
+    return ReportTable(header, rows, caption, f"{len(rows)} families of curves compared")

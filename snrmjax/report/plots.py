@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.report import figures, joint_figures, simulation_figures
+from snrmjax.report import joint_figures, simulation_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch
@@ -36,12 +36,12 @@ def _(result: NextMeasurements, **settings: Any) -> Figure:
 
 @plot_result.register
 def _(result: ResponseCurve, **settings: Any) -> Figure:
-    return figures.simulated_response_figure([result], **settings)
+    return simulation_figures.simulated_response_figure([result], **settings)
 
 
 @plot_result.register
 def _(result: IsolatedResponses, **settings: Any) -> Figure:
-    return figures.simulated_response_figure(result.curves, **settings)
+    return simulation_figures.simulated_response_figure(result.curves, **settings)
 
 
 @plot_result.register
@@ -51,7 +51,7 @@ def _(result: ResponseBatch, **settings: Any) -> Figure:
 
 @plot_result.register
 def _(result: NormalModeBranch, **settings: Any) -> Figure:
-    return figures.normal_mode_figure(result, **settings)
+    return simulation_figures.normal_mode_figure(result, **settings)
 
 
 @plot_result.register

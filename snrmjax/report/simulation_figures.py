@@ -1,30 +1,116 @@
-"""Figures of simulated motions: states under a controller, damped modes, batches and tests."""
+"""Figures of simulated motions: responses, nonlinear modes, batches and virtual tests."""
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.measure.signals import peak_amplitude
+from snrmjax.report.sampling import velocity_of
 from snrmjax.report.style import (
     COLUMN,
     CURVE,
     DOT,
+    HOLLOW,
+    LINE,
     MEASURED,
     PAGE,
     SERIES,
     SIMULATED,
     Style,
+    explain_lines,
     legend,
     marks,
     name_axes,
     panels,
     phase_axis,
     plain,
+    response_line,
+    share_frequencies,
     unit_for,
+    with_unit,
 )
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
-from snrmjax.simulate.solutions.forced_response import ResponseBatch
+from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
+from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+
+def simulated_response_figure(
+    curves: Sequence[ResponseCurve], *, sensor: str | None = None
+) -> Figure:
+    """Forced responses by harmonic balance: amplitude and phase of the velocity fundamental.
+
+    Unstable parts are dashed, parts whose stability was not computed dash-dotted; triangles mark
+    peaks, squares folds, dots phase resonances.
+
+    Arguments: `sensor` by default the first of the curves.
+    Returns the figure. Raises `ValueError` when no curve has a point or the sensor is missing.
+    """
+    drawn = sorted((c for c in curves if len(c.frequency)), key=lambda c: c.force)
+    if not drawn:
+        raise ValueError("there is no response to show: no curve has a point.")
+    name = sensor or drawn[0].sensors[0]
+    forces = sorted({c.force for c in drawn})
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(forces)))
+    colours = dict(zip(forces, shades, strict=True))
+    unit = unit_for(np.concatenate([velocity_of(c, name) for c in drawn]), "m/s")
+    figure, ((speeds,), (phases,)) = panels(PAGE, 5.4, 2, 1)
+    markers = {"peak": "^", "fold": "s", "phase_resonance": "o"}
+    for event in (None, *markers):
+        for curve in drawn:
+            v, x = velocity_of(curve, name), curve.frequency / HERTZ
+            for axes, y in ((speeds, np.abs(v) / unit.size), (phases, np.angle(v) / DEGREE)):
+                if event is None:
+                    label, colour = with_unit(curve.force, "N"), colours[curve.force]
+                    response_line(axes, x, y, curve.stability, label, colour, LINE)
+                    continue
+                at, style = curve.at_events(event), {**HOLLOW, "marker": markers[event]}
+                if event == "phase_resonance":
+                    style |= {"color": "black", "markersize": 2.0}
+                marks(axes, x[at], y[at], style, event.replace("_", " "))
+    speeds.set_ylim(bottom=0.0)
+    share_frequencies(speeds, phases)
+    phase_axis(phases)
+    name_axes(speeds, f"(a) amplitude at {plain(name)}", "", f"Velocity amplitude ({unit.name})")
+    name_axes(phases, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
+    explain_lines(figure)
+    legend(figure)
+    return figure
+
+
+def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -> Figure:
+    """A nonlinear normal mode: velocity against frequency, and frequency against energy.
+
+    The velocity is shown as amplitude of the fundamental and as peak of the whole signal: they
+    part where an internal resonance puts energy into higher harmonics. The energy axis shows the
+    last five decades.
+
+    Arguments: `sensor` by default the branch's first.
+    Returns the figure. Raises `ValueError` when the branch has no point or not this sensor.
+    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
+    doi:10.1016/j.ymssp.2008.04.002, for the frequency-energy plot.
+    """
+    if not len(branch.frequency):
+        raise ValueError("there is no normal mode to show: the branch has no point.")
+    name = sensor or branch.sensors[0]
+    fundamental = np.abs(velocity_of(branch, name))
+    signal = branch.velocity[:, 1:, branch.sensors.index(name)]
+    peak = np.asarray(peak_amplitude(jnp.asarray(signal), tuple(range(1, signal.shape[1] + 1))))
+    unit, omega = unit_for(peak, "m/s"), branch.frequency / HERTZ
+    figure, ((speeds, energies),) = panels(PAGE, 3.2, 1, 2)
+    speeds.plot(omega, peak / unit.size, color=SERIES[5], **CURVE, label="peak of the signal")
+    speeds.plot(omega, fundamental / unit.size, color=SIMULATED, **CURVE, label="fundamental")
+    energies.semilogx(branch.energy, omega, color=SIMULATED, **CURVE)
+    energies.set_xlim(left=max(1e-5 * branch.energy.max(), branch.energy.min()))
+    speeds.set_ylim(bottom=0.0)
+    title, level = f"(a) amplitude at {plain(name)}", f"Velocity amplitude ({unit.name})"
+    name_axes(speeds, title, "Frequency (Hz)", level)
+    name_axes(energies, "(b) frequency and energy", "Energy (J)", "Frequency (Hz)")
+    legend(figure)
+    return figure
 
 
 def motions_figure(
@@ -44,7 +130,7 @@ def motions_figure(
     upper.plot(omega, np.abs(speeds) / unit.size, **style)
     lower.plot(omega, np.angle(speeds) / DEGREE, **style)
     upper.set_ylim(bottom=0.0)
-    lower.sharex(upper)
+    share_frequencies(upper, lower)
     phase_axis(lower)
     title = f"(a) amplitude at {plain(sensor)}"
     name_axes(upper, title, "", f"Velocity amplitude ({unit.name})")

@@ -39,6 +39,7 @@ from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
 from snrmjax.report.identification_report import ComparedResponses, identification_report
 from snrmjax.report.joint_report import ReportedFit, joint_figures, joint_sections, reported_fit
+from snrmjax.report.simulation_figures import normal_mode_figure
 from snrmjax.report.style import PrintedFigure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
@@ -325,7 +326,7 @@ def identification_figures(found: Findings) -> dict[str, Figure]:
     if found.fitted is not None:
         figures |= joint_figures(found.fitted, points)
     if found.truth is not None:
-        figures["nnm"] = plot.normal_mode_figure(found.truth, sensor=points.sensor)
+        figures["nnm"] = normal_mode_figure(found.truth, sensor=points.sensor)
     return figures
 
 

@@ -10,58 +10,14 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
+from truth.beam_forces import FORCES
 
 import snrmjax as sj
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import figures as plot
 from snrmjax.report import style as drawing
+from snrmjax.report.simulation_figures import normal_mode_figure, simulated_response_figure
 from snrmjax.report.style import png_bytes
-
-FORCES = (4.0e-5, 8.0e-5, 1.334e-4)
-
-
-@pytest.fixture(scope="module")
-def model():
-    return sj.model.curved_beam()
-
-
-@pytest.fixture(scope="module")
-def virtual(model):
-    errors = sj.simulate.MeasurementErrors(amplitude=0.005, phase=0.01)
-    return sj.phase_resonance_test(
-        model,
-        FORCES,
-        45 * HERTZ,
-        85 * HERTZ,
-        appropriation=(0.5, 0.98),
-        recording=sj.simulate.Recording(errors, keep_harmonics=(2, 3)),
-        simulation=sj.simulate.SweepSimulation(harmonic_order=3),
-    )
-
-
-@pytest.fixture(scope="module")
-def identification(model, virtual):
-    return sj.identify_backbone(virtual.steady_states, model.modes, n_knots=4)
-
-
-@pytest.fixture(scope="module")
-def backbone(identification):
-    return identification.fit.backbone
-
-
-@pytest.fixture(scope="module")
-def mode(model):
-    return sj.nonlinear_normal_mode(model, 50 * HERTZ, harmonic_order=3)
-
-
-@pytest.fixture(scope="module")
-def predicted(model, backbone):
-    return sj.identify.predict_response(backbone, model.modes, FORCES[2], points_per_side=60)
-
-
-@pytest.fixture(scope="module")
-def resonance(model, backbone):
-    return sj.identify.resonances(backbone, model.modes, FORCES[2])
 
 
 def named(axes, label):
@@ -254,7 +210,7 @@ ARRAYS = [
 def test_names_of_sensors_are_shown_as_they_are(virtual):
     odd = r"$\frac{1_$"
     curves = [dataclasses.replace(curve, sensors=(odd,)) for curve in virtual.curves]
-    figure = plot.simulated_response_figure(curves, sensor=odd)
+    figure = simulated_response_figure(curves, sensor=odd)
     assert png_bytes(figure, dots_per_inch=40)
     assert figure.axes[0].get_title(loc="left") == r"(a) amplitude at \$\frac{1_\$"
 
@@ -346,54 +302,6 @@ def test_responses_refuse_what_they_cannot_show(backbone, virtual):
         plot.response_figure(elsewhere, [], simulated=virtual.curves)
 
 
-def test_simulated_responses_mark_folds_peaks_and_resonances(virtual):
-    figure = plot.simulated_response_figure(virtual.curves)
-    speeds, phases = figure.axes
-    assert speeds.get_ylabel() == "Velocity amplitude (m/s)"
-    assert phases.get_xlabel() == "Frequency (Hz)"
-    assert {"40 µN", "80 µN", "0.1334 mN", "fold", "peak", "unstable"} <= legend_names(figure)
-    (steep,) = [c for c in virtual.curves if c.force == FORCES[2]]
-    for kind, marker in (("fold", "s"), ("peak", "^"), ("phase_resonance", "o")):
-        marked = [line for line in speeds.lines if line.get_marker() == marker]
-        expected = [c.frequency[c.at_events(kind)] / HERTZ for c in virtual.curves]
-        drawn = np.concatenate([line.get_xdata() for line in marked])
-        np.testing.assert_array_equal(drawn, np.concatenate(expected))
-    assert len(steep.at_events("fold")) == 2
-    dashed = [
-        line for line in speeds.lines if line.get_linestyle() == "--" and len(line.get_xdata())
-    ]
-    unstable = sum(int(np.sum(c.is_unstable)) for c in virtual.curves)
-    # A dashed piece ends on the first stable point.
-    assert sum(len(line.get_xdata()) - 1 for line in dashed) == unstable
-
-
-def test_simulated_responses_refuse_nothing(virtual):
-    with pytest.raises(ValueError, match="no curve has a point"):
-        plot.simulated_response_figure([])
-    with pytest.raises(ValueError, match="the sensor must be one of"):
-        plot.simulated_response_figure(virtual.curves, sensor="quarter")
-
-
-def test_normal_mode_against_frequency_and_energy(mode):
-    figure = plot.normal_mode_figure(mode)
-    speeds, energies = figure.axes
-    fundamental = named(speeds, "fundamental")
-    np.testing.assert_array_equal(fundamental.get_xdata(), mode.frequency / HERTZ)
-    np.testing.assert_array_equal(fundamental.get_ydata(), np.abs(mode.velocity[:, 1, 0]))
-    (curve,) = energies.lines
-    np.testing.assert_array_equal(curve.get_xdata(), mode.energy)
-    np.testing.assert_array_equal(curve.get_ydata(), mode.frequency / HERTZ)
-    assert energies.get_xscale() == "log"
-    assert energies.get_xlabel() == "Energy (J)"
-    # The second harmonic falls with the amplitude: below 1 % at a fiftieth of the largest one.
-    peak = named(speeds, "peak of the signal").get_ydata()
-    small = fundamental.get_ydata() < 0.02 * fundamental.get_ydata().max()
-    assert small.any()
-    np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
-    with pytest.raises(ValueError, match="the branch has no point"):
-        plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
-
-
 def test_loops_of_force_and_velocity(virtual):
     data = virtual.steady_states
     figure = plot.force_velocity_figure(data, [0, 4, 2, 7])
@@ -454,7 +362,7 @@ def test_modal_damping_of_several_series(identification, backbone):
 
 
 def test_saved_figures_are_png_files(tmp_path, mode):
-    figure = plot.normal_mode_figure(mode)
+    figure = normal_mode_figure(mode)
     plot.save_figure(figure, tmp_path / "mode.png", dots_per_inch=50)
     image = mpl.image.imread(tmp_path / "mode.png")
     assert image.shape[:2] == (160, 360)
@@ -463,7 +371,7 @@ def test_saved_figures_are_png_files(tmp_path, mode):
 
 
 def test_figures_are_saved_whole_or_not_at_all(tmp_path, mode, monkeypatch):
-    figure = plot.normal_mode_figure(mode)
+    figure = normal_mode_figure(mode)
     target = tmp_path / "mode.png"
     target.write_bytes(b"before")
     with pytest.raises(ValueError, match=r"must end in \.png, but is mode\.pdf"):

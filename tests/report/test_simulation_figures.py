@@ -1,0 +1,68 @@
+"""Figures of simulated motions: events, units and the curves themselves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from truth.beam_forces import FORCES
+
+from snrmjax.io.units import HERTZ
+from snrmjax.report import simulation_figures as plot
+
+
+def named(axes, label):
+    """The one line with a label."""
+    (line,) = [line for line in axes.lines if line.get_label() == label]
+    return line
+
+
+def legend_names(figure):
+    return {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_simulated_responses_mark_folds_peaks_and_resonances(virtual):
+    figure = plot.simulated_response_figure(virtual.curves)
+    speeds, phases = figure.axes
+    assert speeds.get_ylabel() == "Velocity amplitude (m/s)"
+    assert phases.get_xlabel() == "Frequency (Hz)"
+    assert {"40 µN", "80 µN", "0.1334 mN", "fold", "peak", "unstable"} <= legend_names(figure)
+    (steep,) = [c for c in virtual.curves if c.force == FORCES[2]]
+    for kind, marker in (("fold", "s"), ("peak", "^"), ("phase_resonance", "o")):
+        marked = [line for line in speeds.lines if line.get_marker() == marker]
+        expected = [c.frequency[c.at_events(kind)] / HERTZ for c in virtual.curves]
+        drawn = np.concatenate([line.get_xdata() for line in marked])
+        np.testing.assert_array_equal(drawn, np.concatenate(expected))
+    assert len(steep.at_events("fold")) == 2
+    dashed = [
+        line for line in speeds.lines if line.get_linestyle() == "--" and len(line.get_xdata())
+    ]
+    unstable = sum(int(np.sum(c.is_unstable)) for c in virtual.curves)
+    # A dashed piece ends on the first stable point.
+    assert sum(len(line.get_xdata()) - 1 for line in dashed) == unstable
+
+
+def test_simulated_responses_refuse_nothing(virtual):
+    with pytest.raises(ValueError, match="no curve has a point"):
+        plot.simulated_response_figure([])
+    with pytest.raises(ValueError, match="the sensor must be one of"):
+        plot.simulated_response_figure(virtual.curves, sensor="quarter")
+
+
+def test_normal_mode_against_frequency_and_energy(mode):
+    figure = plot.normal_mode_figure(mode)
+    speeds, energies = figure.axes
+    fundamental = named(speeds, "fundamental")
+    np.testing.assert_array_equal(fundamental.get_xdata(), mode.frequency / HERTZ)
+    np.testing.assert_array_equal(fundamental.get_ydata(), np.abs(mode.velocity[:, 1, 0]))
+    (curve,) = energies.lines
+    np.testing.assert_array_equal(curve.get_xdata(), mode.energy)
+    np.testing.assert_array_equal(curve.get_ydata(), mode.frequency / HERTZ)
+    assert energies.get_xscale() == "log"
+    assert energies.get_xlabel() == "Energy (J)"
+    # The second harmonic falls with the amplitude: below 1 % at a fiftieth of the largest one.
+    peak = named(speeds, "peak of the signal").get_ydata()
+    small = fundamental.get_ydata() < 0.02 * fundamental.get_ydata().max()
+    assert small.any()
+    np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
+    with pytest.raises(ValueError, match="the branch has no point"):
+        plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
