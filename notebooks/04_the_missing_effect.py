@@ -90,8 +90,7 @@ modes = sj.model.linear_modes(
     [0.97 * ZETA],
     [[SHAPE]],
     [SHAPE],
-    natural_frequency_std=[0.001 * OMEGA],
-    damping_ratio_std=[0.05 * ZETA],
+    std=sj.model.LinearModesStd([0.001 * OMEGA], [0.05 * ZETA]),
 )
 model = sj.model.structure(modes)
 hidden = make_effect("one_sided_stop", {"stiffness": 0.12 * OMEGA**2, "gap": 3e-4 / SHAPE})

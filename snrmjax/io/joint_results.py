@@ -22,7 +22,7 @@ from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
-from snrmjax.model.modes import LinearModes, linear_modes
+from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 
 BAND_POINTS = 200
 _FORMAT = 2
@@ -184,11 +184,15 @@ def read_joint_fit(path: FilePath) -> JointFit:
 
 
 def _rebuilt(content: dict[str, Any]) -> JointFit:
-    data, modes = content["data"], dict(content["modes"])
-    modes["sensors"] = tuple(modes["sensors"])
+    data, modes = content["data"], content["modes"]
     keys = ("natural_frequency", "damping_ratio", "mode_shape", "participation")
-    first = [modes.pop(key) for key in keys]
-    rebuilt: LinearModes = linear_modes(*first, **modes)
+    rebuilt: LinearModes = linear_modes(
+        *(modes[key] for key in keys),
+        sensors=tuple(modes["sensors"]),
+        mode_of_interest=modes["mode_of_interest"],
+        rigid_body=RigidBodyModes(modes["rigid_body_shape"], modes["rigid_body_participation"]),
+        std=LinearModesStd(modes["natural_frequency_std"], modes["damping_ratio_std"]),
+    )
     squared, damping = (
         _family(content["squared_frequency"]),
         _family(content["modal_damping"]),

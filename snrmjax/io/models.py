@@ -21,7 +21,7 @@ from snrmjax.io.files import (
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.modes import LinearModes, linear_modes
+from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.potential import (
     Monomial,
     PolynomialPotential,
@@ -189,17 +189,17 @@ def _modes(top: _Table, file: str) -> LinearModes:
         [table.number("participation", NOT_ZERO) for table in flexible],
         sensors=sensors,
         mode_of_interest=of_interest - 1,
-        rigid_body_shape=mode_shape[:, len(flexible) :],
-        rigid_body_participation=np.array(
-            [table.number("participation", NOT_ZERO) for table in rigid]
+        rigid_body=RigidBodyModes(
+            mode_shape[:, len(flexible) :],
+            np.array([table.number("participation", NOT_ZERO) for table in rigid]),
         ),
-        natural_frequency_std=[
-            table.number("frequency_std_hz", NOT_NEGATIVE, IN_RANGE_HZ, default=0.0) * HERTZ
-            for table in flexible
-        ],
-        damping_ratio_std=[
-            table.number("damping_ratio_std", NOT_NEGATIVE, default=0.0) for table in flexible
-        ],
+        std=LinearModesStd(
+            [
+                table.number("frequency_std_hz", NOT_NEGATIVE, IN_RANGE_HZ, default=0.0) * HERTZ
+                for table in flexible
+            ],
+            [table.number("damping_ratio_std", NOT_NEGATIVE, default=0.0) for table in flexible],
+        ),
     )
 
 

@@ -22,7 +22,7 @@ from .effect_metadata import (
 )
 from .effect_shape import shape_of
 from .effects import EFFECTS, make_effect, register_effect
-from .modes import LinearModes, linear_modes, linear_response
+from .modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes, linear_response
 from .potential import PolynomialPotential, polynomial_potential, potential_from_force_table
 from .structures import Structure, equilibria, structure
 
@@ -38,11 +38,13 @@ __all__ = [
     "Confusion",
     "Imitation",
     "LinearModes",
+    "LinearModesStd",
     "MotionScales",
     "Parameter",
     "Part",
     "PolynomialPotential",
     "Prior",
+    "RigidBodyModes",
     "Shape",
     "Structure",
     "Symmetry",

@@ -1,6 +1,6 @@
 """Linear modes of a structure and their response to a harmonic force."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -37,6 +37,21 @@ class LinearModes(eqx.Module):
         return tuple(k for k in range(self.n_modes) if k != self.mode_of_interest)
 
 
+class RigidBodyModes(NamedTuple):
+    """Mass-normalised rigid-body modes of a free structure."""
+
+    shape: Shaped[np.ndarray | Array, "sensor rigid"] | list[list[float]]  # kg^-1/2
+    # Φᵀb per newton of the recorded force, kg^-1/2
+    participation: Shaped[np.ndarray | Array, " rigid"] | list[float]
+
+
+class LinearModesStd(NamedTuple):
+    """1σ of what a linear test found; None where it is known exactly."""
+
+    natural_frequency: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # rad/s
+    damping_ratio: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
+
+
 def linear_modes(
     natural_frequency: Shaped[np.ndarray | Array, " mode"] | list[float],
     damping_ratio: Shaped[np.ndarray | Array, " mode"] | list[float],
@@ -45,15 +60,14 @@ def linear_modes(
     *,
     sensors: tuple[str, ...] | None = None,
     mode_of_interest: int = 0,
-    rigid_body_shape: Shaped[np.ndarray | Array, "sensor rigid"] | None = None,
-    rigid_body_participation: Shaped[np.ndarray | Array, " rigid"] | None = None,
-    natural_frequency_std: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None,
-    damping_ratio_std: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None,
+    rigid_body: RigidBodyModes | None = None,
+    std: LinearModesStd | None = None,
 ) -> LinearModes:
     """Build `LinearModes` from arrays or lists, checking shapes and ranges.
 
     Arguments: natural frequencies in rad/s, damping as a fraction of critical, shapes at the
-    sensors and participations Φᵀb in kg^-1/2; rigid-body modes likewise.
+    sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
+    frequencies and damping ratios, without which they are known exactly.
     Raises `ValueError` that names the argument whose shape or value is wrong.
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])
@@ -81,34 +95,28 @@ def linear_modes(
         )
     _require("natural_frequency", frequency, frequency > 0, "positive")
     _require("damping_ratio", damping, (damping >= 0) & (damping < 1), "from 0 to below 1")
-    rigid_shape = (
-        np.zeros((n_sensors, 0))
-        if rigid_body_shape is None
-        else np.asarray(rigid_body_shape, dtype=np.float64)
-    )
+    shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
+    rigid_shape = np.asarray(shapes, dtype=np.float64)
     if rigid_shape.ndim != 2 or rigid_shape.shape[0] != n_sensors:
         raise ValueError(
-            f"`rigid_body_shape` must have shape ({n_sensors} sensors, rigid-body modes), "
+            f"`rigid_body.shape` must have shape ({n_sensors} sensors, rigid-body modes), "
             f"but has {rigid_shape.shape}."
         )
     flat = rigid_shape.reshape(-1)
-    _require("rigid_body_shape", flat, np.isfinite(flat), "finite")
-    rigid_participation = _vector(
-        "rigid_body_participation",
-        [] if rigid_body_participation is None else rigid_body_participation,
-        rigid_shape.shape[1],
-    )
+    _require("rigid_body.shape", flat, np.isfinite(flat), "finite")
     numbers: dict[str, Any] = {
         "natural_frequency": frequency,
         "damping_ratio": damping,
         "mode_shape": shape,
         "participation": _vector("participation", participation, n_modes),
         "rigid_body_shape": rigid_shape,
-        "rigid_body_participation": rigid_participation,
+        "rigid_body_participation": _vector(
+            "rigid_body.participation", participations, rigid_shape.shape[1]
+        ),
     }
-    stds = {"natural_frequency_std": natural_frequency_std, "damping_ratio_std": damping_ratio_std}
-    for name, std in stds.items():
-        numbers[name] = np.zeros(n_modes) if std is None else _vector(name, std, n_modes)
+    for name, own in zip(LinearModesStd._fields, std or LinearModesStd(), strict=True):
+        own = np.zeros(n_modes) if own is None else _vector(f"std.{name}", own, n_modes)
+        numbers[f"{name}_std"] = own
     modes = LinearModes(**numbers, sensors=tuple(names), mode_of_interest=mode_of_interest)
     # All at once: one by one they compile, a copy of every shape.
     return jax.device_put(modes, may_alias=False)

@@ -203,13 +203,12 @@ def structure(
     level_phase_std: float = 0.0,
     level_frequency_std: float = 0.0,
     level_damping_std: float = 0.0,
-    test_order: float = 0.0,
     name: str = "structure",
 ) -> Structure:
     """Build a `Structure`; without a potential it is linear but for its effects.
 
     Arguments: `level_gain_std` relative, `level_phase_std` in rad, `level_frequency_std` in rad/s,
-    `level_damping_std` of the damping ratio, `test_order` from 0 to 1.
+    `level_damping_std` of the damping ratio.
     Raises `ValueError` when potential and modes disagree about the number of modes.
     """
     if potential is None:
@@ -226,7 +225,6 @@ def structure(
         level_phase_std=jnp.asarray(float(level_phase_std)),
         level_frequency_std=jnp.asarray(float(level_frequency_std)),
         level_damping_std=jnp.asarray(float(level_damping_std)),
-        test_order=jnp.asarray(float(test_order)),
         name=name,
     )
 

@@ -29,10 +29,8 @@ def modes(sensors=2):
         np.array([[1.1, 2.0, -0.8], [0.5, -1.2, 0.9]])[:sensors],
         [0.9, 1.5, 1.1],
         mode_of_interest=1,
-        rigid_body_shape=np.array([[0.7], [0.5]])[:sensors],
-        rigid_body_participation=[0.6],
-        natural_frequency_std=[0.5, 0.0, 2.0],
-        damping_ratio_std=[0.001, 0.0, 0.001],
+        rigid_body=sj.model.RigidBodyModes(np.array([[0.7], [0.5]])[:sensors], [0.6]),
+        std=sj.model.LinearModesStd([0.5, 0.0, 2.0], [0.001, 0.0, 0.001]),
     )
 
 

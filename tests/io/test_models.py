@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from snrmjax.io.models import read_model, write_model
 from snrmjax.model.effect_base import AbstractMemoryless
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.modes import linear_modes
+from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import Structure, structure
 
@@ -92,10 +92,8 @@ def test_reads_everything(tmp_path):
             [[11.8, -10.5], [-3.0, 0.0]],
             [247.8, -108.5],
             sensors=("midspan", "tip"),
-            rigid_body_shape=np.array([[1.0], [2.0]]),
-            rigid_body_participation=np.array([1.5]),
-            natural_frequency_std=np.array([0.02, 0.0]) * 2 * np.pi,
-            damping_ratio_std=[0.001, 0.0],
+            rigid_body=RigidBodyModes(np.array([[1.0], [2.0]]), np.array([1.5])),
+            std=LinearModesStd(np.array([0.02, 0.0]) * 2 * np.pi, [0.001, 0.0]),
         ),
         polynomial_potential(
             {"1111": 3.4e12, "112": -2.5e6, "222": 0.0}, 2, coefficient_std={"1111": 1e10}
@@ -554,10 +552,12 @@ def models(draw):
             array(not_zero, n),
             sensors=sensors,
             mode_of_interest=j,
-            rigid_body_shape=array(finite, len(sensors), n_rigid),
-            rigid_body_participation=array(not_zero, n_rigid),
-            natural_frequency_std=array(st.floats(0, 1e6, allow_subnormal=False), n),
-            damping_ratio_std=array(spread, n),
+            rigid_body=RigidBodyModes(
+                array(finite, len(sensors), n_rigid), array(not_zero, n_rigid)
+            ),
+            std=LinearModesStd(
+                array(st.floats(0, 1e6, allow_subnormal=False), n), array(spread, n)
+            ),
         ),
         polynomial_potential(
             {m: draw(finite) for m in sorted(monomials)},

@@ -17,7 +17,7 @@ from snrmjax.measure.force_calibration import (
     equivalent_force,
 )
 from snrmjax.measure.states import steady_states
-from snrmjax.model.modes import linear_modes
+from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 
 # The paper's section 4.1: drives in V, forces in N, gain in N/V, offset in N.
 CURVED = ([0.01, 0.02, 0.03], [1.9138e-4, 4.6678e-4, 7.3752e-4], 2.730673e-2, -8.090884e-5)
@@ -38,9 +38,8 @@ MODES = linear_modes(
     SHAPE,
     PARTICIPATION,
     sensors=("center", "quarter"),
-    rigid_body_shape=[[2.7], [2.7]],
-    rigid_body_participation=[2.7],
-    damping_ratio_std=[2e-4, 1e-3],
+    rigid_body=RigidBodyModes([[2.7], [2.7]], [2.7]),
+    std=LinearModesStd(damping_ratio=[2e-4, 1e-3]),
 )
 SWEEP = 2 * np.pi * np.linspace(145.0, 160.0, 21)
 

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from snrmjax.model.modes import linear_modes, linear_response, residual_velocity
+from snrmjax.model.modes import (
+    LinearModesStd,
+    RigidBodyModes,
+    linear_modes,
+    linear_response,
+    residual_velocity,
+)
 
 # Both sides are a few dozen roundings of well-conditioned sums (the dynamic stiffness is
 # inverted at least 0.1 % away from the undamped poles, where it loses three digits).
@@ -39,8 +45,7 @@ def chain(*, free):
         ratio,
         shape[:, rigid:],
         shape[:, rigid:].T @ pattern,
-        rigid_body_shape=shape[:, :rigid],
-        rigid_body_participation=shape[:, :rigid].T @ pattern,
+        rigid_body=RigidBodyModes(shape[:, :rigid], shape[:, :rigid].T @ pattern),
         mode_of_interest=1,
     )
     return mass, damping, stiffness, pattern, modes
@@ -97,8 +102,9 @@ def test_response_is_invariant_under_signs_order_and_units():
             np.asarray(modes.damping_ratio)[order],
             np.asarray(modes.mode_shape)[:, order] * sign,
             np.asarray(modes.participation)[order] * sign,
-            rigid_body_shape=modes.rigid_body_shape * sign,
-            rigid_body_participation=modes.rigid_body_participation * sign,
+            rigid_body=RigidBodyModes(
+                modes.rigid_body_shape * sign, modes.rigid_body_participation * sign
+            ),
         )
 
     for same in (rebuilt(order=(2, 0, 1)), rebuilt(sign=-1.0)):
@@ -177,17 +183,23 @@ GOOD = {
         ({"mode_shape": [[2.0]]}, r"`mode_shape` must have shape \(sensors, 2 modes\).*\(1, 1\)"),
         ({"mode_shape": np.zeros((0, 2))}, "`mode_shape`"),
         ({"mode_shape": [[2.0, np.nan]]}, "`mode_shape` must be finite, but entry 1 is nan"),
-        ({"rigid_body_shape": [[np.inf]]}, "`rigid_body_shape` must be finite, but entry 0"),
+        (
+            {"rigid_body": RigidBodyModes([[np.inf]], [1.0])},
+            "`rigid_body.shape` must be finite, but entry 0",
+        ),
         ({"participation": [3.0]}, "`participation` must be a vector of 2"),
         ({"participation": [3.0, np.inf]}, "`participation` must be finite.*entry 1 is inf"),
         ({"sensors": ("a", "b")}, "`sensors` names 2 sensors, but `mode_shape` has 1"),
         ({"mode_of_interest": 2}, "`mode_of_interest` must lie between 0 and 1, but is 2"),
         ({"mode_of_interest": -1}, "`mode_of_interest`"),
-        ({"rigid_body_shape": [[1.0], [1.0]]}, r"`rigid_body_shape`.*\(2, 1\)"),
-        ({"rigid_body_shape": [[1.0]]}, "`rigid_body_participation` must be a vector of 1"),
-        ({"rigid_body_participation": [1.0]}, "`rigid_body_participation` must be a vector of 0"),
-        ({"natural_frequency_std": [1.0]}, "`natural_frequency_std` must be a vector of 2"),
-        ({"damping_ratio_std": [1.0, 1.0, 1.0]}, "`damping_ratio_std` must be a vector of 2"),
+        (
+            {"rigid_body": RigidBodyModes([[1.0], [1.0]], [1.0])},
+            r"`rigid_body.shape`.*\(2, 1\)",
+        ),
+        ({"rigid_body": RigidBodyModes([[1.0]], [])}, "`rigid_body.participation` .* vector of 1"),
+        ({"rigid_body": RigidBodyModes([[]], [1.0])}, "`rigid_body.participation` .* vector of 0"),
+        ({"std": LinearModesStd([1.0])}, "`std.natural_frequency` must be a vector of 2"),
+        ({"std": LinearModesStd(None, [1.0] * 3)}, "`std.damping_ratio` must be a vector of 2"),
     ],
 )
 def test_wrong_arguments_are_named(changes, message):

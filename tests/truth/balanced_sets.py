@@ -67,8 +67,7 @@ def linear_model(frequency=OMEGA, damping=ZETA, damping_std=0.01, **settings):
         [damping],
         [[SHAPE]],
         [PARTICIPATION],
-        natural_frequency_std=[1e-4 * OMEGA],
-        damping_ratio_std=[damping_std * ZETA],
+        std=sj.model.LinearModesStd([1e-4 * OMEGA], [damping_std * ZETA]),
     )
     return sj.model.structure(modes, **settings)
 

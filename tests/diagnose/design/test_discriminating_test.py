@@ -32,8 +32,7 @@ def linear_model():
         [ZETA],
         [[SHAPE]],
         [PARTICIPATION],
-        natural_frequency_std=[1e-4 * OMEGA],
-        damping_ratio_std=[0.01 * ZETA],
+        std=sj.model.LinearModesStd([1e-4 * OMEGA], [0.01 * ZETA]),
     )
     return sj.model.structure(modes)
 

@@ -60,7 +60,7 @@ def joint_states():
 def test_a_law_is_found_along_the_narrow_valley_of_precise_data():
     modes = sj.model.linear_modes(
         [OMEGA], [ZETA], [[1.0]], [1.0],
-        natural_frequency_std=[1e-4 * OMEGA], damping_ratio_std=[0.01 * ZETA],
+        std=sj.model.LinearModesStd([1e-4 * OMEGA], [0.01 * ZETA]),
     )  # fmt: skip
     predictions = predictions_of(sj.model.structure(modes), joint_states(), 1.0)
     misfit, kind = weighted_misfit(predictions), "iwan_microslip"

@@ -79,7 +79,7 @@ def rows(data, index):
 def test_a_linear_structure_needs_the_force_of_its_closed_form():
     modes = sj.model.linear_modes(
         [500.0, 1300.0], [0.01, 0.02], [[2.0, 1.0], [0.5, -1.0]], [3.0, 1.0],
-        rigid_body_shape=[[1.0], [0.7]], rigid_body_participation=[2.0],
+        rigid_body=sj.model.RigidBodyModes([[1.0], [0.7]], [2.0]),
     )  # fmt: skip
     omega = np.array([470.0, 500.0, 510.0])
     velocity = np.outer([0.3, 0.5j, 0.2 - 0.1j], [1.0, 1.0])

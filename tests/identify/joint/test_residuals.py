@@ -26,8 +26,7 @@ def drawn(free, *, room=False):
     """Residuals of drawn states, the unknowns near their smallest, and their order."""
     modes = sj.model.linear_modes(
         *([OMEGA, 3 * OMEGA], [0.012, 0.01], [[SHAPE, 1.5]], [PARTICIPATION, 2.0]),
-        natural_frequency_std=[1.0, 5.0],
-        damping_ratio_std=[1e-3, 2e-3],
+        std=sj.model.LinearModesStd([1.0, 5.0], [1e-3, 2e-3]),
     )
     spread = Spread(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3]))
     data = balance_data(noisy(1, gain=0.01), modes)[0]

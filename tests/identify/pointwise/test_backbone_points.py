@@ -9,7 +9,7 @@ import pytest
 from snrmjax.identify.pointwise.backbone_points import identify_points
 from snrmjax.identify.pointwise.inversion import PointStatus
 from snrmjax.measure.states import steady_states
-from snrmjax.model.modes import linear_modes
+from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 
 SENSORS = ("tip", "middle", "root")
 NATURAL = np.array([310.0, 500.0, 1400.0])
@@ -20,7 +20,7 @@ RIGID_SHAPE = np.array([[0.7], [0.5], [0.4]])
 RIGID_PARTICIPATION = np.array([0.6])
 
 
-def three_modes(sensors=(0, 1, 2), time=1.0, force=1.0, residual=1.0, **std):
+def three_modes(sensors=(0, 1, 2), time=1.0, force=1.0, residual=1.0, std=None):
     """The second of three modes is of interest; `time` and `force` are other units."""
     rows = list(sensors)
     others = np.array([residual, 1.0, residual])
@@ -31,9 +31,8 @@ def three_modes(sensors=(0, 1, 2), time=1.0, force=1.0, residual=1.0, **std):
         PARTICIPATION * others / force,
         sensors=tuple(SENSORS[k] for k in rows),
         mode_of_interest=1,
-        rigid_body_shape=RIGID_SHAPE[rows],
-        rigid_body_participation=residual * RIGID_PARTICIPATION / force,
-        **std,
+        rigid_body=RigidBodyModes(RIGID_SHAPE[rows], residual * RIGID_PARTICIPATION / force),
+        std=std,
     )
 
 
@@ -339,9 +338,7 @@ class TestStatedErrors:
             # Noise that is nearly none: only the residual modes' errors count.
             velocity_std=np.full((N, len(rows)), 1e-12),
         )
-        modes = three_modes(
-            sensors, natural_frequency_std=frequency_std, damping_ratio_std=damping_std
-        )
+        modes = three_modes(sensors, std=LinearModesStd(frequency_std, damping_std))
         np.testing.assert_allclose(spread(identify_points(data, modes)), 1.0, atol=0.1)
 
     def test_derivatives_with_respect_to_the_measured_quantities(self):

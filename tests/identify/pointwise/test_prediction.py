@@ -17,7 +17,7 @@ from snrmjax.identify.pointwise.prediction import (
     resonance_by_fixed_point,
     resonances,
 )
-from snrmjax.model.modes import linear_modes, residual_velocity
+from snrmjax.model.modes import RigidBodyModes, linear_modes, residual_velocity
 
 W0 = 500.0
 SHAPE, PARTICIPATION = 2.0, -1.5  # a negative modal constant
@@ -29,8 +29,7 @@ MODES = linear_modes(
     [[SHAPE, 0.8]],
     [PARTICIPATION, 0.5],
     sensors=("tip",),
-    rigid_body_shape=[[0.6]],
-    rigid_body_participation=[0.4],
+    rigid_body=RigidBodyModes([[0.6]], [0.4]),
 )
 POINTS = 120  # a side; one number for all tests, so that they compile once
 predict = partial(predict_response, points_per_side=POINTS)
@@ -361,8 +360,7 @@ class TestResponse:
             MODES.mode_shape,
             MODES.participation,
             sensors=("tip",),
-            rigid_body_shape=MODES.rigid_body_shape,
-            rigid_body_participation=MODES.rigid_body_participation,
+            rigid_body=RigidBodyModes(MODES.rigid_body_shape, MODES.rigid_body_participation),
         )
         (scaled,) = predict(fast, modes, force)
         # Powers of two: the same roundings.

@@ -9,7 +9,7 @@ import scipy.integrate
 import scipy.linalg
 
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
-from snrmjax.model.modes import linear_modes, linear_response, residual_velocity
+from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response, residual_velocity
 
 # A free-free chain of four masses: one rigid-body mode, three flexible ones.
 MASS = np.diag([1.3, 0.7, 2.1, 0.9])
@@ -36,8 +36,7 @@ def chain(mode_of_interest=1):
         SHAPES[:, 1:].T @ PATTERN,
         sensors=("tip", "root"),
         mode_of_interest=mode_of_interest,
-        rigid_body_shape=SHAPES[SENSORS, :1],
-        rigid_body_participation=SHAPES[:, :1].T @ PATTERN,
+        rigid_body=RigidBodyModes(SHAPES[SENSORS, :1], SHAPES[:, :1].T @ PATTERN),
     )
 
 
@@ -107,8 +106,7 @@ def test_the_rigid_body_term_is_that_of_a_free_mass_and_of_the_paper():
         [0.01],
         [[0.0]],  # the flexible mode is not seen
         [1.0],
-        rigid_body_shape=shape,
-        rigid_body_participation=shape[0],
+        rigid_body=RigidBodyModes(shape, shape[0]),
     )
     found = complex(snrm(modes, 500.0, 0.01, jnp.array(omega), jnp.array(force))[0])
     # Eq. (10b), as printed: −Φ Φᵀ F / Ω. One product and one quotient.
@@ -150,8 +148,7 @@ def test_scaling_of_units():
         modes.mode_shape,
         modes.participation,
         mode_of_interest=1,
-        rigid_body_shape=modes.rigid_body_shape,
-        rigid_body_participation=modes.rigid_body_participation,
+        rigid_body=RigidBodyModes(modes.rigid_body_shape, modes.rigid_body_participation),
     )
     scaled = snrm(fast, 8 * natural, 0.02, 8 * frequency, jnp.asarray(FORCE))
     np.testing.assert_array_equal(scaled, base / 8)

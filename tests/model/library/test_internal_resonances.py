@@ -1,5 +1,7 @@
 """Internal resonances against structures that were built with the further mode."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 from snrmjax.model.effects import make_effect
-from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import displacement_scale, simulated_structure, structure
 
@@ -22,23 +24,16 @@ def coupled(*effects, mode_of_interest=1):
         [[1.0, 2.0], [3.0, 4.0], [5.0, -6.0]],
         [1.5, -2.5],
         mode_of_interest=mode_of_interest,
-        rigid_body_shape=np.ones((3, 1)),
-        rigid_body_participation=np.ones(1),
-        natural_frequency_std=[0.1, 0.2],
-        damping_ratio_std=[0.001, 0.002],
+        rigid_body=RigidBodyModes(np.ones((3, 1)), np.ones(1)),
+        std=LinearModesStd([0.1, 0.2], [0.001, 0.002]),
     )
     potential = polynomial_potential(
         {"1111": 2.0, "112": 0.5, "222222": 1.0}, 2, coefficient_std={"112": 0.1}
     )
-    return structure(
-        modes,
-        potential,
-        effects=effects,
-        level_gain_std=0.01,
-        level_phase_std=0.02,
-        test_order=0.3,
-        name="coupled",
+    made = structure(
+        modes, potential, effects=effects, level_gain_std=0.01, level_phase_std=0.02, name="coupled"
     )
+    return dataclasses.replace(made, test_order=jnp.asarray(0.3))
 
 
 def by_hand(extra, frequencies_hz, ratios, mode_of_interest, effects):
@@ -49,23 +44,16 @@ def by_hand(extra, frequencies_hz, ratios, mode_of_interest, effects):
         np.hstack([[[1.0, 2.0], [3.0, 4.0], [5.0, -6.0]], np.zeros((3, n))]),
         [1.5, -2.5, *[0.0] * n],
         mode_of_interest=mode_of_interest,
-        rigid_body_shape=np.ones((3, 1)),
-        rigid_body_participation=np.ones(1),
-        natural_frequency_std=[0.1, 0.2, *[0.0] * n],
-        damping_ratio_std=[0.001, 0.002, *[0.0] * n],
+        rigid_body=RigidBodyModes(np.ones((3, 1)), np.ones(1)),
+        std=LinearModesStd([0.1, 0.2, *[0.0] * n], [0.001, 0.002, *[0.0] * n]),
     )
     potential = polynomial_potential(
         {"1111": 2.0, "112": 0.5, "222222": 1.0} | extra, 2 + n, coefficient_std={"112": 0.1}
     )
-    return structure(
-        modes,
-        potential,
-        effects=effects,
-        level_gain_std=0.01,
-        level_phase_std=0.02,
-        test_order=0.3,
-        name="coupled",
+    made = structure(
+        modes, potential, effects=effects, level_gain_std=0.01, level_phase_std=0.02, name="coupled"
     )
+    return dataclasses.replace(made, test_order=jnp.asarray(0.3))
 
 
 def assert_same(one, other):

@@ -1,5 +1,7 @@
 """Changes of the linear terms against structures that were built with them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +19,7 @@ def changed(*effects, order=0.0, mode_of_interest=1):
         FREQUENCY, RATIO, np.ones((1, 2)), np.ones(2), mode_of_interest=mode_of_interest
     )
     made = tuple(make_effect(kind, {name: value}) for kind, name, value in effects)
-    model = structure(modes, effects=made, test_order=order)
+    model = dataclasses.replace(structure(modes, effects=made), test_order=jnp.asarray(order))
     return tuple(np.asarray(part) for part in model.linear_terms())
 
 

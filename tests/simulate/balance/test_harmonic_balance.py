@@ -1,5 +1,7 @@
 """The balance: its Jacobian, exact residuals of known motions, and its scales."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -75,7 +77,10 @@ def two_modes_with_effects(forces=tuple(MODERATE), others=()):
     effects += [make_effect(k, OTHERS[k]) for k in others]
     potential = polynomial_potential({"111": 0.5, "1122": 0.7, "222": -0.2}, 2)
     return simulated_structure(
-        structure(modes, potential, effects=tuple(effects), test_order=0.6 if others else 0.0)
+        dataclasses.replace(
+            structure(modes, potential, effects=tuple(effects)),
+            test_order=jnp.asarray(0.6 if others else 0.0),
+        )
     )
 
 

@@ -1,5 +1,6 @@
 """Every effect that makes a force: harmonic balance against integration in time from outside.
 
+import dataclasses
 The equations of motion and the laws are written here again, in NumPy. Smooth and kinked forces
 are integrated by SciPy's Dormand-Prince of order 8, Coulomb's oscillator from one stop to the
 next in closed form, sliders marched in small steps with their exact return map.
@@ -307,7 +308,8 @@ def model_with(group, kind, *, without=False):
         values = BESIDE.get(kind, {}).get(name, values)
         effects.append(make_effect(name, values))
     modes = linear_modes([OMEGA], [RATIO], [[1.0]], [PARTICIPATION])
-    return structure(modes, effects=tuple(effects), test_order=ORDER)
+    made = structure(modes, effects=tuple(effects))
+    return dataclasses.replace(made, test_order=jnp.asarray(ORDER))
 
 
 def balanced(model, guess, order):

@@ -9,7 +9,7 @@ import pytest
 
 from snrmjax.model.beams import CURVED_BEAM_FORCES, curved_beam
 from snrmjax.model.effects import make_effect
-from snrmjax.model.modes import linear_modes, linear_response
+from snrmjax.model.modes import RigidBodyModes, linear_modes, linear_response
 from snrmjax.model.structures import structure
 from snrmjax.simulate.virtual_test.controlled_test import (
     phase_controlled_test,
@@ -273,8 +273,7 @@ def test_sensors_see_the_rigid_body_motion_too():
         [0.02],
         [[2.0]],
         [3.0],
-        rigid_body_shape=np.array([[1.5]]),
-        rigid_body_participation=np.array([0.7]),
+        rigid_body=RigidBodyModes(np.array([[1.5]]), np.array([0.7])),
     )
     omega = np.array([480.0, 510.0])
     receptance = 3.0 / (500.0**2 - omega**2 + 20j * omega)
