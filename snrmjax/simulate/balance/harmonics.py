@@ -111,6 +111,7 @@ def displacement_phasors(
     coefficients: Float[Array, "*batch coefficient mode"],
 ) -> Complex[Array, "*batch harmonic mode"]:
     """Phasors X_h of q = Re Σ X_h e^{ihΩt}, h = 0…H, from the real coefficients."""
+    coefficients = jnp.asarray(coefficients)
     mean = coefficients[..., :1, :].astype(jnp.complex128)
     return jnp.concatenate(
         [mean, coefficients[..., 1::2, :] - 1j * coefficients[..., 2::2, :]], axis=-2

@@ -12,7 +12,7 @@ from snrmjax.simulate.continuation.continuation import Linearised, Point, StepCo
 _TRIALS = 40  # of the secant method, at most
 
 
-class Located(NamedTuple):
+class LocatedEvent(NamedTuple):
     """What was found of a sign change between two neighbours."""
 
     point: Point
@@ -29,7 +29,7 @@ def locate_event(
     there: Point,
     control: StepControl,
     wanted: Bool[Array, ""] | bool = True,
-) -> Located:
+) -> LocatedEvent:
     """The point between two neighbours where `test(point, tangent)` changes sign.
 
     Illinois' variant of the secant method in the arclength, each trial corrected across the
@@ -100,7 +100,7 @@ def locate_event(
     resolved = end.converged & inside & changes & jnp.asarray(wanted)
     # Tangents along a curve are a little late: a sign may seem to change where it does not.
     missed = ~resolved & end.doubtful & jnp.asarray(wanted)
-    return Located(end.last.point, end.last.tangent, resolved, missed)
+    return LocatedEvent(end.last.point, end.last.tangent, resolved, missed)
 
 
 class _Known(NamedTuple):

@@ -13,7 +13,7 @@ from snrmjax.numerics.blocks import mapped, taken
 from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import StepControl, correct
-from snrmjax.simulate.continuation.event_location import Located, locate_event
+from snrmjax.simulate.continuation.event_location import LocatedEvent, locate_event
 from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
@@ -64,8 +64,8 @@ def _locate(
     there: Array,
     wanted: Array,
     steps: StepControl,
-) -> Located:
-    def one(balance: HarmonicBalance, *row: Array) -> Located:
+) -> LocatedEvent:
+    def one(balance: HarmonicBalance, *row: Array) -> LocatedEvent:
         kind, here, tangent, there, wanted = row
 
         def test(point: Array, direction: Array) -> Array:

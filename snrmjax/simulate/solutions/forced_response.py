@@ -72,7 +72,8 @@ def forced_response(
     Arguments: `forces` in N, one or many; frequencies in rad/s; `n_samples` over a period, by
     default as many as the forces of the model need.
     Returns one `ResponseCurve` for every force; its `status` says how it ended, and
-    `not_located` names events that are there but were not located. When the curve
+    `not_located` names events that are there but were not located, and with "branch" one that
+    comes in at `to_frequency` but has no start there. When the curve
     from the lower end does not reach the upper one, it is traced from the upper end instead,
     and when that does not reach the lower end either, both parts are returned, a part without a
     start being empty. Where a resonance reaches beyond `to_frequency`, the branch that comes in
@@ -275,14 +276,17 @@ def _chunk_of_curves(
     doubtful = [k for k, known in enumerate(alone) if not known]
     downward = trace_from_rest(balances, np.array(doubtful, dtype=int), *walk, downward=True)
     owner: list[int] = []
+    without_branch: list[int] = []
     parts: list[TracedCurve] = []
     for k, curve in enumerate(upward):
         pieces = [curve]
         if k in doubtful:
             back = downward[doubtful.index(k)]
             if reached[k]:
-                known = len(back.points) and _same_point(back.points[0], curve.points[-1])
-                pieces = [curve] if known or not len(back.points) else [curve, back]
+                started = len(back.points) > 0
+                known = started and _same_point(back.points[0], curve.points[-1])
+                pieces = [curve, back] if started and not known else [curve]
+                without_branch += [] if started else [good[k]]
             else:
                 whole = back.status == CurveStatus.LOWER_END
                 pieces = [back.reversed()] if whole else [curve, back.reversed()]
@@ -298,6 +302,10 @@ def _chunk_of_curves(
     for job, responses in zip(jobs, over_cores(finished, jobs), strict=True):
         for e, response in zip(job, responses, strict=True):
             results[good[owner[e]]].append(response)
+    for k in without_branch:
+        first = results[k][0]
+        missed = (*first.not_located, "branch")
+        results[k][0] = dataclasses.replace(first, not_located=missed)
     return [tuple(curves) for curves in results]
 
 

@@ -56,6 +56,7 @@ class IsolatedResponses(AbstractResult):
     n_failed: int  # starts from which Newton's method did not converge
     n_known: int  # motions outside the frequency range, or on a curve that is known already
     n_not_traced: int  # motions apart from known curves through which no curve was traced
+    backbone_status: CurveStatus  # of the force-appropriated backbone; UPPER_END when it is whole
 
     def __len__(self) -> int:
         return len(self.curves)
@@ -79,7 +80,9 @@ class IsolatedResponses(AbstractResult):
             f" led to known motions or out of the range, {self.n_not_traced} to motions through"
             " which no curve was traced"
         )
-        return tuple(lines)
+        whole = self.backbone_status == CurveStatus.UPPER_END
+        text = f"force-appropriated backbone: {STATUS_MESSAGE[self.backbone_status]}"
+        return tuple(lines) if whole else (*lines, text)
 
     def variables(self) -> dict[str, Variable]:
         """One row a curve: how it was found, its range and status."""
@@ -103,7 +106,9 @@ class IsolatedResponses(AbstractResult):
     def attributes(self) -> dict[str, str | float | int]:
         """Force and what became of the starts."""
         counts = {name: getattr(self, name) for name in ("n_starts", "n_failed", "n_known")}
-        return {"force_n": self.force, **counts, "n_not_traced": self.n_not_traced}
+        status = self.backbone_status.name.lower()
+        last = {"n_not_traced": self.n_not_traced, "backbone_status": status}
+        return {"force_n": self.force, **counts, **last}
 
 
 def isolated_responses(
@@ -144,7 +149,8 @@ def isolated_responses(
         [model], np.array([load]), settings.harmonic_order, settings.n_samples
     )
     balance = as_arrays(taken(balances, 0))
-    named = _starts(balance, ends, search)
+    resonances, backbone_status = _phase_resonances(balance)
+    named = _starts(balance, ends, search, resonances)
     solved = _solutions(balance, named, ends)
     curves = [_scaled(balance, curve) for curve in known if len(curve.frequency) > 1]
     found: list[ResponseCurve] = []
@@ -167,11 +173,12 @@ def isolated_responses(
         n_failed=solved.n_failed,
         n_known=n_known,
         n_not_traced=n_not_traced,
+        backbone_status=backbone_status,
     )
 
 
 def _starts(
-    balance: HarmonicBalance, ends: np.ndarray, search: IsolatedSearch
+    balance: HarmonicBalance, ends: np.ndarray, search: IsolatedSearch, resonances: list[Start]
 ) -> list[tuple[np.ndarray, float, str]]:
     """Coefficients, frequency and origin of every start."""
     model, n = balance.model, balance.n_coefficients
@@ -184,7 +191,7 @@ def _starts(
                 f"{x.shape}."
             )
         rows.append((x, float(frequency), "isolated, from a given start"))
-    rows += [(x, w, "isolated, from a phase resonance") for x, w in _phase_resonances(balance)]
+    rows += [(x, w, "isolated, from a phase resonance") for x, w in resonances]
     wells = [e for e in equilibria(model) if e.stable]
     rng = np.random.default_rng(search.seed)
     j, scale = model.modes.mode_of_interest, float(balance.displacement_scale)
@@ -209,8 +216,8 @@ def _starts(
     return rows
 
 
-def _phase_resonances(balance: HarmonicBalance) -> list[Start]:
-    """Where the force-appropriated backbone passes this force, however often it turns."""
+def _phase_resonances(balance: HarmonicBalance) -> tuple[list[Start], CurveStatus]:
+    """Where the force-appropriated backbone passes this force, and how the backbone ended."""
     force = float(balance.force)
     backbone = phase_controlled(
         balance.model,
@@ -224,7 +231,7 @@ def _phase_resonances(balance: HarmonicBalance) -> list[Start]:
     x, omega = backbone.coefficients, backbone.frequency
     between = x[where] + share[:, None, None] * np.diff(x, axis=0)[where]
     frequency = omega[where] + share * np.diff(omega)[where]
-    return list(zip(between, frequency.tolist(), strict=True))
+    return list(zip(between, frequency.tolist(), strict=True)), backbone.status
 
 
 class _Solutions(NamedTuple):

@@ -79,8 +79,8 @@ def test_a_transient_is_the_closed_form():
     # 8 · 128 steps, each of them right to 1e-8 of the motion.
     scale = abs(steady) * np.array([1.0, omega])
     np.testing.assert_allclose(motion.state[:, 0] / scale, exact / scale, atol=1e-5)
-    exact = IntegrationAccuracy(settled=0.0, step=1e-12)
-    tight = settled_motion(oscillator(), force, omega, max_cycles=8, accuracy=exact)
+    finer = IntegrationAccuracy(settled=0.0, step=1e-12)
+    tight = settled_motion(oscillator(), force, omega, max_cycles=8, accuracy=finer)
     np.testing.assert_allclose(tight.state[:, 0] / scale, exact / scale, atol=1e-9)
     assert motion.n_cycles == 8
     assert not motion.converged
@@ -144,7 +144,7 @@ def test_a_start_of_the_model_is_one_of_the_simulated_structure():
     )
     model = oscillator(effects=[added])
     assert simulated_structure(model).n_modes == 2
-    options = {"max_cycles": 10, "tolerance": 0.0}
+    options = {"max_cycles": 10, "accuracy": IntegrationAccuracy(settled=0.0)}
     short = settled_motion(model, 1.0, 480.0, start=[RESONANT], **options)
     whole = settled_motion(model, 1.0, 480.0, start=[RESONANT, 0.0], **options)
     np.testing.assert_array_equal(short.state, whole.state)
