@@ -175,3 +175,20 @@ def test_a_second_branch_that_stops_early_is_the_status_of_its_member(curve):
         ((stopped, curve), kind.POINT_LIMIT),
     ):
         assert forced_response._summary(parts)["status"] == status
+
+
+def test_a_branch_that_has_no_start_is_named(monkeypatch):
+    # Stiffening carries the resonance beyond the upper end, where the low branch comes in.
+    ends, settings = (1.0, 2.15), {"harmonic_order": 3, "stability": False}
+    assert len(sj.forced_response(oscillator(), FORCE, *ends, **settings)) == 2
+    plain = forced_response.trace_from_rest
+
+    def upward_only(*arguments, downward, **named):
+        traced = plain(*arguments, downward=downward, **named)
+        empty = {"points": np.zeros((0, 8)), "status": sj.simulate.CurveStatus.NO_START}
+        return [one._replace(**empty) for one in traced] if downward else traced
+
+    monkeypatch.setattr(forced_response, "trace_from_rest", upward_only)
+    (curve,) = sj.forced_response(oscillator(), FORCE, *ends, **settings)
+    assert curve.not_located == ("branch",)
+    assert "not located: 1 branch" in repr(curve)
