@@ -116,31 +116,31 @@ for name, true in (("stiffness", 0.12 * OMEGA**2), ("gap", 3e-4 / SHAPE)):
     value, std = found.parameters[f"one_sided_stop.{name}"]
     print(f"  true {name}: {true:.4g}, {abs(value - true) / std:.1f} standard deviations off")
     headline[f"its {name} within three standard deviations"] = abs(value - true) < 3 * std
-headline["the level held out is foretold to within its noise"] = found.gap.interpolated.after < 1.4
+headline["the level left out is predicted to within its noise"] = found.gap.interpolated.after < 1.4
 
 # %% [markdown]
 # Every measured state, before and after: the misfit of the force in units of its noise. Then the
 # responses of both models over the measured states, and what each effect would explain by itself.
 
 # %%
-figures = diagnosis_report.diagnosis_figures(found, test.steady_states)
-foretold, figures["responses"] = diagnosis_report.with_responses(found, model, test.steady_states)
+figures = diagnosis_report.diagnosis_figures(found)
+predicted, figures["responses"] = diagnosis_report.with_responses(found, model)
 show(figures["residuals"], "residuals")
 
 # %%
 show(figures["responses"], "responses")
-for row in foretold:
+for row in predicted:
     print(
-        f"level {row.level}{', not seen' if row.held_out else ''}: resonance measured "
+        f"level {row.level}{', left out' if row.held_out else ''}: resonance measured "
         f"{row.measured.frequency:.3f} Hz, {row.measured.velocity:.4f} m/s; before "
         f"{row.before.frequency:.3f} Hz, {row.before.velocity:.4f} m/s; completed "
         f"{row.after.frequency:.3f} Hz, {row.after.velocity:.4f} m/s"
     )
-unseen = [row for row in foretold if row.held_out]
-headline["resonances of levels not seen foretold within 0.1 Hz and 2 %"] = all(
+left_out = [row for row in predicted if row.held_out]
+headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
     abs(row.after.frequency - row.measured.frequency) < 0.1
     and abs(row.after.velocity / row.measured.velocity - 1) < 0.02
-    for row in unseen
+    for row in left_out
 )
 
 # %%
@@ -206,7 +206,7 @@ else:
     data = read_steady_states(table, linear)
     joint = sj.diagnose_model(linear, data)
     report(joint)
-    figures = diagnosis_report.diagnosis_figures(joint, data)
+    figures = diagnosis_report.diagnosis_figures(joint)
     show(figures["residuals"], "brake_reuss_residuals")
     headline["damping is located to grow"] = any(p.part == "damping" for p in joint.located)
     headline["level held out: gap closed by two thirds or more"] = (

@@ -294,9 +294,9 @@ headline["tuned to resonance: ambiguous, both in the class"] = all(
     one.verdict == "ambiguous" and set(one.candidates[0]) == BOTH for one in tuned
 )
 headline["there the program asks for 30° and more off"] = all(
-    one.request is not None
-    and one.request.kind == "off_resonance"
-    and round(one.request.phase[0]) >= 30
+    one.discriminating_test is not None
+    and one.discriminating_test.kind == "off_resonance"
+    and round(one.discriminating_test.phase[0]) >= 30
     for one in tuned
 )
 headline["18° to 34° and 30° to 60°: an offset is named alone, friction alone"] = all(
@@ -538,7 +538,7 @@ headline["both: held-out and top level foretold to within their noise"] = all(
 )
 
 # %%
-figures = diagnosis_report.diagnosis_figures(soft, read(full["softening"], "peak"))
+figures = diagnosis_report.diagnosis_figures(soft)
 show(figures["residuals"], "peak_residuals")
 
 # %% [markdown]

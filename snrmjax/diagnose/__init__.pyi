@@ -1,3 +1,4 @@
-from .diagnosis import Diagnosis, diagnose_model
+from .diagnosis import diagnose_model
+from .diagnosis_result import Diagnosis
 
 __all__ = ["Diagnosis", "diagnose_model"]

@@ -1,6 +1,7 @@
-"""What models foretell of a test: resonances under its forces."""
+"""Responses that models predict under the forces of a test, and their resonances."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ ORDER = 5  # harmonics of the responses
 _REACH = 0.3  # of the measured range of frequencies, added at both ends
 
 
-class Resonance(NamedTuple):
+class PhaseResonance(NamedTuple):
     """Where a response is in phase with its force; NaN for what a test or a curve does not have."""
 
     frequency: float  # Hz
@@ -25,14 +26,14 @@ class Resonance(NamedTuple):
 
 
 class LevelResponse(NamedTuple):
-    """A level's measured resonance and what two models foretell."""
+    """A level's measured resonance and those that two models predict."""
 
     level: int
     force: float  # N, at resonance
-    measured: Resonance
-    before: Resonance
-    after: Resonance
-    held_out: bool  # whether `after` is of a model that has not seen the level
+    measured: PhaseResonance
+    before: PhaseResonance
+    after: PhaseResonance
+    held_out: bool  # whether the model of `after` was not fitted to the level
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
@@ -76,30 +77,33 @@ def responses(
 
 
 class Simulated(NamedTuple):
-    """Responses of every level: of both models, and of those that have not seen a level."""
+    """Responses of every level: of both models, and of those completed without a level."""
 
     before: list[list[ResponseCurve]]
     after: list[list[ResponseCurve]]
-    blind: dict[int, list[ResponseCurve]]
+    without_level: dict[int, list[ResponseCurve]]
+
+
+class LevelModels(NamedTuple):
+    """The models whose responses are compared with the measured levels."""
+
+    before: Structure  # as given
+    after: Structure  # completed
+    without_level: Mapping[int, Structure] = MappingProxyType({})  # completed without a level
 
 
 def level_simulations(
-    model: Structure,
-    completed: Structure,
-    blind: Mapping[int, Structure],
-    data: SteadyStates,
-    sensor: int,
-    force_gain: float = 1.0,
+    models: LevelModels, data: SteadyStates, sensor: int, force_gain: float = 1.0
 ) -> Simulated:
     """Responses under the levels' forces, before and after.
 
-    `blind` has models that have not seen a level; `force_gain` is acting force over recorded one
-    for the models after. One program follows all responses: what was added counts for nothing in
-    the model before.
+    `force_gain` is acting force over recorded one for the completed models. One program follows
+    all responses: in the model before the effects are there without strength.
     """
+    model, completed, without_level = models
     forces = level_forces(data, sensor)
-    every, seen = list(forces.values()), [level for level in forces if level in blind]
-    after = [completed] * len(every) + [blind[level] for level in seen]
+    every, seen = list(forces.values()), [level for level in forces if level in without_level]
+    after = [completed] * len(every) + [without_level[level] for level in seen]
     loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
     same = with_idle_effects(model, [e.kind for e in completed.effects[len(model.effects) :]])
     found = responses([*[same] * len(every), *after], data, [*every, *loads])
@@ -107,7 +111,7 @@ def level_simulations(
     return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
 
 
-def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance:
+def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
     """By interpolation between the states on both sides; NaN where one side is empty.
 
     Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least. Without
@@ -118,18 +122,18 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> Resonance
     if np.asarray(data.phase_unknown)[mine, sensor].any():
         top = _largest(data, mine, sensor)
         if frequency[top] in (frequency[mine].min(), frequency[mine].max()):
-            return Resonance(np.nan, np.nan)
-        return Resonance(float(frequency[top]) / (2 * np.pi), float(abs(velocity[top])))
+            return PhaseResonance(np.nan, np.nan)
+        return PhaseResonance(float(frequency[top]) / (2 * np.pi), float(abs(velocity[top])))
     velocity, frequency = velocity[mine], frequency[mine]
     phase = np.angle(velocity)
     order = np.argsort(phase)
     order = order[np.cos(phase[order]) > 0]
     phase, velocity, frequency = phase[order], velocity[order], frequency[order]
     if not order.size or phase[0] > 0 or phase[-1] < 0:
-        return Resonance(np.nan, np.nan)
+        return PhaseResonance(np.nan, np.nan)
     at = np.interp(0.0, np.tan(phase), frequency)
     tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
-    return Resonance(float(at) / (2 * np.pi), float(tip))
+    return PhaseResonance(float(at) / (2 * np.pi), float(tip))
 
 
 def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
@@ -138,18 +142,18 @@ def _largest(data: SteadyStates, mine: np.ndarray, sensor: int) -> int:
     return int(np.argmax(np.where(mine & np.isfinite(ratio), ratio, -np.inf)))
 
 
-def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> Resonance:
+def simulated_resonance(curves: Sequence[ResponseCurve], sensor: int) -> PhaseResonance:
     """The strongest phase resonance of a response: of the velocity that a sensor records."""
     found = [(*crossing, curve) for curve in curves for crossing in _in_phase(curve, sensor)]
     if not found:
-        return Resonance(np.nan, np.nan)
+        return PhaseResonance(np.nan, np.nan)
     size, frequency, curve = max(found, key=lambda one: one[0])
     folds = curve.at_events("fold")
     fold = np.nan
     if folds.size:
         tips = np.abs(curve.velocity[folds, 1, sensor])
         fold = float(curve.frequency[folds[np.argmax(tips)]]) / (2 * np.pi)
-    return Resonance(frequency / (2 * np.pi), size, fold)
+    return PhaseResonance(frequency / (2 * np.pi), size, fold)
 
 
 def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
@@ -166,15 +170,15 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
 
 
 def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:
-    """Measured and foretold resonances of every level.
+    """Measured and predicted resonances of every level.
 
-    Models that have not seen a level speak for it in place of the completed one.
+    A level that was left out of the fit is predicted by the model completed without it.
     """
     rows = []
     for (level, force), old, new in zip(
         level_forces(data, sensor).items(), simulated.before, simulated.after, strict=True
     ):
-        own = simulated.blind.get(level, new)
+        own = simulated.without_level.get(level, new)
         rows.append(
             LevelResponse(
                 level,
@@ -182,7 +186,7 @@ def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> li
                 measured_resonance(data, level, sensor),
                 simulated_resonance(old, sensor),
                 simulated_resonance(own, sensor),
-                level in simulated.blind,
+                level in simulated.without_level,
             )
         )
     return rows

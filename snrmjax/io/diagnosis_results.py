@@ -4,30 +4,30 @@ import math
 from collections.abc import Sequence
 
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.diagnosis import Diagnosis
+from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
 
 
-def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] = ()) -> dict:
-    """A diagnosis as plain numbers and texts, in SI units; `foretold` are simulated resonances.
+def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse] = ()) -> dict:
+    """A diagnosis as plain numbers and texts, in SI units; `predicted` are simulated resonances.
 
-    `request` is the measurement of `decide_by` for programs: its `kind` (`harmonics` of the states
-    of `level`, states `off_resonance` at it, a `lower_level` or `higher_level` whose velocities are
+    `request` is the test of `decide_by` for programs: its `kind` (`harmonics` of the states of
+    `level`, states `off_resonance` at it, a `lower_level` or `higher_level` whose velocities are
     those of `level` scaled, or a `calibration`), the force and frequency at resonance, how many
-    `states` and how far off resonance in phase, the `harmonics` wanted with the noise they need,
-    the `quantity` in which rivals differ most, and by how much χ² the rival that is told least well
-    is expected to lose, beside what would settle it; `calibration_too` if effects stay open that
-    only a calibration separates.
+    `states` and how far off resonance in phase, the `harmonics` with the noise that they need, the
+    `quantity` in which the models differ most, the expected gain of χ² over the rival that is
+    separated least well and the gain that is needed; `calibration_too` if effects stay open that
+    only a calibration separates. `tried` has every fit that was compared with its `status`.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
     return {
-        "verdict": diagnosis.verdict,
+        "verdict": diagnosis.verdict.value,
         "effects": list(diagnosis.effects),
         "candidates": [list(group) for group in diagnosis.candidates],
         "decide_by": diagnosis.decide_by,
-        "request": _request(diagnosis.request),
+        "request": _test(diagnosis.discriminating_test),
         "located": [_part(part) for part in diagnosis.located],
         "parameters": {
             name: {"value": value, "std": std}
@@ -45,8 +45,8 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
             "top_level_after": outer.after if outer else None,
         },
         "detection_limits": diagnosis.detection_limits,
-        "p_value": diagnosis.p_value,
-        "noise_scale": diagnosis.noise_scale,
+        "p_value": diagnosis.checks.p_value,
+        "noise_scale": diagnosis.checks.noise_scale,
         "notes": list(diagnosis.notes),
         "resonances": [
             {
@@ -64,7 +64,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
                     if (name, quantity) != ("measured", "fold_hz")
                 },
             }
-            for row in foretold
+            for row in predicted
         ],
         "tried": [
             [
@@ -73,6 +73,7 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
                     "gain": row.gain if math.isfinite(row.gain) else None,
                     "chi_square": row.chi_square if math.isfinite(row.chi_square) else None,
                     "parameters": row.parameters,
+                    "status": row.status.value,
                 }
                 for row in step
             ]
@@ -81,23 +82,24 @@ def summarise_diagnosis(diagnosis: Diagnosis, foretold: Sequence[LevelResponse] 
     }
 
 
-def _request(request: DiscriminatingTest | None) -> dict | None:
-    if request is None:
+def _test(test: DiscriminatingTest | None) -> dict | None:
+    if test is None:
         return None
+    place = test.place
     return {
-        "kind": request.kind,
-        "level": request.level,
-        "force_n": request.force,
-        "frequency_hz": request.frequency,
-        "quantity": request.quantity,
-        "states": request.states,
-        "phase_deg": list(request.phase) if request.phase else None,
-        "harmonics": list(request.harmonics),
-        "harmonic_std_m_s": request.harmonic_std,
-        "expected_gain": request.expected_gain,
-        "needed_gain": request.needed_gain,
-        "settles": request.settles,
-        "calibration_too": request.calibration_too,
+        "kind": test.kind,
+        "level": place.level if place else None,
+        "force_n": place.force if place else None,
+        "frequency_hz": place.frequency if place else None,
+        "quantity": test.quantity,
+        "states": test.states,
+        "phase_deg": list(test.phase) if test.phase else None,
+        "harmonics": list(test.harmonics),
+        "harmonic_std_m_s": test.harmonic_std,
+        "expected_gain": test.expected_gain,
+        "needed_gain": test.needed_gain,
+        "settles": test.settles,
+        "calibration_too": test.calibration_too,
     }
 
 

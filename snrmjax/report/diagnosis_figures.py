@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from snrmjax.diagnose.diagnosis import Diagnosis
+from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
@@ -69,24 +69,23 @@ def effect_name(kind: str) -> str:
     return f"{words[:-2]}:{words[-1]}" if words[-3:-2].isdigit() and words[-1].isdigit() else words
 
 
-def misfit_figure(diagnosis: Diagnosis, data: SteadyStates) -> Figure:
+def misfit_figure(diagnosis: Diagnosis) -> Figure:
     """Misfit of the force of every steady state, in units of its noise, before and after.
 
     Darker is worse; a correct model leaves about 1 everywhere and no pattern. Rings mark the level
     that was left out of a fit to test the answer.
-
-    Arguments: `data` the steady states that were diagnosed.
     """
-    rows = diagnosis.rows
+    data, misfits = diagnosis.data, diagnosis.force_misfit
+    rows = misfits.rows
     frequency = np.asarray(data.frequency)[rows] / HERTZ
-    speed = np.abs(np.asarray(data.velocity))[rows, diagnosis.sensor]
+    speed = np.abs(np.asarray(data.velocity))[rows, misfits.sensor]
     unit = unit_for(speed, "m/s")
     figure, ((before, after),) = panels(PAGE, 3.3, 1, 2)
     out = diagnosis.gap.interpolated
     held = np.asarray(data.level)[rows] == out.level if out else np.zeros(len(rows), dtype=bool)
     for axes, title, misfit in (
-        (before, "(a) model as given", diagnosis.before),
-        (after, "(b) completed model", diagnosis.after),
+        (before, "(a) model as given", misfits.before),
+        (after, "(b) completed model", misfits.after),
     ):
         size = np.sqrt(np.nanmean(misfit**2, axis=1))
         order = np.argsort(size)  # the worst on top
@@ -397,7 +396,9 @@ def _recorded_change(
     return _Law(quantity, ("Change of the velocity", "%, °"), curves, dots=True)
 
 
-def found_effects(diagnosis: Diagnosis) -> Structure:
-    """The completed model with nothing but the effects that were found."""
-    added = diagnosis.completed.effects[-len(diagnosis.effects) :] if diagnosis.effects else ()
+def found_effects(diagnosis: Diagnosis) -> Structure | None:
+    """The completed model with nothing but the effects that were found; None without any."""
+    if diagnosis.completed is None or not diagnosis.effects:
+        return None
+    added = diagnosis.completed.effects[-len(diagnosis.effects) :]
     return dataclasses.replace(diagnosis.completed, effects=added)

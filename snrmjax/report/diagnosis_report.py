@@ -1,6 +1,5 @@
 """The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
 
-import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -9,15 +8,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.diagnose.diagnosis import Diagnosis, diagnose_model
+from snrmjax.diagnose.diagnosis import diagnose_model
+from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.response_prediction import (
+    LevelModels,
     LevelResponse,
-    Resonance,
+    PhaseResonance,
     level_responses,
     level_simulations,
 )
 from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import Row
+from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
@@ -80,69 +81,52 @@ def write_diagnosis(
 ) -> Diagnosis:
     """Diagnose, and write everything that the command writes into a folder.
 
-    Where the force is known as a drive voltage only, a joint fit finds a first gain, which stays
-    free.
+    Where no structure can have the parameters found, there is no `model.toml` and nothing is
+    simulated; the notes say so.
     """
-    notes: tuple[str, ...] = ()
-    gain_std = 0.0
-    if not np.any(np.isfinite(np.asarray(data.force))):
-        # Few need them, and they take as long to import as half the others.
-        from snrmjax.identify.joint.joint_fit import fit_jointly
-        from snrmjax.report.workflow import corrected
-
-        fit = fit_jointly(data, model.modes, free=("force_gain",))
-        data = corrected(data, fit)
-        gain = float(np.exp(fit.unknowns.log_force_gain))
-        notes = (
-            f"the force is known as a drive voltage only: about {gain:.4g} N/V by a joint fit of "
-            "smooth curves. Its gain stays free, so that damping and gain errors cannot be told.",
-        )
-        gain_std = 1.0
-    found = diagnose_model(model, data, force_gain_std=gain_std)
-    if gain_std and found.effects:
-        notes = (*notes, f"the answer puts that gain at {gain * found.force_gain:.4g} N/V.")
-    found = dataclasses.replace(found, notes=(*notes, *found.notes))
+    found = diagnose_model(model, data)
     predicted: list[LevelResponse] = []
-    figures = diagnosis_figures(found, data)
-    if simulate and found.effects:
-        predicted, figures["responses"] = with_responses(found, model, data)
+    figures = diagnosis_figures(found)
+    if simulate and found.effects and found.completed is not None:
+        predicted, figures["responses"] = with_responses(found, model)
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, predicted))
-    write_model(folder / "model.toml", found.completed)
+    if found.completed is not None:
+        write_model(folder / "model.toml", found.completed)
     report = diagnosis_report(
         found,
         f"Diagnosis of {title.replace('_', ' ')}",
         save_figures(folder, figures),
         predicted,
         done={"data": f"{title}.csv", "model": model.name},
-        response_held=holds_response(data, predicted),
+        response_held=holds_response(found.data, predicted),
     )
     write_report(folder / "report.html", report)
     return found
 
 
-def with_responses(
-    diagnosis: Diagnosis, model: Structure, data: SteadyStates
-) -> tuple[list[LevelResponse], Figure]:
-    """Resonances and responses of all levels, simulated with the model as given and completed."""
-    simulated = level_simulations(
-        *(model, diagnosis.completed, diagnosis.blind, data),
-        *(diagnosis.sensor, diagnosis.force_gain),
-    )
-    predicted = level_responses(simulated, data, diagnosis.sensor)
+def with_responses(diagnosis: Diagnosis, model: Structure) -> tuple[list[LevelResponse], Figure]:
+    """Resonances and responses of all levels, simulated with the model as given and completed.
+
+    Raises `ValueError` where there is no completed model.
+    """
+    if diagnosis.completed is None:
+        raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
+    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
+    models = LevelModels(model, diagnosis.completed, diagnosis.checks.completed_without)
+    simulated = level_simulations(models, data, sensor, diagnosis.answer.force_gain)
+    predicted = level_responses(simulated, data, sensor)
     old, new = ([c for one in curves for c in one] for curves in simulated[:2])
-    sensor = data.sensors[diagnosis.sensor]
-    return predicted, comparison_figure(old, new, data, sensor=sensor)
+    return predicted, comparison_figure(old, new, data, sensor=data.sensors[sensor])
 
 
-def diagnosis_figures(diagnosis: Diagnosis, data: SteadyStates) -> dict[str, Figure]:
+def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """The figures that need no simulation, by the names of their files."""
-    figures = {
-        "residuals": misfit_figure(diagnosis, data),
-        "candidates": candidates_figure(diagnosis),
-    }
-    if diagnosis.effects:
-        sensor = data.sensors[diagnosis.sensor]
-        figures["laws"] = effect_laws_figure(found_effects(diagnosis), data, sensor=sensor)
+    figures = {"residuals": misfit_figure(diagnosis), "candidates": candidates_figure(diagnosis)}
+    found = found_effects(diagnosis)
+    if found is not None:
+        data = diagnosis.data
+        sensor = data.sensors[diagnosis.force_misfit.sensor]
+        figures["laws"] = effect_laws_figure(found, data, sensor=sensor)
     return figures
 
 
@@ -189,43 +173,12 @@ def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bo
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """What a diagnosis says, in one plain sentence."""
-    gap = diagnosis.gap
-    found = " and ".join(effect_name(kind) for kind in diagnosis.effects)
-    before, after = _times(gap.before), _times(gap.after)
-    falls = f"the misfit falls from {before} to {after} times the noise"
-    with_it = "with them" if len(diagnosis.effects) > 1 else "with it"
-    if diagnosis.verdict == "none":
-        return (
-            "Nothing is missing that these data could show: the model as given fits them to "
-            f"{after} times the noise."
-        )
-    if diagnosis.verdict == "noise_rejected":
-        return (
-            "The stated noise does not fit the scatter of these data, so no effect is named: state "
-            "the noise of a repeated test, or none, and diagnose again."
-        )
-    if diagnosis.verdict == "unknown":
-        start = "Something is missing that no effect of the library explains reliably"
-        return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
-    if diagnosis.verdict == "named":
-        return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
-    rivals = " and ".join(_alternatives(group) for group in diagnosis.candidates)
-    if any(len(group) > 1 for group in diagnosis.candidates):
-        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
-    return (
-        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
-        "same effect (see the notes)."
-    )
+    """What a diagnosis says in one plain sentence, with the effects' names in words."""
+    return _readable(diagnosis.verdict_sentence)
 
 
 def _times(misfit: float) -> str:
     return f"{misfit:.1f}" if misfit < 10 else number(misfit, 2)
-
-
-def _alternatives(group: Sequence[str]) -> str:
-    *others, last = map(effect_name, group)
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> list[tuple[str, str]]:
@@ -365,7 +318,7 @@ def _words(name: str) -> str:
     return name.removesuffix("_hz").removesuffix("_deg").replace("_", " ")
 
 
-def _tried(row: Row) -> tuple[str, str, str]:
+def _tried(row: TriedEffect) -> tuple[str, str, str]:
     own = _own(row.kind, {name: (value, 0.0) for name, value in row.parameters.items()})
     own = own or {name: (value, 0.0) for name, value in row.parameters.items()}
     values = [
@@ -406,7 +359,7 @@ def _resonances(row: LevelResponse) -> tuple[str, ...]:
     return (f"{row.level}{mark}", _unbroken(with_unit(row.force, "N")), *each)
 
 
-def _resonance(one: Resonance) -> str:
+def _resonance(one: PhaseResonance) -> str:
     if not np.isfinite(one.frequency):
         return "no resonance"
     fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""

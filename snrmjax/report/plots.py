@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.report import joint_figures, simulation_figures
+from snrmjax.report import diagnosis_figures, joint_figures, simulation_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch
@@ -78,3 +79,8 @@ def _(result: VirtualTest) -> Figure:
     frequency, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
     sensor = states.sensors[0]
     return simulation_figures.motions_figure(frequency, velocity, sensor=sensor, joined=False)
+
+
+@plot_result.register
+def _(result: Diagnosis, **settings: Any) -> Figure:
+    return diagnosis_figures.misfit_figure(result, **settings)

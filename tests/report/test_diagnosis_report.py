@@ -140,9 +140,9 @@ def drag():
 
 @pytest.fixture(scope="module")
 def pictures(drag):
-    given, data, found = drag
-    predicted, responses = told.with_responses(found, given, data)
-    return predicted, {**told.diagnosis_figures(found, data), "responses": responses}
+    given, _, found = drag
+    predicted, responses = told.with_responses(found, given)
+    return predicted, {**told.diagnosis_figures(found), "responses": responses}
 
 
 def html_of(found, pictures, **settings):
@@ -188,7 +188,9 @@ def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
 
 def test_rivals_are_told_where_there_are_some(drag):
     rivals = (("quadratic_damping", "cubic_damping", "jenkins_slider"),)
-    unclear = dataclasses.replace(drag[2], verdict="ambiguous", candidates=rivals)
+    unclear = dataclasses.replace(
+        drag[2], verdict="ambiguous", answer=drag[2].answer._replace(candidates=rivals)
+    )
     assert told.verdict_sentence(unclear).startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "
         "tell which"
@@ -200,7 +202,8 @@ def test_a_parameter_without_an_error_is_said_to_be_undetermined(drag, pictures)
     value = drag[2].parameters[name][0]
     html = html_of(drag[2], pictures)
     assert re.search(rf"{value:.1f} ± \d\.\d", html)
-    html = html_of(dataclasses.replace(drag[2], parameters={name: (value, 0.0)}), pictures)
+    answer = drag[2].answer._replace(parameters={name: (value, 0.0)})
+    html = html_of(dataclasses.replace(drag[2], answer=answer), pictures)
     assert "1σ not determined by these data" in html
     assert "e+00" not in html
 
@@ -233,17 +236,20 @@ def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pict
 def test_misfit_and_responses_stand_over_the_states(drag, pictures):
     _, data, found = drag
     before, after = pictures[1]["residuals"].axes[:2]
-    for axes, misfit in ((before, found.before), (after, found.after)):
+    rows, frequency = found.force_misfit.rows, np.asarray(data.frequency)
+    for axes, misfit in ((before, found.force_misfit.before), (after, found.force_misfit.after)):
         (dots,) = axes.collections
         size = np.sqrt(np.nanmean(misfit**2, axis=1))
         np.testing.assert_allclose(np.asarray(dots.get_array()), np.sort(size), rtol=1e-12)
         x = np.asarray(dots.get_offsets())[:, 0]
         np.testing.assert_allclose(
-            np.sort(x), np.sort(np.asarray(data.frequency)[found.rows]) / HERTZ, rtol=1e-12
+            np.sort(x),
+            np.sort(frequency[rows]) / HERTZ,
+            rtol=1e-12,
         )
     (ring,) = [line for line in after.lines if line.get_marker() == "o"]
     out = found.gap.interpolated.level
-    assert len(ring.get_xdata()) == np.sum(np.asarray(data.level)[found.rows] == out)
+    assert len(ring.get_xdata()) == np.sum(np.asarray(data.level)[rows] == out)
     given_axes, completed = pictures[1]["responses"].axes
     assert given_axes.get_ylim() == completed.get_ylim()
     n_levels = len(np.unique(np.asarray(data.level)))

@@ -1,4 +1,4 @@
-"""Whether a completed model predicts levels that it has not seen."""
+"""Cross-validation: whether a completed model predicts levels that it was not fitted to."""
 
 from typing import NamedTuple
 
@@ -12,28 +12,28 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 
 class HeldOut(NamedTuple):
-    """Root-mean-square misfit of one level in units of what is foretold of its scatter."""
+    """Root-mean-square misfit of one level in units of its predicted scatter."""
 
     level: int
     before: float
     after: float
-    p_value: float  # of `after` by noise alone
-    uncertain_p_value: float  # by noise and what the other levels leave open of the parameters
+    p_value: float  # of `after`, by noise alone
+    uncertain_p_value: float  # by noise and the uncertainty of parameters from the other levels
 
 
 def held_out(
-    misfit: WeightedMisfit, nothing: EffectFit, fit: EffectFit, level: int, noise: float = 1.0
+    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, level: int, noise: float = 1.0
 ) -> HeldOut:
     """Fit to the other levels alone, and compare with the one left out.
 
-    The misfit is that of the level given the others: what it shares with them through the
-    baseline's stated errors is foretold too; its own gain and phase are not. `noise` is the
-    variance over the stated one for which probabilities are given.
+    The misfit is that of the level given the others: errors that it shares with them through the
+    baseline's stated uncertainty are predicted too; its own gain and phase are not. `noise` is
+    the variance over the stated one for which probabilities are given.
     """
     out = _rows_of(misfit, level)
     n_out = int(out.sum())
-    before, _ = _foretold(misfit, nothing, out)
-    after, open_too = _foretold(misfit, fit, out)
+    before, _ = _chi_square_of(misfit, baseline, out)
+    after, open_too = _chi_square_of(misfit, fit, out)
     return HeldOut(
         int(misfit.level_numbers[level]),
         float(np.sqrt(before / n_out)),
@@ -43,24 +43,55 @@ def held_out(
     )
 
 
-class Unseen(NamedTuple):
-    """A fit's parameters, and the baseline's, as all levels but one put them."""
+class HeldOutLevels(NamedTuple):
+    """A level between others, and the top one."""
+
+    inner: HeldOut
+    outer: HeldOut
+
+
+def held_out_places(misfit: WeightedMisfit) -> tuple[int, ...]:
+    """Which levels are left out: that in the middle and the top one by velocity.
+
+    None for fewer than three levels.
+    """
+    chosen = misfit.predictions.chosen
+    if chosen.n_levels < 3:
+        return ()
+    level = np.asarray(chosen.states.level)
+    speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
+    order = np.argsort([speed[level == k].max() for k in range(chosen.n_levels)])
+    return int(order[chosen.n_levels // 2]), int(order[-1])
+
+
+def held_out_levels(
+    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, noise: float = 1.0
+) -> HeldOutLevels | None:
+    """Cross-validation on the level in the middle and the top one; None below three levels."""
+    places = held_out_places(misfit)
+    if not places:
+        return None
+    return HeldOutLevels(*(held_out(misfit, baseline, fit, place, noise) for place in places))
+
+
+class FitWithoutLevel(NamedTuple):
+    """A fit's parameters, and the baseline's, by all levels but one."""
 
     level: int
     values: Float[np.ndarray, " parameter"]
     baseline: dict[str, float]
 
 
-def without_level(misfit: WeightedMisfit, fit: EffectFit, level: int) -> Unseen:
+def without_level(misfit: WeightedMisfit, fit: EffectFit, level: int) -> FitWithoutLevel:
     """One step from the whole fit to the best one without a level's rows."""
     kept = ~_rows_of(misfit, level)
     change, rows, _ = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
     number = int(misfit.level_numbers[level])
-    return Unseen(number, values, misfit.baseline_parameters(rows, kept))
+    return FitWithoutLevel(number, values, misfit.baseline_parameters(rows, kept))
 
 
-def gap(misfit: WeightedMisfit, fit: EffectFit) -> float:
+def rms_misfit(misfit: WeightedMisfit, fit: EffectFit) -> float:
     """Root-mean-square misfit of all rows in units of noise."""
     return float(np.sqrt(misfit.chi_square(fit.rows) / misfit.n_rows))
 
@@ -75,9 +106,10 @@ def _refitted(
 ) -> tuple[
     Float[np.ndarray, " parameter"], Float[np.ndarray, " row"], Float[np.ndarray, "row any"]
 ]:
-    """The change of a fit's parameters that some rows ask for, all rows after it, and its root.
+    """The refit of a fit's parameters to some rows, to first order.
 
-    The root's columns are what independent unit errors of the change add to all rows.
+    Returns the change of the parameters, all rows after it, and the root of its covariance: what
+    independent unit errors of the change add to all rows.
     """
     slopes = fit.slopes
     if not slopes.shape[1]:
@@ -91,12 +123,12 @@ def _refitted(
     left = solve_triangular(lower, fit.rows[kept], lower=True)
     change = -np.linalg.pinv(matrix, rcond=1e-12) @ (arms.T @ left)
     values, vectors = np.linalg.eigh(matrix)
-    # What the kept rows do not see at all is open: as good as any size.
+    # What the kept rows do not determine at all is open: it may have any size.
     root = vectors / np.sqrt(np.maximum(values, 1e-12))
     return change / size, fit.rows + scaled @ change, scaled @ root
 
 
-def _foretold(
+def _chi_square_of(
     misfit: WeightedMisfit, fit: EffectFit, out: Bool[np.ndarray, " row"]
 ) -> tuple[float, float]:
     """χ² of rows left out, with the fitted parameters taken as known and as uncertain.

@@ -1,36 +1,226 @@
-"""The verdict on an answer: whether it leaves noise, and whether it foretells unseen levels.
+"""The verdict on an answer: the one place where it is decided, by a list of rules.
 
 Noise that is stated too small makes every misfit larger by one factor, everywhere and without
 order. What grows with the level, or what neighbours along the resonance share, is physics.
 """
 
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtr
 
-from snrmjax.diagnose.checks.cross_validation import HeldOut
-from snrmjax.diagnose.checks.doubts import Doubt
+from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels
+from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
+from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, never_seen, part_of
 from snrmjax.diagnose.checks.patterns import UNLIKELY, along, left_curve, pattern
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
 
-_MISSED = 0.05  # probability of a held-out level below which an imitation is of no use
-_MISSED_BY_ONE = 0.01  # and below which one of several that cannot be told apart is of none
-_AS_NOISE = 1.3  # times the noise, by which an imitation may miss it at most
-_FAR = 2.0  # times the noise, that the top level is missed by
-_TOLERATED = 1.7  # variance over the stated one that neighbours show
-_WRONG_NOISE = 4.0  # 1σ of the noise as neighbours show it
-_LOUD = 2.0  # times the noise, that neighbours scatter, worth a word
+_MISSED = 0.05  # probability of a held-out level below which a doubted answer is refuted
+_MISSED_BY_ONE = 0.01  # and below which one of several effects that fit equally well is
+_AS_NOISE = 1.3  # times the noise, by which a doubted answer may miss a level at most
+_FAR = 2.0  # times the noise, by which the top level is missed where nothing proves the law
+_TOLERATED = 1.7  # variance over the stated one that neighbouring states may show
+_WRONG_NOISE = 4.0  # 1σ of the noise that neighbouring states show
+_LOUD = 2.0  # times the noise that neighbouring states scatter, from which on it is mentioned
 
 
-def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> tuple[float, float]:
-    """Variance of the force's misfit as second differences along every level show it, and 1σ.
+class Verdict(StrEnum):
+    """What a diagnosis says as a whole."""
 
-    What varies smoothly from state to state, explained or not, does not enter; what baseline and
-    levels may have in common is taken out first. Where phases are those of the fit, which may be
-    wrong, the order of the test counts too: noise is smooth in neither.
+    NOTHING_MISSING = "none"
+    NAMED = "named"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+    NOISE_REJECTED = "noise_rejected"
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether effects are given as an answer."""
+        return self in (Verdict.NAMED, Verdict.AMBIGUOUS)
+
+
+def verdict_sentence(
+    verdict: Verdict, classes: Sequence[Sequence[str]], before: float, after: float
+) -> str:
+    """A verdict in one plain sentence.
+
+    Arguments: `classes` has every effect of the answer with those that fit as well; misfits
+    before and after it in units of noise.
+    """
+    found = " and ".join(group[0] for group in classes)
+    falls = f"the misfit falls from {before:#.2g} to {after:#.2g} times the noise"
+    with_it = "with them" if len(classes) > 1 else "with it"
+    if verdict is Verdict.NOTHING_MISSING:
+        return (
+            "Nothing is missing that these data could show: the model as given fits them to "
+            f"{after:#.2g} times the noise."
+        )
+    if verdict is Verdict.NOISE_REJECTED:
+        return (
+            "The stated noise does not fit the scatter of these data, so no effect is named: state "
+            "the noise of a repeated test, or none, and diagnose again."
+        )
+    if verdict is Verdict.UNKNOWN:
+        start = "Something is missing that no effect of the library explains reliably"
+        return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
+    if verdict is Verdict.NAMED:
+        return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
+    if any(len(group) > 1 for group in classes):
+        rivals = " and ".join(_alternatives(group) for group in classes)
+        return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
+    return (
+        f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
+        "same effect (see the notes)."
+    )
+
+
+def _alternatives(group: Sequence[str]) -> str:
+    *others, last = group
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+class NeighbourNoise(NamedTuple):
+    """Noise that neighbouring states show."""
+
+    variance: float  # over the stated one
+    std: float  # 1σ of the variance
+
+
+class Judgement(NamedTuple):
+    """A verdict, its reasons, and what stays open."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...] = ()
+    open_questions: tuple[Doubt, ...] = ()
+
+
+def judge(
+    found: FoundEffects,
+    neighbours: NeighbourNoise,
+    located: tuple[Located, ...],
+    levels: HeldOutLevels | None,
+) -> Judgement:
+    """The verdict on what a search found. The first rule that applies decides.
+
+    1. `noise_rejected`: the misfit is improbably small for the stated noise, or neighbouring
+       states scatter more than it allows without any pattern in what is left.
+    2. `unknown`: what is left is improbable as noise, or a free curve of amplitude or of test
+       order still explains a part of it.
+    3. `none`: no effect was needed.
+    4. `unknown`: a doubt refutes the law, as a contradicting power of amplitude does (`doubts`).
+    5. `unknown`: a level that was left out of the fit is missed (`refuted_by_levels`).
+    6. `ambiguous`: the top level, left out, proves nothing; or a law that was not tried could do
+       the same (`doubts`); or several effects fit about equally well.
+    7. `named`: none of these.
+
+    Arguments: `located` are the parts of the misfit before any effect was named; `levels` are
+    None where there are too few to leave one out.
+    """
+    judgement = judge_fit(found, neighbours)
+    if not judgement.verdict.is_answer:
+        return judgement
+    verdict, reasons = judgement.verdict, judgement.reasons
+    open_questions = _doubts(found, located)
+    if open_questions:
+        refuted = any(doubt.refutes for doubt in open_questions)
+        verdict = Verdict.UNKNOWN if refuted else Verdict.AMBIGUOUS
+        reasons = tuple(doubt.reason for doubt in open_questions)
+    if levels is None or not verdict.is_answer:
+        return Judgement(verdict, reasons, tuple(open_questions))
+    missed = refuted_by_levels(
+        levels,
+        doubted=not all(doubt.twin for doubt in open_questions),
+        unclear=any(len(group) > 1 for group in found.classes),
+        parts_missing=bool(found.misfit.predictions.chosen.phase_unknown[:, 0].any()),
+    )
+    if missed is not None:
+        return Judgement(Verdict.UNKNOWN, (missed, *reasons), tuple(open_questions))
+    unproved = unproved_beyond(levels.outer)
+    if unproved is not None:
+        verdict, reasons = Verdict.AMBIGUOUS, (*reasons, unproved.reason)
+        open_questions = [*open_questions, unproved]
+    return Judgement(verdict, reasons, tuple(open_questions))
+
+
+def judge_fit(found: FoundEffects, neighbours: NeighbourNoise) -> Judgement:
+    """The verdict by what the fit leaves alone: rules 1 to 3 of `judge`, else 6 or 7."""
+    noise, noise_std = neighbours
+    n = found.misfit.n_rows - len(found.fit.values)
+    reduced = found.fit.chi_square / n
+    too_good = float(chdtr(n, found.fit.chi_square))
+    stated = found.misfit.predictions.chosen.noise_stated
+    if stated and too_good < UNLIKELY:
+        return Judgement(
+            Verdict.NOISE_REJECTED,
+            (
+                f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: the noise is "
+                "overstated, and smaller effects may be hidden by it.",
+            ),
+        )
+    improbable = found.p_value < UNLIKELY
+    structure = curve = None
+    if improbable:
+        structure = pattern(found.misfit, found.fit)
+    elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
+        curve = left_curve(found.misfit, found.fit)
+    loud = noise - 1 > (0.5 if improbable else 1.0) * _WRONG_NOISE * noise_std
+    if stated and loud and structure is None:
+        return Judgement(
+            Verdict.NOISE_REJECTED,
+            (
+                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated "
+                "noise allows: the noise is understated; state it correctly before an effect is "
+                "named.",
+            ),
+        )
+    if chi_square_p_value(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
+        reasons = ["no effect of the library explains what is left."]
+        if structure is not None:
+            reasons.append(structure)
+        if noise > _LOUD**2:
+            reasons.append(
+                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
+                "that counts here: state the scatter of a repeated test, or no noise at all, and "
+                "diagnose again."
+            )
+        return Judgement(Verdict.UNKNOWN, tuple(reasons))
+    if curve is not None:
+        return Judgement(Verdict.UNKNOWN, (curve,))
+    if not found.fit.kinds:
+        return Judgement(Verdict.NOTHING_MISSING)
+    unclear = any(len(group) > 1 for group in found.classes)
+    return Judgement(Verdict.AMBIGUOUS if unclear else Verdict.NAMED)
+
+
+def _doubts(found: FoundEffects, located: tuple[Located, ...]) -> list[Doubt]:
+    """Reasons to doubt an answer that fits."""
+    misfit, fit = found.misfit, found.fit
+    part = part_of(fit.kinds)
+    stepped = np.asarray(misfit.predictions.chosen.states.frequency)
+    return doubts(
+        fit.kinds,
+        located,
+        misfit.predictions.chosen.orders,
+        frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind)),
+        power_of_answer(misfit, found.baseline, fit, part) if part else None,
+        frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0),
+        frozenset(k for k in fit.kinds if never_seen(k, fit.of_kind(k)[1:], stepped)),
+    )
+
+
+def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> NeighbourNoise:
+    """Variance of the force's misfit by second differences along every level.
+
+    What varies smoothly from state to state, explained or not, does not enter; errors that states
+    share are taken out first. Where phases are those of the fit, which may be wrong, the order of
+    the test counts too: noise is smooth in neither.
     """
     left = misfit.noise.without_shared(fit.rows)
     unsure = misfit.predictions.chosen.phase_unknown.any()
@@ -39,126 +229,87 @@ def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> tuple[float, floa
 
 def _scatter(
     misfit: WeightedMisfit, left: Float[np.ndarray, " row"], *, of_test: bool
-) -> tuple[float, float]:
-    """Variance from second differences in an order of the states, and 1σ."""
+) -> NeighbourNoise:
+    """Variance by second differences in one order of the states."""
     squares = [
         (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
         for some in along(misfit, left, of_test=of_test)
         if len(some) > 2
     ]
     if not squares:
-        return 1.0, np.inf
+        return NeighbourNoise(1.0, np.inf)
     every = np.concatenate(squares)
-    # Jumps and kinks are no noise: beyond four times the median's 1σ they are cut.
+    # Jumps and kinks are not noise: beyond four times the median's 1σ they are cut off.
     limit = 16 * np.median(every) / 0.4549
     # Neighbouring differences share states: about half as many are independent.
     value = float(np.mean(np.minimum(every, limit)))
-    return value, value * float(np.sqrt(2 / (0.51 * len(every))))
-
-
-def judged(found: FoundEffects, noise: float, noise_std: float) -> tuple[str, list[str]]:
-    """Verdict and reasons from the fit; `noise` and 1σ are as neighbours show it."""
-    n = found.misfit.n_rows - len(found.fit.values)
-    reduced = found.fit.chi_square / n
-    too_good = float(chdtr(n, found.fit.chi_square))
-    stated = found.misfit.predictions.chosen.noise_stated
-    if stated and too_good < UNLIKELY:
-        return "noise_rejected", [
-            f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: it is overstated, and "
-            "smaller effects may be hidden by it."
-        ]
-    misfit = found.p_value < UNLIKELY
-    structure = curve = None
-    if misfit:
-        structure = pattern(found.misfit, found.fit)
-    elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
-        curve = left_curve(found.misfit, found.fit)
-    loud = noise - 1 > (0.5 if misfit else 1.0) * _WRONG_NOISE * noise_std
-    if stated and loud and structure is None:
-        return "noise_rejected", [
-            f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated noise "
-            "allows: it is understated; state it rightly before an effect is named."
-        ]
-    if chi_square_p_value(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
-        reasons = ["no effect of the library explains what is left."]
-        if structure is not None:
-            reasons.append(structure)
-        if noise > _LOUD**2:
-            reasons.append(
-                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
-                "that counts here: state what a repeated test shows, or no noise at all, and "
-                "diagnose again."
-            )
-        return "unknown", reasons
-    if curve is not None:
-        return "unknown", [curve]
-    if not found.fit.kinds:
-        return "none", []
-    unclear = any(len(group) > 1 for group in found.classes)
-    return ("ambiguous" if unclear else "named"), []
+    return NeighbourNoise(value, value * float(np.sqrt(2 / (0.51 * len(every)))))
 
 
 def tolerated(noise: float, structure: str | None = None) -> float:
-    """Variance that counts as noise: one stated a little too small is no sign of further physics.
+    """Variance that counts as noise: stated a little too small it is no sign of further physics.
 
-    Not where what is left has a structure.
+    It is the stated one where what is left has a pattern.
     """
     return float(np.clip(noise, 1.0, _TOLERATED)) if structure is None else 1.0
 
 
-def not_foretold(
-    inner: HeldOut,
-    outer: HeldOut,
+def refuted_by_levels(
+    levels: HeldOutLevels,
     *,
     doubted: bool,
     unclear: bool = False,
     parts_missing: bool = False,
 ) -> str | None:
-    """Why held-out levels speak against an answer; None where they do not.
+    """Why levels that were left out of the fit refute an answer; None where they do not.
 
-    Arguments: `inner` is a level between others, `outer` the top one; `doubted` says that the
-    answer may be an imitation, which is then worth no more than what it foretells; `unclear` that
-    several effects fit, any of which should foretell a level between those it was fitted to; with
-    `parts_missing`, of forces of which the size alone is compared, fewer levels leave parameters
-    open, and worse than nothing counts only beyond that.
+    A level is missed by more than the uncertainty of the parameters allows; or the level between
+    others is predicted worse than without the effects; or it is missed although a law that was
+    not tried may act alike (`doubted`), or although several effects fit (`unclear`), each of
+    which should predict a level between those it was fitted to. With `parts_missing`, where of
+    some forces the size alone is compared, fewer levels leave parameters open, and worse than
+    without the effects counts beyond that uncertainty only.
     """
+    inner, outer = levels
     for held in (inner, outer):
         if held.uncertain_p_value < UNLIKELY / 2:
             return (
-                f"level {held.level}, left out, is missed by {held.after:.2g} times the noise, "
-                "more than the uncertainty of the parameters allows: the law is another one."
+                f"level {held.level}, left out of the fit, is missed by {held.after:.2g} times the "
+                "noise, more than the uncertainty of the parameters allows: the true law is "
+                "another one."
             )
     chance = inner.uncertain_p_value if parts_missing else inner.p_value
     if inner.after > inner.before and chance < UNLIKELY:
         return (
-            f"level {inner.level}, left out, is foretold worse than without the effects: "
-            f"{inner.after:.2g} times the noise, {inner.before:.2g} before."
+            f"level {inner.level}, left out of the fit, is predicted worse than without the "
+            f"effects: {inner.after:.2g} times the noise, {inner.before:.2g} before."
         )
     if doubted and (inner.p_value < _MISSED or inner.after > _AS_NOISE):
         return (
-            f"the answer may be an imitation, and level {inner.level}, left out, is missed by "
-            f"{inner.after:.2g} times the noise."
+            f"another law may act alike, and level {inner.level}, left out of the fit, is missed "
+            f"by {inner.after:.2g} times the noise."
         )
     if unclear and inner.uncertain_p_value < _MISSED_BY_ONE:
         return (
-            "several effects fit and may all be imitations: level "
-            f"{inner.level}, left out, is missed by {inner.after:.2g} times the noise."
+            "several models fit, and the true law may be outside the library: level "
+            f"{inner.level}, left out of the fit, is missed by {inner.after:.2g} times the noise."
         )
     return None
 
 
-def unproved(outer: HeldOut) -> Doubt | None:
-    """The doubt that stays where the top level is not foretold for want of certain parameters.
+def unproved_beyond(outer: HeldOut) -> Doubt | None:
+    """The doubt that stays where the top level is missed, for want of certain parameters.
 
-    That it is not missed by more than they leave open refutes no answer, and proves none: beyond
-    the levels that put the parameters the law may be another one, as that of a contact is which
-    stiffens on after it has closed.
+    A miss that the uncertainty of the parameters allows refutes no answer, and proves none:
+    beyond the levels that determine the parameters the law may be another one, as that of a
+    contact that stiffens further after it has closed.
     """
     if outer.after < _FAR or outer.p_value >= UNLIKELY:
         return None
     return Doubt(
-        f"level {outer.level}, left out, is missed by {outer.after:.2g} times the noise, which "
-        "what the other levels leave open of the parameters allows: nothing proves the law there.",
+        f"level {outer.level}, left out of the fit, is missed by {outer.after:.2g} times the "
+        "noise, which the uncertainty of the parameters from the other levels allows: nothing "
+        "proves the law there.",
         f"measure levels between level {outer.level} and the one below it, or above it",
         twin=True,
     )

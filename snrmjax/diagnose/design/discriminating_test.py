@@ -1,4 +1,4 @@
-"""Which measurement would settle what is open: what rivals are expected to lose by it."""
+"""Which further test is expected to separate competing models: optimal design."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from snrmjax.diagnose.design.further_states import (
+from snrmjax.diagnose.design.design_points import (
     HARMONICS,
-    Compared,
-    Foretold,
-    Further,
+    DesignPoints,
+    ModelRows,
+    PredictedTest,
     Rows,
-    foretold_states,
-    predicted,
-    refitted,
-    rows_of,
+    columns_of,
+    in_noise_units,
+    predicted_test,
+    refitted_chi_square,
     separation,
 )
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
@@ -26,66 +26,71 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
 
 STATES = 12
-"""Of a level, or off resonance, that a request is for."""
+"""Of a level, or off resonance, in a further test."""
 
-_RIVALS = 4  # of a class, that are weighed
+_RIVALS = 4  # of a class, that are compared
 _WITHIN = np.radians(55.0)  # phases of a further level
 _OFF = np.radians(np.linspace(30.0, 60.0, STATES // 2))
 _HIGHER, _LOWER = (1.5, 2.0), 0.5  # times the velocities of the largest and the smallest level
-_CERTAIN = 1.64  # 1σ of what noise makes of an expected gain: 95 % of tests do better
-_ORDINARY = 3e-3  # of the largest velocity: noise of harmonics that nobody took care of
+_CERTAIN = 1.64  # 1σ below the expected gain: noise leaves 95 % of tests with more
+_ORDINARY = 3e-3  # of the largest velocity: noise of harmonics measured without special care
 _RESOLVED = {"velocity": 0.01, "frequency": 2e-4}  # relative, by a careful test
 _SEEN = 0.1  # of the larger of two harmonics, above which the smaller one has a phase
-_CLOSER, _FINEST = 3.0, 1e-4  # the steps in which less noise is asked for, and the end of it
+_CLOSER, _FINEST = 3.0, 1e-4  # factor between the noise floors tried, and the lowest one
+
+
+class TestedLevel(NamedTuple):
+    """Where in the measured range a test is, by its resonance."""
+
+    level: int  # that is measured again, or whose velocities are scaled
+    force: float  # N
+    frequency: float  # Hz
 
 
 class DiscriminatingTest(NamedTuple):
-    """A measurement that is expected to settle what a diagnosis left open.
+    """A test that is expected to separate the models that a diagnosis could not.
 
     What does not apply is None: a calibration has no level, and only harmonics have a noise that
-    is asked for.
+    they need.
     """
 
     kind: str  # "harmonics", "off_resonance", "lower_level", "higher_level", "calibration"
     sentence: str
-    quantity: str | None = None  # in which rivals differ most: "harmonic 2", "velocity", …
-    level: int | None = None  # that is measured again, or whose velocities are scaled
-    force: float | None = None  # N, at resonance
-    frequency: float | None = None  # Hz, at resonance
+    quantity: str | None = None  # in which the models differ most: "harmonic 2", "velocity", …
+    place: TestedLevel | None = None
     states: int | None = None
     phase: tuple[float, float] | None = None  # degrees off resonance, on both sides
     harmonics: tuple[int, ...] = ()
-    harmonic_std: float | None = None  # m/s
-    expected_gain: float | None = None  # of χ², over the rival that is told least well
+    harmonic_std: float | None = None  # m/s, that they need
+    expected_gain: float | None = None  # of χ² over the rival that is separated least well
     needed_gain: float | None = None
-    calibration_too: bool = False  # whether two that only it separates stay open
+    calibration_too: bool = False  # whether effects stay open that only a calibration separates
 
     @property
     def settles(self) -> bool:
-        """Whether what is expected is enough."""
+        """Whether the expected gain is enough."""
         if self.expected_gain is None or self.needed_gain is None:
             return self.kind == "calibration"
         return self.expected_gain >= self.needed_gain
 
 
 class _Option(NamedTuple):
-    """Some rows of what was foretold."""
+    """Some rows of a predicted test."""
 
     kind: str
-    place: int  # of the `Further`
+    place: int  # of the design points
     orders: tuple[int, ...]  # of harmonics that count
     of_force: bool
-    floor: float | None  # m/s, that is asked for
+    floor: float | None  # m/s, that harmonics need
 
 
-def requested(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTest | None:
-    """The cheapest measurement that is expected to leave only what is true of some classes.
+def discriminating_test(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTest | None:
+    """The cheapest test that is expected to reject the competing models of some classes.
 
-    Every member of a class at one of the `places` is taken for true in turn, further states are
-    foretold by it, and its rivals are refitted to the measured and the further states together, to
-    first order: they lose what their own freedom cannot follow. Enough is what leaves them behind
-    with 95 % probability. Where nothing is enough, what comes nearest; None where no rival can be
-    compared.
+    Every member of a class at one of the `places` is taken for true in turn and predicts the test;
+    its rivals are refitted to the measured and the further states together, to first order. A
+    test is enough where it leaves the rivals behind with 95 % probability. Where none is enough
+    it is the one that comes nearest; None where no rival can be compared.
     """
     misfit = found.misfit
     speed = np.abs(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
@@ -103,9 +108,9 @@ def requested(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTes
     for option in _options(ordinary, float(speed.max()), measured=floor is not None):
         worst: DiscriminatingTest | None = None
         for hypothesis in hypotheses if every else []:
-            request = hypothesis.request(option)
-            if request is not None and (worst is None or _share(request) < _share(worst)):
-                worst = request
+            test = hypothesis.expected(option)
+            if test is not None and (worst is None or _share(test) < _share(worst)):
+                worst = test
             if worst is None or not worst.settles:
                 break
         if worst is not None and worst.settles:
@@ -116,13 +121,13 @@ def requested(found: FoundEffects, places: tuple[int, ...]) -> DiscriminatingTes
 
 
 def _can_be_told(one: EffectFit, other: EffectFit) -> bool:
-    """Whether two answers are different ones that no calibration is needed for."""
+    """Whether two answers differ by more than what only a calibration separates."""
     differ = set(one.kinds) ^ set(other.kinds)
     return bool(differ) and not only_by_calibration(differ)
 
 
-def _share(request: DiscriminatingTest) -> float:
-    return (request.expected_gain or 0.0) / (request.needed_gain or 1.0)
+def _share(test: DiscriminatingTest) -> float:
+    return (test.expected_gain or 0.0) / (test.needed_gain or 1.0)
 
 
 def _floor(misfit: WeightedMisfit) -> float | None:
@@ -134,7 +139,7 @@ def _floor(misfit: WeightedMisfit) -> float | None:
     return float(np.median(own[own > 0])) if np.any(own > 0) else None
 
 
-def _further(misfit: WeightedMisfit) -> tuple[Further, ...]:
+def _design_points(misfit: WeightedMisfit) -> tuple[DesignPoints, ...]:
     """The largest level as it is, both ends off resonance, a smaller level and larger ones."""
     states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
@@ -142,12 +147,12 @@ def _further(misfit: WeightedMisfit) -> tuple[Further, ...]:
     low, top = int(np.argmin(peaks)), int(np.argmax(peaks))
     again = np.sort(np.angle(velocity[level == top]))
     off, spread = np.concatenate([-_OFF[::-1], _OFF]), np.linspace(-_WITHIN, _WITHIN, STATES)
-    higher = [Further(top, scale, spread) for scale in _HIGHER]
+    higher = [DesignPoints(top, scale, spread) for scale in _HIGHER]
     return (
-        Further(top, 1.0, again[:: -(-len(again) // (2 * STATES))]),
-        Further(low, 1.0, off),
-        Further(top, 1.0, off),
-        Further(low, _LOWER, spread),
+        DesignPoints(top, 1.0, again[:: -(-len(again) // (2 * STATES))]),
+        DesignPoints(low, 1.0, off),
+        DesignPoints(top, 1.0, off),
+        DesignPoints(low, _LOWER, spread),
         *higher,
     )
 
@@ -171,18 +176,18 @@ def _options(ordinary: float, largest: float, *, measured: bool) -> Iterator[_Op
 
 
 def _rivals(found: FoundEffects, place: int) -> Iterator[EffectFit]:
-    """What the class at a place has beside the answer, as the table says that it fits."""
+    """The rivals of the answer in the class at a place, with their parameters from the table."""
     misfit = found.misfit
     for name in found.classes[place][1 : 1 + _RIVALS]:
         kinds = {name if k == place else kind for k, kind in enumerate(found.fit.kinds)}
         # One effect with more parameters may stand for two.
         fit = _from_table(found, kinds) or _from_table(found, {name})
-        columns = fit and predicted(misfit.predictions, fit)
+        columns = fit and columns_of(misfit.predictions, fit)
         if fit is None or columns is None:
             continue
-        rows = rows_of(misfit, columns)
+        rows = in_noise_units(misfit, columns)
         if np.all(np.isfinite(rows.left)) and np.all(np.isfinite(rows.slopes)):
-            least = refitted(rows, misfit.noise.shared)
+            least = refitted_chi_square(rows, misfit.noise.shared)
             yield fit._replace(rows=rows.left, slopes=rows.slopes, chi_square=least)
 
 
@@ -194,72 +199,83 @@ def _from_table(found: FoundEffects, kinds: set[str]) -> EffectFit | None:
             rows, slopes = np.zeros(0), np.zeros((0, len(values)))
             labels = tuple(row.parameters)
             return EffectFit(
-                tuple(kinds), labels, values, row.chi_square, rows, slopes, values, values
+                tuple(kinds),
+                labels,
+                values,
+                row.chi_square,
+                rows,
+                slopes,
+                values,
+                values,
+                row.status,
             )
     return None
 
 
 class _Hypothesis:
-    """One model that may be true, what it foretells of further states, and its rivals."""
+    """One model taken for true, the tests that it predicts, and its rivals."""
 
     def __init__(
         self, misfit: WeightedMisfit, truth: EffectFit, rivals: list[EffectFit], floor: float
     ):
         self.misfit, self.truth, self.rivals = misfit, truth, rivals
-        self.floor = floor  # m/s, of harmonics where none is asked for
-        self.further = _further(misfit)
+        self.floor = floor  # m/s, of harmonics where an option needs none
+        self.points = _design_points(misfit)
 
     @cached_property
-    def _foretold(self) -> dict[float, Foretold]:
+    def _tests(self) -> dict[float, PredictedTest]:
         """By the noise of harmonics."""
-        first = foretold_states(self.misfit, self.truth, self.further, self.floor)
+        first = predicted_test(self.misfit, self.truth, self.points, self.floor)
         return {self.floor: first}
 
     @cached_property
     def _predicted(self) -> list[Predicted | None]:
         """Of the truth, then of the rivals."""
-        predictions = self._foretold[self.floor].misfit.predictions
-        return [predicted(predictions, fit) for fit in (self.truth, *self.rivals)]
+        predictions = self._tests[self.floor].misfit.predictions
+        return [columns_of(predictions, fit) for fit in (self.truth, *self.rivals)]
 
     @cached_property
     def _measured(self) -> list[tuple[Rows, float]]:
-        """Rows of the measured states, refitted, and the χ² that they leave: as `_predicted`."""
+        """Rows of the measured states and χ² after a refit: of the truth, then of the rivals."""
         rows = [Rows(fit.rows, fit.slopes) for fit in (self.truth, *self.rivals)]
-        return [(one, refitted(one, self.misfit.noise.shared)) for one in rows]
+        return [(one, refitted_chi_square(one, self.misfit.noise.shared)) for one in rows]
 
-    def request(self, option: _Option) -> DiscriminatingTest | None:
-        """What an option is expected to gain over the rival that it tells least well."""
+    def expected(self, option: _Option) -> DiscriminatingTest | None:
+        """The expected gain of an option over the rival that it separates least well."""
         floor = self.floor if option.floor is None else option.floor
-        if floor not in self._foretold:
-            self._foretold[floor] = self._foretold[self.floor].with_floor(floor)
-        foretold = self._foretold[floor]
-        kept = _rows(foretold, option)
+        if floor not in self._tests:
+            self._tests[floor] = self._tests[self.floor].with_floor(floor)
+        test = self._tests[floor]
+        kept = _rows(test, option)
         exact, *others = self._predicted
         if exact is None or not kept.any():
             return None
-        own = Compared(*self._measured[0], rows_of(foretold.misfit, exact))
+        own = ModelRows(*self._measured[0], in_noise_units(test.misfit, exact))
         found = []
         for fit, before, columns in zip(self.rivals, self._measured[1:], others, strict=True):
             if columns is None:
                 continue
-            its = Compared(*before, rows_of(foretold.misfit, columns))
-            gain = separation(self.misfit, foretold.misfit, own, its, kept)
+            its = ModelRows(*before, in_noise_units(test.misfit, columns))
+            gain = separation(self.misfit, test.misfit, own, its, kept)
             n = self.misfit.n_rows
             needed = _needed(fit.criterion(n) - self.truth.criterion(n))
-            said = _difference(foretold, (self.truth, exact), (fit, columns), option)
+            said = _difference(test, (self.truth, exact), (fit, columns), option)
             found.append((gain, needed, *said))
         if not found:
             return None
         gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
-        one = self.further[option.place]
+        one = self.points[option.place]
         size = np.degrees(np.abs(one.phase))
-        request = DiscriminatingTest(
-            kind=option.kind,
-            sentence="",
-            quantity=quantity,
+        place = TestedLevel(
             level=int(self.misfit.level_numbers[one.level]),
-            force=foretold.force[option.place],
-            frequency=foretold.frequency[option.place] / (2 * np.pi),
+            force=test.force[option.place],
+            frequency=test.frequency[option.place] / (2 * np.pi),
+        )
+        return DiscriminatingTest(
+            kind=option.kind,
+            sentence=f"{_what_to_measure(place, one.scale, test, option)}: {words}.",
+            quantity=quantity,
+            place=place,
             states=len(one.phase),
             phase=(float(size.min()), float(size.max())),
             harmonics=option.orders if option.floor is not None else (),
@@ -267,19 +283,16 @@ class _Hypothesis:
             expected_gain=float(gain),
             needed_gain=needed,
         )
-        return request._replace(
-            sentence=f"{_place(request, one.scale, foretold, option)}: {words}."
-        )
 
 
-def _place(request: DiscriminatingTest, scale: float, foretold: Foretold, option: _Option) -> str:
+def _what_to_measure(place: TestedLevel, scale: float, test: PredictedTest, option: _Option) -> str:
     """Where and what to measure, in words."""
-    at = f"near {request.frequency:.4g} Hz"
-    level = f"level {request.level} ({request.force:.3g} N)"
+    at = f"near {place.frequency:.4g} Hz"
+    level = f"level {place.level} ({place.force:.3g} N)"
     closely = ""
     if option.floor is not None:
-        velocity = np.asarray(foretold.misfit.predictions.chosen.states.velocity)[:, 0]
-        largest = np.abs(velocity[foretold.rows_of[option.place]]).max()
+        velocity = np.asarray(test.misfit.predictions.chosen.states.velocity)[:, 0]
+        largest = np.abs(velocity[test.members[option.place]]).max()
         names = " and ".join(str(h) for h in option.orders)
         plural = "s" if len(option.orders) > 1 else ""
         closely = (
@@ -292,8 +305,8 @@ def _place(request: DiscriminatingTest, scale: float, foretold: Foretold, option
         return f"Measure {STATES} states 30° to 60° off resonance, on both sides, at {level} {at}"
     beside = f", with {closely}" if closely else ""
     return (
-        f"Add a level of {request.force:.3g} N, {scale:g} times the velocities of level "
-        f"{request.level}, with {STATES} states within 55° of resonance {at}{beside}"
+        f"Add a level of {place.force:.3g} N, {scale:g} times the velocities of level "
+        f"{place.level}, with {STATES} states within 55° of resonance {at}{beside}"
     )
 
 
@@ -306,10 +319,10 @@ def _needed(ahead: float) -> float:
     return float((_CERTAIN + np.sqrt(_CERTAIN**2 + least)) ** 2)
 
 
-def _rows(foretold: Foretold, option: _Option) -> Bool[np.ndarray, " row"]:
-    noise = foretold.misfit.noise
-    mine = foretold.rows_of[option.place][noise.state]
-    first = 2 * len(foretold.misfit.predictions.chosen.sensors)
+def _rows(test: PredictedTest, option: _Option) -> Bool[np.ndarray, " row"]:
+    noise = test.misfit.noise
+    mine = test.members[option.place][noise.state]
+    first = 2 * len(test.misfit.predictions.chosen.sensors)
     wanted = [noise.column < 2] if option.of_force else []
     for order in option.orders:
         at = first + 2 * HARMONICS.index(order)
@@ -318,17 +331,17 @@ def _rows(foretold: Foretold, option: _Option) -> Bool[np.ndarray, " row"]:
 
 
 def _difference(
-    foretold: Foretold,
+    test: PredictedTest,
     truth: tuple[EffectFit, Predicted],
     rival: tuple[EffectFit, Predicted],
     option: _Option,
 ) -> tuple[str, str]:
     """In what two models differ most under an option, and by how much, in words."""
-    states = foretold.misfit.predictions.chosen.states
+    states = test.misfit.predictions.chosen.states
     velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
     columns = rival[1].columns[0] - truth[1].columns[0]
     apart = columns[:, 0::2] + 1j * columns[:, 1::2]
-    mine = np.flatnonzero(foretold.rows_of[option.place])
+    mine = np.flatnonzero(test.members[option.place])
     mine = mine[np.isfinite(apart[mine]).all(axis=1)]
     kinds = truth[0].kinds, rival[0].kinds
     one, other = (
@@ -340,7 +353,7 @@ def _difference(
     if option.floor is not None:
         places = [HARMONICS.index(h) for h in option.orders]
         own = np.asarray(states.harmonics)[at, 0, places] / np.abs(velocity[at])
-        its = own + apart[at, [len(foretold.misfit.predictions.chosen.sensors) + k for k in places]]
+        its = own + apart[at, [len(test.misfit.predictions.chosen.sensors) + k for k in places]]
         most = int(np.argmax(np.abs(own - its)))
         name = f"harmonic {option.orders[most]}"
         sizes = [f"{round(100 * abs(h[most]), 6):.2g} %" for h in (own, its)]
@@ -354,7 +367,7 @@ def _difference(
         share = 100 * float(np.abs(apart[mine, 0]).max())
         return "velocity", f"with {one} and {other} velocities differ by up to {share:.2g} %"
     # The force goes with iΩδ + Δω̃² there: more of it is less velocity, or a higher frequency.
-    modes, j = foretold.misfit.model.modes, foretold.misfit.model.modes.mode_of_interest
+    modes, j = test.misfit.model.modes, test.misfit.model.modes.mode_of_interest
     slower = float(apart[at, 0].real)
     shift = -float(apart[at, 0].imag * modes.damping_ratio[j])
     if abs(slower) / _RESOLVED["velocity"] > abs(shift) / _RESOLVED["frequency"]:

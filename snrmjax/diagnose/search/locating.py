@@ -107,17 +107,17 @@ def located(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
 
 
-def own_power(
-    misfit: WeightedMisfit, nothing: EffectFit, fit: EffectFit, part: str
+def power_of_answer(
+    misfit: WeightedMisfit, baseline: EffectFit, fit: EffectFit, part: str
 ) -> float | None:
-    """The power of amplitude that a fitted answer itself has, located as in what was measured.
+    """The power of amplitude with which a fitted answer changes a part, found as in the data.
 
     A law has its power to lowest order only: softening by q² has terms of the fourth power of the
     amplitude too. None where the answer follows no power or does not change the part.
     """
     if misfit.predictions.chosen.phase_unknown.any():
         return None  # sizes are not linear in what an answer changes
-    alone = nothing._replace(rows=nothing.rows - fit.rows)
+    alone = baseline._replace(rows=baseline.rows - fit.rows)
     powers = [one.exponent for one in located(misfit, alone).parts if one.part == part]
     return powers[0] if powers else None
 

@@ -20,6 +20,7 @@ from snrmjax.diagnose.search.screening import foretold, foretold_pairs
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.blocks import over_cores
+from snrmjax.numerics.levenberg_marquardt import FitStatus
 
 DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
 AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
@@ -35,23 +36,24 @@ _MOST = 3  # effects of an answer
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 
 
-class Row(NamedTuple):
-    """A candidate of one step, as a report shows it."""
+class TriedEffect(NamedTuple):
+    """A candidate that one step of the search compared."""
 
     kind: str
     gain: float  # of the criterion over what was there before
     chi_square: float
     parameters: dict[str, float]
+    status: FitStatus
 
 
 class FoundEffects(NamedTuple):
     """What the data ask for."""
 
-    misfit: WeightedMisfit  # weighed with the answer
+    misfit: WeightedMisfit  # with errors passed on as the answer passes them
     fit: EffectFit
-    nothing: EffectFit
+    baseline: EffectFit
     classes: tuple[tuple[str, ...], ...]  # of every effect, itself first
-    table: tuple[tuple[Row, ...], ...]  # of every step
+    table: tuple[tuple[TriedEffect, ...], ...]  # of every step
 
     @property
     def p_value(self) -> float:
@@ -60,7 +62,9 @@ class FoundEffects(NamedTuple):
         return chi_square_p_value(self.fit.chi_square, freedom)
 
 
-def named(misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]) -> FoundEffects:
+def find_effects(
+    misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]
+) -> FoundEffects:
     """Add effects one after the other while the criterion asks for them, three at most.
 
     A linear mode close by has three numbers of its own and would follow a part of most laws: it
@@ -90,7 +94,7 @@ def _questioned(
     fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
     if not fit.kinds or fits_by_itself or misfit.predictions.sizes.alone.any():
         return found
-    jobs = [(close, found.nothing)]
+    jobs = [(close, found.baseline)]
     if alike and others:
         jobs.append((close, _only(misfit, every, fit, others)))
     if refuted and len(fit.kinds) < _MOST:
@@ -99,7 +103,7 @@ def _questioned(
     if not fits:
         return found
     best = _simplest(misfit, fits)
-    gain, table = _gain(misfit, fit, best), (*found.table, _table(misfit, found.nothing, [best]))
+    gain, table = _gain(misfit, fit, best), (*found.table, _table(misfit, found.baseline, [best]))
     if gain > AS_GOOD:
         return _replaced(found._replace(table=table), close, every, best)
     found = found._replace(table=table)
@@ -252,7 +256,7 @@ def _promising(
 
 def _tried(
     misfit: WeightedMisfit, every: dict[str, EffectCandidate], before: EffectFit
-) -> tuple[WeightedMisfit, list[EffectFit], tuple[Row, ...]]:
+) -> tuple[WeightedMisfit, list[EffectFit], tuple[TriedEffect, ...]]:
     """Candidates, the promising ones weighed with the best one's way of passing on errors.
 
     Returns all of them as rows for a report too, in the noise that all share.
@@ -327,13 +331,16 @@ def _class(
     return (kind, *(name for name in near if name != kind))
 
 
-def _table(misfit: WeightedMisfit, before: EffectFit, fits: list[EffectFit]) -> tuple[Row, ...]:
+def _table(
+    misfit: WeightedMisfit, before: EffectFit, fits: list[EffectFit]
+) -> tuple[TriedEffect, ...]:
     rows = [
-        Row(
+        TriedEffect(
             fit.kinds[-1],
             _gain(misfit, before, fit),
             fit.chi_square,
             dict(zip(fit.labels, fit.values.tolist(), strict=True)),
+            fit.status,
         )
         for fit in fits
     ]

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
+from snrmjax.diagnose.design.design_points import (
+    DesignPoints,
+    Rows,
+    predicted_test,
+    refitted_chi_square,
+)
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, requested
-from snrmjax.diagnose.design.further_states import Further, Rows, foretold_states, refitted
 from snrmjax.diagnose.diagnosis import _decide_by
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
@@ -83,18 +88,18 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
     # The same by one regression: shared errors are parameters that were measured as zero.
     matrix = np.block([[rows.slopes / [1e6, 1e-3], shared], [np.zeros((4, 2)), np.eye(4)]])
     left = np.linalg.lstsq(matrix, np.append(rows.left, np.zeros(4)))[1]
-    assert refitted(rows, shared) == pytest.approx(left[0], rel=1e-9)
+    assert refitted_chi_square(rows, shared) == pytest.approx(left[0], rel=1e-9)
     # What a parameter can do by itself costs nothing.
-    assert refitted(Rows(rows.slopes[:, 0], rows.slopes), shared) < 1e-9
+    assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), shared) < 1e-9
 
 
-def test_further_states_obey_the_law_that_foretells_them():
+def test_design_points_obey_the_law_that_foretells_them():
     predictions = predictions_of(linear_model(), measured())
     misfit, scales = weighted_misfit(predictions), scales_of(predictions)
     found = named(misfit, scales, ("cubic_damping",))
     (size,) = found.fit.values
     phase = np.radians([-50.0, -10.0, 30.0])
-    foretold = foretold_states(found.misfit, found.fit, (Further(4, 2.0, phase),), 1e-3)
+    foretold = predicted_test(found.misfit, found.fit, (DesignPoints(4, 2.0, phase),), 1e-3)
     states = foretold.misfit.predictions.chosen.states
     omega, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
     np.testing.assert_allclose(np.angle(velocity), phase, atol=2e-3)

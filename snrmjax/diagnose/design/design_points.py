@@ -1,4 +1,4 @@
-"""States that a test could add, as an answer foretells them, and what they would tell of rivals."""
+"""Steady states that a further test could add, and how well they would separate two models."""
 
 from typing import NamedTuple
 
@@ -13,30 +13,30 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_mis
 from snrmjax.measure.states import SteadyStates, steady_states
 
 HARMONICS = COMPARED
-"""That are foretold of further states."""
+"""Those that are predicted for a further test."""
 
-_RESOLUTION = 1e-12  # of singular values: what further states do not see at all stays open
+_RESOLUTION = 1e-12  # of singular values: directions that no state determines stay open
 
 
-class Further(NamedTuple):
-    """States that could be added: motions of a measured level, scaled."""
+class DesignPoints(NamedTuple):
+    """States of a further test: motions of a measured level, scaled."""
 
     level: int  # counted from zero
     scale: float  # of its velocities
     phase: Float[np.ndarray, " state"]  # rad
 
 
-class Foretold(NamedTuple):
-    """Further states as an answer foretells them, without noise."""
+class PredictedTest(NamedTuple):
+    """The states of a further test as one model predicts them, without noise."""
 
     misfit: WeightedMisfit
-    rows_of: tuple[Bool[np.ndarray, " state"], ...]  # the states of every `Further`
-    force: tuple[float, ...]  # N at resonance, of every `Further`
+    members: tuple[Bool[np.ndarray, " state"], ...]  # the states of each set of design points
+    force: tuple[float, ...]  # N at resonance, of each set
     frequency: tuple[float, ...]  # rad/s at resonance
     floor: float  # m/s, noise of harmonics
 
-    def with_floor(self, floor: float) -> "Foretold":
-        """The same with another noise of harmonics."""
+    def with_floor(self, floor: float) -> "PredictedTest":
+        """The same test with another noise of harmonics."""
         chosen = self.misfit.predictions.chosen
         own = chosen.states.own_std * (floor / self.floor)
         states = chosen.states._replace(own_std=own)
@@ -44,19 +44,19 @@ class Foretold(NamedTuple):
         return self._replace(misfit=misfit, floor=floor)
 
 
-def foretold_states(
-    misfit: WeightedMisfit, fit: EffectFit, further: tuple[Further, ...], floor: float
-) -> Foretold:
-    """Further states of the structure that a fit describes.
+def predicted_test(
+    misfit: WeightedMisfit, fit: EffectFit, points: tuple[DesignPoints, ...], floor: float
+) -> PredictedTest:
+    """The states of a further test, predicted by the structure that a fit describes.
 
-    A motion is held, as everywhere in a diagnosis, and its force follows: velocities of a level
-    are scaled, and frequencies are moved to where the phase is the one wanted. Noise is that of the
-    states measured, in the median; `floor` is that of harmonics, m/s.
+    A motion is prescribed, as everywhere in a diagnosis, and its force follows: velocities of a
+    level are scaled, and frequencies are moved to where the phase is the one wanted. Noise is the
+    median of that of the measured states; `floor` is that of harmonics, m/s.
     """
     states = misfit.predictions.chosen.states
     level, velocity = np.asarray(states.level), np.asarray(states.velocity)[:, 0]
     speed, omega, member = [], [], []
-    for number, one in enumerate(further):
+    for number, one in enumerate(points):
         mine = level == one.level
         phase = np.angle(velocity[mine])
         order = np.argsort(phase)
@@ -64,7 +64,7 @@ def foretold_states(
         speed.append(one.scale * np.interp(one.phase, phase[order], tip[order]) * np.cos(one.phase))
         omega.append(np.interp(one.phase, phase[order], np.asarray(states.frequency)[mine][order]))
         member.append(np.full(len(one.phase), number))
-    aim = np.concatenate([one.phase for one in further])
+    aim = np.concatenate([one.phase for one in points])
     size, at, whose = (np.concatenate(parts) for parts in (speed, omega, member))
     modes, j = misfit.model.modes, misfit.model.modes.mode_of_interest
     sensor = misfit.predictions.chosen.sensors[0]
@@ -87,10 +87,10 @@ def foretold_states(
         misfit, whose[good], at[good], own[good], np.abs(force)[good], seen[good], floor
     )
     predictions = predictions_of(misfit.model, found, misfit.predictions.force_gain_std)
-    rows = tuple(whose[good] == number for number in range(len(further)))
+    rows = tuple(whose[good] == number for number in range(len(points)))
     ends = [_at_resonance(data=found, mine=mine, sensor=sensor) for mine in rows]
     force_at, frequency_at = zip(*ends, strict=True)
-    return Foretold(
+    return PredictedTest(
         with_errors_passed_on(weighted_misfit(predictions), fit),
         rows,
         force_at,
@@ -162,8 +162,8 @@ def _needed(
     return 1.0 + parts[:, 0], higher * np.abs(velocity)[:, None]
 
 
-def predicted(predictions: Predictions, fit: EffectFit) -> Predicted | None:
-    """Columns of all states under a fit's parameters; None where no program has all its kinds."""
+def columns_of(predictions: Predictions, fit: EffectFit) -> Predicted | None:
+    """Columns of all states under a fit's parameters; None where no program has all its effects."""
     group = predictions.group
     if not set(fit.labels) <= set(group.names):
         return None
@@ -179,24 +179,24 @@ class Rows(NamedTuple):
     slopes: Float[np.ndarray, "row parameter"]
 
 
-class Compared(NamedTuple):
-    """A model by its measured rows, the χ² that they leave it, and its rows of further states."""
+class ModelRows(NamedTuple):
+    """Rows of one model: of the measured states, with the χ² left there, and of a further test."""
 
     measured: Rows
     least: float
     further: Rows
 
 
-def rows_of(misfit: WeightedMisfit, found: Predicted) -> Rows:
-    """Predictions of one trial in units of a misfit's noise."""
+def in_noise_units(misfit: WeightedMisfit, found: Predicted) -> Rows:
+    """Predictions of one trial in units of noise."""
     slopes = misfit.noise.noise_units(np.moveaxis(found.slopes[0], 2, 0))
     return Rows(misfit.noise.noise_units(found.columns)[0], slopes.T)
 
 
-def together(
+def shared_by_both(
     old: WeightedMisfit, new: WeightedMisfit, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
-    """What measured states and some rows of further ones share: the baseline, not their levels."""
+    """Errors shared by measured states and a further test: the baseline's, not the levels'."""
     stated = sum(std > 0 for std in old.model.level_stds)
     parts = old.noise.shared, new.noise.shared[kept]
     own = [stated * misfit.predictions.chosen.n_levels for misfit in (old, new)]
@@ -211,7 +211,7 @@ def together(
     )
 
 
-def refitted(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
+def refitted_chi_square(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
     return _least(rows, np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T))
 
@@ -231,18 +231,18 @@ def _least(rows: Rows, lower: Float[np.ndarray, "row row"]) -> float:
 def separation(
     old: WeightedMisfit,
     new: WeightedMisfit,
-    truth: Compared,
-    rival: Compared,
+    truth: ModelRows,
+    rival: ModelRows,
     kept: Bool[np.ndarray, " row"],
 ) -> float:
-    """How much more χ² of a rival grows by some rows of further states than that of the truth.
+    """How much more χ² grows for a rival than for the truth by some rows of a further test.
 
-    Each is refitted to the measured and the further rows, with what they share. Rows for which one
-    of the two has no motion do not count.
+    Each is refitted to the measured rows and those of the test, with their shared errors. Rows for
+    which one of the two has no motion do not count.
     """
     for _, _, rows in (truth, rival):
         kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)
-    shared = together(old, new, kept)
+    shared = shared_by_both(old, new, kept)
     lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
     gains = []
     for before, least, after in (truth, rival):

@@ -1,0 +1,191 @@
+"""What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
+
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.diagnose.checks.cross_validation import HeldOut
+from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
+from snrmjax.diagnose.completed_model import CompletedStatus
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
+from snrmjax.diagnose.search.locating import Located
+from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effects import EFFECTS
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.result import AbstractResult, Variable
+
+
+class Estimate(NamedTuple):
+    """A fitted parameter."""
+
+    value: float
+    std: float  # 1σ
+
+
+class Answer(NamedTuple):
+    """The effects that were found, and the model with them."""
+
+    effects: tuple[str, ...]  # in the order added
+    candidates: tuple[tuple[str, ...], ...]  # of every effect: itself, and what fits as well
+    parameters: dict[str, Estimate]
+    status: FitStatus
+    completed: Structure | None  # None where no structure can have these parameters
+    completed_status: CompletedStatus
+    force_gain: float  # acting force over recorded one, where a gain was free; else 1
+
+
+class Gap(NamedTuple):
+    """Root-mean-square misfits in units of the stated noise."""
+
+    before: float
+    after: float
+    interpolated: HeldOut | None  # a level between others, left out of the fit
+    extrapolated: HeldOut | None  # the top level, left out of the fit
+
+
+class Checks(NamedTuple):
+    """How the answer fared beyond its own fit."""
+
+    p_value: float  # of the misfit that is left
+    noise_scale: float  # that neighbouring states show, over the stated noise
+    completed_without: dict[int, Structure]  # by level: completed without a level's states
+    unconverged_fits: int  # of the candidates in the table
+
+
+class ForceMisfit(NamedTuple):
+    """Misfit of the force over noise, less errors that states share.
+
+    NaN where the size alone is compared.
+    """
+
+    rows: Int[np.ndarray, " state"]  # of the data, that were used
+    sensor: int  # whose velocity was prescribed
+    before: Float[np.ndarray, "state part"]
+    after: Float[np.ndarray, "state part"]
+
+
+class Diagnosis(AbstractResult):
+    """What a model lacks, how well that is known, and what would decide what is open."""
+
+    verdict: Verdict
+    answer: Answer
+    decide_by: str | None
+    discriminating_test: DiscriminatingTest | None  # of `decide_by`, where one was compared
+    located: tuple[Located, ...]
+    gap: Gap
+    checks: Checks
+    detection_limits: dict[str, float]
+    table: tuple[tuple[TriedEffect, ...], ...]  # what each step of the search compared
+    notes: tuple[str, ...]
+    force_misfit: ForceMisfit
+    data: SteadyStates  # as they were compared: in N, where a drive voltage was given
+
+    coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The best single answer, in the order added."""
+        return self.answer.effects
+
+    @property
+    def candidates(self) -> tuple[tuple[str, ...], ...]:
+        """Of every effect the class that the data cannot tell from it, itself first."""
+        return self.answer.candidates
+
+    @property
+    def parameters(self) -> dict[str, Estimate]:
+        """Value and 1σ of the effects' parameters."""
+        return self.answer.parameters
+
+    @property
+    def completed(self) -> Structure | None:
+        """The model with the effects; None where `answer.completed_status` is `NOT_PHYSICAL`."""
+        return self.answer.completed
+
+    @property
+    def verdict_sentence(self) -> str:
+        """The verdict in one plain sentence."""
+        before, after = self.gap.before, self.gap.after
+        return verdict_sentence(Verdict(self.verdict), self.candidates, before, after)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult.summary`."""
+        gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
+        lines = [f"Diagnosis: {self.verdict_sentence}"]
+        for name, (value, std) in self.parameters.items():
+            unit = unit_of(name)
+            lines.append(f"{name} = {value:.4g} ± {std:.2g}{f' {unit}' if unit else ''}")
+        lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
+        lines += [
+            f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"
+            for out in (inner, outer)
+            if out is not None
+        ]
+        if self.decide_by:
+            lines.append(f"to decide: {self.decide_by}")
+        tried = sum(len(step) for step in self.table)
+        lines.append(
+            f"status: fit {self.answer.status.value}, completed model "
+            f"{self.answer.completed_status.value}; {self.checks.unconverged_fits} of {tried} "
+            "compared fits unconverged"
+        )
+        return tuple(lines)
+
+    def variables(self) -> Mapping[str, Variable]:
+        """See `AbstractResult.variables`."""
+        tried = [(number + 1, row) for number, step in enumerate(self.table) for row in step]
+        rows = [row for _, row in tried]
+        powers = [
+            (np.nan, np.nan) if p.exponent is None else (p.exponent, p.exponent_std)
+            for p in self.located
+        ]
+        ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
+        exponent = np.array(powers, dtype=float).reshape(-1, 2)
+        names = list(self.parameters)
+        of_row, of_part, of_parameter = ("candidate",), ("part",), ("parameter",)
+        return {
+            "candidate": Variable(of_row, [row.kind for row in rows], "", "effect compared"),
+            "step": Variable(of_row, [number for number, _ in tried], "1", "step of the search"),
+            "gain": Variable(of_row, [r.gain for r in rows], "1", "fall of Schwarz's criterion"),
+            "chi_square": Variable(of_row, [r.chi_square for r in rows], "1", "χ² that is left"),
+            "fit_status": Variable(of_row, [r.status.value for r in rows], "", "end of the fit"),
+            "part": Variable(of_part, [p.part for p in self.located], "", "part of the misfit"),
+            "velocity_low_m_s": Variable(of_part, ranges[:, 0], "m/s", "lowest velocity affected"),
+            "velocity_high_m_s": Variable(
+                of_part, ranges[:, 1], "m/s", "highest velocity affected"
+            ),
+            "p_value": Variable(of_part, [p.p_value for p in self.located], "1", "by chance"),
+            "exponent": Variable(of_part, exponent[:, 0], "1", "power of amplitude"),
+            "exponent_std": Variable(of_part, exponent[:, 1], "1", "1σ of the power"),
+            "parameter": Variable(of_parameter, names, "", "parameter of an effect"),
+            "value": Variable(
+                of_parameter, [p.value for p in self.parameters.values()], "unit", "in `unit`"
+            ),
+            "value_std": Variable(
+                of_parameter, [p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"
+            ),
+            "unit": Variable(of_parameter, [unit_of(name) for name in names], "", "of the value"),
+        }
+
+    def attributes(self) -> Mapping[str, str | float | int]:
+        """See `AbstractResult.attributes`."""
+        return {
+            "verdict": self.verdict.value,
+            "verdict_sentence": self.verdict_sentence,
+            "effects": ", ".join(self.effects),
+            "decide_by": self.decide_by or "",
+            "gap_before": self.gap.before,
+            "gap_after": self.gap.after,
+            "p_value_of_fit": self.checks.p_value,
+            "notes": " ".join(self.notes),
+        }
+
+
+def unit_of(parameter: str) -> str:
+    """The unit of a parameter such as "quadratic_damping.coefficient"; "" where none is stated."""
+    kind, _, name = parameter.partition(".")
+    return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""

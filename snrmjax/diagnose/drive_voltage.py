@@ -1,0 +1,55 @@
+"""States whose force is known as a drive voltage only: a first value of the unknown gain."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from snrmjax.diagnose.misfit.predictions import predictions_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+
+FREE_GAIN_STD = 1.0
+"""Relative 1σ of a force gain that is unknown."""
+
+
+class FirstGain(NamedTuple):
+    """States with a force in N by a first value of the gain."""
+
+    data: SteadyStates
+    gain: float  # N/V
+    note: str
+
+
+def driven_by_voltage(data: SteadyStates) -> bool:
+    """Whether the force is known as a drive voltage only."""
+    force, drive = np.asarray(data.force), np.asarray(data.drive)
+    return bool(not np.any(np.isfinite(force)) and np.any(np.isfinite(drive)))
+
+
+def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
+    """The states with a force by a first value of the unknown gain, which must stay free.
+
+    A joint fit of smooth curves gives it; where phases are unknown, which a joint fit needs, the
+    force that the model needs for the measured motions does, in the median over the states.
+    """
+    if np.any(np.asarray(data.phase_unknown)):
+        in_volts = eqx.tree_at(lambda d: d.force, data, data.drive)
+        needed = weighted_misfit(predictions_of(model, in_volts, FREE_GAIN_STD)).baseline.force
+        gain = float(np.median(np.abs(needed)[np.isfinite(needed)]))
+        found, by = eqx.tree_at(lambda d: d.force, data, gain * data.drive), "the model as given"
+    else:
+        # Few need it, and it takes as long to import as half the others.
+        from snrmjax.identify.inference.corrected_states import corrected_states
+        from snrmjax.identify.joint.joint_fit import fit_jointly
+
+        fit = fit_jointly(data, model.modes, free=("force_gain",))
+        gain = float(np.exp(fit.unknowns.log_force_gain))
+        found, by = corrected_states(data, fit), "a joint fit of smooth curves"
+    return FirstGain(
+        found,
+        gain,
+        f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. Its gain stays "
+        "free, so that damping and gain errors cannot be told apart.",
+    )
