@@ -317,9 +317,9 @@ def _unconverged(found: FoundEffects) -> list[float]:
 def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     if not behind:
         return []
-    tried = sum(len(step) for step in found.table)
+    tried, near = sum(len(step) for step in found.table), sum(one < AS_GOOD for one in behind)
     return [
-        f"{len(behind)} of {tried} fits that were compared had not converged when they ended; the "
-        f"closest of them is {min(behind):.3g} behind the best fit of its step by Schwarz's "
-        f"criterion, where {AS_GOOD:g} counts as equal."
+        f"{len(behind)} of {tried} fits that were compared had not converged when they ended; "
+        f"{near or 'none'} of them came within {AS_GOOD:g} of the best fit of their step by "
+        "Schwarz's criterion, which counts as equal."
     ]

@@ -6,11 +6,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
 from snrmjax.identify.inference.optimal_design import (
@@ -19,7 +18,7 @@ from snrmjax.identify.inference.optimal_design import (
     next_measurements,
 )
 from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
-from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
+from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.pointwise.backbone import BackboneValues, CurveFamily
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
@@ -178,7 +177,7 @@ def identify_jointly(
         free=[name for names in settings.free for name in names.split(",")],
         robust=settings.robust,
     )
-    data = corrected(data, fit)
+    data = corrected_states(data, fit)
     found = identification_of_fit(data, fit)
     asked: list[tuple[float, float | None]] = [
         (force, float(fit.recorded_force(np.asarray(force))) if fit.drive_known_only else None)
@@ -268,21 +267,6 @@ def headline(found: Findings) -> list[str]:
         place = f"{load} at {advised.frequency / HERTZ:.6g} Hz"
         lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
     return lines
-
-
-def corrected(data: SteadyStates, fit: JointFit) -> SteadyStates:
-    """The states with the force and the phase that a joint fit found for their instruments."""
-    unknowns = fit.unknowns
-    nominal = data.drive if fit.drive_known_only else data.force
-    offset = unknowns.force_offset * jnp.min(fit.data.force)
-    return eqx.tree_at(
-        lambda d: (d.force, d.velocity),
-        data,
-        (
-            nominal * jnp.exp(unknowns.log_force_gain) + offset,
-            data.velocity * jnp.exp(-1j * unknowns.instrument_phase),
-        ),
-    )
 
 
 def equilibria_notes(model: Structure) -> list[str]:

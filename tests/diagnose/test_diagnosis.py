@@ -38,7 +38,7 @@ from snrmjax.diagnose.response_prediction import (
     responses,
     simulated_resonance,
 )
-from snrmjax.diagnose.search.model_search import named
+from snrmjax.diagnose.search.model_search import find_effects
 from snrmjax.model.effects import EFFECTS
 
 
@@ -90,14 +90,14 @@ def test_the_hidden_effect_is_in_the_answer_and_the_gap_closes(name):
 def test_unseen_levels_resonate_where_the_completed_model_says():
     model, data = files("blind_12")
     found, _ = blind("blind_12")
-    top = max(found.blind)
+    top = max(found.checks.completed_without)
     force = level_forces(data)[top]
-    (curves,) = responses(found.blind[top], data, [force])
-    foretold, measured = simulated_resonance(curves, 0), measured_resonance(data, top, 0)
+    (curves,) = responses(found.checks.completed_without[top], data, [force])
+    predicted, measured = simulated_resonance(curves, 0), measured_resonance(data, top, 0)
     # The model that has not seen the level is another one than that which has seen all.
-    assert found.blind[top].effects != found.completed.effects
-    assert foretold.frequency == pytest.approx(measured.frequency, rel=2e-3)
-    assert foretold.velocity == pytest.approx(measured.velocity, rel=0.02)
+    assert found.checks.completed_without[top].effects != found.completed.effects
+    assert predicted.frequency == pytest.approx(measured.frequency, rel=2e-3)
+    assert predicted.velocity == pytest.approx(measured.velocity, rel=0.02)
     (before,) = responses(model, data, [force])
     assert not simulated_resonance(before, 0).velocity < 1.2 * measured.velocity
 
@@ -117,7 +117,7 @@ def test_where_nothing_is_hidden_nothing_is_found():
 def test_understated_noise_is_refused():
     found, key = blind("blind_01")
     assert found.verdict == "noise_rejected"
-    assert found.noise_scale == pytest.approx(1 / key["stated_over_true"], rel=0.3)
+    assert found.checks.noise_scale == pytest.approx(1 / key["stated_over_true"], rel=0.3)
     assert "understated" in found.notes[0]
 
 
@@ -125,7 +125,7 @@ def test_understated_noise_is_refused():
 def test_an_effect_that_no_one_knows_is_not_named():
     found, _ = blind("blind_02")
     assert found.verdict == "unknown"
-    assert found.p_value < 1e-3
+    assert found.checks.p_value < 1e-3
 
 
 def test_two_simple_effects_are_not_read_as_a_further_mode():
@@ -154,7 +154,7 @@ def test_a_mode_close_by_is_not_taken_for_noise():
 def test_an_imitation_that_misses_the_level_left_out_is_no_answer():
     found, key = blind("blind_16")
     assert key["outside"] == "magnet_stiffness"
-    assert found.p_value > 1e-3  # it fits
+    assert found.checks.p_value > 1e-3  # it fits
     assert found.gap.interpolated.p_value < 1e-3
     assert found.verdict == "unknown"
 
@@ -209,7 +209,9 @@ def test_a_step_that_promises_nothing_is_taken_without_a_look(monkeypatch):
 def test_damping_of_one_direction_shows_in_harmonic_2():
     model, data = files("blind_15")
     scales = scales_of(predictions_of(model, data))
-    found = named(weighted_misfit(predictions_of(model, data)), scales, ("quadratic_damping",))
+    found = find_effects(
+        weighted_misfit(predictions_of(model, data)), scales, ("quadratic_damping",)
+    )
     assert KEYS["blind_15"]["outside"] == "asymmetric_damping"
     # It acts in one direction only: even and odd part are equal.
     share, std = even_share(found.misfit, found.fit, "quadratic_damping")
@@ -376,7 +378,7 @@ def test_an_unknown_force_gain_passes_for_nothing():
     value, std = found.parameters["quadratic_damping.coefficient"]
     known = sj.diagnose_model(linear_model(), data).parameters["quadratic_damping.coefficient"]
     assert abs(value - known[0]) < 3 * std
-    assert found.force_gain == pytest.approx(1 / 1.5, rel=0.01)
+    assert found.answer.force_gain == pytest.approx(1 / 1.5, rel=0.01)
     # Gains and the modal mass are the same to a force of unknown size.
     assert not any("gain" in name or "mass" in name for name in found.detection_limits)
 
@@ -390,7 +392,7 @@ def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, 
         kinds.extend(some)
         raise InterruptedError
 
-    monkeypatch.setattr("snrmjax.diagnose.diagnosis.named", noted)
+    monkeypatch.setattr("snrmjax.diagnose.diagnosis.find_effects", noted)
     with pytest.raises(InterruptedError):
         sj.diagnose_model(linear_model(), balanced(quadratic), force_gain_std=gain_std)
     assert ("close_mode" in kinds) == asked
@@ -413,7 +415,9 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
     inner = np.linalg.qr(np.vstack([spread.T, np.eye(len(left))]), mode="r")
     expected = np.linalg.norm(np.linalg.solve(inner.T, left)) / np.sqrt(len(left))
     found = held_out(misfit, nothing, nothing, 2)
-    assert found.after == found.before == pytest.approx(expected, rel=1e-4)
+    assert (
+        found.force_misfit.after == found.force_misfit.before == pytest.approx(expected, rel=1e-4)
+    )
 
 
 def test_data_of_another_mode_and_of_one_level_are_said():

@@ -1,4 +1,4 @@
-"""What models foretell of a test, against closed forms of a linear mode."""
+"""Responses that models predict for a test, against closed forms of a linear mode."""
 
 import dataclasses
 
@@ -9,6 +9,7 @@ import pytest
 import snrmjax as sj
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
+    LevelModels,
     level_forces,
     level_responses,
     level_simulations,
@@ -74,7 +75,7 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         )
         for more in (ZETA, 2 * ZETA)
     )
-    found = level_simulations(model, doubled, {1: tripled}, data, 0)
+    found = level_simulations(LevelModels(model, doubled, {1: tripled}), data, 0)
     assert [len(part) for part in found] == [2, 2, 1]
     rows = level_responses(found, data, 0)
     assert [row.held_out for row in rows] == [False, True]
@@ -82,7 +83,7 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
-    louder = level_responses(level_simulations(model, doubled, {}, data, 0, 1.5), data, 0)
+    louder = level_responses(level_simulations(LevelModels(model, doubled), data, 0, 1.5), data, 0)
     for row, same in zip(louder, rows, strict=True):
         assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)

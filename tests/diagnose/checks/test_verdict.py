@@ -5,14 +5,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.checks.cross_validation import HeldOut, held_out
+from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels, held_out
 from snrmjax.diagnose.checks.patterns import pattern
-from snrmjax.diagnose.checks.verdict import judged, neighbour_noise, not_foretold, unproved
+from snrmjax.diagnose.checks.verdict import (
+    NeighbourNoise,
+    judge_fit,
+    neighbour_noise,
+    refuted_by_levels,
+    unproved_beyond,
+)
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
 from snrmjax.diagnose.search.model_search import FoundEffects
 
 LEVELS, PER_LEVEL = 4, 15
+NOISE = NeighbourNoise(1.0, 0.2)
 LEVEL = np.repeat(np.arange(LEVELS), PER_LEVEL)
 ANGLE = np.tile(np.linspace(-1.0, 1.0, PER_LEVEL), LEVELS)
 N_ROWS = 2 * len(LEVEL)
@@ -54,21 +61,21 @@ def noise(seed=0):
 
 def verdict_on(misfit, rows):
     fit = fit_to(rows)
-    return judged(FoundEffects(misfit, fit, fit, (), ()), *neighbour_noise(misfit, fit))
+    return judge_fit(FoundEffects(misfit, fit, fit, (), ()), neighbour_noise(misfit, fit))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_twice_as_large_everywhere_is_refused_as_noise(seed):
     misfit = misfit_of()
     assert pattern(misfit, fit_to(2 * noise(seed))) is None
-    verdict, reasons = verdict_on(misfit, 2 * noise(seed))
+    verdict, reasons, _ = verdict_on(misfit, 2 * noise(seed))
     assert verdict == "noise_rejected"
     assert "understated" in reasons[0]
 
 
 def test_scatter_that_grows_with_the_level_is_no_noise():
     rows = noise() * np.repeat(1.0 + LEVEL, 2)
-    verdict, reasons = verdict_on(misfit_of(), rows)
+    verdict, reasons, _ = verdict_on(misfit_of(), rows)
     assert verdict == "unknown"
     assert "level 4" in reasons[1]
 
@@ -78,7 +85,7 @@ def test_what_neighbours_along_the_resonance_share_is_no_noise():
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
     shuffled = np.random.default_rng(1).permutation(len(LEVEL))
     mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
-    verdict, reasons = verdict_on(misfit_of(shuffled), mixed)
+    verdict, reasons, _ = verdict_on(misfit_of(shuffled), mixed)
     assert verdict == "unknown"
     assert "along the resonance" in reasons[1]
 
@@ -92,14 +99,14 @@ def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
     misfit = misfit_of()
     found = FoundEffects(misfit, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
     assert found.p_value > 1e-3
-    verdict, reasons = judged(found, 1.0, 0.2)
+    verdict, reasons, _ = judge_fit(found, NOISE)
     assert verdict == "unknown"
     assert "order of the test" in reasons[0]
     misfit.predictions.chosen.noise_stated = False  # then it counts as noise
-    assert judged(found, 1.0, 0.2) == ("named", [])
+    assert judge_fit(found, NOISE) == ("named", (), ())
     misfit.predictions.chosen.noise_stated = True
     plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
-    assert judged(plain, 1.0, 0.2) == ("named", [])
+    assert judge_fit(plain, NOISE) == ("named", (), ())
 
 
 def test_what_neighbours_in_the_test_share_is_no_noise():
@@ -107,7 +114,7 @@ def test_what_neighbours_in_the_test_share_is_no_noise():
         [np.random.default_rng(k).permutation(PER_LEVEL) + PER_LEVEL * k for k in range(LEVELS)]
     )
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
-    verdict, reasons = verdict_on(misfit_of(shuffled), rows)
+    verdict, reasons, _ = verdict_on(misfit_of(shuffled), rows)
     assert verdict == "unknown"
     assert "order of the test" in reasons[1]
 
@@ -122,7 +129,7 @@ def test_the_order_of_rows_does_not_change_the_noise_of_neighbours():
 
 
 def test_a_level_left_out_is_judged_with_what_the_others_leave_open():
-    # With flat priors χ² of all is that of the others plus that of the level foretold from them.
+    # With flat priors χ² of all is that of the others plus that of the level predicted from them.
     rng = np.random.default_rng(3)
     shared = 0.5 * rng.normal(size=(N_ROWS, 2))
     slopes = rng.normal(size=(N_ROWS, 2)) * np.repeat(np.where(LEVEL == 3, 5.0, 0.1), 2)[:, None]
@@ -155,34 +162,34 @@ FINE = HeldOut(3, 5.0, 1.0, 0.5, 0.5)
         (FINE, FINE._replace(after=9.0, p_value=0.0, uncertain_p_value=0.1), True, None),
         (FINE, FINE._replace(level=5, uncertain_p_value=1e-6), False, "level 5"),
         (FINE._replace(after=1.5, p_value=0.01), FINE, False, None),
-        (FINE._replace(after=1.5, p_value=0.01), FINE, True, "imitation"),
-        # Few states: chance may have it, but foretold it is not.
-        (FINE._replace(after=1.35, p_value=0.1), FINE, True, "imitation"),
+        (FINE._replace(after=1.5, p_value=0.01), FINE, True, "another law may act alike"),
+        # Few states: it may be by chance, but the level is not predicted to within the noise.
+        (FINE._replace(after=1.35, p_value=0.1), FINE, True, "another law may act alike"),
         (FINE._replace(after=1.35, p_value=0.1), FINE, False, None),
         (FINE._replace(after=6.0, p_value=0.0), FINE, False, "worse"),
         (FINE._replace(before=0.9, after=1.1, p_value=0.2), FINE, False, None),
     ],
 )
 def test_levels_left_out_speak_against_an_answer(inner, outer, doubted, word):
-    reason = not_foretold(inner, outer, doubted=doubted)
+    reason = refuted_by_levels(HeldOutLevels(inner, outer), doubted=doubted)
     assert reason is None if word is None else word in reason
 
 
 def test_one_of_several_that_fit_should_foretell_a_level_between_others():
     missed = FINE._replace(after=1.45, p_value=0.006, uncertain_p_value=0.006)
-    assert not_foretold(missed, FINE, doubted=False) is None
-    reason = not_foretold(missed, FINE, doubted=False, unclear=True)
+    assert refuted_by_levels(HeldOutLevels(missed, FINE), doubted=False) is None
+    reason = refuted_by_levels(HeldOutLevels(missed, FINE), doubted=False, unclear=True)
     assert "level 3" in reason
     # By noise alone one level in twenty is missed so, and what parameters leave open excuses more.
     for held in (missed._replace(uncertain_p_value=0.05), FINE):
-        assert not_foretold(held, FINE, doubted=False, unclear=True) is None
+        assert refuted_by_levels(HeldOutLevels(held, FINE), doubted=False, unclear=True) is None
 
 
 def test_a_top_level_that_open_parameters_excuse_proves_nothing():
     """A contact's law beyond the levels that put its parameters is anybody's guess."""
-    assert unproved(FINE) is None
-    assert unproved(FINE._replace(after=1.4, p_value=1e-4)) is None
-    doubt = unproved(FINE._replace(after=13.0, p_value=1e-9, uncertain_p_value=0.3))
+    assert unproved_beyond(FINE) is None
+    assert unproved_beyond(FINE._replace(after=1.4, p_value=1e-4)) is None
+    doubt = unproved_beyond(FINE._replace(after=13.0, p_value=1e-9, uncertain_p_value=0.3))
     assert doubt.twin
     assert not doubt.refutes
     assert "nothing proves" in doubt.reason
@@ -202,9 +209,12 @@ def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_gu
     assert neighbour_noise(guessed, fit_to(2 * noise()))[0] == pytest.approx(4.0, rel=0.3)
 
 
-def test_open_parameters_excuse_a_level_foretold_worse_where_parts_are_missing():
+def test_open_parameters_excuse_a_level_predicted_worse_where_parts_are_missing():
     inner, outer = HeldOut(3, 1.4, 1.8, 1e-6, 0.2), HeldOut(4, 5.0, 1.1, 0.3, 0.5)
-    assert "worse than without" in not_foretold(inner, outer, doubted=False)
-    assert not_foretold(inner, outer, doubted=False, parts_missing=True) is None
+    assert "worse than without" in refuted_by_levels(HeldOutLevels(inner, outer), doubted=False)
+    assert refuted_by_levels(HeldOutLevels(inner, outer), doubted=False, parts_missing=True) is None
     certain = inner._replace(uncertain_p_value=8e-4)
-    assert not_foretold(certain, outer, doubted=False, parts_missing=True) is not None
+    assert (
+        refuted_by_levels(HeldOutLevels(certain, outer), doubted=False, parts_missing=True)
+        is not None
+    )

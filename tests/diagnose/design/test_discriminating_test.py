@@ -15,12 +15,12 @@ from snrmjax.diagnose.design.design_points import (
     predicted_test,
     refitted_chi_square,
 )
-from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, requested
-from snrmjax.diagnose.diagnosis import _decide_by
+from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, discriminating_test
+from snrmjax.diagnose.design.recommendation import recommendation
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
-from snrmjax.diagnose.search.model_search import named
+from snrmjax.diagnose.search.model_search import find_effects
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 
 SHAPE, PARTICIPATION, OMEGA, ZETA = 2.0, 3.0, 300.0, 0.01
@@ -96,11 +96,11 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
 def test_design_points_obey_the_law_that_foretells_them():
     predictions = predictions_of(linear_model(), measured())
     misfit, scales = weighted_misfit(predictions), scales_of(predictions)
-    found = named(misfit, scales, ("cubic_damping",))
+    found = find_effects(misfit, scales, ("cubic_damping",))
     (size,) = found.fit.values
     phase = np.radians([-50.0, -10.0, 30.0])
-    foretold = predicted_test(found.misfit, found.fit, (DesignPoints(4, 2.0, phase),), 1e-3)
-    states = foretold.misfit.predictions.chosen.states
+    test = predicted_test(found.misfit, found.fit, (DesignPoints(4, 2.0, phase),), 1e-3)
+    states = test.misfit.predictions.chosen.states
     omega, velocity = np.asarray(states.frequency), np.asarray(states.velocity)[:, 0]
     np.testing.assert_allclose(np.angle(velocity), phase, atol=2e-3)
     speed = np.abs(velocity) / SHAPE
@@ -119,41 +119,41 @@ def test_design_points_obey_the_law_that_foretells_them():
 
 
 def test_the_expected_gain_is_that_of_the_closed_form(ambiguous):
-    request = ambiguous.request
+    test = ambiguous.discriminating_test
     assert set(ambiguous.candidates[0]) == set(THIRD)
-    assert (request.kind, request.quantity, request.harmonics) == ("harmonics", "harmonic 3", (3,))
-    assert request.level == 4
+    assert (test.kind, test.quantity, test.harmonics) == ("harmonics", "harmonic 3", (3,))
+    assert test.place.level == 4
     x = np.abs(np.asarray(measured().velocity)[4 * len(PHASES) :, 0]) / SHAPE / OMEGA
     size, _ = ambiguous.parameters["cubic_damping.coefficient"]
     growth = 0.75 * size * OMEGA**2
     apart = 0.5 * growth * x**3 * SHAPE  # V₃ of both differs by Δδ/2Ω
-    expected = np.sum(apart**2) / (request.harmonic_std**2 / 2)
+    expected = np.sum(apart**2) / (test.harmonic_std**2 / 2)
     # 0.05: what the rival gives way, and Ω that is another one off resonance.
-    assert request.expected_gain == pytest.approx(expected, rel=0.05)
-    assert request.settles
+    assert test.expected_gain == pytest.approx(expected, rel=0.05)
+    assert test.settles
     assert "harmonic 3" in ambiguous.decide_by
     summary = summarise_diagnosis(ambiguous)["request"]
     assert summary["kind"] == "harmonics"
-    assert summary["force_n"] == pytest.approx(request.force)
+    assert summary["force_n"] == pytest.approx(test.place.force)
 
 
 @pytest.mark.parametrize("truth", list(THIRD))
 def test_the_measurement_that_was_asked_for_leaves_the_truth(ambiguous, truth):
-    asked = ambiguous.request
-    data = measured(truth, asked.harmonic_std, (asked.level,))
+    asked = ambiguous.discriminating_test
+    data = measured(truth, asked.harmonic_std, (asked.place.level,))
     found = sj.diagnose_model(linear_model(), data)
     assert found.candidates == ((truth,),)
 
 
 def test_where_no_measurement_would_settle_it_that_is_said():
     predictions = predictions_of(linear_model(), measured())
-    found = named(weighted_misfit(predictions), scales_of(predictions), tuple(THIRD))
-    request = requested(found, (0,))
-    weak = request._replace(expected_gain=0.5 * request.needed_gain)
-    said = _decide_by(found, weak, [], phases=True)
-    assert said.startswith("No single measurement")
-    assert request.sentence in said
-    assert "No single" not in _decide_by(found, request, [], phases=True)
+    found = find_effects(weighted_misfit(predictions), scales_of(predictions), tuple(THIRD))
+    test = discriminating_test(found, (0,))
+    weak = test._replace(expected_gain=0.5 * test.needed_gain)
+    said = recommendation(found, weak, [], phases=True)
+    assert said.startswith("No single test")
+    assert test.sentence in said
+    assert "No single" not in recommendation(found, test, [], phases=True)
 
 
 def test_what_no_test_of_one_mode_separates_needs_a_calibration():

@@ -160,9 +160,9 @@ def test_the_hidden_damping_is_named_without_phases():
     assert found.gap.before > 1.5
     assert out.after - 1 < 0.25 * max(out.before - 1, 1.0)
     assert any("phases of 36 of 36 states are unknown" in note for note in found.notes)
-    assert found.after.shape == (36, 2)
-    assert np.isfinite(found.after[:, 0]).all()
-    assert np.isnan(found.after[:, 1]).all()
+    assert found.force_misfit.after.shape == (36, 2)
+    assert np.isfinite(found.force_misfit.after[:, 0]).all()
+    assert np.isnan(found.force_misfit.after[:, 1]).all()
     # The velocities are put where the answer has them: that is where they were measured.
     measured = np.angle(np.asarray(files("blind_12")[1].velocity)[:, 0])
     model, data = files("blind_12")
@@ -236,9 +236,9 @@ def test_states_with_and_without_phases_stand_side_by_side():
     assert "quadratic_damping" in found.candidates[0]
     assert any("phases of 23 of 45 states" in note for note in found.notes)
     assert "sensor_phase_error.phase_deg" in found.detection_limits
-    assert np.isnan(found.after[::2, 1]).all()
-    assert np.isfinite(found.after[1::2]).all()
-    assert np.isfinite(found.p_value)
+    assert np.isnan(found.force_misfit.after[::2, 1]).all()
+    assert np.isfinite(found.force_misfit.after[1::2]).all()
+    assert np.isfinite(found.checks.p_value)
 
 
 def test_amplitudes_count_once():

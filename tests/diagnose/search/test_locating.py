@@ -8,7 +8,7 @@ import pytest
 from snrmjax.diagnose.checks.doubts import doubts
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.search.locating import located, own_power, power_of_amplitude
+from snrmjax.diagnose.search.locating import located, power_of_amplitude, power_of_answer
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
 OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common
@@ -106,14 +106,14 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
     parts = located(misfit, nothing).parts
     (part,) = (one for one in parts if one.part == "stiffness")
-    own = own_power(misfit, nothing, fit, "stiffness")
-    assert own_power(misfit, nothing, fit, "damping") is None
+    own = power_of_answer(misfit, nothing, fit, "stiffness")
+    assert power_of_answer(misfit, nothing, fit, "damping") is None
     assert abs(part.exponent - 2) > 4 * part.exponent_std
     assert abs(part.exponent - own) < 2 * part.exponent_std
     for seed in range(1, 5):  # what noise leaves is no part of the answer's own
         other = np.random.default_rng(seed).normal(size=2 * n)
         again = nothing._replace(rows=other - law), fit._replace(rows=other)
-        assert own_power(misfit, *again, "stiffness") == own
+        assert power_of_answer(misfit, *again, "stiffness") == own
     (doubt,) = doubts(fit.kinds, parts)
     assert doubt.refutes
     assert doubts(fit.kinds, parts, own_power=own) == []

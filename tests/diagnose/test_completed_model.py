@@ -1,0 +1,71 @@
+"""Completed models, and answers whose parameters are none that a structure can have."""
+
+import json
+
+import numpy as np
+import pytest
+from truth.balanced_sets import OMEGA, ZETA, balanced, linear_model
+
+import snrmjax as sj
+from snrmjax.diagnose.completed_model import CompletedStatus, completed_model
+from snrmjax.io.models import read_model
+from snrmjax.report.diagnosis_report import write_diagnosis
+
+
+def fed(velocity):
+    """A linear damping below zero, −0.2 of the model's, and quadratic damping that outweighs it."""
+    return -1.2 * 2 * ZETA * OMEGA + 120.0 * velocity
+
+
+def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
+    """The model is uncertain of its damping ratio; the data put it below zero."""
+    model, data = linear_model(damping_std=3.0), balanced(fed)
+    found = write_diagnosis(tmp_path, "fed", model, data, simulate=True)
+    assert "quadratic_damping" in found.effects
+    assert found.completed is None
+    assert found.answer.completed_status is CompletedStatus.NOT_PHYSICAL
+    (note,) = (note for note in found.notes if "completed model" in note)
+    assert "damping_ratio" in note
+    ratio = float(note.split("but is ")[1].split(". ")[0])
+    assert ratio == pytest.approx(-0.2 * ZETA, rel=0.1)
+    told = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert told["effects"] == list(found.effects)
+    assert told["gap"]["after"] < 1.2
+    assert (tmp_path / "report.html").exists()
+    assert (tmp_path / "residuals.png").exists()
+    assert not (tmp_path / "model.toml").exists()
+
+
+def test_a_negative_frequency_is_refused_with_a_reason():
+    """A relative shift of −1.4 leaves a natural frequency below zero, which no structure has."""
+    kinds, values = ("linear_frequency_shift",), {"linear_frequency_shift.relative_shift": -1.4}
+    refused = completed_model(linear_model(), {}, kinds, values)
+    assert refused.model is None
+    assert refused.status is CompletedStatus.NOT_PHYSICAL
+    assert "relative_shift" in refused.reason
+    own = {"mode_1.natural_frequency": -3.0}
+    below = completed_model(linear_model(), own, kinds, dict.fromkeys(values, 0.1))
+    assert below.status is CompletedStatus.NOT_PHYSICAL
+    assert "natural_frequency" in below.reason
+
+
+def test_a_model_that_lacks_nothing_stays_as_it_is():
+    model = linear_model()
+    found = completed_model(model, {"mode_1.damping_ratio": 0.02}, (), {})
+    assert found.model is model
+    assert found.status is CompletedStatus.NOTHING_ADDED
+
+
+def test_a_completed_model_has_what_was_found(tmp_path):
+    found = completed_model(
+        linear_model(),
+        {"mode_1.damping_ratio": 0.02},
+        ("cubic_stiffness",),
+        {"cubic_stiffness.coefficient": 7.0},
+    )
+    assert found.status is CompletedStatus.COMPLETED
+    sj.io.write_model(tmp_path / "model.toml", found.model)
+    again = read_model(tmp_path / "model.toml")
+    assert float(again.modes.damping_ratio[0]) == pytest.approx(0.02)
+    assert float(again.effects[0].coefficient) == 7.0
+    assert np.isfinite(float(again.modes.natural_frequency[0]))

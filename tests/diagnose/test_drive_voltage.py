@@ -1,0 +1,75 @@
+"""Diagnoses of states whose force is known as a drive voltage only."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truth.balanced_sets import balanced, linear_model, quadratic
+
+import snrmjax as sj
+from snrmjax.cli import diagnose
+from snrmjax.io.models import write_model
+from snrmjax.io.tables import write_steady_states
+
+GAIN = 0.8  # N/V
+
+
+def driven(data):
+    """The states with the voltage that made their force."""
+    return dataclasses.replace(
+        data,
+        drive=jnp.asarray(data.force) / GAIN,
+        force=jnp.full(data.n_states, jnp.nan),
+        force_std=jnp.full(data.n_states, jnp.nan),
+    )
+
+
+def without_phases(data):
+    """The states with amplitudes alone."""
+    return dataclasses.replace(
+        data,
+        velocity=np.abs(data.velocity) + 0j,
+        phase_std=np.full(data.velocity.shape, np.pi),
+    )
+
+
+def check(found):
+    """The damping is found, and the gain by which it is right."""
+    assert "quadratic_damping" in found.candidates[0]
+    (first, last) = (note for note in found.notes if "N/V" in note)
+    assert "drive voltage" in first
+    answered = float(last.split("gain at ")[1].split(" N/V")[0])
+    assert answered == pytest.approx(GAIN, rel=0.03)
+    # The states are in newtons now.
+    assert np.isfinite(np.asarray(found.data.force)).all()
+
+
+def test_the_python_verb_takes_a_drive_voltage():
+    check(sj.diagnose_model(linear_model(), driven(balanced(quadratic))))
+
+
+def test_a_drive_voltage_without_phases_is_diagnosed():
+    """A joint fit would need the phases, and sends to the diagnosis for want of them."""
+    data = without_phases(driven(balanced(quadratic)))
+    with pytest.raises(ValueError, match="diagnosis"):
+        sj.fit_jointly(data, linear_model())
+    found = sj.diagnose_model(linear_model(), data)
+    assert "quadratic_damping" in found.candidates[0]
+    assert any("the model as given" in note for note in found.notes)
+
+
+def test_command_and_verb_agree(tmp_path):
+    data = driven(balanced(quadratic))
+    write_steady_states(tmp_path / "driven.csv", data)
+    write_model(tmp_path / "linear.toml", linear_model())
+    diagnose([tmp_path / "driven.csv"], tmp_path / "linear.toml", tmp_path / "out", responses=False)
+    told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    found = sj.diagnose_model(linear_model(), data)
+    assert told["effects"] == list(found.effects)
+    assert told["notes"] == list(found.notes)
+    for name, (value, std) in found.parameters.items():
+        # What the file's digits leave.
+        assert told["parameters"][name]["value"] == pytest.approx(value, rel=1e-6)
+        assert told["parameters"][name]["std"] == pytest.approx(std, rel=1e-6)
