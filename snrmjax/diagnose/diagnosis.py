@@ -12,7 +12,7 @@ from snrmjax.diagnose.checks.cross_validation import (
     rms_misfit,
     without_level,
 )
-from snrmjax.diagnose.checks.level_variance import says_of_levels, with_levels_as_found
+from snrmjax.diagnose.checks.level_variance import states_level_errors, with_level_variance
 from snrmjax.diagnose.checks.verdict import (
     Verdict,
     judge,
@@ -81,9 +81,9 @@ def diagnose_model(
     given, levels_note = model, ""
     # Beside a gain that is unknown no joint fit tells what levels scatter.
     tells = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
-    silent = not predictions.chosen.noise_stated and not says_of_levels(model)
+    silent = not predictions.chosen.noise_stated and not states_level_errors(model)
     if silent and tells and predictions.chosen.n_levels > 2:
-        model, levels_note = with_levels_as_found(model, data)
+        model, levels_note = with_level_variance(model, data)
         if levels_note:
             predictions = predictions_of(model, data, force_gain_std)
     misfit = weighted_misfit(predictions)

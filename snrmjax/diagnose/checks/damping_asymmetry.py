@@ -1,4 +1,4 @@
-"""Whether a damping acts in both directions alike, which only even harmonics tell."""
+"""Whether a damping acts equally in both directions, which only even harmonics show."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ _SAMPLES = 256  # of a cycle
 def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
     """Whether harmonic 2 excludes that a damping acts in one direction only.
 
-    Where it does, its force, such as c|q̇|ⁿ⁻¹q̇, has an even part c|q̇|ⁿ beside it.
+    The force of such a one, such as c|q̇|ⁿ⁻¹q̇, has an even part c|q̇|ⁿ beside it.
     """
     chosen = misfit.predictions.chosen
     if not is_drag(kind) or 2 not in chosen.orders or chosen.phase_unknown.any():
@@ -29,7 +29,7 @@ def acts_both_ways(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> bool:
 
 
 def even_share(misfit: WeightedMisfit, fit: EffectFit, kind: str) -> tuple[float, float]:
-    """The even part of a damping over its odd one as harmonic 2 shows it, and 1σ.
+    """Ratio of a damping's even part to its odd part by harmonic 2, and its 1σ.
 
     To first order, (ω₀² − 4Ω² + 4iζω₀Ω) X₂ = −F₂, where F₂ is the second harmonic of the force
     f(|q̇|): c V²/2 for c|q̇|², with the modal velocity V.

@@ -18,12 +18,12 @@ _CURVE = 0.05  # 1σ of an exponent that a free curve of few knots adds
 
 
 class Doubt(NamedTuple):
-    """Why an answer may be an imitation, and what would tell."""
+    """Why another law may explain the data as well, and what would separate them."""
 
     reason: str
     decide_by: str
     refutes: bool = False
-    twin: bool = False  # the other law does the same to all that was measured
+    identical: bool = False  # the other law changes all that was measured alike
 
 
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"
@@ -38,22 +38,22 @@ def doubts(
     feeding: frozenset[str] = frozenset(),
     wide: frozenset[str] = frozenset(),
 ) -> list[Doubt]:
-    """Reasons to doubt the effects that were found, from what was located before any name.
+    """Reasons to doubt the effects that were found.
 
-    `orders` are the harmonics that were measured; `both_ways` are kinds of damping that harmonic 2
-    shows to act in both directions; `own_power` is the power of amplitude that one effect, as
-    fitted, has at the states, which is that of its law to lowest order only; `feeding` are kinds
-    of damping that were found to put energy in; `wide` are internal resonances as `never_seen`
-    has them.
+    Arguments: `located` are the parts of the misfit before any effect was named; `orders` are the
+    measured harmonics; `both_ways` are kinds of damping that by harmonic 2 act in both directions;
+    `own_power` is the power of amplitude of one effect as fitted, which is that of its law to
+    lowest order only; `feeding` are kinds of damping with a negative coefficient, which add
+    energy; `wide` are internal resonances wider than the measured range (`wider_than_measured`).
     """
     found = _of_harmonics(effects, orders, both_ways)
-    # Nothing passive does so; what does has a source, and the law of a loop need not be this one.
+    # Nothing passive adds energy: there is a source, whose law may be another one.
     found += [
         Doubt(
-            f"{kind} below zero feeds the motion: a feedback or a force that lags behind the "
-            "displacement does the same.",
-            "measure with every feedback off, or record the force of the loop",
-            twin=True,
+            f"{kind} with a negative coefficient adds energy: a feedback, or a force that lags "
+            "behind the displacement, does the same.",
+            "measure with every feedback off, or record the feedback's force",
+            identical=True,
         )
         for kind in effects
         if kind in feeding
@@ -68,7 +68,7 @@ def doubts(
     ]
     found += [
         Doubt(
-            f"{kind} is wider than all frequencies measured: nothing was seen of it as a "
+            f"{kind} is wider than the range of frequencies measured: it was not observed as a "
             "resonance, and many laws of amplitude look like one side of it.",
             "step through a wider range of frequencies at the largest level",
         )
@@ -76,20 +76,20 @@ def doubts(
         if kind in wide
     ]
     if len(effects) > 2:
-        found.append(Doubt("three effects together can follow most laws.", _WIDER))
+        found.append(Doubt("three effects together can fit most laws.", _WIDER))
     alike = [pair for pair in combinations(effects, 2) if _act_alike(*pair)]
     if alike:
         found.append(
             Doubt(
-                f"{' and '.join(alike[0])} act on the same part: they may be one law that the "
-                "library does not have.",
+                f"{' and '.join(alike[0])} change the same part of the force balance: together "
+                "they may stand for one law that the library does not have.",
                 _WIDER,
             )
         )
     elif len(effects) > 1 and any(_resonance(kind) for kind in effects):
         found.append(
             Doubt(
-                "a further mode beside another effect can imitate a law that the library does not "
+                "a further mode beside another effect can fit a law that the library does not "
                 "have.",
                 f"step finely through the frequency of the further mode, or {_WIDER}",
             )
@@ -97,7 +97,9 @@ def doubts(
     return found
 
 
-def never_seen(kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray, " state"]) -> bool:
+def wider_than_measured(
+    kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray, " state"]
+) -> bool:
     """Whether an internal resonance is wider than the range of frequencies measured.
 
     Arguments: the further mode's frequency in Hz and damping ratio; frequencies of states in rad/s.
@@ -113,7 +115,7 @@ def never_seen(kind: str, shape: tuple[float, ...], frequency: Float[np.ndarray,
 def _of_harmonics(
     effects: tuple[str, ...], orders: tuple[int, ...], both_ways: frozenset[str]
 ) -> list[Doubt]:
-    """What has the same fundamental, and is told by a harmonic that was not or hardly measured."""
+    """Laws with the same fundamental, where the harmonic that separates them is not known well."""
     found = []
     mine = [kind for kind in effects if is_drag(kind) and kind not in both_ways]
     if mine:
@@ -122,7 +124,7 @@ def _of_harmonics(
             Doubt(
                 f"a damping that acts in one direction only has the same fundamental as {mine[0]}.",
                 f"record harmonic 2 at the largest level{closer}",
-                twin=True,
+                identical=True,
             )
         )
     found += [
@@ -135,7 +137,7 @@ def _of_harmonics(
 
 
 def _doubt(one: Imitation) -> Doubt:
-    return Doubt(one.reason, one.separated_by, twin=one.identical)
+    return Doubt(one.reason, one.separated_by, identical=one.identical)
 
 
 def _resonance(kind: str) -> type[AbstractInternalResonance] | None:
@@ -175,7 +177,7 @@ def _power_law(kind: str) -> Shape | None:
 
 
 def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | None) -> list[Doubt]:
-    """The power of amplitude that was located, against that of the law that was named."""
+    """The power of amplitude in the data, compared with that of the law that was named."""
     law = _power_law(effect)
     if law is None or law.power is None:
         return []
@@ -187,7 +189,7 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
     if abs(exponent - expected) > _CONTRADICTED * std:
         reason = (
             f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
-            f"which is not the {expected:.3g} of {effect}."
+            f"not with the power {expected:.3g} of {effect}."
         )
         return [Doubt(reason, _WIDER, refutes=True)]
     return [

@@ -1,4 +1,4 @@
-"""What levels differ by, where nobody says anything of errors."""
+"""Level-to-level variance, estimated where no uncertainty is stated."""
 
 import dataclasses
 
@@ -8,21 +8,21 @@ import numpy as np
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
-_MOST = 0.2  # 1σ of a deviation, beyond which smooth curves were not those of the structure
+_MOST = 0.2  # 1σ of a deviation, beyond which the smooth curves do not describe the structure
 
 
-def says_of_levels(model: Structure) -> bool:
-    """Whether a model states any error that the states of a level share."""
+def states_level_errors(model: Structure) -> bool:
+    """Whether a model states any error that the states of one level share."""
     return any(std > 0 for std in model.level_stds)
 
 
-def with_levels_as_found(model: Structure, data: SteadyStates) -> tuple[Structure, str]:
-    """The model with the errors of levels that a joint fit of smooth curves finds, and a sentence.
+def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure, str]:
+    """The model with level-to-level errors by a joint fit of smooth curves, and a note.
 
-    Curves of amplitude of any shape know nothing of the physics: what differs from level to level
-    beside them is no law of amplitude. Restricted likelihood says whether there is any. The model
-    as it is, and nothing, where there is none, where levels differ by more than those of one
-    structure can, or where no smooth curves are found.
+    Smooth curves of amplitude follow any law: what differs from level to level beside them is no
+    function of amplitude. Its variance is estimated by restricted maximum likelihood. Returns the
+    model unchanged and no note where that is zero, where levels differ by more than those of one
+    structure can, or where the joint fit fails.
     """
     # Few diagnoses need it, and it takes long to import.
     from snrmjax.identify.inference.fitted_curves import values_at_displacement
@@ -44,7 +44,7 @@ def with_levels_as_found(model: Structure, data: SteadyStates) -> tuple[Structur
         level_damping_std=jnp.asarray(damping * modal_damping / (2 * omega)),
     )
     return widened, (
-        f"no error of levels is stated: smooth curves leave them different by "
+        f"no errors of levels are stated: beside smooth curves of amplitude the levels differ by "
         f"{in_words(fit.level_std)} (1σ), which is taken for errors that the states of a level "
         "share."
     )

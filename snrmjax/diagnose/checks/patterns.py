@@ -1,4 +1,4 @@
-"""What is left of a fit, if it has an order: noise has none, of whatever size it is."""
+"""Patterns in the misfit that a fit leaves: noise has none, whatever its size."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,11 +11,11 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 UNLIKELY = 1e-3
 _OF_AMPLITUDE, _OF_TEST = 6, 8  # knots of free curves
-_RESOLUTION = 1e-6  # of singular values: curves that an answer has already
+_RESOLUTION = 1e-6  # of singular values: directions that an answer has already
 
 
 def pattern(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
-    """Why what is left cannot be noise of any one size; None where it can."""
+    """Why the misfit that is left cannot be noise of any one size; None where it can."""
     left = misfit.noise.without_shared(fit.rows)
     for reason in (
         _by_level(misfit, left),
@@ -28,12 +28,12 @@ def pattern(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
 
 
 def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
-    """Which free curve still explains something beside an answer; None where chance does as much.
+    """Which free curve still explains a part of the misfit beside an answer; None if none does.
 
-    Stiffness and damping may change with the amplitude as they like, and the stiffness with the
-    order of the test: a law that is nearly right, or a drift that is no straight line, leaves
-    little of χ² and all of it in such a curve. The answer's own parameters stay free, and Fisher's
-    ratio asks for no noise of the stated size.
+    Stiffness and damping are free functions of amplitude, and the stiffness one of the order of
+    the test: a law that is nearly right, or a drift that is not linear, leaves little of χ² and
+    all of it in such a curve. The answer's own parameters stay free. Fisher's ratio does not
+    depend on the size of the noise.
     """
     chosen, noise = misfit.predictions.chosen, misfit.noise
     if chosen.phase_unknown.any():
@@ -64,8 +64,8 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     if chance * len(curves) >= UNLIKELY:
         return None
     return (
-        f"{name} still explains a part of what is left (by chance with a probability of "
-        f"{chance:.0e}): the law is another one."
+        f"{name} still explains a part of the misfit that is left (probability by chance "
+        f"{chance:.0e}): the true law is another one."
     )
 
 
@@ -83,17 +83,17 @@ def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | 
             name = misfit.level_numbers[int(level[mine][0])]
             what = "the force" if of_force[mine][0] else "the harmonics"
             return (
-                f"what is left of {what} at level {name} is {np.sqrt(ratio):.2g} times as large as "
-                "elsewhere: noise of one size it is not."
+                f"the misfit of {what} that is left at level {name} is {np.sqrt(ratio):.2g} times "
+                "as large as elsewhere: it is not noise of one size."
             )
     return None
 
 
 def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
-    """Misfits of the force along what a natural frequency would do, larger than those across.
+    """Misfits of the force in the direction of a frequency change, larger than those across it.
 
-    Noise of one size is the same in every direction of whitened parts; a structure whose natural
-    frequency is another one for every state, by its temperature for example, has one direction.
+    Noise of one size is the same in every direction of whitened parts; a natural frequency that
+    differs from state to state, with temperature for example, has one direction.
     """
     noise = misfit.noise
     force = np.full((len(noise.known), 2), np.nan)
@@ -112,14 +112,14 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
     if not fdtrc(len(with_it), len(with_it), ratio) < UNLIKELY:
         return None
     return (
-        f"what is left is {np.sqrt(ratio):.2g} times as large along a change of the natural "
-        "frequency as across it: noise of one size it is not. Were the states of a level measured "
-        "at different temperatures?"
+        f"the misfit that is left is {np.sqrt(ratio):.2g} times as large in the direction of a "
+        "change of the natural frequency as across it: it is not noise of one size. Were the "
+        "states of a level measured at different temperatures?"
     )
 
 
 def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | None:
-    """Misfits that neighbours along a level share."""
+    """Misfits that are correlated between neighbouring states of a level."""
     for of_test in (True, False):
         parts = list(along(misfit, left, of_test=of_test))
         number = sum(max(len(some) - 1, 0) for some in parts)
@@ -130,8 +130,8 @@ def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> s
         if ndtr(-common * np.sqrt(number)) < UNLIKELY / 2:
             order = "in the order of the test" if of_test else "along the resonance"
             return (
-                f"neighbours {order} are left with like misfits (correlation {common:.2f}): noise "
-                "has none."
+                f"the misfits of neighbouring states {order} are correlated ({common:.2f}): those "
+                "of noise are not."
             )
     return None
 
@@ -141,7 +141,8 @@ def along(
 ) -> Iterator[Float[np.ndarray, " state"]]:
     """Rows of the force, level by level, along the resonance or in the order of the test.
 
-    Along a resonance that bends over the phase of the velocity is what never turns back.
+    Along the resonance states are ordered by the phase of the velocity, which is monotonic even
+    where a resonance bends over.
     """
     noise, chosen = misfit.noise, misfit.predictions.chosen
     level = np.asarray(chosen.states.level)
@@ -156,13 +157,13 @@ def along(
 
 
 def _hats(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndarray, "state knot"]:
-    """Curves of straight pieces with as many states between any two knots."""
+    """Piecewise linear curves with equally many states between any two knots."""
     at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
     return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
 
 
 def _basis(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row any"]:
-    """Orthonormal columns that span the same."""
+    """Orthonormal columns with the same span."""
     size = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(size > 0, size, 1.0)
     if not columns.shape[1]:

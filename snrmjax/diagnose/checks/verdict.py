@@ -14,7 +14,7 @@ from scipy.special import chdtr
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels
 from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
-from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, never_seen, part_of
+from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, part_of, wider_than_measured
 from snrmjax.diagnose.checks.patterns import UNLIKELY, along, left_curve, pattern
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
@@ -136,7 +136,7 @@ def judge(
         return Judgement(verdict, reasons, tuple(open_questions))
     missed = refuted_by_levels(
         levels,
-        doubted=not all(doubt.twin for doubt in open_questions),
+        doubted=not all(doubt.identical for doubt in open_questions),
         unclear=any(len(group) > 1 for group in found.classes),
         parts_missing=bool(found.misfit.predictions.chosen.phase_unknown[:, 0].any()),
     )
@@ -211,7 +211,7 @@ def _doubts(found: FoundEffects, located: tuple[Located, ...]) -> list[Doubt]:
         frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind)),
         power_of_answer(misfit, found.baseline, fit, part) if part else None,
         frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0),
-        frozenset(k for k in fit.kinds if never_seen(k, fit.of_kind(k)[1:], stepped)),
+        frozenset(k for k in fit.kinds if wider_than_measured(k, fit.of_kind(k)[1:], stepped)),
     )
 
 
@@ -311,5 +311,5 @@ def unproved_beyond(outer: HeldOut) -> Doubt | None:
         "noise, which the uncertainty of the parameters from the other levels allows: nothing "
         "proves the law there.",
         f"measure levels between level {outer.level} and the one below it, or above it",
-        twin=True,
+        identical=True,
     )

@@ -1,4 +1,4 @@
-"""Where model and data disagree, before any name: stiffness, damping, harmonics, or neither."""
+"""Which part of the force balance disagrees: stiffness, damping, harmonics, or none of them."""
 
 from typing import NamedTuple
 
@@ -11,22 +11,22 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
-_SEEN = 2.0  # 1σ of a free curve beyond which an amplitude belongs to the range
+_SEEN = 2.0  # 1σ beyond which a free curve counts as changed at an amplitude
 _P_VALUE = 1e-3
 _STEP = 0.01
 _POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
-_TELLING = 16.0  # of χ², that a power must explain before it is told
+_TELLING = 16.0  # of χ², that a power must explain to be reported
 _RULE = StepRule(steps=30, settled=0.02)  # of a fit of curves to sizes
 _STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
 class Located(NamedTuple):
-    """One part of the disagreement."""
+    """One part of the force balance in which model and data disagree."""
 
     part: str
     velocity_range: tuple[float, float]  # m/s
     p_value: float
-    exponent: float | None = None  # of the change against amplitude
+    exponent: float | None = None  # power of amplitude with which the part changes
     exponent_std: float | None = None
 
 
@@ -39,15 +39,15 @@ class FreeFit(NamedTuple):
 
     @property
     def p_value(self) -> float:
-        """Of what no function of amplitude explains."""
+        """Probability by chance of what no function of amplitude explains."""
         return chi_square_p_value(self.chi_square, self.freedom)
 
 
 def located(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
-    """Fit free curves of stiffness and damping to the force, and judge every part by itself.
+    """Fit free curves of stiffness and damping to the force, and test every part by itself.
 
-    Where sizes alone are compared, states off resonance tell the stiffness and those near it the
-    damping: a part that hides behind the other is not told.
+    Where sizes alone are compared, states off resonance determine the stiffness and those near it
+    the damping: a part that the other one can explain as well is not reported.
     """
     noise, states = misfit.noise, misfit.predictions.states
     speed = np.abs(states.velocity[:, 0])
@@ -65,7 +65,8 @@ def located(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     together = _curves(misfit, rows, hats, [0, 1])
     fits = [force.fitted(together, start) for start in starts]
     free, values, covariance = min(fits, key=lambda fit: fit[0])
-    if np.any(together.weight > 0):  # sizes bend: what curves of few knots leave is doubt as well
+    # Sizes are not linear: what curves of few knots leave adds uncertainty.
+    if np.any(together.weight > 0):
         covariance = covariance * max(free / max(int(of_force.sum()) - 2 * _FREE, 1), 1.0)
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
@@ -123,7 +124,7 @@ def power_of_answer(
 
 
 class _Curves(NamedTuple):
-    """Rows with free curves on top of the baseline: linear in them, but for sizes."""
+    """Rows with free curves added to the baseline: linear in them, except for sizes."""
 
     rows: Float[np.ndarray, " row"]
     arms: Float[np.ndarray, "row value"]
@@ -191,7 +192,7 @@ class _Rows:
     def fitted(
         self, curves: _Curves, start: Float[np.ndarray, " value"]
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """χ², values and their covariance; Levenberg–Marquardt from a start where sizes count."""
+        """χ², values and their covariance; by Levenberg–Marquardt where sizes are compared."""
         if not np.any(curves.weight > 0):
             return self.chi_square(curves.rows, curves.arms)
 
@@ -222,10 +223,10 @@ def _range(
 def power_of_amplitude(
     logarithm: np.ndarray, values: np.ndarray, covariance: np.ndarray
 ) -> tuple[float | None, float | None]:
-    """The power of amplitude that a free curve follows, and 1σ; None where it follows no power.
+    """The power of amplitude that a free curve follows, and 1σ; None where it follows none.
 
-    Least squares on the curve itself with all its covariance: what the linear parameters leave
-    open moves every amplitude alike, and small changes are kept although they are not seen.
+    Least squares on the curve with its full covariance: uncertainty of the linear parameters
+    moves every amplitude alike, and changes that are not significant by themselves are kept.
     """
     straight = (_STRAIGHT * values) ** 2 + 1e-12 * np.trace(covariance)
     doubt = covariance + np.diag(straight)

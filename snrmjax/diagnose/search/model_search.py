@@ -1,4 +1,4 @@
-"""Which effects the data ask for, and which others they cannot tell from them."""
+"""Stepwise search for the effects that explain a misfit, and for those that fit equally well."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,19 +16,23 @@ from snrmjax.diagnose.misfit.effect_fit import (
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.screening import foretold, foretold_pairs
+from snrmjax.diagnose.search.screening import screened, screened_pairs
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.blocks import over_cores
 from snrmjax.numerics.levenberg_marquardt import FitStatus
 
-DETECTED = 10.0  # of the criterion: what an effect must gain to be believed
-AS_GOOD = 6.0  # of the criterion: what separates an effect from those it may be
-_PROMISING = 40.0  # of the criterion: within it a candidate is weighed anew
-_DOUBTFUL = 0.05  # probability of a fit below which pairs without the best one are fitted too
+DETECTED = 10.0
+"""Gain of Schwarz's criterion from which on an effect counts as detected."""
+
+AS_GOOD = 6.0
+"""Difference of Schwarz's criterion within which two models count as equally good."""
+
+_NEAR = 40.0  # of the criterion: candidates that far behind the best are fitted again
+_DOUBTFUL = 0.05  # probability of a fit below which pairs without the best effect are fitted
 _REFUTED = 1e-3  # probability of a pair below which a third effect is looked for
 _PAIRS = 8  # that are fitted from their own starts
-_ONE = 2  # parameters of one effect; one with more is weighed against two effects
+_ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
@@ -40,24 +44,26 @@ class TriedEffect(NamedTuple):
     """A candidate that one step of the search compared."""
 
     kind: str
-    gain: float  # of the criterion over what was there before
+    gain: float  # fall of Schwarz's criterion from what was there before
     chi_square: float
     parameters: dict[str, float]
     status: FitStatus
 
 
 class FoundEffects(NamedTuple):
-    """What the data ask for."""
+    """The effects that a search found."""
 
     misfit: WeightedMisfit  # with errors passed on as the answer passes them
     fit: EffectFit
     baseline: EffectFit
-    classes: tuple[tuple[str, ...], ...]  # of every effect, itself first
+    classes: tuple[
+        tuple[str, ...], ...
+    ]  # of every effect: itself, then those that fit equally well
     table: tuple[tuple[TriedEffect, ...], ...]  # of every step
 
     @property
     def p_value(self) -> float:
-        """Of the misfit that is left."""
+        """Probability by chance of at least the misfit that is left."""
         freedom = self.misfit.n_rows - len(self.fit.values)
         return chi_square_p_value(self.fit.chi_square, freedom)
 
@@ -65,27 +71,27 @@ class FoundEffects(NamedTuple):
 def find_effects(
     misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]
 ) -> FoundEffects:
-    """Add effects one after the other while the criterion asks for them, three at most.
+    """Add effects one by one while Schwarz's criterion falls by `DETECTED`, at most three.
 
-    A linear mode close by has three numbers of its own and would follow a part of most laws: it
-    is no candidate, but what it may have caused is compared with it.
+    A close linear mode has three parameters of its own and could follow a part of most laws: it
+    is not searched for, but an answer that it could have caused is compared with it.
     """
     every = {kind: candidate(kind, scales) for kind in kinds}
     alternatives = [every.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
     found = _searched(misfit, every)
     for one in alternatives:
-        found = _questioned(found, one, every)
+        found = _compared_with(found, one, every)
     return found
 
 
-def _questioned(
+def _compared_with(
     found: FoundEffects, close: EffectCandidate, every: dict[str, EffectCandidate]
 ) -> FoundEffects:
-    """The answer, unless a close mode is a better one; where it is as good, it is another reading.
+    """The answer, or a close mode where that fits better; where it fits equally well, both.
 
-    It is asked in place of all that was found, in place of what acts like it, and beside what does
-    not fit. Nothing is asked where nothing was found, nor of a single nonlinearity that fits: a
-    linear mode does the same at every level.
+    The mode is fitted in place of all effects, in place of the linear ones, and beside an answer
+    that does not fit. It is not compared where nothing was found, nor with a single nonlinearity
+    that fits: a linear mode does the same at every level.
     """
     misfit, fit = found.misfit, found.fit
     alike = [kind for kind in fit.kinds if EFFECTS[kind].is_linear]
@@ -118,9 +124,9 @@ def _questioned(
 def _replaced(
     found: FoundEffects, close: EffectCandidate, every: dict[str, EffectCandidate], best: EffectFit
 ) -> FoundEffects:
-    """The answer with a close mode, weighed with it; each class of what stays is tried beside it.
+    """The answer with a close mode, with errors passed on by it; other effects are chosen again.
 
-    The one before where the new one's own way of passing on errors refutes it.
+    The former answer where the new one no longer fits with its own propagation of errors.
     """
     misfit, pool = with_errors_passed_on(found.misfit, best), every | {close.kind: close}
     beside = _only(misfit, pool, best, best.kinds[:-1])
@@ -143,7 +149,7 @@ def _replaced(
 def _only(
     misfit: WeightedMisfit, every: dict[str, EffectCandidate], fit: EffectFit, kinds: Sequence[str]
 ) -> EffectFit:
-    """Some of the effects of a fit by themselves."""
+    """A fit with some of the effects of another one only."""
     found = baseline_fit(misfit)
     for kind in kinds:
         found = fit_effect(misfit, _where(every, fit, kind), found)
@@ -180,13 +186,13 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     alone = [_alone(misfit, every, kind, pair) for kind in pair.kinds]
     simple = min(alone, key=lambda fit: fit.criterion(misfit.n_rows))
     if _gain(misfit, simple, fit_effect(misfit, *_rest(every, simple, pair))) <= DETECTED:
-        # What two seemed to be is one that no start had come near to.
+        # One effect explains what two seemed to: no start had come near it.
         others = [f for f in singles if f.kinds != simple.kinds]
         fits = fit_effects(misfit, [(_from(every, f), nothing) for f in others])
         one = _simplest(misfit, [simple, *fits])
         answers = (_class(misfit, [simple, *fits], one.kinds[0]),)
         return FoundEffects(misfit, one, nothing, answers, tuple(table))
-    # Each is chosen anew beside the other: the first one beside the second, then the reverse.
+    # Each is chosen again beside the other: the first beside the second, then the reverse.
     classes: list[tuple[str, ...]] = []
     kind, other = pair.kinds[0], alone[1]
     for place in range(2):
@@ -202,12 +208,12 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         if place == 0:
             kind, chosen = pair.kinds
             other = alone[0] if chosen == alone[0].kinds[0] else _alone(misfit, every, chosen, pair)
-    if single:  # one effect with more parameters is another reading of both
+    if single:  # one effect with more parameters fits equally well as both
         best = fit_effect(misfit, _from(every, best))
         if _gain(misfit, best, pair) < AS_GOOD and best.kinds[0] not in classes[0]:
             classes[0] = (*classes[0], *best.kinds)
     if _is_below(misfit, pair, _REFUTED) and of_one.p_value > _REFUTED:
-        return of_one  # weighed with its own way of passing on errors the pair is worse
+        return of_one  # with errors passed on by itself the pair no longer fits
     if _is_below(misfit, pair, _REFUTED):
         thirds = fit_effects(misfit, [(c, pair) for c in _promising(misfit, every, pair)])
         third = min(thirds, key=lambda fit: fit.criterion(misfit.n_rows), default=pair)
@@ -221,16 +227,18 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
 def _pairs(
     misfit: WeightedMisfit, every: dict[str, EffectCandidate], most: int | None = None
 ) -> list[EffectFit]:
-    """Fits of the two kinds each that promise most, from starts of their own.
+    """Fits of the pairs of effects with the largest expected gain, from their own starts.
 
-    With at most so many parameters.
+    Of pairs with at most `most` parameters.
     """
-    promised = [
+    screened_ones = [
         (one, two)
-        for _, one, two in foretold_pairs(misfit, list(every.values()))
+        for _, one, two in screened_pairs(misfit, list(every.values()))
         if most is None or len(one.unit) + len(two.unit) <= most
     ]
-    return fit_effects(misfit, [(two, unfitted(misfit, one)) for one, two in promised[:_PAIRS]])
+    return fit_effects(
+        misfit, [(two, unfitted(misfit, one)) for one, two in screened_ones[:_PAIRS]]
+    )
 
 
 def _is_below(misfit: WeightedMisfit, fit: EffectFit, probability: float) -> bool:
@@ -240,13 +248,13 @@ def _is_below(misfit: WeightedMisfit, fit: EffectFit, probability: float) -> boo
 def _promising(
     misfit: WeightedMisfit, every: dict[str, EffectCandidate], before: EffectFit
 ) -> list[EffectCandidate]:
-    """The candidates of which one start, scaled, would explain most of what is left.
+    """The candidates of which one start, scaled, is expected to explain most of what is left.
 
-    Starts are coarse: what explains a quarter of what the best one explains may yet win.
+    Starts are coarse: a candidate with a quarter of the largest expected gain may still win.
     """
     others = [c for kind, c in every.items() if kind not in before.kinds]
     over_cores(misfit.start_changes, others)  # many short programs
-    changes = [foretold(misfit, c, before) for c in others]
+    changes = [screened(misfit, c, before) for c in others]
     changes.sort(key=lambda pair: -pair[0])
     share = _SHARE_OF_SIZES if misfit.predictions.sizes.alone.any() else _SHARE
     least = max(_WORTH, share * max((gain for gain, _ in changes), default=0.0))
@@ -271,19 +279,19 @@ def _tried(
         return misfit, fits, rows
     least = best.criterion(misfit.n_rows)
     again = with_errors_passed_on(misfit, best)
-    reach = least + max(_PROMISING, 0.5 * best.chi_square)
+    reach = least + max(_NEAR, 0.5 * best.chi_square)
     near = [fit for fit in fits if fit.criterion(misfit.n_rows) < reach]
     nothing = baseline_fit(again)
     return again, fit_effects(again, [(_from(every, fit), nothing) for fit in near]), rows
 
 
 def _also_from(one: EffectCandidate, pair: EffectFit) -> EffectCandidate:
-    """A candidate that also begins where it stands in a pair."""
+    """A candidate that also begins at its parameters in a pair."""
     return one._replace(starts=(*one.starts, pair.of_kind(one.kind)))
 
 
 def _where(every: dict[str, EffectCandidate], pair: EffectFit, kind: str) -> EffectCandidate:
-    """A candidate that begins where it stands in a pair."""
+    """A candidate that begins at its parameters in a pair."""
     return every[kind]._replace(starts=(pair.of_kind(kind),))
 
 
@@ -296,7 +304,7 @@ def _alone(
 def _rest(
     every: dict[str, EffectCandidate], first: EffectFit, pair: EffectFit
 ) -> tuple[EffectCandidate, EffectFit]:
-    """The other one of a pair, and what it is fitted beside."""
+    """The other one of a pair, and the fit beside which it is fitted."""
     (kind,) = set(pair.kinds) - set(first.kinds)
     return _also_from(every[kind], pair), first
 
@@ -311,10 +319,10 @@ def _gain(misfit: WeightedMisfit, before: EffectFit, after: EffectFit) -> float:
 
 
 def _simplest(misfit: WeightedMisfit, fits: list[EffectFit]) -> EffectFit:
-    """Of the fits that are about as good as the best, one with the fewest parameters.
+    """Of the fits that are equally good as the best, one with the fewest parameters.
 
-    A further mode or a threshold can be laid where chance bends the data; no criterion that
-    counts parameters charges for the choice of place.
+    A further mode or a threshold can be placed where the data deviate by chance; a criterion that
+    counts parameters does not account for the choice of the place.
     """
     least = min(fit.criterion(misfit.n_rows) for fit in fits)
     near = [fit for fit in fits if fit.criterion(misfit.n_rows) < least + AS_GOOD]
@@ -324,7 +332,7 @@ def _simplest(misfit: WeightedMisfit, fits: list[EffectFit]) -> EffectFit:
 def _class(
     misfit: WeightedMisfit, fits: list[EffectFit], kind: str, at: int = 0
 ) -> tuple[str, ...]:
-    """The kinds that cannot be told from one, itself first."""
+    """The kinds that fit equally well as one, itself first."""
     order = sorted(fits, key=lambda fit: fit.criterion(misfit.n_rows))
     least = order[0].criterion(misfit.n_rows)
     near = [f.kinds[at] for f in order if f.criterion(misfit.n_rows) < least + AS_GOOD]

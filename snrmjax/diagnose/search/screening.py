@@ -1,4 +1,4 @@
-"""Which candidates are worth a fit: what their starts, scaled, would explain."""
+"""Screening of candidates: the gain that is expected if their starts are scaled to fit best."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 _KEPT = 2  # starts of a candidate
 _SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
-_TIMES = 3  # that a kind stands in pairs
+_TIMES = 3  # that a kind may be in pairs
 _ALIKE = 1e-3  # 1 − cos² between changes, less than which is not relied upon
 
 
-def foretold(
+def screened(
     misfit: WeightedMisfit, candidate: EffectCandidate, beside: EffectFit
 ) -> tuple[float, EffectCandidate]:
-    """How much χ² would fall if the best start were scaled as it fits, and the best starts.
+    """The expected fall of χ² if the best start is scaled to fit best, and the best starts.
 
-    These are the candidate's own, scaled so.
+    Returns the fall and the candidate with its best starts so scaled.
     """
     changes = misfit.noise.noise_units(misfit.start_changes(candidate))
     if beside.slopes.shape[1]:
@@ -41,13 +41,13 @@ def foretold(
     return float(np.max(gains)), candidate._replace(starts=starts)
 
 
-def foretold_pairs(
+def screened_pairs(
     misfit: WeightedMisfit, candidates: Sequence[EffectCandidate]
 ) -> list[tuple[float, EffectCandidate, EffectCandidate]]:
-    """How much the criterion would fall if a start each of two kinds were scaled as both fit.
+    """The expected fall of Schwarz's criterion if starts of two effects are scaled to fit best.
 
-    Of every two kinds the best starts, scaled so; the best two first. No kind stands in more than
-    a few pairs: a strong one would fill them all.
+    Of every two effects the best starts, so scaled; the best pair first. No effect is in more
+    than a few pairs: a strong one would be in all of them.
     """
     rows = [misfit.noise.noise_units(misfit.start_changes(c)) for c in candidates]
     whose = np.repeat(np.arange(len(candidates)), [len(some) for some in rows])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.checks.doubts import doubts, never_seen
+from snrmjax.diagnose.checks.doubts import doubts, wider_than_measured
 from snrmjax.diagnose.misfit.candidates import decide_by
 from snrmjax.diagnose.search.locating import Located
 
@@ -53,20 +53,20 @@ def test_imitations_are_marked_with_what_would_decide(effects):
 
 def test_a_mode_close_by_is_a_twin_of_much():
     (doubt,) = doubts(("close_mode",), ())
-    assert doubt.twin
+    assert doubt.identical
     assert "second sensor" in doubt.decide_by
 
 
 def test_an_internal_resonance_wider_than_the_frequencies_measured_was_never_seen():
     kind, stepped = "internal_resonance_1_3", 2 * np.pi * np.array([49.0, 50.0, 51.0])
     # Half-power points of a mode of 150 Hz and 1 %: 3 Hz apart, passed by the force within 1 Hz.
-    assert not never_seen(kind, (150.0, 0.01), stepped)
-    assert never_seen(kind, (150.0, 0.021), stepped)
-    assert never_seen("internal_resonance_1_2", (150.0, 0.015), stepped)
-    assert not never_seen("gap_stiffness", (0.1,), stepped)
+    assert not wider_than_measured(kind, (150.0, 0.01), stepped)
+    assert wider_than_measured(kind, (150.0, 0.021), stepped)
+    assert wider_than_measured("internal_resonance_1_2", (150.0, 0.015), stepped)
+    assert not wider_than_measured("gap_stiffness", (0.1,), stepped)
     assert doubts((kind,), ()) == []
     (doubt,) = doubts((kind,), (), wide=frozenset({kind}))
-    assert not doubt.twin
+    assert not doubt.identical
     assert not doubt.refutes
     assert "wider range" in doubt.decide_by
 
@@ -74,7 +74,7 @@ def test_an_internal_resonance_wider_than_the_frequencies_measured_was_never_see
 @pytest.mark.parametrize("orders", [(), (2, 3)])
 def test_damping_of_one_direction_is_a_twin_until_harmonic_2_excludes_it(orders):
     (doubt,) = doubts(("quadratic_damping",), grows("damping", 1.0), orders)
-    assert doubt.twin
+    assert doubt.identical
     assert "one direction" in doubt.reason
     assert ("less noise" in doubt.decide_by) == bool(orders)
 
@@ -87,14 +87,14 @@ def test_damping_that_feeds_the_motion_may_be_a_loop():
     assert fed == pytest.approx(1.0)  # q̇³ with the coefficient −1
     feeding = frozenset({"van_der_pol_damping"})
     (doubt,) = doubts(("van_der_pol_damping",), (), (2, 3), feeding=feeding)
-    assert doubt.twin
+    assert doubt.identical
     assert "feedback" in doubt.reason
     assert doubts(("van_der_pol_damping",), (), (2, 3)) == []
 
 
 def test_a_sensor_that_saturates_is_told_by_harmonic_3():
     (doubt,) = doubts(("mode_shape_change",), (), ())
-    assert not doubt.twin
+    assert not doubt.identical
     assert doubts(("mode_shape_change",), (), (2, 3)) == []
 
 

@@ -8,7 +8,7 @@ from truth.balanced_sets import OMEGA, PARTICIPATION, SHAPE, ZETA, balanced, lin
 
 import snrmjax as sj
 from snrmjax.diagnose import diagnosis
-from snrmjax.diagnose.checks.level_variance import with_levels_as_found
+from snrmjax.diagnose.checks.level_variance import with_level_variance
 
 LEVELS, SHIFT, SEED = 6, 4e-3, 3
 
@@ -42,7 +42,7 @@ def test_levels_that_differ_hide_no_effect_and_make_none(found):
 
 
 def test_the_differences_are_those_that_were_put_in(found):
-    (note,) = (note for note in found.notes if note.startswith("no error of levels"))
+    (note,) = (note for note in found.notes if note.startswith("no errors of levels"))
     assert "natural frequency" in note
     put_in = SHIFT * np.random.default_rng([SEED, 1]).normal(size=LEVELS)
     size = float(found.completed.level_frequency_std) / OMEGA
@@ -53,7 +53,7 @@ def test_the_differences_are_those_that_were_put_in(found):
 
 def test_levels_that_agree_are_not_said_to_differ():
     model = linear_model()
-    same, note = with_levels_as_found(model, silent(balanced(quadratic, seed=SEED)))
+    same, note = with_level_variance(model, silent(balanced(quadratic, seed=SEED)))
     assert note == ""
     assert same is model
 
@@ -83,7 +83,7 @@ def test_errors_of_levels_are_looked_for_where_nothing_is_said(
     def stop(predictions):
         raise Reached
 
-    monkeypatch.setattr(diagnosis, "with_levels_as_found", seen)
+    monkeypatch.setattr(diagnosis, "with_level_variance", seen)
     monkeypatch.setattr(diagnosis, "weighted_misfit", stop)
     given = balanced(quadratic, seed=SEED, levels=LEVELS, shift=SHIFT) if stated else data
     with pytest.raises(Reached):

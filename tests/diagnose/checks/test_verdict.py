@@ -190,7 +190,7 @@ def test_a_top_level_that_open_parameters_excuse_proves_nothing():
     assert unproved_beyond(FINE) is None
     assert unproved_beyond(FINE._replace(after=1.4, p_value=1e-4)) is None
     doubt = unproved_beyond(FINE._replace(after=13.0, p_value=1e-9, uncertain_p_value=0.3))
-    assert doubt.twin
+    assert doubt.identical
     assert not doubt.refutes
     assert "nothing proves" in doubt.reason
     assert "level 3" in doubt.decide_by
