@@ -18,7 +18,7 @@ _REACH = 0.3  # of the measured range of frequencies, added at both ends
 
 
 class PhaseResonance(NamedTuple):
-    """Where a response is in phase with its force; NaN for what a test or a curve does not have."""
+    """Where a response is in phase with its force; NaN where there is no such state."""
 
     frequency: float  # Hz
     velocity: float  # m/s

@@ -1,9 +1,9 @@
-"""Velocities of which the amplitude alone is known: what of a state is compared, and what is lost.
+"""Velocities of which only the amplitude is known: what is compared of a state, and what is lost.
 
-A motion has its force, whatever the time is counted from: where the phase of a velocity is not
-known the model's force is compared with the measured one by its size, and its phase is the model's
-answer. One equation a state is left of two. Every candidate has phases of its own: nothing is
-assumed, and nothing iterated.
+The force that a motion needs does not depend on where time is counted from: where the phase of a
+velocity is unknown, the size of the model's force is compared with the measured one, and its phase
+follows from the model. One equation is left of two for a state. Every candidate has phases of its
+own: none is assumed, and nothing is iterated.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ _OFF = np.radians(30.0)  # beyond which a state is off resonance, and within whi
 
 
 class Sizes(NamedTuple):
-    """What the columns compare, as phasors, and of which of them the size alone counts.
+    """The measured phasors that columns are compared with, and for which of them only the size is.
 
     A part is the force, over the measured one, another sensor's fundamental or a harmonic, over
     the reference velocity: two columns each.
@@ -63,13 +63,13 @@ class Sizes(NamedTuple):
     def phasors(
         self, columns: Float[np.ndarray, "trial state column"]
     ) -> Complex[np.ndarray, "trial state part"]:
-        """What the model has where the measured one is in `measured`."""
+        """The model's phasors in place of the measured ones."""
         return _complex(columns, 2) + self.measured
 
     def own_std(
         self, stated: Float[np.ndarray, "state column"], phasors: Complex[np.ndarray, "state part"]
     ) -> Float[np.ndarray, "state column"]:
-        """1σ of what a column alone has, where a model has these phasors.
+        """1σ of the noise that a column alone has, for a model with these phasors.
 
         The size of a harmonic that noise hides scatters less than one of its parts.
         """
@@ -83,7 +83,7 @@ class Sizes(NamedTuple):
         return found
 
     def _expected(self, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of a measured size where this is the true one, and twice its slope by the square.
+        """Expected measured size for a true one, and twice its slope by the square of that.
 
         Rice's distribution: noise makes small harmonics larger.
         """
@@ -98,7 +98,7 @@ class Sizes(NamedTuple):
 
 
 def sizes_of(chosen: ComparedColumns) -> Sizes:
-    """What the states' columns compare."""
+    """The phasors that the columns of the states compare."""
     states: CalibrationStates = chosen.states
     velocity = np.asarray(states.velocity)
     n, sensors = velocity.shape
@@ -118,7 +118,7 @@ def sizes_of(chosen: ComparedColumns) -> Sizes:
 def what_is_lost(
     chosen: ComparedColumns, phase: Float[np.ndarray, " state"], levels: np.ndarray
 ) -> list[str]:
-    """What a diagnosis without phases cannot say, in words.
+    """Notes on what a diagnosis cannot find without phases.
 
     Arguments: `phase` is that of the velocities as the model has it, rad; `levels` are the
     numbers of the levels.
@@ -129,17 +129,19 @@ def what_is_lost(
     if not unknown.any():
         return ["the phases of some sensors are unknown: their amplitudes alone are compared."]
     notes = [
-        f"the phases of {int(unknown.sum())} of {len(unknown)} states are unknown: of these the "
-        "size of the force is compared, one number in place of two, and the phases are those "
-        "that the model has. Lost is most of what tells stiffness from damping: at resonance an "
-        "amplitude shows damping alone, off resonance hardly any."
+        f"the phases of {int(unknown.sum())} of {len(unknown)} states are unknown: for these only "
+        "the size of the force is compared, one number in place of two, and the phases are those "
+        "of the model. This hardly separates stiffness from damping: at resonance an amplitude "
+        "shows the damping alone, off resonance hardly any of it."
     ]
     if unknown.all():
-        notes.append("an error of the sensor's phase cannot be seen: it is no candidate.")
+        notes.append(
+            "an error of the sensor's phase cannot be detected: it is not among the candidates."
+        )
     if chosen.orders:
         notes.append(
-            "of harmonics the sizes alone are compared: their signs, which tell cubic from van der "
-            "Pol damping, are lost."
+            "of harmonics the sizes alone are compared: their signs, which separate cubic from van "
+            "der Pol damping, are lost."
         )
     level = np.asarray(chosen.states.level)
     lacking: dict[str, list[str]] = {"at": [], "off": []}
@@ -154,7 +156,7 @@ def what_is_lost(
             near = "within" if where == "at" else "beyond"
             notes.append(
                 f"no state {near} 30° of resonance at level {', '.join(lacking[where])} (by the "
-                f"model): its {what} is hardly seen there."
+                f"model): its {what} is hardly determined."
             )
     return notes
 

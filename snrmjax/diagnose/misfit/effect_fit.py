@@ -152,7 +152,7 @@ def fit_effects(
 def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
     """The misfit with errors passed on as the fitted model passes them, the baseline's too.
 
-    An effect turns and scales the errors of what it turns and scales.
+    An effect that turns or scales a quantity turns and scales its errors too.
     """
     predictions, known, values = misfit.predictions, misfit.errors, _values(misfit, fit)
     if not fit.kinds:

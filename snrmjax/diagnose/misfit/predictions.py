@@ -1,7 +1,7 @@
-"""What a model with an effect says of measured states: the force and the harmonics they need.
+"""The force and the harmonics that measured motions need by a model with further effects.
 
-Effects stand in a structure without strength, so that one program answers for many candidates:
-a candidate is a vector of parameters.
+The structure has all effects with zero strength, so that one compiled program serves every
+candidate: a candidate is a vector of parameters.
 """
 
 import dataclasses
@@ -39,18 +39,18 @@ _TRIALS = _BLOCK  # that may meet in a block, at most
 
 
 class Group(NamedTuple):
-    """A structure with all effects that are known, without strength."""
+    """A structure with all known effects at zero strength."""
 
     model: Structure
     names: tuple[str, ...]
     values: Float[np.ndarray, " parameter"]
-    unit: Float[np.ndarray, " parameter"]  # a change that is plainly seen, or smaller
+    unit: Float[np.ndarray, " parameter"]  # a change that is clearly detectable, or smaller
     is_strength: Bool[np.ndarray, " parameter"]  # the first of an added effect
     is_shape: Bool[np.ndarray, " parameter"]  # another one of it
     force: Int[np.ndarray, " parameter"]  # of the added forces, whose it is; −1: of none
 
     def place(self, name: str) -> int:
-        """Where a parameter is."""
+        """The place of a parameter in `names`."""
         return self.names.index(name)
 
 
@@ -65,10 +65,9 @@ class _Steps(NamedTuple):
 class Predicted(NamedTuple):
     """Columns of all states for several trials, and their derivatives along given directions.
 
-    NaN where no motion was found. A column is what is missed of the force, relative to the
-    measured one, or of a harmonic, relative to the measured velocity: real and imaginary parts, or
-    the size and nothing where the phase is unknown. The phasors are what the model has, and are
-    relative to a velocity of unknown phase.
+    NaN where no motion was found. A column is the misfit of the force over the measured force, or
+    of a harmonic over the measured velocity: real and imaginary parts, or the size and zero where
+    the phase is unknown. The phasors are those of the model.
     """
 
     columns: Float[np.ndarray, "trial state column"]
@@ -138,10 +137,10 @@ class Predictions:
         values: Float[np.ndarray, "trial parameter"],
         along: Sequence[str] = (),
     ) -> Predicted:
-        """What the states miss under every trial's parameters, and slopes along some of these."""
+        """The misfit of the states for every trial's parameters, and slopes along some of these."""
         places = np.array([group.place(name) for name in along], dtype=int)
-        # Slopes are differences, over a small share of what is plainly seen. The unit of a shape
-        # may be a guess: its own size counts, unless that is nothing.
+        # Slopes are differences, over a small share of a change that is clearly detectable. The
+        # unit of a shape may be a guess: its own size counts, unless that is zero.
         size = np.abs(values)
         length = np.maximum(group.unit, np.where(group.is_strength, size, 0.0))
         own = np.clip(size, _LEAST * group.unit, group.unit)
@@ -185,25 +184,30 @@ class Predictions:
         steps: "_Steps",
         wanted: int,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns and slopes: friction by its formulas, and marching where they fail."""
+        """Columns and slopes: friction by quick formulas, over the whole cycle where they fail."""
         used = np.any(values != group.values, axis=0)
         used[steps.place[:wanted][steps.place[:wanted] >= 0]] = True
         active = np.zeros(group.force.max() + 1, dtype=bool)
         active[group.force[used & (group.force >= 0)]] = True
-        fixed = (group.model, group.names, self.compared, len(self.model.effects))
         n, trials = len(self.chosen.rows), len(values)
         state, trial = np.tile(np.arange(n), trials), np.repeat(np.arange(trials), n)
 
-        def answered(swings: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        def answered(quick: bool, rows: np.ndarray) -> tuple[np.ndarray, ...]:
             def block(some: np.ndarray) -> list[np.ndarray]:
                 at = padded(some, _BLOCK)
                 first = int(trial[some[0]])
                 near = slice(first, first + _TRIALS)
                 ours = [padded(a[near], _TRIALS) for a in (values, steps.length)]
                 parts: list[Any] = [*ours, steps.place, steps.by_error]
-                table = programs.Trials(*parts)
-                which, rows_at = (active, np.array(wanted)), (state[at], trial[at] - first)
-                found = programs.missed(*fixed, swings, *which, self._stored, table, *rows_at)
+                asked: list[Any] = [active, np.array(wanted), state[at], trial[at] - first]
+                found = programs.missed(
+                    group.model,
+                    programs.Settings(group.names, self.compared, len(self.model.effects), quick),
+                    programs.Wanted(*asked[:2]),
+                    self._stored,
+                    programs.Trials(*parts),
+                    programs.Rows(*asked[2:]),
+                )
                 return [np.asarray(a)[: len(some), self.own_columns] for a in found]
 
             blocks = np.split(rows, range(_BLOCK, len(rows), _BLOCK))

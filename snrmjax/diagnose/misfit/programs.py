@@ -1,8 +1,8 @@
-"""The compiled programs behind predictions: rows of states, each under parameters of its own.
+"""The compiled programs behind predictions: rows of states, each with parameters of its own.
 
-A motion under a trial's parameters is reached from the baseline's by steps with the baseline's
-Jacobian, for many rows at once. One program answers for many effects: those that a call does not
-ask for are passed over.
+A motion with a trial's parameters is reached from the baseline's by steps with the baseline's
+Jacobian, for many rows at once. One program serves all effects: those with zero strength are
+skipped.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ from snrmjax.simulate.balance.harmonics import displacement_phasors, harmonic_ba
 from snrmjax.simulate.balance.prescribed_motion import Secants, nothing_of, start_of
 
 HARMONICS = 5
-"""Of the motions: one sees three of them, and two more bend those."""
+"""Of the motions: three that are compared, and two more that influence those."""
 
 COMPARED = (2, 3)
-"""Harmonics that have room in the programs, measured or not."""
+"""Harmonics that the programs hold, measured or not."""
 
 _STEP = 2.5e-4  # of a direction, between the two ends of a slope
 _SHARE = 1e-2  # of a slope's first step, below which the last one is
@@ -87,30 +87,47 @@ class Trials(NamedTuple):
     by_error: Float[Array, "input direction"]
 
 
+class Settings(NamedTuple):
+    """What is compiled into a program beside the structure."""
+
+    names: tuple[str, ...]  # of all parameters of the structure
+    compared: Compared
+    own: int  # how many effects are the baseline's: the first ones
+    quick: bool  # whether friction is taken by formulas for cycles that turn only twice
+
+
+class Wanted(NamedTuple):
+    """What a call asks for."""
+
+    active: Bool[Array, " force"]  # which of the added `forces_of` have strength
+    directions: Int[Array, ""]  # how many of the directions have slopes
+
+
+class Rows(NamedTuple):
+    """The state and the trial of every row, by their numbers."""
+
+    state: Int[Array, " row"]
+    trial: Int[Array, " row"]
+
+
 @compiled
 def missed(
     model: Structure,
-    names: tuple[str, ...],
-    compared: Compared,
-    own: int,
-    swings: bool,
-    active: Bool[Array, " force"],
-    wanted: Int[Array, ""],
+    settings: Settings,
+    wanted: Wanted,
     stored: Stored,
     trials: Trials,
-    state: Int[Array, " row"],
-    trial: Int[Array, " row"],
+    rows: Rows,
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
-    """What every row misses, and its slopes along the directions `wanted`, else zero.
+    """The misfit of every row, and its slopes along the wanted directions, else zero.
 
-    NaN where no motion was found. Slopes are differences between motions a small step apart: the
-    second is a step or two from the first, and the equations are compiled but once.
-    Arguments: the first `own` effects are the baseline's; with `swings` friction is taken by
-    formulas for cycles that turn only twice, and others give NaN; of the added `forces_of` only
-    the `active` count; a row is a state and a trial by their numbers.
+    NaN where no motion was found, and with `quick` formulas for cycles to which they do not apply.
+    Slopes are differences between motions a small step apart: the second is a step or two from
+    the first, and the equations are compiled only once.
     """
-    n_directions = len(trials.place)
-    close = jnp.where(wanted > 0, _CLOSER, _CLOSE)
+    names, compared, own, quick = settings
+    n_directions, n_wanted = len(trials.place), wanted.directions
+    close = jnp.where(n_wanted > 0, _CLOSER, _CLOSE)
 
     def one(state: Array, trial: Array) -> tuple[Array, Array]:
         measured, near, inverse = jax.tree.map(lambda a: a[state], stored)
@@ -123,13 +140,13 @@ def missed(
             mine = trials.place[number - 1] == jnp.arange(len(names))
             changed = with_parameters(model, names, values + (length @ along) * mine)
             added = changed.effects[own:]
-            forces = [_quick(added[k], swings=swings) for k in forces_of(added)]
+            forces = [_quick(added[k], quick=quick) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
             erring = StateWithErrors(measured, 1.0, trials.by_error @ along)
             motion = erring.motion(changed, compared.sensors[0], compared.harmonic_order)
             parts = {f.name: getattr(motion.balance, f.name) for f in fields(motion.balance)}
-            balance = _ForcedBalance(**parts, forces=tuple(forces), active=active)
+            balance = _ForcedBalance(**parts, forces=tuple(forces), active=wanted.active)
             motion = dataclasses.replace(motion, balance=balance)
             share = jnp.where(number > 0, _SHARE, 0.0)
             end = motion.solved_by_secants(inverse, start, close, share)
@@ -143,13 +160,13 @@ def missed(
 
         none = nothing_of(near) + jnp.zeros((measured.known.shape[0], n_directions + 1))
         columns = jax.lax.fori_loop(
-            0, wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
+            0, n_wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
         )[1]
         change = columns[:, 1:] - columns[:, :1]
-        seen = (jnp.arange(n_directions) < wanted) & ~(jnp.abs(change) < _NOTHING)
+        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < _NOTHING)
         return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
 
-    return jax.vmap(one)(state, trial)
+    return jax.vmap(one)(*rows)
 
 
 def forces_of(effects: Sequence[AbstractEffect]) -> list[int]:
@@ -207,11 +224,11 @@ def _samples(force: AbstractForce) -> int:
     return 128 if isinstance(force, AbstractMemoryless) else 256
 
 
-def _quick(effect: AbstractEffect, *, swings: bool) -> AbstractForce:
+def _quick(effect: AbstractEffect, *, quick: bool) -> AbstractForce:
     if isinstance(effect, AbstractInternalResonance):
         return _Resonance(effect)
     force = cast(AbstractForce, effect)  # one of `forces_of`
-    return _Quick(force) if swings and force.has_quick_formula() else force
+    return _Quick(force) if quick and force.has_quick_formula() else force
 
 
 class _Quick(AbstractForce):

@@ -180,7 +180,7 @@ def test_an_error_of_the_phase_cannot_be_seen_without_phases():
     found, key = stripped("blind_09")
     assert key["effects"] == ["sensor_phase_error"]
     assert found.verdict == "none"
-    assert any("sensor's phase cannot be seen" in note for note in found.notes)
+    assert any("sensor's phase cannot be detected" in note for note in found.notes)
 
 
 @pytest.mark.long

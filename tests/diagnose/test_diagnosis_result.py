@@ -1,0 +1,71 @@
+"""What a diagnosis shows of itself: one screen of text, a labelled data set, a figure."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from truth.balanced_sets import balanced, linear_model, quadratic
+
+import snrmjax as sj
+from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
+from snrmjax.diagnose.diagnosis_result import unit_of
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sj.diagnose_model(linear_model(), balanced(quadratic))
+
+
+def test_a_diagnosis_says_itself_on_one_screen(found):
+    first, *lines = repr(found).splitlines()
+    assert first.startswith("Diagnosis: The model")
+    assert "quadratic_damping" in first
+    assert len(lines) < 20
+    value, std = found.parameters["quadratic_damping.coefficient"]
+    (line,) = (one for one in lines if "coefficient" in one)
+    assert f"{value:.4g} ± {std:.2g}" in line
+    assert line.endswith(unit_of("quadratic_damping.coefficient"))
+    assert any("left out" in one for one in lines)
+    assert "fit converged, completed model completed" in lines[-1]
+
+
+def test_a_diagnosis_is_a_labelled_data_set(found):
+    data = found.to_xarray()
+    assert data.sizes["candidate"] == sum(len(step) for step in found.table)
+    assert list(data["part"].values) == ["damping"]
+    assert data["velocity_low_m_s"].attrs["units"] == "m/s"
+    assert float(data["velocity_low_m_s"][0]) < float(data["velocity_high_m_s"][0])
+    (value,) = data["value"].values
+    assert value == found.parameters["quadratic_damping.coefficient"].value
+    assert str(data["unit"].values[0]) == unit_of("quadratic_damping.coefficient") != ""
+    best = str(data["candidate"][int(np.argmax(data["gain"].values))].values)
+    assert best in found.candidates[0]
+    assert data.attrs["verdict"] == found.verdict == "ambiguous"
+    assert set(data["fit_status"].values) <= {"converged", "stalled", "step_limit", "not_finite"}
+
+
+def test_a_diagnosis_is_drawn(found):
+    figure = found.plot()
+    assert isinstance(figure, Figure)
+    assert len(figure.axes[0].collections[0].get_offsets()) == len(found.force_misfit.rows)
+
+
+def test_fits_that_did_not_converge_are_marked_and_counted(found):
+    rows = [row for step in found.table for row in step]
+    unconverged = [row for row in rows if not row.status.found_minimum]
+    assert found.checks.unconverged_fits == len(unconverged)
+    notes = [note for note in found.notes if "had not converged" in note]
+    assert len(notes) == bool(unconverged)
+    if notes:
+        assert notes[0].startswith(f"{len(unconverged)} of {len(rows)} fits")
+
+
+def test_every_verdict_has_a_sentence_of_its_own():
+    classes = (("cubic_damping", "quadratic_damping"),)
+    sentences = [verdict_sentence(one, classes, 4.0, 1.0) for one in Verdict]
+    assert len(set(sentences)) == len(Verdict) == 5
+    assert all(one[0].isupper() and one.endswith(".") for one in sentences)
+    told = verdict_sentence(Verdict.AMBIGUOUS, classes, 4.0, 1.0)
+    assert "cubic_damping or quadratic_damping" in told
+    assert "4.0 to 1.0" in told
+    alone = verdict_sentence(Verdict.AMBIGUOUS, (("cubic_damping",),), 4.0, 1.0)
+    assert "probably" in alone
