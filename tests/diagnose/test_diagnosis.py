@@ -415,9 +415,7 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
     inner = np.linalg.qr(np.vstack([spread.T, np.eye(len(left))]), mode="r")
     expected = np.linalg.norm(np.linalg.solve(inner.T, left)) / np.sqrt(len(left))
     found = held_out(misfit, nothing, nothing, 2)
-    assert (
-        found.force_misfit.after == found.force_misfit.before == pytest.approx(expected, rel=1e-4)
-    )
+    assert found.after == found.before == pytest.approx(expected, rel=1e-4)
 
 
 def test_data_of_another_mode_and_of_one_level_are_said():
