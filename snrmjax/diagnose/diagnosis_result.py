@@ -186,6 +186,6 @@ class Diagnosis(AbstractResult):
 
 
 def unit_of(parameter: str) -> str:
-    """The unit of a parameter such as "quadratic_damping.coefficient"; "" where none is stated."""
+    """The unit of a parameter, named by its effect and itself; "" where none is stated."""
     kind, _, name = parameter.partition(".")
     return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""
