@@ -92,9 +92,7 @@ def run_in_a_process(*arguments: object) -> Ended:
 def drawn():
     """Figures are drawn in the tests of figures: here every file is the same small one."""
     dot = png_bytes(Figure(figsize=(1, 1)))
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("figures", "html"):
-            patch.setattr(f"snrmjax.report.{module}.png_bytes", lambda *_, **__: dot)
+    with mock.patch.object(Figure, "savefig", lambda _, buffer, **__: buffer.write(dot)):
         yield
 
 
