@@ -1,4 +1,5 @@
 from .calibrate.calibration import CalibratedModel, calibrate_model
+from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedPoint, FittedResponse, fitted_response
@@ -12,23 +13,14 @@ from .inference.profiles import profile
 from .inference.resampling import bootstrap, compare_bands, sample_posterior
 from .inference.sensitivity import contributions, sensitivity
 from .joint.joint_fit import JointFit, fit_jointly
-from .pointwise.backbone import Backbone, BackboneFit, fit_backbone
-from .pointwise.backbone_points import BackbonePoints, identify_points
+from .pointwise.backbone import Backbone, BackboneFit, BackboneValues, fit_backbone
+from .pointwise.backbone_points import identify_points
 from .pointwise.identification import Identification, identify_backbone
-from .pointwise.inversion import (
-    PointStatus,
-    SnrmPoints,
-    closed_form,
-    invert_amplitude_phase,
-    invert_phasor,
-)
-from .pointwise.prediction import (
-    PredictedResponse,
-    Resonance,
-    predict_response,
-    resonance_by_fixed_point,
-    resonances,
-)
+from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_phasor
+from .pointwise.inversion_result import PointStatus, SnrmPoints
+from .pointwise.points_result import BackbonePoints
+from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
+from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 
 __all__ = [
@@ -37,10 +29,12 @@ __all__ = [
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
+    "BackboneValues",
     "CalibratedModel",
     "FittedPoint",
     "FittedResponse",
     "Identification",
+    "InverseForce",
     "JointFit",
     "NextMeasurement",
     "NextMeasurements",
@@ -59,6 +53,7 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
+    "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
     "next_measurements",

@@ -8,7 +8,7 @@ import numpy as np
 
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
-from snrmjax.identify.pointwise.inversion import PointStatus
+from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.identification import Identification
-from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
+from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
     PredictedResponse,

@@ -3,12 +3,18 @@
 import functools
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.inference.optimal_design import NextMeasurements
-from snrmjax.report import diagnosis_figures, joint_figures, simulation_figures
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneFit, BackboneValues
+from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.pointwise.points_result import BackbonePoints
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse
+from snrmjax.measure.states import SteadyStates
+from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch
@@ -84,3 +90,52 @@ def _(result: VirtualTest) -> Figure:
 @plot_result.register
 def _(result: Diagnosis, **settings: Any) -> Figure:
     return diagnosis_figures.misfit_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: Identification, **settings: Any) -> Figure:
+    return figures.backbone_figure(result.points, result.fit.backbone, **settings)
+
+
+@plot_result.register
+def _(result: BackbonePoints) -> Figure:
+    velocity = result.backbone_velocity
+    return simulation_figures.amplitudes_figure(
+        *(velocity, result.natural_frequency, result.damping_ratio), result.sensor, joined=False
+    )
+
+
+@plot_result.register
+def _(result: Backbone) -> Figure:
+    ends = float(result.smallest), float(result.largest)
+    values = result.values(jnp.asarray(np.linspace(*ends, 200)))
+    return simulation_figures.amplitudes_figure(
+        *(values.velocity, values.natural_frequency, values.damping_ratio), result.sensor
+    )
+
+
+@plot_result.register
+def _(result: BackboneFit) -> Figure:
+    return plot_result(result.backbone)
+
+
+@plot_result.register
+def _(result: BackboneValues) -> Figure:
+    return simulation_figures.amplitudes_figure(
+        result.velocity, result.natural_frequency, result.damping_ratio
+    )
+
+
+@plot_result.register
+def _(result: PredictedResponse) -> Figure:
+    return simulation_figures.motions_figure(result.frequency, result.velocity, joined=True)
+
+
+@plot_result.register
+def _(result: SteadyStates, *, sensor: str | None = None) -> Figure:
+    name = sensor or result.sensors[0]
+    if name not in result.sensors:
+        raise ValueError(f"`sensor` must be one of {result.sensors}, but is {name!r}.")
+    velocity = np.asarray(result.velocity)[:, result.sensors.index(name)]
+    frequency = np.asarray(result.frequency)
+    return simulation_figures.motions_figure(frequency, velocity, sensor=name, joined=False)

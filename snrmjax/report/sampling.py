@@ -56,7 +56,14 @@ def sample_fit(
 
 
 def _in_units(values: BackboneValues, beyond: np.ndarray) -> BackboneSamples:
-    omega, omega_std, damping, damping_std, modal, modal_std = map(np.asarray, values[1:])
+    omega, omega_std, damping, damping_std, modal, modal_std = (
+        np.asarray(of)
+        for of in (
+            *(values.natural_frequency, values.natural_frequency_std),
+            *(values.damping_ratio, values.damping_ratio_std),
+            *(values.modal_damping, values.modal_damping_std),
+        )
+    )
     return BackboneSamples(
         velocity=np.asarray(values.velocity),
         frequency=omega / HERTZ,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
@@ -150,17 +151,37 @@ def damped_mode_figure(branch: DampedModeBranch, *, sensor: str | None = None) -
     if name not in branch.sensors:
         raise ValueError(f"`sensor` must be one of {branch.sensors}, but is {name!r}.")
     velocity = np.abs(branch.velocity[:, 1, branch.sensors.index(name)])
-    unit = unit_for(velocity, "m/s")
+    return amplitudes_figure(velocity, branch.frequency, branch.damping_ratio, name)
+
+
+def amplitudes_figure(
+    velocity: Float[Array | np.ndarray, " point"],
+    frequency: Float[Array | np.ndarray, " point"],
+    damping_ratio: Float[Array | np.ndarray, " point"],
+    sensor: str = "the sensor",
+    *,
+    joined: bool = True,
+) -> Figure:
+    """Natural frequency and damping ratio of a mode against the velocity amplitude.
+
+    Arguments: `velocity` in m/s at `sensor`, `frequency` in rad/s; `joined` draws a curve.
+    Returns the figure. Raises `ValueError` without a finite point.
+    """
+    speeds = np.asarray(velocity)
+    if not np.any(np.isfinite(speeds)):
+        raise ValueError("there is no mode to show: no point is finite.")
+    unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
     figure, ((frequencies, dampings),) = panels(PAGE, 3.2, 1, 2)
+    style: Style = {"color": SIMULATED, **CURVE} if joined else {**DOT, "color": MEASURED}
     for axes, values in (
-        (frequencies, branch.frequency / HERTZ),
-        (dampings, 100 * branch.damping_ratio),
+        (frequencies, np.asarray(frequency) / HERTZ),
+        (dampings, 100 * np.asarray(damping_ratio)),
     ):
-        axes.plot(velocity / unit.size, values, color=SIMULATED, **CURVE)
+        axes.plot(speeds / unit.size, values, **style)
         axes.set_xlim(left=0.0)
     level = f"Velocity amplitude ({unit.name})"
     name_axes(frequencies, "(a) natural frequency", level, "Natural frequency (Hz)")
-    name_axes(dampings, f"(b) damping, at {plain(name)}", level, "Damping ratio (%)")
+    name_axes(dampings, f"(b) damping, at {plain(sensor)}", level, "Damping ratio (%)")
     return figure
 
 

@@ -145,7 +145,7 @@ def identify_by_points(
         )
         for force in dict.fromkeys(loads.forces)
     )
-    notes = (*data.notes, *found.notes, *notes_on_predictions(predictions, ratio))
+    notes = (*found.notes, *notes_on_predictions(predictions, ratio))
     words = {
         "amplitude": f"{settings.amplitude}, {settings.measure}",
         "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),

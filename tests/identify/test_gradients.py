@@ -233,7 +233,7 @@ class TestInversion:
                 velocity * (1 + size) * jnp.exp(1j * phase),
                 RESIDUAL * (1 + relative[-1]),  # of all members
             )
-            return numbers(*points[:4])
+            return numbers(*jax.tree.leaves(points)[:4])
 
         check_derivatives(of, 3 * N + 1, failed=[] if broken is None else [2, N + 2, 2 * N + 2])
 
@@ -258,7 +258,7 @@ class TestInversion:
         assert {PointStatus.OK, PointStatus.NO_ROOT, PointStatus.NOT_FINITE} < set(status.tolist())
         failed = np.flatnonzero(np.isin(status, [PointStatus.NO_ROOT, PointStatus.NOT_FINITE]))
         check_derivatives(
-            lambda relative: numbers(*points_of(relative)[:4]),
+            lambda relative: numbers(*jax.tree.leaves(points_of(relative))[:4]),
             3 * N + 1,
             failed=[k * N + m for k in range(3) for m in failed],
         )
@@ -282,7 +282,9 @@ def test_backbone_curves(curve, argument):
         )
         at = amplitude * (1 + relative[10:])
         values = backbone.values(at)
-        return numbers(*values, backbone.natural_frequency(at), backbone.damping_ratio(at))
+        return numbers(
+            *jax.tree.leaves(values), backbone.natural_frequency(at), backbone.damping_ratio(at)
+        )
 
     check_derivatives(of, 16)
 

@@ -1,6 +1,7 @@
 """Reports: escaped, complete in one file, and right in their numbers."""
 
 import base64
+import dataclasses
 import io
 import re
 from html.parser import HTMLParser
@@ -281,7 +282,9 @@ def test_points_left_out_are_counted_with_the_reason(identification, modes):
         .at[1:3]
         .set(int(sj.identify.PointStatus.NEGATIVE_DAMPING))
     )
-    doubted = identification._replace(points=eqx.tree_at(lambda p: p.status, points, status))
+    doubted = dataclasses.replace(
+        identification, points=eqx.tree_at(lambda p: p.status, points, status)
+    )
     rows = dict(identification_summary(doubted, modes))
     assert rows["steady states used"].startswith("29 of 32")
     assert rows["left out"] == (
@@ -291,13 +294,14 @@ def test_points_left_out_are_counted_with_the_reason(identification, modes):
 
 
 def test_unstated_noise_and_scatter_of_levels(identification, modes):
-    fit = identification.fit._replace(
+    fit = dataclasses.replace(
+        identification.fit,
         noise_stated=False,
         noise_scale=(0.012, 0.034),
         level_frequency_std=0.2 * HERTZ,
         level_damping_std=0.001,
     )
-    rows = dict(identification_summary(identification._replace(fit=fit), modes))
+    rows = dict(identification_summary(dataclasses.replace(identification, fit=fit), modes))
     assert rows["noise"] == (
         "not stated; from the scatter 1.2 % (frequency) and 3.4 % (damping) of the measured phasor"
     )
@@ -355,7 +359,7 @@ def test_curves_that_start_at_zero_are_told_from_there(identification, modes):
             *(damping.knots.at[0].set(0.0), damping.values.at[0].set(LINEAR_DAMPING)),
         ],
     )
-    anchored = identification._replace(fit=fit._replace(backbone=anchored))
+    anchored = dataclasses.replace(identification, fit=dataclasses.replace(fit, backbone=anchored))
     rows = dict(identification_summary(anchored, modes))
     assert re.match(r"80\.0\d* ± \S+ Hz at 0 m/s", rows["natural frequency (± 95 %)"])
     assert re.match(r"2\.0\d* ± \S+ % at 0 m/s", rows["damping ratio (± 95 %)"])

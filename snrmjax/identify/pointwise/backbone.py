@@ -1,6 +1,6 @@
 """The identified backbone: natural frequency and damping of a mode as curves with bands."""
 
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,12 +22,16 @@ from snrmjax.identify.pointwise.curve_fit import (
     place_knots,
     predict_left_out,
 )
+from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.least_squares import ErrorSizes
+from snrmjax.numerics.result import AbstractResult, Variable
 
 CurveFamily = Literal["spline", "piecewise_linear"]
 MOST_KNOTS = 60
+_SAMPLES = 200  # as many as files have: one compiled function serves both
+_HERTZ = 2 * np.pi
 SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-12, 3))
 
 
@@ -42,8 +46,10 @@ class Anchor(NamedTuple):
     largest_damping_shift: float
 
 
-class BackboneValues(NamedTuple):
+class BackboneValues(AbstractResult):
     """A backbone at some amplitudes, with 1σ."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 
     velocity: Float[Array, " point"]  # m/s
     natural_frequency: Float[Array, " point"]  # rad/s
@@ -53,9 +59,37 @@ class BackboneValues(NamedTuple):
     modal_damping: Float[Array, " point"]  # 2ζ̃ω̃, 1/s
     modal_damping_std: Float[Array, " point"]
 
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        return (
+            f"BackboneValues: {np.size(self.velocity)} amplitudes, {spans(self.velocity)} m/s",
+            f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
+            f"damping ratio {spans(self.damping_ratio)}",
+        )
 
-class Backbone(eqx.Module):
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; the columns of `backbone.csv`."""
+
+        def column(values: Array | np.ndarray, unit: str, meaning: str) -> Variable:
+            return Variable(("velocity_m_s",), np.asarray(values).reshape(-1), unit, meaning)
+
+        natural, natural_std = self.natural_frequency, self.natural_frequency_std
+        return {
+            "velocity_m_s": column(self.velocity, "m/s", "velocity amplitude"),
+            "natural_frequency_hz": column(np.asarray(natural) / _HERTZ, "Hz", "natural frequency"),
+            "natural_frequency_std_hz": column(np.asarray(natural_std) / _HERTZ, "Hz", "its 1σ"),
+            "damping_ratio": column(self.damping_ratio, "1", "damping ratio"),
+            "damping_ratio_std": column(self.damping_ratio_std, "1", "its 1σ"),
+            "modal_damping_1_s": column(self.modal_damping, "1/s", "modal damping 2ζω"),
+            "modal_damping_std_1_s": column(self.modal_damping_std, "1/s", "its 1σ"),
+        }
+
+
+class Backbone(AbstractResult):
     """ω̃ and ζ̃ of one mode as functions of the amplitude of its motion at one sensor.
+
+    All its functions are differentiable by the amplitude and the values at the knots; straight
+    lines have two slopes at a knot, of which derivatives give the mean.
 
     `squared_frequency` is ω̃² (rad²/s²) and `modal_damping` 2ζ̃ω̃ (1/s), against the
     displacement (m) or the velocity (m/s) amplitude, as `argument` says. Their covariances
@@ -71,6 +105,30 @@ class Backbone(eqx.Module):
     largest: Float[Array, ""]  # amplitude of the largest point used
     argument: AmplitudeArgument = eqx.field(static=True)
     sensor: str = eqx.field(static=True)
+    coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        ends = self._sampled()
+        return (
+            f"Backbone at {self.sensor!r} against {self.argument}: "
+            f"{self.squared_frequency.knots.shape[0]} and {self.modal_damping.knots.shape[0]} "
+            "knots of natural frequency and damping",
+            *ends.summary()[1:],
+            f"velocity {spans(ends.velocity)} m/s",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; between the smallest and the largest measured amplitude."""
+        return self._sampled().variables()
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {"sensor": self.sensor, "amplitude": self.argument}
+
+    def _sampled(self) -> BackboneValues:
+        ends = float(self.smallest), float(self.largest)
+        return self.values(jnp.asarray(np.linspace(*ends, _SAMPLES)))
 
     @eqx.filter_jit
     def natural_frequency(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -114,8 +172,10 @@ class Backbone(eqx.Module):
         )
 
 
-class BackboneFit(NamedTuple):
+class BackboneFit(AbstractResult):
     """A backbone with what its fit found out."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("velocity_m_s",)
 
     backbone: Backbone
     noise_scale: tuple[float, float]  # of ω̃² and of 2ζ̃ω̃; relative noise where none is stated
@@ -123,6 +183,32 @@ class BackboneFit(NamedTuple):
     level_damping_std: float  # the same of the damping ratio
     noise_stated: bool
     anchor: Anchor | None
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        first, *others = self.backbone.summary()
+        scatter = " and ".join(f"{size:.3g}" for size in self.noise_scale)
+        kind = "times the stated noise" if self.noise_stated else "of the measured phasor (1σ)"
+        return (
+            first.replace("Backbone", "BackboneFit", 1),
+            *others,
+            f"scatter of natural frequency and damping: {scatter} {kind}",
+            f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
+            f"{self.level_damping_std:.2g} of the damping ratio (1σ)",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; those of the backbone."""
+        return self.backbone.variables()
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {
+            **self.backbone.attributes(),
+            "noise_stated": int(self.noise_stated),
+            "level_frequency_std_hz": self.level_frequency_std / _HERTZ,
+            "level_damping_ratio_std": self.level_damping_std,
+        }
 
 
 def fit_backbone(
@@ -135,6 +221,9 @@ def fit_backbone(
 ) -> BackboneFit:
     """Fit smooth or piecewise linear curves of ω̃² and 2ζ̃ω̃ to identified points.
 
+    `family` "spline" is a shape-preserving cubic (PCHIP) in the squared amplitude, and
+    "piecewise_linear" has straight lines in the amplitude, as the paper has.
+
     Points are weighted by the stated noise carried through the inversion, the error of their
     amplitude included; where no noise is stated, all have the same relative error of amplitude
     and phase, whose size the scatter gives. What the points of a level share is estimated and
@@ -145,6 +234,7 @@ def fit_backbone(
     zero amplitude and reports how far this moves them.
     Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
+    Not differentiable: knots and smoothing are chosen on the host.
     """
     use = np.asarray(points.usable & jnp.isfinite(points.amplitude))
     if use.sum() < 2:

@@ -7,9 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.identify.pointwise.inversion import PointStatus, SnrmPoints, invert_one, invert_phasor
+from snrmjax.identify.pointwise.inversion import invert_one, invert_phasor
+from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
+from snrmjax.identify.pointwise.points_result import (
+    AmplitudeArgument,
+    BackbonePoints,
+    MeasuredStates,
+    OtherRoot,
+    PointErrors,
+)
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
@@ -17,7 +25,6 @@ from snrmjax.measure.states import SteadyStates, check_force, check_phases, rela
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.finite_slopes import safe_root
 
-AmplitudeArgument = Literal["displacement", "velocity"]
 AmplitudeMeasure = Literal["fundamental", "peak"]
 
 INPUTS = ("log_force", "log_velocity", "phase")
@@ -30,47 +37,6 @@ OUTPUTS = ("squared_frequency", "modal_damping", "log_amplitude")
 """The quantities whose derivatives `BackbonePoints.sensitivity` holds."""
 
 
-class BackbonePoints(eqx.Module):
-    """One natural frequency and damping ratio from every steady state.
-
-    Amplitudes are those of the nonlinear mode at one sensor, `sensor`. `sensitivity` holds the
-    derivatives of `OUTPUTS` (ω̃², 2ζ̃ω̃ and the logarithm of the amplitude) with respect to
-    `INPUTS`; `relative_std` the 1σ of those inputs, NaN where nobody stated it.
-    """
-
-    level: Int[Array, " state"]
-    frequency: Float[Array, " state"]  # rad/s, of the force
-    force: Float[Array, " state"]  # N
-    velocity: Complex[Array, " state"]  # m/s, of the sensor, residual modes included
-    mode_velocity: Complex[Array, " state"]  # m/s, of the nonlinear mode alone
-    appropriation: Float[Array, " state"]  # Eq. (20)
-    natural_frequency: Float[Array, " state"]  # rad/s
-    damping_ratio: Float[Array, " state"]
-    amplitude: Float[Array, " state"]  # m or m/s, the argument of the backbone
-    backbone_velocity: Float[Array, " state"]  # m/s, where the point lies on the backbone
-    natural_frequency_std: Float[Array, " state"]  # rad/s, NaN where no noise is stated
-    damping_ratio_std: Float[Array, " state"]
-    alternative_natural_frequency: Float[Array, " state"]  # rad/s, the other root or NaN
-    alternative_damping_ratio: Float[Array, " state"]
-    sensitivity: Float[Array, "state output input"]
-    relative_std: Float[Array, "state input"]
-    linear_variance: Float[Array, "state output"]  # from the other linear modes' stated errors
-    filter_residual: Float[Array, " state"]  # part of the mode's motion that its shape misses
-    status: Int[Array, " state"]  # `PointStatus`
-    sensor: str = eqx.field(static=True)
-    argument: AmplitudeArgument = eqx.field(static=True)
-
-    @property
-    def modal_damping(self) -> Float[Array, " state"]:
-        """2ζ̃ω̃ in 1/s."""
-        return 2 * self.damping_ratio * self.natural_frequency
-
-    @property
-    def usable(self) -> Array:
-        """Points that enter curves: solved, and solved without doubt."""
-        return self.status == int(PointStatus.OK)
-
-
 def identify_points(
     data: SteadyStates,
     modes: LinearModes,
@@ -78,7 +44,7 @@ def identify_points(
     amplitude: AmplitudeArgument = "displacement",
     measure: AmplitudeMeasure = "fundamental",
 ) -> BackbonePoints:
-    """Invert the SNRM function for every steady state.
+    """Invert the SNRM function for every steady state: one point of the backbone from each.
 
     The velocities of the residual linear modes and of the rigid-body modes are subtracted; with
     several sensors the remainder is projected on the mode shape by weighted least squares; the
@@ -91,6 +57,9 @@ def identify_points(
     Returns `BackbonePoints`; every state has a status and NaN where there is no answer.
     Raises `ValueError` when the peak is asked for without harmonics, when the force or a phase is
     unknown, or when the sensors are not those of the modes.
+    Differentiable by velocities, forces, frequencies, stated errors and the modes, in forward and
+    reverse mode; a state without an answer has derivatives zero or NaN and leaves the others' as
+    they are. The other root of a state counts as far as there is one.
     Reference: Kwarta & Allen, section 2.2; the displacement argument is this package's own.
     """
     if data.sensors != modes.sensors:
@@ -161,24 +130,29 @@ def _identify(
         (raw.force == 0) & moving & timed, int(PointStatus.ZERO_FORCE), int(PointStatus.NOT_FINITE)
     )
     return BackbonePoints(
-        level=data.level,
-        frequency=raw.frequency,
-        force=raw.force,
-        velocity=jnp.where(usable, measured, bare),
+        measured=MeasuredStates(
+            level=data.level,
+            frequency=raw.frequency,
+            force=raw.force,
+            velocity=jnp.where(usable, measured, bare),
+            appropriation=appropriation_of(raw),
+        ),
         mode_velocity=jnp.where(usable, mode_velocity, bare),
-        appropriation=appropriation_of(raw),
         natural_frequency=natural,
         damping_ratio=damping,
         amplitude=jnp.where(found, argument, jnp.nan),
         backbone_velocity=jnp.where(found, on_backbone, jnp.nan),
-        natural_frequency_std=natural_std,
-        damping_ratio_std=damping_std,
-        alternative_natural_frequency=solved.alternative_natural_frequency,
-        alternative_damping_ratio=solved.alternative_damping_ratio,
-        sensitivity=sensitivity,
-        relative_std=filtered_std,
-        linear_variance=linear_variance,
-        filter_residual=jnp.where(sound, filter_residual, jnp.nan),
+        other_root=OtherRoot(
+            solved.alternative_natural_frequency, solved.alternative_damping_ratio
+        ),
+        errors=PointErrors(
+            natural_frequency_std=natural_std,
+            damping_ratio_std=damping_std,
+            sensitivity=sensitivity,
+            relative_std=filtered_std,
+            linear_variance=linear_variance,
+            filter_residual=jnp.where(sound, filter_residual, jnp.nan),
+        ),
         status=jnp.where(usable, solved.status, status),
         sensor=modes.sensors[r],
         argument=amplitude,

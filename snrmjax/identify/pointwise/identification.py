@@ -1,6 +1,6 @@
 """The whole inverse method in one call: steady states in, backbone and damping out."""
 
-from typing import NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,18 +14,44 @@ from snrmjax.identify.pointwise.backbone_points import (
     identify_points,
     off_resonance_error_factor,
 )
-from snrmjax.identify.pointwise.inversion import STATUS_MESSAGE, PointStatus
+from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
+from snrmjax.numerics.result import AbstractResult, Variable
 
 
-class Identification(NamedTuple):
+class Identification(AbstractResult):
     """Points, curves and everything that a reader of them should know."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state", "level", "backbone_amplitude_m_s")
 
     points: BackbonePoints
     fit: BackboneFit
     notes: tuple[str, ...]
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        states, *_ = self.points.summary()
+        _, *curves = self.fit.summary()
+        return (
+            states.replace("BackbonePoints", "Identification", 1),
+            *curves,
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; those of the points, and of the curves under `backbone_…`."""
+        own = dict(self.points.variables())
+        for name, variable in self.fit.variables().items():
+            at = "backbone_amplitude_m_s"
+            key = at if name == "velocity_m_s" else f"backbone_{name}"
+            own[key] = variable._replace(dimensions=(at,))
+        return own
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {**self.fit.attributes(), "notes": "\n".join(self.notes)}
 
 
 def identify_backbone(
@@ -41,10 +67,11 @@ def identify_backbone(
     """Backbone and damping of the mode of interest from near-resonant steady states.
 
     `identify_points`, then `fit_backbone`; their arguments are described there. `modes` may also be
-    the structure that has them. Where no noise
-    is stated, the standard deviations of the points come from the scatter about the curves.
-    Returns an `Identification` whose `notes` say in words what was left out, what the noise
-    turned out to be and how far an anchor moved the curves.
+    the structure that has them. Where no noise is stated, the standard deviations of the points
+    come from the scatter about the curves.
+    Returns an `Identification` whose `notes` say in words what the reader of the file did not use,
+    what was left out, what the noise turned out to be and how far an anchor moved the curves.
+    Not differentiable, since curves are chosen: differentiate `identify_points`.
     Reference: Kwarta & Allen, section 2.2.
     """
     modes = modes_of(modes)
@@ -52,7 +79,7 @@ def identify_backbone(
     fit = fit_backbone(points, modes, family=family, n_knots=n_knots, anchor=anchor)
     if not fit.noise_stated:
         points = errors_from_scatter(points, fit)
-    return Identification(points, fit, _notes(points, fit, modes))
+    return Identification(points, fit, (*data.notes, *_notes(points, fit, modes)))
 
 
 def errors_from_scatter(

@@ -6,49 +6,15 @@ paper's Eq. (17) reads (ω̃² − Ω²) = 2ζ̃ω̃Ω tan φ, and is used multi
 resonance (φ = 0) and at ±90° alike.
 """
 
-from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float
 
-
-class PointStatus(IntEnum):
-    """What became of one inversion."""
-
-    OK = 0
-    TWO_ROOTS = 1  # two answers fit equally; the other one is in `alternative_…`
-    NEGATIVE_DAMPING = 2  # solved, but the phase says that the force takes energy out
-    NO_ROOT = 3  # no response of the mode fits amplitude and phase
-    NO_REAL_FREQUENCY = 4  # the measurement asks for a negative ω̃²
-    ZERO_FORCE = 5  # no force or no participation: nothing to divide by
-    NOT_FINITE = 6  # NaN or infinity in the measurement, or a zero response
-    NOT_CONVERGED = 7  # Newton's method did not reach its tolerance
-
-
-STATUS_MESSAGE: dict[PointStatus, str] = {
-    PointStatus.OK: "ok",
-    PointStatus.TWO_ROOTS: "two roots: the residual response exceeds the measured one",
-    PointStatus.NEGATIVE_DAMPING: "negative damping: phase beyond 90° of resonance",
-    PointStatus.NO_ROOT: "no root: amplitude and phase contradict the residual modes",
-    PointStatus.NO_REAL_FREQUENCY: "no real natural frequency",
-    PointStatus.ZERO_FORCE: "zero force or participation",
-    PointStatus.NOT_FINITE: "measurement is zero or not finite",
-    PointStatus.NOT_CONVERGED: "Newton's method did not converge",
-}
-
-
-class SnrmPoints(NamedTuple):
-    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none."""
-
-    natural_frequency: Float[Array, "*batch"]  # rad/s
-    damping_ratio: Float[Array, "*batch"]
-    alternative_natural_frequency: Float[Array, "*batch"]  # rad/s, NaN = there is no other root
-    alternative_damping_ratio: Float[Array, "*batch"]
-    status: Int[Array, "*batch"]  # `PointStatus`
+from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 
 
 class CramersRule(lx.AbstractLinearSolver[Any]):

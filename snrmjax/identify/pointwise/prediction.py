@@ -1,5 +1,6 @@
 """Forced responses that an identified backbone predicts: resonances and whole curves."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument
+from snrmjax.identify.pointwise.points_result import AmplitudeArgument
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.pointwise.snrm import nonlinear_mode_velocity
 from snrmjax.model.modes import LinearModes, residual_velocity
 
@@ -18,31 +20,6 @@ LARGEST_AMPLITUDE_RATIO = 1.5
 """Predictions end, unless asked for more, at this multiple of the largest measured amplitude."""
 
 _SCAN = 4096
-
-
-class Resonance(NamedTuple):
-    """A phase resonance under a given force: the nonlinear mode moves in phase with it."""
-
-    force: float  # N
-    amplitude: float  # of the backbone's argument, m or m/s
-    frequency: float  # rad/s
-    damping_ratio: float
-    velocity: float  # m/s at the backbone's sensor, residual modes included
-    continued: bool  # beyond the measured amplitudes
-
-
-class PredictedResponse(NamedTuple):
-    """One connected response curve in order: up the low-frequency side, down the other."""
-
-    force: float  # N
-    frequency: Float[np.ndarray, " point"]  # rad/s
-    velocity: Complex[np.ndarray, " point"]  # m/s at the backbone's sensor
-    amplitude: Float[np.ndarray, " point"]  # of the backbone's argument
-    stable: Bool[np.ndarray, " point"]
-    branch: tuple[str, ...]  # "lead" (velocity leads the force) or "lag" for every point
-    continued: Bool[np.ndarray, " point"]  # beyond the measured amplitudes
-    isolated: bool  # a closed curve, apart from the main one
-    note: str  # where the curve extrapolates the backbone; empty where it nowhere does
 
 
 def resonances(
@@ -387,7 +364,8 @@ def _part(curve: PredictedResponse, keep: np.ndarray, backbone: Backbone) -> Pre
             f"amplitude, up to {amplitude.max() / float(backbone.largest):.3g} times it: there the "
             "backbone is extrapolated, which no measurement supports."
         )
-    return curve._replace(
+    return dataclasses.replace(
+        curve,
         frequency=curve.frequency[keep],
         velocity=curve.velocity[keep],
         amplitude=amplitude,

@@ -75,7 +75,7 @@ def measured():
 
 
 def arrays(points: SnrmPoints):
-    return SnrmPoints(*(np.asarray(field) for field in points))
+    return jax.tree.map(np.asarray, points)
 
 
 def few_of(function, *arguments):
@@ -87,7 +87,7 @@ def few_of(function, *arguments):
         dtypes[2] = complex
     full = [np.resize(a.ravel(), 64).astype(d) for a, d in zip(columns, dtypes, strict=True)]
     points = function(*full)
-    return SnrmPoints(*(np.asarray(f)[: columns[0].size].reshape(shape) for f in points))
+    return jax.tree.map(lambda f: np.asarray(f)[: columns[0].size].reshape(shape), points)
 
 
 def eq_12(natural, damping, constant, frequency, amplitude, residual):

@@ -1,0 +1,96 @@
+"""What an inversion answers: a natural frequency and a damping ratio, or the reason for none."""
+
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+
+
+class PointStatus(IntEnum):
+    """What became of one inversion."""
+
+    OK = 0
+    TWO_ROOTS = 1  # two answers fit equally; the other one is in `alternative_…`
+    NEGATIVE_DAMPING = 2  # solved, but the phase says that the force takes energy out
+    NO_ROOT = 3  # no response of the mode fits amplitude and phase
+    NO_REAL_FREQUENCY = 4  # the measurement asks for a negative ω̃²
+    ZERO_FORCE = 5  # no force or no participation: nothing to divide by
+    NOT_FINITE = 6  # NaN or infinity in the measurement, or a zero response
+    NOT_CONVERGED = 7  # Newton's method did not reach its tolerance
+
+
+STATUS_MESSAGE: dict[PointStatus, str] = {
+    PointStatus.OK: "ok",
+    PointStatus.TWO_ROOTS: "two roots: the residual response exceeds the measured one",
+    PointStatus.NEGATIVE_DAMPING: "negative damping: phase beyond 90° of resonance",
+    PointStatus.NO_ROOT: "no root: amplitude and phase contradict the residual modes",
+    PointStatus.NO_REAL_FREQUENCY: "no real natural frequency",
+    PointStatus.ZERO_FORCE: "zero force or participation",
+    PointStatus.NOT_FINITE: "measurement is zero or not finite",
+    PointStatus.NOT_CONVERGED: "Newton's method did not converge",
+}
+
+
+def statuses_in_words(status: Int[np.ndarray | Array, "*batch"]) -> str:
+    """How many members have which status: "12 ok, 1 two_roots"."""
+    kinds, counts = np.unique(np.asarray(status), return_counts=True)
+    pairs = zip(kinds, counts, strict=True)
+    return ", ".join(f"{n} {PointStatus(int(kind)).name.lower()}" for kind, n in pairs)
+
+
+def status_names(status: Int[np.ndarray | Array, " state"]) -> np.ndarray:
+    """The status of every member as text, as files have it."""
+    return np.array([PointStatus(int(one)).name.lower() for one in np.asarray(status)], dtype=str)
+
+
+def spans(values: Float[np.ndarray | Array, "*batch"]) -> str:
+    """From the smallest to the largest finite number, in four digits."""
+    finite = np.asarray(values)[np.isfinite(np.asarray(values))]
+    if not finite.size:
+        return "none"
+    return f"{finite.min():.4g} to {finite.max():.4g}"
+
+
+class SnrmPoints(AbstractResult):
+    """ω̃ and ζ̃ of a batch of steady states; NaN wherever the status says that there is none."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("member",)
+
+    natural_frequency: Float[Array, "*batch"]  # rad/s
+    damping_ratio: Float[Array, "*batch"]
+    alternative_natural_frequency: Float[Array, "*batch"]  # rad/s, NaN = there is no other root
+    alternative_damping_ratio: Float[Array, "*batch"]
+    status: Int[Array, "*batch"]  # `PointStatus`
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        return (
+            f"SnrmPoints: {np.size(self.status)} inversions ({statuses_in_words(self.status)})",
+            f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
+            f"damping ratio {spans(self.damping_ratio)}",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; the batch in one row."""
+
+        def column(values: Array | np.ndarray, unit: str, meaning: str) -> Variable:
+            return Variable(("member",), np.asarray(values).reshape(-1), unit, meaning)
+
+        other = self.alternative_natural_frequency, self.alternative_damping_ratio
+        return {
+            "member": column(np.arange(np.size(self.status)), "1", "member of the batch"),
+            "natural_frequency_hz": column(
+                np.asarray(self.natural_frequency) / _HERTZ, "Hz", "natural frequency"
+            ),
+            "damping_ratio": column(self.damping_ratio, "1", "damping ratio"),
+            "alternative_natural_frequency_hz": column(
+                np.asarray(other[0]) / _HERTZ, "Hz", "natural frequency of the other root"
+            ),
+            "alternative_damping_ratio": column(other[1], "1", "damping ratio of the other root"),
+            "status": column(status_names(np.ravel(self.status)), "", "what became of it"),
+        }
