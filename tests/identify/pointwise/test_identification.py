@@ -177,7 +177,7 @@ class TestLinearMode:
         velocity[3] = np.nan
         spoilt = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
         found = sj.identify_backbone(spoilt, MODES)
-        assert any(note.startswith("1 of 30 points are left out") for note in found.notes)
+        assert any(note.startswith("1 of 30 steady states are left out") for note in found.notes)
 
     def test_an_anchor_is_told(self):
         found = sj.identify_backbone(linear_test(0, 0.01), MODES, anchor=True)
