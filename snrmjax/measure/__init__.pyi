@@ -10,7 +10,7 @@ from .harmonic_fit import FitStatus, HarmonicFit, fit_harmonics, phasor_relative
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .records import RecordFit, fit_records, steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
-from .states import SteadyStates, join_steady_states, steady_states
+from .states import OptionalColumns, SteadyStates, join_steady_states, steady_states
 
 __all__ = [
     "EquivalentForce",
@@ -19,6 +19,7 @@ __all__ = [
     "ForceStatus",
     "ForceVelocityLoop",
     "HarmonicFit",
+    "OptionalColumns",
     "RecordFit",
     "SteadyStates",
     "apply_calibration",

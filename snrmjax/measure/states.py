@@ -1,14 +1,16 @@
 """A table of measured steady states: the input of every identification."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, TypedDict, Unpack
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
+
+from snrmjax.numerics.result import AbstractResult, Variable
 
 PHASE_UNKNOWN = np.pi / 3
 """1σ of a phase, rad, from which on it counts as unknown.
@@ -17,20 +19,24 @@ Errors are carried to first order, which at a radian says nothing any more: a ve
 resonance would pass for anything from cos 60° of its size on.
 """
 
+_HERTZ = 2 * np.pi
+
 NO_PHASE = np.pi
 """1σ, rad, that stands for a phase that was not measured."""
 
 
-class SteadyStates(eqx.Module):
+class SteadyStates(AbstractResult):
     """Steady states, each measured by one or several sensors.
 
     Phasors e^{+iΩt} relative to the force (velocity phase 0 = phase resonance), peak amplitudes.
     A sensor that did not measure a state has `measured` False and velocity 0. A standard
-    deviation that nobody stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
+    deviation that is not stated is NaN. A phase with a 1σ of `PHASE_UNKNOWN` or more is unknown:
     of such a velocity and of its harmonics the amplitudes alone count. A force known only as a
     drive voltage is in `drive` and `force` is NaN. `notes` say what a reader of files did not use
-    or did not find stated.
+    or did not find stated. To differentiate by a column, change it with `dataclasses.replace`.
     """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state", "sensor", "harmonic", "level")
 
     level: Int[Array, " state"]
     frequency: Float[Array, " state"]  # rad/s
@@ -48,6 +54,76 @@ class SteadyStates(eqx.Module):
     sensors: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+
+        def spans(values: Any, unit: str) -> str:
+            finite = np.asarray(values)[np.isfinite(np.asarray(values))]
+            return f"{finite.min():.4g} to {finite.max():.4g} {unit}" if finite.size else "unknown"
+
+        n_levels = len(np.unique(np.asarray(self.level)))
+        volts = np.isfinite(np.asarray(self.drive)).any() and not np.isfinite(self.force).any()
+        load = spans(self.drive, "V (force unknown)") if volts else spans(self.force, "N")
+        stated = [
+            name
+            for name, std in (
+                ("velocity", self.velocity_std),
+                ("phase", self.phase_std),
+                ("force", self.force_std),
+            )
+            if np.isfinite(np.asarray(std)).any()
+        ]
+        size = np.where(np.asarray(self.measured), np.abs(np.asarray(self.velocity)), np.nan)
+        missing = int(np.sum(~np.asarray(self.measured)))
+        lines = [
+            f"SteadyStates: {self.n_states} states of {n_levels} levels at "
+            f"{', '.join(self.sensors)}",
+            f"frequency {spans(np.asarray(self.frequency) / _HERTZ, 'Hz')}, force {load}",
+            f"velocity {spans(size, 'm/s')}",
+            f"errors stated of {', '.join(stated) or 'nothing'}",
+        ]
+        if missing:
+            lines.append(f"{missing} velocities not measured")
+        if self.harmonic_order:
+            lines.append(f"harmonics {', '.join(map(str, self.harmonic_order))}")
+        return (*lines, *(f"note: {note}" for note in self.notes))
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; the columns of a table of steady states."""
+
+        def column(values: Any, unit: str, meaning: str) -> Variable:
+            array = np.asarray(values)
+            return Variable(("state", "sensor", "harmonic")[: array.ndim], array, unit, meaning)
+
+        velocity = np.where(self.measured, self.velocity, np.nan)
+        phase_std = np.degrees(np.asarray(self.phase_std))
+        orders = np.asarray(self.harmonic_order, dtype=int)
+        own = {
+            "state": column(np.arange(self.n_states), "1", "steady state"),
+            "sensor": Variable(("sensor",), np.asarray(self.sensors), "", "sensor"),
+            "harmonic": Variable(("harmonic",), orders, "1", "harmonic of the forcing frequency"),
+            "level": column(self.level, "1", "level of the test"),
+            "frequency_hz": column(np.asarray(self.frequency) / _HERTZ, "Hz", "forcing frequency"),
+            "force_n": column(self.force, "N", "force amplitude"),
+            "force_std_n": column(self.force_std, "N", "its 1σ"),
+            "drive_v": column(self.drive, "V", "drive voltage where the force is unknown"),
+            "order": column(self.order, "1", "place in the test, from 0 to 1"),
+            "velocity_re_m_s": column(velocity.real, "m/s", "velocity in phase with the force"),
+            "velocity_im_m_s": column(velocity.imag, "m/s", "velocity 90° ahead of the force"),
+            "velocity_std_m_s": column(self.velocity_std, "m/s", "1σ of the amplitude"),
+            "phase_std_deg": column(phase_std, "deg", "1σ of the phase"),
+            "harmonic_std_m_s": column(self.harmonic_std, "m/s", "rms error of a harmonic"),
+        }
+        harmonics = np.asarray(self.harmonics)
+        return own | {
+            "harmonic_re_m_s": column(harmonics.real, "m/s", "real part of a harmonic"),
+            "harmonic_im_m_s": column(harmonics.imag, "m/s", "imaginary part of a harmonic"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {"notes": "\n".join(self.notes)} if self.notes else {}
+
     @property
     def n_states(self) -> int:
         """Number of steady states."""
@@ -63,33 +139,57 @@ class SteadyStates(eqx.Module):
         return eqx.tree_at(lambda data: data.level, self, self.level + offset)
 
 
+class OptionalColumns(TypedDict, total=False):
+    """Columns of a table of steady states that may be left out, as keywords of `steady_states`.
+
+    A column that is None is left out. One number a state, or one a state and sensor (a vector where there is one sensor).
+    """
+
+    measured: (
+        Bool[np.ndarray, "state sensor"] | None
+    )  # False: this sensor did not measure this state
+    velocity_std: Float[np.ndarray, "state sensor"] | None  # m/s, 1σ of the amplitude
+    phase_std: Float[np.ndarray, "state sensor"] | None  # rad, 1σ
+    force_std: Float[np.ndarray, " state"] | None  # N, 1σ
+    drive: Float[np.ndarray, " state"] | None  # V, in place of a force that is unknown (NaN)
+    order: Float[np.ndarray, " state"] | None  # place in the test, from 0 to 1
+    harmonics: Complex[np.ndarray, "state sensor harmonic"] | None  # m/s, relative to the force
+    harmonic_std: (
+        Float[np.ndarray, "state sensor"] | None
+    )  # m/s, rms of the complex error of a harmonic
+    harmonic_order: tuple[int, ...]  # which harmonics `harmonics` has
+
+
 def steady_states(
     level: Int[np.ndarray, " state"],
     frequency: Float[np.ndarray, " state"],
     force: Float[np.ndarray, " state"],
     velocity: Complex[np.ndarray, "state sensor"],
     *,
-    sensors: tuple[str, ...] = ("sensor 1",),
-    measured: Bool[np.ndarray, "state sensor"] | None = None,
-    velocity_std: Float[np.ndarray, "state sensor"] | None = None,
-    phase_std: Float[np.ndarray, "state sensor"] | None = None,
-    force_std: Float[np.ndarray, " state"] | None = None,
-    drive: Float[np.ndarray, " state"] | None = None,
-    order: Float[np.ndarray, " state"] | None = None,
-    harmonics: Complex[np.ndarray, "state sensor harmonic"] | None = None,
-    harmonic_std: Float[np.ndarray, "state sensor"] | None = None,
-    harmonic_order: tuple[int, ...] = (),
+    sensors: Sequence[str] = ("sensor 1",),
+    **columns: Unpack[OptionalColumns],
 ) -> SteadyStates:
-    """Build `SteadyStates` from arrays; `velocity` may be a vector when there is one sensor.
+    """Build `SteadyStates` from arrays or lists; `velocity` may be a vector for one sensor.
 
     Arguments: `frequency` in rad/s, `force` in N, `velocity` phasors in m/s relative to the
-    force; standard deviations in the same units, `phase_std` in rad.
-    Raises `ValueError` naming the argument whose shape does not fit.
+    force; further columns by name, those of `OptionalColumns`: `measured`, `velocity_std` (m/s),
+    `phase_std` (rad), `force_std` (N), `drive` (V), `order`, `harmonics` (m/s), `harmonic_std`
+    (m/s) and `harmonic_order`. Arrays are copied to the host: no derivatives pass through.
+    Raises `ValueError` naming the argument whose shape does not fit, `TypeError` for a column that
+    does not exist.
 
     >>> data = steady_states([1, 1], [500.0, 510.0], [1.0, 1.0], [0.6 + 0.0j, 0.5 - 0.2j])
     >>> data.n_states, data.velocity.shape
     (2, (2, 1))
     """
+    unknown = sorted(set(columns) - set(OptionalColumns.__annotations__))
+    if unknown:
+        raise TypeError(
+            f"`steady_states` has no column {unknown[0]!r}, but "
+            f"{', '.join(OptionalColumns.__annotations__)}."
+        )
+    measured, harmonics = columns.get("measured"), columns.get("harmonics")
+    harmonic_order = tuple(int(order) for order in columns.get("harmonic_order", ()))
     omega = np.asarray(frequency, dtype=np.float64)
     if omega.ndim != 1:
         raise ValueError(f"`frequency` must be a vector, but has shape {omega.shape}.")
@@ -128,14 +228,14 @@ def steady_states(
         measured=per_sensor(
             "measured", np.ones((n_states, n_sensors)) if measured is None else measured, np.bool_
         ),
-        velocity_std=per_sensor("velocity_std", velocity_std),
-        phase_std=per_sensor("phase_std", phase_std),
-        force_std=per_state("force_std", force_std),
-        drive=per_state("drive", drive),
-        order=per_state("order", order),
+        velocity_std=per_sensor("velocity_std", columns.get("velocity_std")),
+        phase_std=per_sensor("phase_std", columns.get("phase_std")),
+        force_std=per_state("force_std", columns.get("force_std")),
+        drive=per_state("drive", columns.get("drive")),
+        order=per_state("order", columns.get("order")),
         harmonics=told,
-        harmonic_std=per_sensor("harmonic_std", harmonic_std),
-        harmonic_order=tuple(harmonic_order),
+        harmonic_std=per_sensor("harmonic_std", columns.get("harmonic_std")),
+        harmonic_order=harmonic_order,
         sensors=tuple(sensors),
     )
     # All at once: one by one they compile, a copy of every shape.

@@ -50,7 +50,8 @@ class AbstractResult(eqx.Module):
 
     def __repr__(self) -> str:
         """The summary; within `jax.jit`, where nothing has a value yet, the fields' shapes."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+        valueless = (jax.core.Tracer, jax.ShapeDtypeStruct)
+        if any(isinstance(leaf, valueless) for leaf in jax.tree.leaves(self)):
             return eqx.tree_pformat(self)
         first, *others = self.summary()
         return "\n".join([first, *(f"  {line}" for line in others)])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import snrmjax as sj
 
@@ -66,3 +67,48 @@ def test_records_joined_written_and_read_back(tmp_path):
     np.testing.assert_allclose(again.force, [1.0, 2.0, 3.0], rtol=1e-10)
     np.testing.assert_allclose(again.velocity[:, 0], list(truth.values()), rtol=1e-10)
     np.testing.assert_allclose(again.harmonics[:, 0, 0], list(third.values()), rtol=1e-9)
+
+
+class TestSaying:
+    def data(self):
+        nothing = np.full((3, 2, 1), np.nan + 0j)
+        return sj.measure.steady_states(
+            [1, 1, 2],
+            OMEGA + np.arange(3.0),
+            [1.0, 1.0, 2.0],
+            [[0.1, 0.2], [0.1j, 0.0], [0.3, 0.4]],
+            sensors=["tip", "root"],
+            measured=[[True, True], [True, False], [True, True]],
+            velocity_std=np.full((3, 2), 0.01),
+            harmonics=nothing,
+            harmonic_order=[3],
+        )
+
+    def test_one_screen(self):
+        lines = repr(self.data()).splitlines()
+        assert lines[0] == "SteadyStates: 3 states of 2 levels at tip, root"
+        assert "force 1 to 2 N" in lines[1]
+        assert lines[2].strip() == "velocity 0.1 to 0.4 m/s"
+        assert lines[3].strip() == "errors stated of velocity"
+        assert lines[4].strip() == "1 velocities not measured"
+
+    def test_a_drive_alone(self):
+        data = sj.measure.steady_states([1], [OMEGA], [np.nan], [0.1], drive=[0.5])
+        assert "force 0.5 to 0.5 V (force unknown)" in repr(data)
+
+    def test_labelled(self):
+        data = self.data().to_xarray()
+        assert data.frequency_hz.attrs["units"] == "Hz"
+        np.testing.assert_allclose(data.frequency_hz[0], 80.0)
+        assert data.velocity_re_m_s.sel(sensor="root").isnull().sum() == 1
+        assert data.harmonic_re_m_s.sizes == {"state": 3, "sensor": 2, "harmonic": 1}
+
+    def test_drawn(self):
+        assert isinstance(self.data().plot(sensor="root"), Figure)
+        with pytest.raises(ValueError, match="`sensor` must be one of"):
+            self.data().plot(sensor="middle")
+
+
+def test_a_column_that_does_not_exist_is_refused():
+    with pytest.raises(TypeError, match=r"no column 'phase_error', but measured, velocity_std"):
+        sj.measure.steady_states([1], [OMEGA], [1.0], [0.1], phase_error=[0.1])

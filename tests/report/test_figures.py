@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -187,11 +188,7 @@ def test_far_outliers_leave_the_axis_and_are_counted(identification, backbone):
 
 def test_many_points_are_drawn_small(identification, backbone):
     points = identification.points
-    tiled = eqx.tree_at(
-        lambda p: [getattr(p, name) for name in ARRAYS],
-        points,
-        [jnp.concatenate([getattr(points, name)] * 10) for name in ARRAYS],
-    )
+    tiled = jax.tree.map(lambda column: jnp.concatenate([column] * 10), points)
     few, many = (
         named(plot.backbone_figure(p, backbone).axes[0], "identified, 95 % bars")
         for p in (points, tiled)
@@ -255,7 +252,8 @@ def test_response_pieces_make_up_the_predicted_curve(backbone, predicted, resona
 
 def test_parts_beyond_the_data_are_pale(backbone, predicted):
     (curve,) = predicted
-    beyond = curve._replace(continued=np.abs(curve.velocity) > 0.5 * np.abs(curve.velocity).max())
+    far = np.abs(curve.velocity) > 0.5 * np.abs(curve.velocity).max()
+    beyond = dataclasses.replace(curve, continued=far)
     figure = plot.response_figure(backbone, [beyond])
     lines = [p for p in pieces(figure.axes[0], drawing.IDENTIFIED) if p.get_linestyle() != ":"]
     for line in lines:

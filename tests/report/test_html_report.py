@@ -263,8 +263,8 @@ def test_a_curve_that_turns_tells_its_lowest_and_highest_value(identification, m
     squared = identification.fit.backbone.squared_frequency
     values = squared.values.at[1].set((70.0 * HERTZ) ** 2)
     dipped = eqx.tree_at(lambda b: b.squared_frequency.values, identification.fit.backbone, values)
-    fit = identification.fit._replace(backbone=dipped)
-    turned = identification._replace(fit=fit)
+    fit = dataclasses.replace(identification.fit, backbone=dipped)
+    turned = dataclasses.replace(identification, fit=fit)
     rows = dict(identification_summary(turned, modes))
     ends = re.fullmatch(
         r"(\S+) Hz at \S+ m/s to (\S+) Hz at \S+ m/s", rows["lowest to highest frequency"]
