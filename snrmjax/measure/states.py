@@ -142,21 +142,18 @@ class SteadyStates(AbstractResult):
 class OptionalColumns(TypedDict, total=False):
     """Columns of a table of steady states that may be left out, as keywords of `steady_states`.
 
-    A column that is None is left out. One number a state, or one a state and sensor (a vector where there is one sensor).
+    A column that is None is left out. One number a state, or one a state and sensor (a vector
+    where there is one sensor).
     """
 
-    measured: (
-        Bool[np.ndarray, "state sensor"] | None
-    )  # False: this sensor did not measure this state
+    measured: Bool[np.ndarray, "state sensor"] | None  # False where a sensor missed a state
     velocity_std: Float[np.ndarray, "state sensor"] | None  # m/s, 1σ of the amplitude
     phase_std: Float[np.ndarray, "state sensor"] | None  # rad, 1σ
     force_std: Float[np.ndarray, " state"] | None  # N, 1σ
     drive: Float[np.ndarray, " state"] | None  # V, in place of a force that is unknown (NaN)
     order: Float[np.ndarray, " state"] | None  # place in the test, from 0 to 1
     harmonics: Complex[np.ndarray, "state sensor harmonic"] | None  # m/s, relative to the force
-    harmonic_std: (
-        Float[np.ndarray, "state sensor"] | None
-    )  # m/s, rms of the complex error of a harmonic
+    harmonic_std: Float[np.ndarray, "state sensor"] | None  # m/s, rms of a complex error
     harmonic_order: tuple[int, ...]  # which harmonics `harmonics` has
 
 
