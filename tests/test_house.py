@@ -59,7 +59,7 @@ LONGEST = 450
 # Rules about effects stand in the classes of effects: no other room knows an effect by its kind.
 KINDS = {
     kind
-    for path in (PACKAGE / "model").rglob("*.py")
+    for path in (PACKAGE / "model" / "library").glob("*.py")
     for kind in re.findall(r'kind: ClassVar\[str\] = "(\w+)"', path.read_text(encoding="utf-8"))
 }
 KIND = re.compile(r"\b(" + "|".join(sorted(KINDS)) + r")\b")

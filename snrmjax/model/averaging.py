@@ -13,7 +13,7 @@ ForceLaw = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
 
 
 class AveragedForce(NamedTuple):
-    """What a force f(q, q̇) does to a mode that moves as q = Q cos Ωt."""
+    """Equivalent stiffness and damping of a force on a mode that moves as q = Q cos Ωt."""
 
     stiffness: Float[Array, "*batch"]  # Δ(ω̃²), 1/s²
     damping: Float[Array, "*batch"]  # Δ(2ζ̃ω̃), 1/s
@@ -59,8 +59,8 @@ def averaged_effect(
 ) -> AveragedForce:
     """Equivalent stiffness and damping of an effect over one steady cycle, with a memory or not.
 
-    The integrals of `averaged_force` for q = Q cos Ωt, with the turning points among the samples:
-    friction is off by the square of the step.
+    The integrals of `averaged_force` for q = Q cos Ωt, with the turning points among the samples;
+    the error of friction falls with the square of the step.
 
     Arguments: `amplitude` Q in kg^1/2 m, not zero; `frequency` Ω in rad/s. Returns 1/s² and 1/s.
     First order in the force: harmonics of the response are neglected.
@@ -97,7 +97,7 @@ def averaged_response(
     amplitude: Float[Array, "*batch"],
     frequency: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch"]:
-    """Modal force that holds q = Q cos Ωt, as a phasor relative to the displacement.
+    """Modal force that is needed for q = Q cos Ωt, as a phasor relative to the displacement.
 
     P = Q [ω₀² + Δ(ω̃²) − Ω² + iΩ(2ζω₀ + Δ(2ζ̃ω̃))]: the complex form of Eq. (8).
 

@@ -150,10 +150,10 @@ class AbstractMemoryless(AbstractForce):
 class AbstractKinked(AbstractMemoryless):
     """A memoryless force whose slope jumps where a contact opens or closes.
 
-    In time the kink is a kink. Over a cycle it is rounded over a hundredth of half the range of
-    q to either side: harmonic balance sees a cycle at samples, and a kink between two of them
-    would move in steps. The stiffness that a motion feels changes by less than 1e-4 of the
-    contact's.
+    In time integration the kink is sharp. Over a cycle it is rounded over a hundredth of half the
+    range of q to either side: harmonic balance evaluates a cycle at samples, and a sharp kink
+    would jump from one sample to the next. The equivalent stiffness changes by less than 1e-4 of
+    the contact's.
     """
 
     @abstractmethod
@@ -189,11 +189,11 @@ def ramp(beyond: Scalar, width: Scalar) -> Scalar:
 
 
 class AbstractHysteresis(AbstractForce):
-    """A force with a memory: internal states beside q and q̇ when it is integrated in time.
+    """A force with memory: it has internal states beside q and q̇ in time integration.
 
-    `cycle_force` is that of the steady cycle, which needs no states. For integration in time,
-    take the effect that `scaled_for` returns, begin with its `initial_states`, integrate
-    `state_rate` and apply `state_force`.
+    `cycle_force` is that of the steady cycle, which needs no states. For time integration take
+    the effect that `scaled_for` returns, begin with its `initial_states`, integrate `state_rate`
+    and apply `state_force`.
     """
 
     def scaled_for(self, displacement: Scalar, velocity: Scalar) -> Self:
@@ -235,7 +235,7 @@ class AbstractLinearChange(AbstractEffect):
     def linear_terms(
         self, natural_frequency: Scalar, damping_ratio: Scalar, order: Scalar
     ) -> tuple[Scalar, Scalar, Scalar]:
-        """What is added to the mass 1, the damping 2ζω₀ and the stiffness ω₀².
+        """The terms that are added to the mass 1, the damping 2ζω₀ and the stiffness ω₀².
 
         Arguments: ω₀ in rad/s, ζ, and the test order from 0 to 1. Returns mass (relative to the
         modal mass), damping (1/s) and stiffness (1/s²). Several changes add up; their products,

@@ -49,6 +49,8 @@ class Prior(NamedTuple):
 
 ANY = Prior()
 NOT_BELOW_ZERO = Prior(lower=0.0)
+MORE_THAN_NOTHING = Prior(lower=-0.99)
+"""Relative changes of what stays positive."""
 FURTHER_DAMPING = Prior(1e-5, 0.2)
 """Damping ratios that a further mode may have."""
 

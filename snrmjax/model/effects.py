@@ -78,10 +78,22 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
 def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     """Make an effect of your own known to files, simulations, calibrations and diagnoses.
 
-    Use as a decorator of a class with a `kind`, parameters as fields and a force. The class may
-    state what the library's do (see `AbstractEffect` and `parameter`); it is treated like these
-    wherever and whenever it is registered.
-    Raises `ValueError` for a kind that exists already and for a class without parameters.
+    Use as a decorator of a class with a `kind`, parameters as fields and a force, whose
+    derivatives must be finite, at rest too. What the class does not state (see `AbstractEffect`
+    and `parameter`) is computed from its force, and it is treated like an effect of the library
+    wherever and whenever it is registered:
+
+        @sj.model.register_effect
+        class RootDamping(sj.model.AbstractMemoryless):
+            kind: ClassVar[str] = "root_damping"
+            description: ClassVar[str] = "Damping with the square root of the velocity."
+            coefficient: Array = sj.model.parameter("(kg^1/2 m/s)^(1/2)/s", "root damping")
+
+            def force(self, displacement, velocity):
+                return self.coefficient * velocity / (velocity**2 + 1e-12) ** 0.25
+
+    Returns the class. Raises `ValueError` for a kind that exists already and for a class without
+    parameters.
     """
     if effect.kind in EFFECTS:
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")

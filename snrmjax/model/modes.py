@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Shaped
 
+_SHOWN = 12  # modes, in a text
+
 
 class LinearModes(eqx.Module):
     """Mass-normalised linear modes, seen at some sensors and driven by one force pattern.
@@ -26,6 +28,22 @@ class LinearModes(eqx.Module):
     sensors: tuple[str, ...] = eqx.field(static=True)
     mode_of_interest: int = eqx.field(static=True, default=0)
 
+    def __repr__(self) -> str:
+        """A line for every mode; within `jax.jit` and for a batch, the fields' shapes."""
+        if not have_values(self) or self.natural_frequency.ndim != 1:
+            return eqx.tree_pformat(self)
+        rigid = self.rigid_body_participation.shape[0]
+        beside = f" and {rigid} rigid-body mode{'s' if rigid > 1 else ''}" if rigid else ""
+        count = f"{self.n_modes} mode{'s' if self.n_modes > 1 else ''}"
+        lines = [f"LinearModes: {count}{beside} at {', '.join(self.sensors)}"]
+        for k in range(min(self.n_modes, _SHOWN)):
+            hertz, ratio = float(self.natural_frequency[k]) / (2 * np.pi), self.damping_ratio[k]
+            chosen = ", of interest" if k == self.mode_of_interest else ""
+            lines.append(f"mode {k + 1}: {hertz:.6g} Hz, damping {100 * ratio:.3g} %{chosen}")
+        if self.n_modes > _SHOWN:
+            lines.append(f"… and {self.n_modes - _SHOWN} more")
+        return "\n  ".join(lines)
+
     @property
     def n_modes(self) -> int:
         """Number of flexible modes."""
@@ -33,8 +51,15 @@ class LinearModes(eqx.Module):
 
     @property
     def residual_modes(self) -> tuple[int, ...]:
-        """Indices of the flexible modes that respond linearly beside the mode of interest."""
+        """Indices of the flexible modes other than the mode of interest, which respond linearly."""
         return tuple(k for k in range(self.n_modes) if k != self.mode_of_interest)
+
+
+def have_values(tree: object) -> bool:
+    """Whether all leaves are arrays with values, as they are outside `jax.jit`."""
+    leaves = jax.tree.leaves(tree)
+    kinds = (np.ndarray, jax.Array)
+    return all(isinstance(a, kinds) and not isinstance(a, jax.core.Tracer) for a in leaves)
 
 
 class RigidBodyModes(NamedTuple):
@@ -142,7 +167,7 @@ def residual_velocity(
     frequency: Float[Array, "*batch"],
     force: Float[Array, "*batch"],
 ) -> Complex[Array, "*batch sensor"]:
-    """Velocity of the linear modes beside the mode of interest and of the rigid-body modes.
+    """Velocity of the linear modes other than the mode of interest and of rigid-body modes.
 
     V_lin + V_RB of Eq. (10b), as phasors e^{+iΩt} relative to the force: a flexible mode gives
     iΩ Φ ΦᵀF / (ω² − Ω² + 2iζωΩ), a rigid-body mode −iΦ ΦᵀF / Ω.

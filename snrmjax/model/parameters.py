@@ -21,8 +21,7 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
 
     Names such as "potential.1111", "mode_1.natural_frequency" (rad/s), "mode_1.damping_ratio",
     "mode_1.participation" (kg^-1/2) and "quadratic_damping.coefficient"; of several effects of a
-    kind the second is "quadratic_damping_2". Parameters of effects that are no single numbers
-    have no name.
+    kind the second is "quadratic_damping_2". Parameters that are arrays have no name.
 
     >>> from snrmjax.model import curved_beam
     >>> parameter_names(curved_beam())[:3]
@@ -32,7 +31,10 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
 
 
 def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
-    """The names as a tuple; `ValueError` where one is unknown, with what is near it, or twice."""
+    """The names as a tuple, checked.
+
+    Raises `ValueError` for an unknown name, with similar ones, and for one that is given twice.
+    """
     known = parameter_names(model)
     if isinstance(names, str) or not names:
         raise ValueError(f"`parameters` must be a sequence of names, but is {names!r}.")
@@ -40,7 +42,7 @@ def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=5, cutoff=0.5) or known[:5]
             raise ValueError(
-                f"`parameters` names {name!r}, which the model does not have; near it are "
+                f"`parameters` names {name!r}, which the model does not have; similar ones are "
                 f"{', '.join(near)}."
             )
         if list(names).count(name) > 1:
@@ -101,7 +103,7 @@ def with_parameters(
 def with_stated_std(
     model: Structure, names: Sequence[str], std: Float[Array, " parameter"]
 ) -> Structure:
-    """The model with other stated 1σ of named numbers, where it has a place for them."""
+    """The model with other 1σ of named numbers; those that have no 1σ in a model are left out."""
     places = _places(model)
     wanted = [places[name] for name in names]
     wanted = [place._replace(field=f"{place.field}_std") for place in wanted]

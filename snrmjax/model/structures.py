@@ -20,7 +20,7 @@ from snrmjax.model.effect_base import (
     AbstractMeasurementEffect,
     AbstractMemoryless,
 )
-from snrmjax.model.modes import LinearModes
+from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
 
 
@@ -37,9 +37,9 @@ class Structure(eqx.Module):
 
     `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ errors that all measurements
     of one level share; `level_frequency_std` (rad/s) and `level_damping_std` (of the damping ratio)
-    say how far the mode of interest itself differs from level to level, as a bolted joint does
-    from run to run. They belong to the test set-up and travel with the model file.
-    `test_order`, from 0 to 1, is when in a test the structure is looked at.
+    are the run-to-run variability of the mode of interest itself, as bolted joints have it. They
+    belong to the test set-up and are kept in the model file. `test_order` is the place of the
+    motion in the test, from 0 (first state) to 1 (last), for effects that drift.
     """
 
     modes: LinearModes
@@ -51,6 +51,26 @@ class Structure(eqx.Module):
     level_damping_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     test_order: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     name: str = eqx.field(static=True, default="structure")
+
+    def __repr__(self) -> str:
+        """Name, modes, potential, effects, errors; within `jax.jit` and of a batch the shapes."""
+        if not have_values(self) or self.test_order.ndim:
+            return eqx.tree_pformat(self)
+        monomials = self.potential.monomials
+        terms = f"{len(monomials)} terms to degree {self.potential.degree}" if monomials else "none"
+        lines = [f"Structure {self.name!r}", *repr(self.modes).splitlines()]
+        lines.append(f"polynomial potential: {terms}")
+        for effect in self.effects:
+            values = [
+                f"{name} {_text(getattr(effect, name))} {one.unit}".removesuffix(" 1")
+                for name, one in effect.parameters().items()
+            ]
+            lines.append(f"effect {effect.kind}: {', '.join(values)}")
+        names = ("relative gain", "phase (rad)", "natural frequency (rad/s)", "damping ratio")
+        stated = [f"{n} {s:.3g}" for n, s in zip(names, self.level_stds, strict=True) if s > 0]
+        if stated:
+            lines.append(f"1σ between levels: {', '.join(stated)}")
+        return "\n  ".join(lines)
 
     @property
     def level_stds(self) -> tuple[float, float, float, float]:
@@ -67,10 +87,8 @@ class Structure(eqx.Module):
 
     @property
     def own_mode(self) -> Float[np.ndarray, " mode"]:
-        """One for the mode of interest, zero for others.
-
-        What adds to that mode is multiplied by it: a `vmap` makes a loop of writing to an entry.
-        """
+        """One for the mode of interest, zero for the others: adds a force to that mode alone."""
+        # Multiplying is faster than writing to an entry, of which a `vmap` makes a loop.
         return np.eye(self.n_modes)[self.modes.mode_of_interest]
 
     @property
@@ -99,7 +117,7 @@ class Structure(eqx.Module):
 
     @property
     def measurement_effects(self) -> tuple[AbstractMeasurementEffect, ...]:
-        """The effects that falsify the record, in the order in which they act."""
+        """The effects that change what is recorded, in the order in which they act."""
         found = [e for e in self.effects if isinstance(e, AbstractMeasurementEffect)]
         return tuple(sorted(found, key=lambda effect: effect.stage))
 
@@ -153,8 +171,8 @@ class Structure(eqx.Module):
         """Energy in J of a structure held at rest: linear, polynomial and of memoryless effects.
 
         The effects' part is the work ∫ f(s, 0) ds from zero, by Gauss's rule with 64 points:
-        exact for a polynomial force, to about 1e-4 of it where the force has a kink. What
-        friction stores is left out.
+        exact for a polynomial force, to about 1e-4 of it where the force has a kink. The elastic
+        energy of friction elements is not included.
         """
         linear = 0.5 * (displacement**2 @ self.linear_terms().stiffness)
         energy = linear + self.potential.energy(displacement)
@@ -192,6 +210,10 @@ class Structure(eqx.Module):
 def modes_of(model: Structure | LinearModes) -> LinearModes:
     """The linear modes of a structure; linear modes themselves as they are."""
     return model.modes if isinstance(model, Structure) else model
+
+
+def _text(value: Array) -> str:
+    return f"{float(value):.6g}" if value.ndim == 0 else f"of shape {value.shape}"
 
 
 def structure(
@@ -232,8 +254,8 @@ def structure(
 def simulated_structure(model: Structure) -> Structure:
     """The structure that is simulated: with the further modes of its internal resonances.
 
-    A further mode follows the others, is driven by no force and seen by no sensor. Returns the
-    model itself where no effect adds a mode.
+    A further mode comes after the others; no force drives it directly and no sensor sees it.
+    Returns the model itself where no effect adds a mode.
     """
     adding = [e for e in model.effects if isinstance(e, AbstractAddedMode)]
     if not adding:
@@ -260,7 +282,7 @@ def equilibria(model: Structure, *, n_starts: int = 512, seed: int = 0) -> list[
     otherwise by Newton's method from many starts (a search, not a proof of completeness).
     A structure whose list has more than one stable entry is bistable: its forced response has
     wells that a curve followed from rest does not visit. Friction, which could hold a structure
-    elsewhere, is left out, and so are further modes (see `simulated_structure`).
+    away from an equilibrium, is neglected, and so are further modes (see `simulated_structure`).
 
     Returns the distinct equilibria found, sorted by |q|.
     """
@@ -331,9 +353,9 @@ def _energy_and_tangent(
 def displacement_scale(model: Structure) -> np.ndarray:
     """The displacement of each mode (kg^1/2 m) at which its own nonlinear force is not small.
 
-    Where a term of the potential matches the linear force, or memoryless effects change it by a
-    tenth of it.
-    Sets the scale of searches and continuations; modes without own terms take the median.
+    There a term of the potential is as large as the linear force, or memoryless effects change
+    that by a tenth. It is the scale of searches and continuations; modes without terms of their
+    own take the median of the others.
     """
     squared = np.asarray(model.linear_terms().stiffness)
     scale = np.full(model.n_modes, np.nan)

@@ -78,7 +78,7 @@ def test_starts_lie_inside_the_priors_and_priors_inside_the_rules(kind):
         assert min(steps) > 0 or kind == "force_harmonics"
         for value, (lower, upper), one in zip(start, bounds, parameters.values(), strict=True):
             assert lower <= value <= upper
-            for bound in filter(np.isfinite, (lower, upper)):
+            for bound in (max(lower, -1e200), min(upper, 1e200)):
                 assert all(rule.good(bound) for rule in one.rules)
     make_effect(kind, dict(zip(parameters, starts[0], strict=True)))
 

@@ -1,8 +1,10 @@
 """Structures: forces and tangents against differences, and equilibria against exact ones."""
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -297,3 +299,23 @@ def test_what_is_not_said_is_linear_and_exact():
     np.testing.assert_array_equal(damping, [0.04, 0.06])
     np.testing.assert_array_equal(stiffness, [4.0, 9.0])
     assert (model.n_modes, model.name, model.effects) == (2, "structure", ())
+
+
+def test_a_structure_says_itself_on_one_screen():
+    slider = make_effect("jenkins_slider", {"stiffness": 9.0, "slip_displacement": 2e-4})
+    model = dataclasses.replace(flat_beam(), effects=(slider,), level_gain_std=jnp.asarray(0.01))
+    text = repr(model)
+    assert len(text.splitlines()) < 20
+    for part in (
+        "mode 1: 79.02 Hz, damping 5 %, of interest",
+        "55 terms",
+        "0.01",
+        "stiffness 9 1/s²",
+    ):
+        assert part in text
+    assert "slip_displacement 0.0002 kg^1/2 m" in text
+    seen = []
+    jax.jit(lambda m: seen.append(repr(m)) or m.modes.participation)(model)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), model)
+    for shapes in (seen[0], repr(batch), repr(batch.modes), repr(jax.tree.map(lambda _: 1, model))):
+        assert "natural_frequency=" in shapes

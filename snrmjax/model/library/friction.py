@@ -53,12 +53,11 @@ def settled_positions(
     """Positions of sliders over the steady cycle of a periodic motion, in kg^1/2 m.
 
     z ↦ clip(z, q − x_s, q + x_s) from sample to sample, from z = 0. Such maps are closed under
-    composition, and that of a whole cycle changes nothing when it is applied twice: the second
-    cycle is exactly the steady one. A slider that never slips stays where the first approach
-    from rest to sample 0 left it.
+    composition, and that of a whole cycle is idempotent: the second cycle is exactly the steady
+    one. A slider that never slips stays where the first approach from rest to sample 0 left it.
 
-    Every position is a sample of q plus or minus x_s, or 0. Which one is found without
-    derivatives; the derivatives are then those of picking it: exact, and cheap for many tangents.
+    Every position is a sample of q plus or minus x_s, or 0. Which sample it is, is found without
+    derivatives; the position is then looked up, so that its derivatives are exact and cheap.
     """
     n = displacement.shape[0]
     q, slip = jax.lax.stop_gradient((displacement, slip_displacement))
@@ -96,7 +95,7 @@ class AbstractSliders(AbstractHysteresis):
     def state_force(
         self, displacement: Scalar, velocity: Scalar, states: Float[Array, " state"]
     ) -> Scalar:
-        """See `AbstractHysteresis.state_force`; positions that an integrator left are corrected."""
+        """See `AbstractHysteresis.state_force`; errors of an integrator's positions are removed."""
         return -jnp.sum(self.sliders().stiffness * self.moved_states(displacement, states))
 
     def state_rate(
@@ -160,7 +159,7 @@ class JenkinsSlider(AbstractSliders):
     def cycle_force(
         self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
     ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`; the direction of time is the samples' own."""
+        """See `AbstractForce.cycle_force`."""
         return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
 
     def quick_cycle_force(
@@ -252,7 +251,7 @@ class IwanMicroslip(AbstractSliders):
     def cycle_force(
         self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
     ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`; what happened before the cycle leaves no trace."""
+        """See `AbstractForce.cycle_force`."""
         half_range = 0.5 * (jnp.max(displacement) - jnp.min(displacement))
         sliders = self._sliders_up_to(half_range)
         return settled_positions(displacement, sliders.slip_displacement) @ -sliders.stiffness

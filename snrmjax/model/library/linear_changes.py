@@ -5,7 +5,14 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from snrmjax.model.effect_base import AbstractLinearChange, Scalar, Starts
-from snrmjax.model.effect_metadata import Confusion, MotionScales, Part, Shape, parameter
+from snrmjax.model.effect_metadata import (
+    MORE_THAN_NOTHING,
+    Confusion,
+    MotionScales,
+    Part,
+    Shape,
+    parameter,
+)
 from snrmjax.model.library.confusions import DRIFT, STIFFNESS_OR_MASS
 from snrmjax.numerics.rules import ABOVE_MINUS_ONE
 
@@ -30,7 +37,10 @@ class LinearFrequencyShift(AbstractLinearChange):
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
     confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
     relative_shift: Scalar = parameter(
-        "1", "relative shift of the natural frequency", rules=(ABOVE_MINUS_ONE,)
+        "1",
+        "relative shift of the natural frequency",
+        rules=(ABOVE_MINUS_ONE,),
+        prior=MORE_THAN_NOTHING,
     )
 
     @classmethod
@@ -59,7 +69,10 @@ class FrequencyDrift(AbstractLinearChange):
     shape: ClassVar[Shape] = Shape(Part.TIME)
     confusions: ClassVar[tuple[Confusion, ...]] = (DRIFT,)
     relative_drift: Scalar = parameter(
-        "1", "relative shift of the natural frequency over the test", rules=(ABOVE_MINUS_ONE,)
+        "1",
+        "relative shift of the natural frequency over the test",
+        rules=(ABOVE_MINUS_ONE,),
+        prior=MORE_THAN_NOTHING,
     )
 
     @classmethod
@@ -105,7 +118,9 @@ class AddedMass(AbstractLinearChange):
     shape: ClassVar[Shape] = Shape(Part.STIFFNESS, power=0)
     confusions: ClassVar[tuple[Confusion, ...]] = (STIFFNESS_OR_MASS,)
     like_force_gain: ClassVar[bool] = True
-    mass: Scalar = parameter("1", "mass over the modal mass", rules=(ABOVE_MINUS_ONE,))
+    mass: Scalar = parameter(
+        "1", "mass over the modal mass", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
+    )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:

@@ -1,4 +1,4 @@
-"""Errors of the force's spectrum and of the instruments, and what sensors see beside a mode."""
+"""Errors of force and instruments, and responses of modes that the model lacks."""
 
 from typing import ClassVar, Self
 
@@ -14,6 +14,7 @@ from snrmjax.model.effect_base import (
 )
 from snrmjax.model.effect_metadata import (
     FURTHER_DAMPING,
+    MORE_THAN_NOTHING,
     VISIBLE_CHANGE,
     Confusion,
     Imitation,
@@ -74,7 +75,9 @@ class ForceGainError(AbstractMeasurementEffect):
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter("1", "relative error of the force", rules=(ABOVE_MINUS_ONE,))
+    gain: Scalar = parameter(
+        "1", "relative error of the force", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
+    )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
@@ -123,7 +126,9 @@ class SensorGainError(AbstractMeasurementEffect):
     confusions: ClassVar[tuple[Confusion, ...]] = (SIZE_OF_RESPONSE, FORCE_OR_SENSOR_GAIN)
     is_linear: ClassVar[bool] = True
     like_force_gain: ClassVar[bool] = True
-    gain: Scalar = parameter("1", "relative error of the velocity", rules=(ABOVE_MINUS_ONE,))
+    gain: Scalar = parameter(
+        "1", "relative error of the velocity", rules=(ABOVE_MINUS_ONE,), prior=MORE_THAN_NOTHING
+    )
 
     @classmethod
     def starts(cls, scales: MotionScales) -> Starts:
