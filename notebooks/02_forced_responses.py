@@ -21,7 +21,7 @@
 # 3. motions apart from the main curve: another well, a branch cut off by the range, a true loop;
 # 4. how many harmonics it takes, and whether the estimated error can be believed;
 # 5. what the peak and the jump hinge on, by exact derivatives;
-# 6. two hundred scattered beams, and whether those derivatives foretold the scatter.
+# 6. two hundred scattered beams, and whether those derivatives predicted the scatter.
 #
 # Conventions: frequencies in rad/s in the code and in Hz in print and figures; amplitudes are those
 # of the velocity's fundamental harmonic at midspan. The first call of a kind takes seconds, in
@@ -215,8 +215,8 @@ c.set(xlim=(1e-6, 2e-1))
 for curve in held:
     x, y = curve.frequency / HERTZ, curve.force * 1e3
     d.plot(x, y, color="0.4", linewidth=drawing.LINE)
-    low = np.flatnonzero(y < 37)[0]
-    d.annotate(f"{level(curve)[0]:.2f} m/s", (x[low], y[low]), (9, 0), **note)
+    low = int(np.argmin(y))  # the curves' valleys lie apart from one another
+    d.annotate(f"{level(curve)[0]:.2f} m/s", (x[low], y[low]), (-14, -11), **note)
 d.plot(locked.frequency / HERTZ, locked.force * 1e3, "--", color=ORANGE)
 d.set(ylim=(0, 40), xlim=(70, 110))
 drawing.name_axes(a, "(a) flat beam: responses and backbones", HZ, VELOCITY)
@@ -320,7 +320,7 @@ b.set(xlim=(19, 45), ylim=(0, 0.15))
 c.set(xlim=(72, 90), ylim=(0, 0.8))
 drawing.name_axes(a, "(a) two wells: 0.133 mN", HZ, VELOCITY)
 drawing.name_axes(b, "(b) cut off at 20 Hz: 0.667 mN", HZ, VELOCITY)
-drawing.name_axes(c, "(c) a closed loop: odd damping", HZ, VELOCITY)
+drawing.name_axes(c, "(c) loop: odd damping", HZ, VELOCITY)
 drawing.explain_lines(figure)
 show(figure, "isolated_responses")
 
@@ -456,7 +456,7 @@ for axes, row, title in zip(both, sensitivity, titles, strict=True):
     bars = axes.barh(label, size, color=np.where(size > 0, BLUE, ORANGE))
     axes.bar_label(bars, [f"{s:+.3f}" for s in size], padding=4, fontsize=drawing.SMALL)
     axes.axvline(0.0, color="0.4", linewidth=0.7)
-    axes.margins(x=0.16)
+    axes.margins(x=0.3)
     drawing.name_axes(axes, title, "Sensitivity (% per %)", "")
 show(figure, "sensitivity")
 
@@ -481,11 +481,11 @@ batch = sj.simulate.forced_response_batch(
 )
 jumps = np.array([c[0].frequency[c[0].at_events("fold")].max() for c in batch.curves])
 computed = 100 * (np.stack([batch.peak_velocity, jumps], axis=1) / nominal - 1)
-foretold = scatter @ sensitivity.T
+predicted = scatter @ sensitivity.T
 quantities = "peak velocity", "upper fold's frequency"
-for what, value, guess in zip(quantities, computed.T, foretold.T, strict=True):
+for what, value, guess in zip(quantities, computed.T, predicted.T, strict=True):
     print(
-        f"{what}: scatter {value.std():.3f} %, foretold {guess.std():.3f} %, "
+        f"{what}: scatter {value.std():.3f} %, predicted {guess.std():.3f} %, "
         f"worst beam off by {np.abs(value - guess).max():.2f} %"
     )
 
@@ -494,13 +494,13 @@ figure, ((a, b),) = drawing.panels(drawing.PAGE, 3.2, 1, 2)
 a.plot(batch.peak_frequency / HERTZ, batch.peak_velocity, **DOTS, color=BLUE)
 a.plot(summit[1] / HERTZ, nominal[0], **CIRCLE, label="the beam without scatter")
 for what, colour, value, guess in zip(
-    quantities, (BLUE, ORANGE), computed.T, foretold.T, strict=True
+    quantities, (BLUE, ORANGE), computed.T, predicted.T, strict=True
 ):
     b.plot(guess, value, **DOTS, color=colour, label=what)
 b.plot([-10, 12], [-10, 12], color="0.5", linewidth=0.7, zorder=1)
 b.set(xlim=(-10, 12), ylim=(-10, 12))
 drawing.name_axes(a, "(a) peaks of 200 beams", HZ, VELOCITY)
-drawing.name_axes(b, "(b) foretold by derivatives", "Foretold change (%)", "Computed change (%)")
+drawing.name_axes(b, "(b) predicted by derivatives", "Predicted change (%)", "Computed change (%)")
 show(figure, "two_hundred_beams")
 
 # %%
@@ -530,10 +530,10 @@ headline = {
     "closed loop four times above the main curve": level(loop).max() > 4 * level(below).max(),
     "estimated error within 10 % of the true one": 0.9 < believed[0] <= believed[1] < 1.1,
     "peak falls by 0.99 % per % of damping": abs(sensitivity[0, len(keys) + 4] + 0.99) < 5e-3,
-    "200 beams foretold within 0.1 % of scatter": np.all(
+    "200 beams predicted within 0.1 % of scatter": np.all(
         batch.status == sj.simulate.CurveStatus.UPPER_END
     )
-    and np.allclose(computed.std(axis=0), foretold.std(axis=0), atol=0.1),
+    and np.allclose(computed.std(axis=0), predicted.std(axis=0), atol=0.1),
 }
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))
 if not all(headline.values()):

@@ -331,7 +331,7 @@ else:
     show(plot.residuals_figure(bolted), "brake_reuss_residuals")
 
 # %% [markdown]
-# Levels 4 and 7 are now left out, and foretold by the other six. Dots are their single states.
+# Levels 4 and 7 are now left out, and predicted by the other six. Dots are their single states.
 #
 # Mind the bands of this fit. Six levels leave too little to tell how far natural frequencies differ
 # from level to level: its remarks name gain and phase only, and its bands are far too narrow. All
@@ -349,7 +349,7 @@ else:
     show(plot.fitted_curves_figure(series), "levels_held_out")
     close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
     at = np.asarray(unseen.backbone_velocity)
-    foretold = sj.identify.fitted_values(six, at)
+    predicted = sj.identify.fitted_values(six, at)
     yardstick = sj.identify.fitted_values(bolted, at, of_a_new_level=True)
     remarks(six)
     for level in (4, 7):
@@ -358,15 +358,15 @@ else:
         def typical(values, rows=rows):
             return float(np.median(np.asarray(values)[rows]))
 
-        hertz = typical(unseen.natural_frequency - foretold.natural_frequency) / HERTZ
-        ratio = typical(unseen.damping_ratio / foretold.damping_ratio) - 1
+        hertz = typical(unseen.natural_frequency - predicted.natural_frequency) / HERTZ
+        ratio = typical(unseen.damping_ratio / predicted.damping_ratio) - 1
         scatter = typical(yardstick.natural_frequency_std) / HERTZ
         relative = typical(yardstick.damping_ratio_std / yardstick.damping_ratio)
         print(
             f"level {level}: frequency off by {hertz:+.3f} Hz (1σ of a level: {scatter:.3f}), "
             f"damping by {100 * ratio:+.1f} % ({100 * relative:.1f})"
         )
-        headline[f"level {level} foretold within 0.15 Hz and 15 % of damping"] = (
+        headline[f"level {level} predicted within 0.15 Hz and 15 % of damping"] = (
             abs(hertz) < 0.15 and abs(ratio) < 0.15
         )
 

@@ -311,7 +311,7 @@ offsets = {
 headline["the offset within three standard deviations"] = all(
     abs(value + share * forces[0]) < 3 * std for share, (value, std) in offsets.items()
 )
-headline["held-out and top level foretold to within their noise"] = all(
+headline["held-out and top level predicted to within their noise"] = all(
     max(one.gap.interpolated.after, one.gap.extrapolated.after) < 1.4 for one in found.values()
 )
 nothing = sj.diagnose_model(model, recorded(motions["beam"], 18, 34))
@@ -533,7 +533,7 @@ headline["stiffening: a gain of the sensor of −10 to −14 % is named, no damp
     stiff.candidates == (("sensor_gain_error",),)
     and -0.14 < stiff.parameters["sensor_gain_error.gain"][0] < -0.10
 )
-headline["both: held-out and top level foretold to within their noise"] = all(
+headline["both: held-out and top level predicted to within their noise"] = all(
     max(one.gap.interpolated.after, one.gap.extrapolated.after) < 1.4 for one in (soft, stiff)
 )
 

@@ -52,7 +52,7 @@ _SHOWN = 10  # candidates
 _LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
 _SAME_FORCE = 0.05  # relative: further from a level's force a state is drawn pale
 _SAMPLES = 361  # of a cycle
-_AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "kg^1/2 m/s²")  # units without prefixes
+_AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "√kg m/s²")  # units without prefixes
 _PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
 _SINGLE_VALUED = 0.02  # of a force's range, between going there and coming back
 
@@ -161,7 +161,7 @@ def comparison_figure(
         (grid[0, 1], after, IDENTIFIED, "completed model"),
     ):
         marks(axes, frequency[~same], speed[~same] / unit.size, pale, "measured, other forces")
-        marks(axes, frequency[same], speed[same] / unit.size, DOT, "measured")
+        marks(axes, frequency[same], speed[same] / unit.size, {**DOT, "zorder": 4}, "measured")
         for k, curve in enumerate(curves):
             size = np.abs(np.asarray(curve.velocity)[:, 1, r]) / unit.size
             label = name if k == 0 else None
@@ -268,7 +268,7 @@ def _law(effect: AbstractEffect, model: Structure, data: SteadyStates, sensor: i
         place = np.zeros((_SAMPLES, len(modes.natural_frequency)))
         place[:, model.modes.mode_of_interest] = q
         force = np.asarray(potential.force(jnp.asarray(place)))[:, -1]
-        quantity = ("Force on the further mode", "kg^1/2 m/s²")
+        quantity = ("Coupling force", "√kg m/s²")
         return _Law(("Displacement", "m"), quantity, (_Curve(motion.shape * q, force),))
     cycles = [_cycle(effect, motion, one) for one in motion.reached]
     if isinstance(effect, AbstractLinearChange):

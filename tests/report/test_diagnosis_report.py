@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from truth.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.diagnose.search.locating import Located
@@ -257,3 +258,16 @@ def test_misfit_and_responses_stand_over_the_states(drag, pictures):
     assert len(drawn) == n_levels
     with pytest.raises(ValueError, match="no response to show"):
         plot.comparison_figure([], [], data)
+
+
+def test_figures_of_a_diagnosis_can_be_read_on_a_printed_page(pictures, states):
+    loops = make_effect("jenkins_slider", {"stiffness": 100.0, "slip_displacement": 2e-4})
+    gain = make_effect("sensor_gain_error", {"gain": 0.07})
+    coupled = {"coefficient": 1e9, "frequency_hz": 30.0, "damping_ratio": 0.01}
+    further = make_effect("internal_resonance_1_2", coupled)
+    figures = pictures[1] | {
+        "two laws": plot.effect_laws_figure(model(loops, gain), states),
+        "three laws": plot.effect_laws_figure(model(loops, gain, further), states),
+    }
+    for name, figure in figures.items():
+        assert unreadable(figure) == [], name

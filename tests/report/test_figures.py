@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from truth.beam_forces import FORCES
+from truth.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.io.units import DEGREE, HERTZ
@@ -407,3 +408,22 @@ def test_units_suit_the_size(value, name, text):
     assert drawing.with_unit(value, name) == text
     assert drawing.unit_for([0.0], name) == (1.0, name)
     assert drawing.unit_for([np.nan, -value], name) == drawing.unit_for(value, name)
+
+
+def test_figures_can_be_read_on_a_printed_page(
+    identification, backbone, model, mode, predicted, resonance, virtual
+):
+    series = [plot.DampingSeries("both", identification.points, backbone)]
+    for figure in (
+        plot.backbone_figure(identification.points, backbone, truth=mode, modes=model.modes),
+        plot.response_figure(
+            *(backbone, predicted, resonance),
+            simulated=virtual.curves,
+            measured=virtual.steady_states,
+        ),
+        plot.force_velocity_figure(virtual.steady_states, [0, 4, 2, 7]),
+        plot.modal_damping_figure(series, linear=40.7),
+        simulated_response_figure(virtual.curves),
+        normal_mode_figure(mode),
+    ):
+        assert unreadable(figure) == []

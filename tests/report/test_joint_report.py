@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from truth.exact_states import damping, modes, noisy, squared
+from truth.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.identify.inference.sensitivity import Contribution
@@ -196,3 +197,8 @@ def test_nothing_to_show_is_an_error():
     ):
         with pytest.raises(ValueError, match=named):
             draw([])
+
+
+def test_figures_of_a_fit_can_be_read_on_a_printed_page(figures):
+    for name, figure in figures.items():
+        assert unreadable(figure) == [], name
