@@ -48,7 +48,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, differ: bool) -> Found:
             float(np.mean(values.natural_frequency_std / values.natural_frequency)),
             float(np.mean(values.modal_damping_std / values.modal_damping)),
         ),
-        fit.level_std,
+        fit.noise.level_std,
     )
 
 

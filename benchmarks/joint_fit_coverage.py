@@ -171,8 +171,10 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
         "damping": np.asarray(damping).tolist(),
         "frequency_band": float(np.mean(values.natural_frequency_std / values.natural_frequency)),
         "damping_band": float(np.mean(values.modal_damping_std / values.modal_damping)),
-        "noise": fit.noise_scale,
-        "families": [c.family + f":{c.size}@{c.argument}" for c in fit.candidates if c.chosen],
+        "noise": fit.noise.scale,
+        "families": [
+            c.family + f":{c.size}@{c.argument}" for c in fit.families.candidates if c.chosen
+        ],
         "notes": list(fit.notes),
     }
     curves = fitted_response(fit, case.foretold)

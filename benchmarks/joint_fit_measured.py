@@ -28,7 +28,7 @@ import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_with_slopes
 from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.joint.fitting import _solve
-from snrmjax.identify.joint.force_balance import weighing_at
+from snrmjax.identify.joint.force_balance import weighting_at
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import all_residuals
 from snrmjax.io.models import read_model
@@ -94,7 +94,7 @@ def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
                 (
                     *(level, level in inside, best.velocity / velocity - 1),
                     (best.frequency - frequency) / HERTZ,
-                    np.hypot(best.velocity_std / velocity, float(fit.spread.level[0])),
+                    np.hypot(best.velocity_std / velocity, float(fit.prior.level[0])),
                     best.frequency_std / HERTZ,
                 )
             )
@@ -127,14 +127,14 @@ def describe(name: str, fit: JointFit, seconds: float) -> None:
         measurement="fit",
         beam=name,
         seconds=seconds,
-        families=[f"{c.family}:{c.size}@{c.argument}" for c in fit.candidates if c.chosen],
+        families=[f"{c.family}:{c.size}@{c.argument}" for c in fit.families.candidates if c.chosen],
         velocity=at,
         natural_frequency_hz=np.asarray(values.natural_frequency) / HERTZ,
         natural_frequency_std_hz=np.asarray(values.natural_frequency_std) / HERTZ,
         damping_per_cent=100 * np.asarray(values.damping_ratio),
         damping_std_per_cent=100 * np.asarray(values.damping_ratio_std),
-        noise_scale=fit.noise_scale,
-        level_std=fit.level_std,
+        noise_scale=fit.noise.scale,
+        level_std=fit.noise.level_std,
         whitened_rms=np.sqrt(np.mean(fit.residuals**2)),
         notes=fit.notes,
     )
@@ -169,8 +169,8 @@ def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple
 
 
 @compiled
-def _residuals(vector, restore, data, modes, spread, weighing):
-    return all_residuals(vector, restore, data, modes, spread, weighing)
+def _residuals(vector, unravel, problem, weighting):
+    return all_residuals(vector, unravel, problem, weighting)
 
 
 def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
@@ -181,9 +181,9 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
         return sj.fit_jointly(data, model.modes, **settings)
 
     fit = fit_once()
-    vector, restore = fit.vector()
-    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
-    given = (restore, fit.data, fit.modes, fit.spread, weighing)
+    vector, unravel = fit.vector()
+    weighting = weighting_at(unravel(vector), fit.problem)
+    given = (unravel, fit.problem, weighting)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def residuals(y: np.ndarray) -> np.ndarray:

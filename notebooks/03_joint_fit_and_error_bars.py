@@ -63,7 +63,7 @@ def show(figure, name):
 
 def taken(fit):
     """The families of a fit, as the command takes them."""
-    return [f"{c.family}:{c.size}@{c.argument}" for c in fit.candidates if c.chosen]
+    return [f"{c.family}:{c.size}@{c.argument}" for c in fit.families.candidates if c.chosen]
 
 
 def remarks(fit):

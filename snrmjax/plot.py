@@ -19,6 +19,7 @@ from snrmjax.report.joint_figures import (
     advice_figure,
     contributions_figure,
     fitted_curves_figure,
+    profile_figure,
     residuals_figure,
 )
 from snrmjax.report.simulation_figures import (
@@ -46,6 +47,7 @@ __all__ = [
     "modal_damping_figure",
     "motions_figure",
     "normal_mode_figure",
+    "profile_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",

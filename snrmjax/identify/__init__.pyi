@@ -2,17 +2,41 @@ from .calibrate.calibration import CalibratedModel, calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
 from .inference.fitted_curves import fitted_values
-from .inference.fitted_response import FittedPoint, FittedResponse, fitted_response
+from .inference.fitted_response import FittedResponse, fitted_response
+from .inference.located_points import FittedPoint, LocatedStatus
 from .inference.optimal_design import (
     AdviceStatus,
     NextMeasurement,
     NextMeasurements,
     next_measurements,
 )
-from .inference.profiles import profile
-from .inference.resampling import bootstrap, compare_bands, sample_posterior
-from .inference.sensitivity import contributions, sensitivity
-from .joint.joint_fit import JointFit, fit_jointly
+from .inference.profiles import IntervalEnd, Profile, profile
+from .inference.resampling import (
+    ComparedBand,
+    ComparedBands,
+    bootstrap,
+    compare_bands,
+    inference_data,
+    sample_posterior,
+)
+from .inference.sensitivity import (
+    Contribution,
+    Contributions,
+    Sensitivity,
+    contributions,
+    sensitivity,
+)
+from .joint.fitting import FitStatus
+from .joint.joint_fit import (
+    FailedRival,
+    FamilyChoice,
+    JointFit,
+    NoiseEstimate,
+    Rival,
+    fit_jointly,
+)
+from .joint.ranking import FamilyCandidate
+from .joint.selection import SelectionStatus
 from .pointwise.backbone import Backbone, BackboneFit, BackboneValues, fit_backbone
 from .pointwise.backbone_points import identify_points
 from .pointwise.identification import Identification, identify_backbone
@@ -31,16 +55,31 @@ __all__ = [
     "BackbonePoints",
     "BackboneValues",
     "CalibratedModel",
+    "ComparedBand",
+    "ComparedBands",
+    "Contribution",
+    "Contributions",
+    "FailedRival",
+    "FamilyCandidate",
+    "FamilyChoice",
+    "FitStatus",
     "FittedPoint",
     "FittedResponse",
     "Identification",
+    "IntervalEnd",
     "InverseForce",
     "JointFit",
+    "LocatedStatus",
     "NextMeasurement",
     "NextMeasurements",
+    "NoiseEstimate",
     "PointStatus",
     "PredictedResponse",
+    "Profile",
     "Resonance",
+    "Rival",
+    "SelectionStatus",
+    "Sensitivity",
     "SnrmPoints",
     "bootstrap",
     "calibrate_model",
@@ -53,6 +92,7 @@ __all__ = [
     "fitted_values",
     "identify_backbone",
     "identify_points",
+    "inference_data",
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",

@@ -10,14 +10,28 @@ import numpy as np
 
 from snrmjax.identify.curves.families import FAMILIES
 from snrmjax.identify.curves.family_base import AbstractFamily
-from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
-from snrmjax.identify.inference.fitted_response import FittedPoint, FittedResponse
+from snrmjax.identify.inference.fitted_response import FittedResponse
+from snrmjax.identify.inference.located_points import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
 from snrmjax.identify.inference.sensitivity import Contribution
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
-from snrmjax.identify.joint.joint_fit import JointFit, Rival
-from snrmjax.identify.joint.selection import Candidate
+from snrmjax.identify.joint.fitting import FitStatus
+from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
+    BalanceData,
+    BalanceProblem,
+    PriorStd,
+    Unknowns,
+)
+from snrmjax.identify.joint.joint_fit import (
+    FailedRival,
+    FamilyChoice,
+    JointFit,
+    NoiseEstimate,
+    Rival,
+)
+from snrmjax.identify.joint.ranking import FamilyCandidate
+from snrmjax.identify.joint.selection import SelectionStatus
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
@@ -60,9 +74,10 @@ def summarise_fit(
     vector = np.asarray(fit.vector()[0])
     linear = len(fit.unknowns.linear)
     shown = len(vector) - fit.data.n_levels * len(LEVEL_ERRORS) - linear
-    level = dict(zip(LEVEL_ERRORS, np.asarray(fit.level_std).tolist(), strict=True))
+    level = dict(zip(LEVEL_ERRORS, np.asarray(fit.noise.level_std).tolist(), strict=True))
     return {
         "converged": fit.converged,
+        "status": fit.status.name.lower(),
         "backbone": described(fit.unknowns.squared_frequency),
         "damping": described(fit.unknowns.modal_damping),
         "parameters": {
@@ -73,10 +88,10 @@ def summarise_fit(
         },
         "covariance": fit.covariance[:shown, :shown].tolist(),
         "noise": {
-            "stated": fit.noise_stated,
-            "scale": fit.noise_scale,
-            "scale_std": fit.noise_scale_std,
-            "correlation_of_neighbours": float(np.max(fit.neighbour_correlation)),
+            "stated": fit.noise.stated,
+            "scale": fit.noise.scale,
+            "scale_std": fit.noise.scale_std,
+            "correlation_of_neighbours": float(np.max(fit.noise.autocorrelation)),
             "wandering_of_natural_frequency": 0.5 * float(fit.data.std[0, 3]),
         },
         "levels": {
@@ -85,18 +100,27 @@ def summarise_fit(
             "natural_frequency_std_relative": 0.5 * level["stiffness"],
             "damping_std_relative": level["damping"],
         },
-        "tried": [candidate._asdict() for candidate in fit.candidates],
+        "tried": [candidate._asdict() for candidate in fit.families.candidates],
         "rivals": [
             {
                 "curve": one.curve,
                 "family": described(_curve(one.fit, one.curve)),
                 "weight": one.weight,
             }
-            for one in fit.rivals
+            for one in fit.families.rivals
         ],
+        "failed_rivals": [
+            {**one._asdict(), "status": one.status.name.lower()} for one in fit.families.failed
+        ],
+        "selection": fit.families.status.name.lower(),
         "contributions": [one._asdict() for one in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
+        "not_located": [
+            {"kind": p.kind, "force_n": p.force, "frequency_hz": p.frequency / HERTZ}
+            for r in responses
+            for p in r.not_located
+        ],
         "notes": list(fit.notes),
     }
 
@@ -108,11 +132,7 @@ def _curve(fit: JointFit, name: str) -> AbstractFamily:
 
 def described(family: AbstractFamily) -> str:
     """A family as the command takes it."""
-    size = getattr(family, "order", None)
-    if isinstance(family, Spline):
-        size = family.parameters.shape[0]
-    plain = family.kind == "polynomial" or isinstance(family, Spline)
-    return f"{family.kind}{f':{size}' if plain else ''}@{family.argument}"
+    return family.label
 
 
 def _point(point: FittedPoint) -> dict:
@@ -132,7 +152,7 @@ def write_joint_fit(path: FilePath, fit: JointFit) -> None:
 
 
 def _content(fit: JointFit) -> dict:
-    unknowns = fit.unknowns
+    unknowns, failed = fit.unknowns, fit.families.failed
     return {
         "format": _FORMAT,
         "names": list(fit.names()),
@@ -144,15 +164,24 @@ def _content(fit: JointFit) -> dict:
             name: getattr(unknowns, name)
             for name in ("log_force_gain", "force_offset", "instrument_phase", "level", "linear")
         },
-        "spread": {"level": fit.spread.level, "linear": fit.spread.linear},
+        "spread": {"level": fit.prior.level, "linear": fit.prior.linear},
         "data": vars(fit.data),
         "modes": vars(fit.modes),
         "residuals": fit.residuals,
-        "level_std": fit.level_std,
-        "neighbour_correlation": fit.neighbour_correlation,
-        "candidates": [candidate._asdict() for candidate in fit.candidates],
-        "rivals": [[one.curve, one.weight, _of_a_rival(one.fit)] for one in fit.rivals],
-        **{name: getattr(fit, name) for name in _PLAIN},
+        "level_std": fit.noise.level_std,
+        "neighbour_correlation": fit.noise.autocorrelation,
+        "candidates": [candidate._asdict() for candidate in fit.families.candidates],
+        "rivals": [[one.curve, one.weight, _of_a_rival(one.fit)] for one in fit.families.rivals],
+        "failed_rivals": [[one.curve, one.family, one.weight, one.status] for one in failed],
+        "selection_status": fit.families.status,
+        "noise_scale": fit.noise.scale,
+        "noise_scale_std": fit.noise.scale_std,
+        "noise_stated": fit.noise.stated,
+        "drive_known_only": fit.drive_known_only,
+        "free": fit.free,
+        "notes": fit.notes,
+        "converged": fit.converged,
+        "status": fit.status,
     }
 
 
@@ -161,12 +190,6 @@ _SHARED = ("modes", "candidates")  # by a fit and its rivals
 
 def _of_a_rival(fit: JointFit) -> dict:
     return {key: value for key, value in _content(fit).items() if key not in _SHARED}
-
-
-_PLAIN = (
-    *("noise_scale", "noise_scale_std", "drive_known_only", "noise_stated"),
-    *("free", "notes", "converged"),
-)
 
 
 def read_joint_fit(path: FilePath) -> JointFit:
@@ -199,23 +222,37 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
     )
     arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
     shared = {key: content[key] for key in _SHARED}
-    plain = {name: content[name] for name in _PLAIN}
-    plain |= {"free": tuple(plain["free"]), "notes": tuple(plain["notes"])}
+    prior = PriorStd(*(jnp.asarray(content["spread"][k]) for k in ("level", "linear")))
+    # Files written before a fit had a status know only whether it converged.
+    known = FitStatus.CONVERGED if content["converged"] else FitStatus.NOT_SETTLED
     return JointFit(
         unknowns=Unknowns(squared_frequency=squared, modal_damping=damping, **arrays),
         covariance=np.asarray(content["covariance"]),
-        spread=Spread(*(jnp.asarray(content["spread"][k]) for k in ("level", "linear"))),
-        data=BalanceData(**_on_device(data)),
-        modes=rebuilt,
-        level_std=np.asarray(content["level_std"]),
-        residuals=np.asarray(content["residuals"]),
-        neighbour_correlation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
-        candidates=tuple(Candidate(**row) for row in content["candidates"]),
-        rivals=tuple(
-            Rival(curve, weight, _rebuilt(rival | shared))
-            for curve, weight, rival in content.get("rivals", [])
+        problem=BalanceProblem(BalanceData(**_on_device(data)), rebuilt, prior),
+        noise=NoiseEstimate(
+            scale=content["noise_scale"],
+            scale_std=content["noise_scale_std"],
+            level_std=np.asarray(content["level_std"]),
+            autocorrelation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
+            stated=content["noise_stated"],
         ),
-        **plain,
+        families=FamilyChoice(
+            candidates=tuple(FamilyCandidate(**row) for row in content["candidates"]),
+            rivals=tuple(
+                Rival(curve, weight, _rebuilt(rival | shared))
+                for curve, weight, rival in content.get("rivals", [])
+            ),
+            failed=tuple(
+                FailedRival(curve, family, weight, FitStatus(status))
+                for curve, family, weight, status in content.get("failed_rivals", [])
+            ),
+            status=SelectionStatus(content.get("selection_status", SelectionStatus.SETTLED)),
+        ),
+        residuals=np.asarray(content["residuals"]),
+        drive_known_only=content["drive_known_only"],
+        free=tuple(content["free"]),
+        notes=tuple(content["notes"]),
+        status=FitStatus(content.get("status", known)),
     )
 
 

@@ -10,6 +10,7 @@ from matplotlib.ticker import PercentFormatter
 
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
+from snrmjax.identify.inference.profiles import Profile
 from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
@@ -102,7 +103,7 @@ def fitted_curves_figure(
             for axes, y, kept in zip((natural, damping), each, dots, strict=True):
                 marks(axes, own, y, style, None if len(series) > 1 else "single states")
                 kept += [*y]
-        if len(series) == 1 and np.any(one.fit.level_std[2:] > 0):
+        if len(series) == 1 and np.any(one.fit.noise.level_std[2:] > 0):
             wide = sample_fit(one.fit, of_a_new_level=True)
             _bands(natural, damping, wide, unit, colour, "95 % band of a further level", 0.5)
         _bands(natural, damping, curve, unit, colour, "95 % band")
@@ -217,6 +218,21 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     return figure
 
 
+def profile_figure(profile: Profile) -> Figure:
+    """Rise of χ² against one unknown, and where it ends the 95 % interval.
+
+    A parabola is what an unknown with a normal distribution has. Refits that failed are left out.
+    """
+    figure, ((axes,),) = panels(COLUMN, 2.8, 1, 1)
+    marks(axes, profile.values, profile.rise, {**DOT, "color": MEASURED}, "refits")
+    axes.plot(profile.values, profile.rise, color=MEASURED)
+    axes.axhline(BAND**2, color=SIMULATED, linestyle="--", linewidth=LINE, label="95 %")
+    axes.set_ylim(bottom=0.0)
+    name_axes(axes, "", f"{plain(profile.name)} ({profile.unit})", "Rise of χ² (1)")
+    legend(figure)
+    return figure
+
+
 def advice_figure(
     responses: Sequence[FittedResponse], advice: Sequence[NextMeasurement], sensor: str
 ) -> Figure:
@@ -236,12 +252,15 @@ def advice_figure(
         [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
     )
     sign = 1.0 if np.sum(resonant.real) >= 0 else -1.0
+    drives = {one.force: one.drive for one in advice if one.drive is not None}
     for curve in responses:
         colour = SERIES[forces.index(curve.force) % len(SERIES)]
         size = np.abs(curve.velocity)
         mine = [one.velocity for one in advice if one.force == curve.force]
         near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
-        x, name = curve.frequency[near] / HERTZ, with_unit(curve.force, "N")
+        drive = drives.get(curve.force)
+        name = with_unit(curve.force, "N") if drive is None else with_unit(drive, "V")
+        x = curve.frequency[near] / HERTZ
         turn = np.angle(sign * curve.velocity[near]) / DEGREE
         for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
             pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])

@@ -107,7 +107,7 @@ def joint_sections(
         pictured = [ReportFigure(figures["next"], ADVICE_CAPTION)]
         table = advice_table(told.advice)
         sections.append(Section("What to measure next", (), pictured, [table]))
-    if fit.candidates:
+    if fit.families.candidates:
         sections.append(Section("Families tried", (), (), [family_table(summary)]))
     return sections
 
@@ -185,18 +185,21 @@ def contribution_table(shares: Sequence[Contribution]) -> ReportTable:
 
 def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
     """Advised states by rank, with the reason of each."""
-    load = unit_for([one.force for one in advice], "N")
+    drives = [one.drive for one in advice if one.drive is not None]
+    # Where only the drive is known, nobody can set a force in newtons.
+    loads, what = (drives, "drive") if drives else ([one.force for one in advice], "force")
+    load = unit_for(loads, "V" if drives else "N")
     unit = unit_for([one.velocity for one in advice], "m/s")
     rows = [
         (
-            *(f"{one.rank}", f"{one.force / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
+            *(f"{one.rank}", f"{size / load.size:.4g}", f"{one.frequency / HERTZ:.6g}"),
             *(f"{one.velocity / unit.size:.3g}", minus(f"{round(one.phase / DEGREE):d}")),
             *(f"{100 * one.expected_band_ratio:.1f}", one.reason),
         )
-        for one in advice
+        for one, size in zip(advice, loads, strict=True)
     ]
     header = (
-        *("rank", f"force ({load.name})", "frequency (Hz)", f"velocity ({unit.name})"),
+        *("rank", f"{what} ({load.name})", "frequency (Hz)", f"velocity ({unit.name})"),
         *("phase (°)", "bands left (%)", "reason"),
     )
     caption = (

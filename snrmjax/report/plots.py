@@ -8,7 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurements
+from snrmjax.identify.inference.profiles import Profile
+from snrmjax.identify.inference.sensitivity import Contributions
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneFit, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.points_result import BackbonePoints
@@ -36,9 +40,7 @@ def plot_result(result: object, **settings: Any) -> Figure:
 
 @plot_result.register
 def _(result: NextMeasurements, **settings: Any) -> Figure:
-    return joint_figures.advice_figure(
-        result.responses, result.measurements, result.sensor, **settings
-    )
+    return joint_figures.advice_figure(result.responses, result.rows, result.sensor, **settings)
 
 
 @plot_result.register
@@ -139,3 +141,24 @@ def _(result: SteadyStates, *, sensor: str | None = None) -> Figure:
     velocity = np.asarray(result.velocity)[:, result.sensors.index(name)]
     frequency = np.asarray(result.frequency)
     return simulation_figures.motions_figure(frequency, velocity, sensor=name, joined=False)
+
+
+@plot_result.register
+def _(result: JointFit, **settings: Any) -> Figure:
+    series = [joint_figures.FitSeries("joint fit", result)]
+    return joint_figures.fitted_curves_figure(series, **settings)
+
+
+@plot_result.register
+def _(result: FittedResponse, **settings: Any) -> Figure:
+    return joint_figures.advice_figure([result], [], result.sensor, **settings)
+
+
+@plot_result.register
+def _(result: Contributions, **settings: Any) -> Figure:
+    return joint_figures.contributions_figure(result.rows, **settings)
+
+
+@plot_result.register
+def _(result: Profile, **settings: Any) -> Figure:
+    return joint_figures.profile_figure(result, **settings)

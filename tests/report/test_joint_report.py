@@ -73,7 +73,7 @@ def test_errors_found_are_those_of_the_fit(fit, sections):
     rows = dict(sections[0].tables[1].rows)
     scale = rows["random noise, from the residuals"]
     assert scale.endswith("× the stated one")
-    close_to(scale.split(" ± ")[0], fit.noise_scale)
+    close_to(scale.split(" ± ")[0], fit.noise.scale)
     assert rows["gain of a level"] == "1 %"
     assert rows["natural frequency, from state to state"] == "0 %"
 
@@ -181,7 +181,7 @@ def test_families_are_listed_best_first():
         joint_report.reported_fit(tried),
         dict.fromkeys(("joint_fit", "residuals", "contributions"), drawing.panels(1, 1, 1, 1)[0]),
     )[-1].tables[0]
-    scores = [c.score for c in tried.candidates if c.curve == "backbone"]
+    scores = [c.score for c in tried.families.candidates if c.curve == "backbone"]
     listed = [row for row in table.rows if row[0] == "backbone"]
     assert len(listed) == len(scores) > 1
     assert listed[0][3] == "0.0"

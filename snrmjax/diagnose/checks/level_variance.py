@@ -30,8 +30,8 @@ def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure
     from snrmjax.identify.joint.notes import in_words
 
     fit = fit_jointly(data, model.modes)
-    gain, phase, stiffness, damping = np.asarray(fit.level_std)
-    if not fit.converged or not 0 < np.max(fit.level_std) < _MOST:
+    gain, phase, stiffness, damping = np.asarray(fit.noise.level_std)
+    if not fit.converged or not 0 < np.max(fit.noise.level_std) < _MOST:
         return model, ""
     values = values_at_displacement(fit, np.asarray(fit.motion().displacement))[0]
     squared, modal_damping = np.median(values, axis=0)
@@ -45,6 +45,6 @@ def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure
     )
     return widened, (
         f"no errors of levels are stated: beside smooth curves of amplitude the levels differ by "
-        f"{in_words(fit.level_std)} (1σ), which is taken for errors that the states of a level "
-        "share."
+        f"{in_words(fit.noise.level_std)} (1σ), which is taken for errors that the states of a "
+        "level share."
     )

@@ -1,7 +1,7 @@
 """Families of smooth curves of amplitude with a few parameters, for the joint fit."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -76,6 +76,11 @@ class Polynomial(SumOfPowers):
 
     kind: ClassVar[str] = "polynomial"
     orders: ClassVar[tuple[int, ...]] = (0, 1, 2, 3, 4)
+
+    @property
+    def size(self) -> int | None:
+        """See `AbstractFamily`: the number of terms beside the first."""
+        return self.order
 
     @classmethod
     def powers(cls, order: int) -> tuple[float, ...]:
@@ -218,6 +223,9 @@ FAMILIES: dict[str, type[AbstractFamily]] = {
 }
 """Families by name."""
 
+ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
+"""Amplitudes that a curve may be a function of."""
+
 # What "auto" tries. Constant damping is the polynomial of size 0 there: one that may grow. Splines
 # with free knots are no law, and their bands hold nothing of what few knots cannot follow.
 BACKBONE_FAMILIES = ("polynomial", "power_law", "smoothing_spline")
@@ -225,6 +233,31 @@ DAMPING_FAMILIES = (
     *("polynomial", "viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
     *("power_law", "smoothing_spline"),
 )
+
+
+class Choice(NamedTuple):
+    """What the user fixed of a family."""
+
+    kind: str  # or "auto"
+    size: int | None
+    argument: Argument | None
+
+
+def parse_family(text: str) -> Choice:
+    """Family, size and amplitude of "spline:5@velocity"; what is not said is None.
+
+    Raises `ValueError` for what is no family.
+    """
+    head, _, argument = text.partition("@")
+    kind, _, size = head.partition(":")
+    if kind not in FAMILIES and kind != "auto":
+        raise ValueError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
+    if size and not size.isdigit():
+        raise ValueError(f"the size of a family must be a whole number, but is {size!r}.")
+    known = {"": None} | {name: name for name in ARGUMENTS}
+    if argument not in known:
+        raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
+    return Choice(kind, int(size) if size else None, known[argument])
 
 
 def values_and_slopes(

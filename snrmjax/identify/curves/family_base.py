@@ -49,6 +49,17 @@ class AbstractFamily(AbstractCurve):
     orders: ClassVar[tuple[int, ...]]  # sizes that a selection by data tries, simplest first
     argument: Argument = eqx.field(static=True)
 
+    @property
+    def label(self) -> str:
+        """Family, size and amplitude as the joint fit takes them: "polynomial:2@velocity"."""
+        size = "" if self.size is None else f":{self.size}"
+        return f"{self.kind}{size}@{self.argument}"
+
+    @property
+    def size(self) -> int | None:
+        """The size that is said beside the family's name; None where there is but one."""
+        return None
+
     def amplitude(self, displacement: Array, velocity: Array) -> Array:
         """See `AbstractCurve`."""
         return displacement if self.argument == "displacement" else velocity

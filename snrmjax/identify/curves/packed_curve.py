@@ -15,7 +15,7 @@ _FAR = 1e6  # (amplitude/scale)² of a knot that is none
 _SIZE = 12  # parameters; a larger family takes a multiple of it
 
 
-class AnyFamily(AbstractCurve):
+class PackedCurve(AbstractCurve):
     """Σ c_k x^e_k + Σ d_k h_k(x²), with the `hats` h_k and coefficients linear in the parameters.
 
     What a family does not have is multiplied by zero: parameters beyond its own move nothing.
@@ -97,8 +97,8 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return _value(x, parameters, shape), slope
 
 
-def as_any_family(family: AbstractFamily) -> AbstractCurve:
-    """The same curve as an `AnyFamily`; a family that users wrote stays what it is."""
+def packed(family: AbstractFamily) -> AbstractCurve:
+    """The same curve as an `PackedCurve`; a family that users wrote stays what it is."""
     n = family.parameters.shape[0]
     size = -(-n // _SIZE) * _SIZE
     exponents, knots = np.zeros(size), _FAR * np.arange(1.0, size + 3)
@@ -119,7 +119,7 @@ def as_any_family(family: AbstractFamily) -> AbstractCurve:
         mix[size : size + n - 2, :n] = np.asarray(family.mix)[2:]
     else:
         return family
-    return AnyFamily(
+    return PackedCurve(
         parameters=jnp.pad(family.parameters, (0, size - n)),
         scale=family.scale,
         exponents=jnp.asarray(exponents),

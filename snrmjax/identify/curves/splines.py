@@ -32,6 +32,11 @@ class Spline(AbstractFamily):
         u = (jnp.asarray(amplitude) / self.scale) ** 2
         return _drawn(u, self.mix @ self.parameters, self.knots)
 
+    @property
+    def size(self) -> int | None:
+        """See `AbstractFamily`: the number of knots."""
+        return self.parameters.shape[0]
+
     def coefficients(self) -> tuple[Coefficient, ...]:
         """See `AbstractFamily`."""
         n = self.parameters.shape[0]

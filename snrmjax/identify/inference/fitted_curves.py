@@ -10,15 +10,18 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.joint.force_balance import Unknowns
-from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.backbone import BackboneValues
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
+from snrmjax.identify.pointwise.curve_fit import PchipCurve
+from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 
 _BLOCK = 256  # amplitudes that one program works on
 _LEAST = 0.01  # of the largest amplitude, below which rivals are not asked
 _ITERATIONS = 12
+_KNOTS = 120  # of the curves for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
 
@@ -52,7 +55,7 @@ def fitted_values(
     covariance += np.einsum("koc,kod->ocd", shifts, shifts)
     squared, damping = values.T
     if of_a_new_level:
-        stiffness, dissipation = np.asarray(fit.spread.level)[2:]
+        stiffness, dissipation = np.asarray(fit.prior.level)[2:]
         covariance[:, 0, 0] += (squared * stiffness) ** 2
         covariance[:, 1, 1] += (damping * dissipation) ** 2
     omega, zeta = np.sqrt(squared), damping / (2 * np.sqrt(squared))
@@ -93,9 +96,9 @@ def open_choice(
             values, slopes = values_with_slopes(one, at)
         return values, np.einsum("ocp,pq,ocq->oc", slopes, one.covariance, slopes)
 
-    shifts = np.zeros((len(fit.rivals), len(at), 2))
-    own = described(fit, at) if fit.rivals else (at, at)
-    for shift, rival in zip(shifts, fit.rivals, strict=True):
+    shifts = np.zeros((len(fit.families.rivals), len(at), 2))
+    own = described(fit, at) if fit.families.rivals else (at, at)
+    for shift, rival in zip(shifts, fit.families.rivals, strict=True):
         has = np.ones(len(at), dtype=bool)
         if velocity is not None:
             has = at < _near(rival.fit, float(np.max(at))).once
@@ -138,6 +141,45 @@ def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
     if _near(fit, velocity).turns_back_at is None:
         return fitted_values(fit, velocity * steps)
     return fitted_values(fit, displacement=displacement * steps)
+
+
+def as_backbone(
+    fit: JointFit, *, largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+) -> Backbone:
+    """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
+
+    Damping that belongs to the velocity is taken where it lies on the backbone. The knots reach up
+    to `largest_amplitude_ratio` times the largest measured amplitude.
+    """
+    displacement = largest_amplitude_ratio * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+    sampled = values_at_displacement(fit, displacement)
+    # A polynomial may fall below zero beyond the data: there is no motion there.
+    sound = np.append(sampled[0][:, 0] > 0, False).argmin()
+    if sound < _KNOTS:
+        displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
+        sampled = values_at_displacement(fit, displacement)
+    values, slopes = (jnp.asarray(part) for part in sampled[:2])
+    shifts = jnp.asarray(open_choice(fit, displacement=displacement))
+    covariance = [
+        slopes[:, k] @ fit.covariance @ slopes[:, k].T + shifts[:, :, k].T @ shifts[:, :, k]
+        for k in range(2)
+    ]
+    measured = np.asarray(fit.motion().displacement)
+    # Dry friction has no finite damping at rest: there the next knot's value stands.
+    damping = (
+        values[:, 1].at[0].set(jnp.where(jnp.isfinite(values[0, 1]), values[0, 1], values[1, 1]))
+    )
+    return Backbone(
+        squared_frequency=PchipCurve(jnp.asarray(displacement), values[:, 0]),
+        modal_damping=PchipCurve(jnp.asarray(displacement), damping),
+        squared_frequency_covariance=covariance[0],
+        modal_damping_covariance=jnp.nan_to_num(covariance[1]),
+        modal_constant=fit.problem.modal_constant,
+        smallest=jnp.asarray(measured.min()),
+        largest=jnp.asarray(measured.max()),
+        argument="displacement",
+        sensor=fit.modes.sensors[fit.data.sensor],
+    )
 
 
 def curve_values(
@@ -184,9 +226,9 @@ def values_with_slopes(
 
     Raises `ValueError` where the backbone has a velocity at several displacements.
     """
-    vector, restore, own = fit.programmed()
+    vector, unravel, own = fit.packed()
     near = displacement_near(fit, velocity)
-    found = by_blocks(lambda v, x: _at_velocity(vector, restore, v, x), _BLOCK, velocity, near)
+    found = by_blocks(lambda v, x: _at_velocity(vector, unravel, v, x), _BLOCK, velocity, near)
     return found[0], found[1][:, :, own]
 
 
@@ -198,8 +240,8 @@ def values_at_displacement(
     Float[np.ndarray, " point"],
 ]:
     """ω̃² and 2ζ̃ω̃, their derivatives by the free unknowns, and the velocity, at displacements."""
-    vector, restore, own = fit.programmed()
-    found = by_blocks(lambda x: _at_displacement(vector, restore, x), _BLOCK, displacement)
+    vector, unravel, own = fit.packed()
+    found = by_blocks(lambda x: _at_displacement(vector, unravel, x), _BLOCK, displacement)
     return found[0], found[1][:, :, own], found[2]
 
 
@@ -236,11 +278,11 @@ class _Reached(NamedTuple):
 
 def _near(fit: JointFit, velocity: float) -> _Reached:
     """The backbone from rest to beyond the measured displacements and a velocity."""
-    vector, restore, _ = fit.programmed()
+    vector, unravel, _ = fit.packed()
     reach = fit.largest[0]
     for _ in range(_DOUBLINGS):
         x = np.linspace(0.0, reach, _BLOCK)
-        speed = np.asarray(_at_displacement(vector, restore, x)[2])
+        speed = np.asarray(_at_displacement(vector, unravel, x)[2])
         turns = np.flatnonzero(~(np.diff(speed) > 0))
         if turns.size and np.min(speed[turns[0] :]) < velocity:
             return _Reached(x, speed, float(speed[turns[0]]))
@@ -253,20 +295,20 @@ def _near(fit: JointFit, velocity: float) -> _Reached:
 
 @compiled
 def _at_velocity(
-    vector: Array, restore: Restore, velocity: Array, near: Array
+    vector: Array, unravel: Unravel, velocity: Array, near: Array
 ) -> tuple[Array, Array]:
     def of(vector: Array) -> Array:
-        return curve_values(restore(vector), velocity, near)
+        return curve_values(unravel(vector), velocity, near)
 
     return of(vector), jax.jacfwd(of)(vector)
 
 
 @compiled
-def _at_displacement(vector: Array, restore: Restore, x: Array) -> tuple[Array, Array, Array]:
+def _at_displacement(vector: Array, unravel: Unravel, x: Array) -> tuple[Array, Array, Array]:
     def of(vector: Array) -> Array:
-        squared, damping = restore(vector).squared_frequency, restore(vector).modal_damping
+        squared, damping = unravel(vector).squared_frequency, unravel(vector).modal_damping
         speed = _speed(squared, x)
         pair = [curve(curve.amplitude(x, speed)) for curve in (squared, damping)]
         return jnp.stack(pair, axis=1)
 
-    return of(vector), jax.jacfwd(of)(vector), _speed(restore(vector).squared_frequency, x)
+    return of(vector), jax.jacfwd(of)(vector), _speed(unravel(vector).squared_frequency, x)

@@ -1,8 +1,9 @@
 """Which steady state to measure next: the one that makes a band narrowest."""
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Sequence
 from enum import IntEnum
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,25 +12,23 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.identify.inference.fitted_curves import values_at_displacement
-from snrmjax.identify.inference.fitted_response import (
-    FittedResponse,
-    fitted_response,
-    point_slopes,
-)
+from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
+from snrmjax.identify.inference.located_points import Kind, point_slopes
+from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
-    Spread,
+    BalanceProblem,
     Unknowns,
     no_errors,
-    weighing_at,
+    weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_levels
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import whitened
-from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.result import Variable
 
 Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
 
@@ -72,29 +71,16 @@ class NextMeasurement(NamedTuple):
     drive: float | None = None  # V, where only the drive is known
 
 
-class NextMeasurements(AbstractResult):
+class NextMeasurements(AbstractTable[NextMeasurement]):
     """Advised steady states, the best first; a sequence of `NextMeasurement`."""
 
-    coordinates: ClassVar[tuple[str, ...]] = ("rank",)
+    coordinates = ("rank",)
 
-    measurements: tuple[NextMeasurement, ...]
     responses: tuple[FittedResponse, ...]  # the main curves under the advised forces
     sensor: str = eqx.field(static=True)
     target: str = eqx.field(static=True)
     status: AdviceStatus = eqx.field(static=True)
     drive_known_only: bool = eqx.field(static=True)
-
-    def __len__(self) -> int:
-        """Number of advised states."""
-        return len(self.measurements)
-
-    def __getitem__(self, place: int) -> NextMeasurement:
-        """The state at a place, the best at 0."""
-        return self.measurements[place]
-
-    def __iter__(self) -> Iterator[NextMeasurement]:
-        """The states, the best first."""
-        return iter(self.measurements)
 
     @property
     def message(self) -> str:
@@ -104,7 +90,7 @@ class NextMeasurements(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
-        for one in self.measurements[:_SHOWN]:
+        for one in self.rows[:_SHOWN]:
             load = f"{one.force:.4g} N" if one.drive is None else f"{one.drive:.4g} V"
             lines.append(f"{one.rank}. {load} at {one.frequency / _HERTZ:.6g} Hz: {one.reason}")
         if len(self) > _SHOWN:
@@ -116,22 +102,21 @@ class NextMeasurements(AbstractResult):
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
 
-        def column(values: list, unit: str, meaning: str) -> Variable:
-            return Variable(("rank",), np.array(values), unit, meaning)
-
-        rows = self.measurements
-        load = {"force_n": column([one.force for one in rows], "N", "force")}
+        rows = self.rows
+        load = {"force_n": self.column([one.force for one in rows], "N", "force")}
         if self.drive_known_only:
-            load = {"drive_v": column([one.drive for one in rows], "V", "drive voltage")}
+            load = {"drive_v": self.column([one.drive for one in rows], "V", "drive voltage")}
         ratio = [one.expected_band_ratio for one in rows]
         return {
-            "rank": column([one.rank for one in rows], "1", "rank, the best first"),
+            "rank": self.column([one.rank for one in rows], "1", "rank, the best first"),
             **load,
-            "frequency_hz": column([one.frequency / _HERTZ for one in rows], "Hz", "frequency"),
-            "velocity_m_s": column([one.velocity for one in rows], "m/s", "expected velocity"),
-            "phase_deg": column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
-            "expected_band_ratio": column(ratio, "1", "mean band width after it, over today's"),
-            "reason": column([one.reason for one in rows], "", "why this state"),
+            "frequency_hz": self.column(
+                [one.frequency / _HERTZ for one in rows], "Hz", "frequency"
+            ),
+            "velocity_m_s": self.column([one.velocity for one in rows], "m/s", "expected velocity"),
+            "phase_deg": self.column(np.degrees([o.phase for o in rows]).tolist(), "deg", "phase"),
+            "expected_band_ratio": self.column(ratio, "1", "mean band after it, over today's"),
+            "reason": self.column([one.reason for one in rows], "", "why this state"),
         }
 
     def attributes(self) -> dict[str, str | float | int]:
@@ -179,7 +164,7 @@ def next_measurements(
     loads = {one.force for one in advice}
     status = AdviceStatus.COMPLETE if len(advice) == count else AdviceStatus.FEWER_STATES
     return NextMeasurements(
-        measurements=tuple(advice),
+        rows=tuple(advice),
         responses=() if states is None else tuple(c for c in states.curves if c.force in loads),
         sensor=fit.modes.sensors[fit.data.sensor],
         target=target,
@@ -285,7 +270,8 @@ def _target(
     if not points:
         raise ValueError(f"the fitted response to {force:g} N has no {target}.")
     best = max(points, key=lambda point: point.velocity)
-    return point_slopes(fit, force, target, best)[:1], np.array([best.frequency])
+    kind: Kind = "resonance" if target == "resonance" else "fold"
+    return point_slopes(fit, force, kind, best)[:1], np.array([best.frequency])
 
 
 def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state part unknown"]:
@@ -306,29 +292,31 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )
-    vector, restore, own = fit.programmed()
-    by_vector, by_level = _slopes(vector, restore, data, fit.modes, fit.spread)
+    program, n_padded = fit.packed(), len(padded(states.frequency))
+    padded_states = jax.tree.map(lambda rows: filled(rows, n_padded, None), data)
+    levels = dataclasses.replace(padded_states, n_levels=padded_levels(n_levels))
+    problem = BalanceProblem(levels, fit.modes, fit.prior)
+    found = _slopes(program.vector, program.unravel, problem)
+    by_vector, by_level = (np.asarray(part)[:n] for part in found)
     rows = np.zeros((n, 2, fit.covariance.shape[0] + n_levels * len(LEVEL_ERRORS)))
-    rows[:, :, : fit.covariance.shape[0]] = np.asarray(by_vector)[:, :, own]
+    rows[:, :, : fit.covariance.shape[0]] = by_vector[:, :, program.own]
     for k in range(len(LEVEL_ERRORS)):
         place = fit.covariance.shape[0] + states.level * len(LEVEL_ERRORS) + k
-        rows[np.arange(n)[:, None], np.arange(2), place[:, None]] = np.asarray(by_level)[:, :, k]
+        rows[np.arange(n)[:, None], np.arange(2), place[:, None]] = by_level[:, :, k]
     return rows
 
 
 @compiled
-def _slopes(
-    vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
-) -> tuple[Array, Array]:
-    new = jnp.zeros((data.n_levels, len(LEVEL_ERRORS)))
+def _slopes(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
+    new = jnp.zeros((problem.data.n_levels, len(LEVEL_ERRORS)))
 
     def unknowns_of(vector: Array, level: Array) -> Unknowns:
-        return eqx.tree_at(lambda u: u.level, restore(vector), level)
+        return eqx.tree_at(lambda u: u.level, unravel(vector), level)
 
-    weighing = weighing_at(unknowns_of(vector, new), data, modes, spread)
+    weighting = weighting_at(unknowns_of(vector, new), problem)
 
     def residuals(vector: Array, level: Array) -> Array:
-        return whitened(unknowns_of(vector, level), data, modes, spread, weighing)
+        return whitened(unknowns_of(vector, level), problem, weighting)
 
     # The levels of the fit have no part in a new one: their columns come out as zeros.
     by_vector = jax.jacfwd(residuals)(vector, new)

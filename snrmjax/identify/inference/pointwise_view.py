@@ -6,7 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.inference.fitted_response import FittedResponse, as_backbone
+from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.joint.force_balance import with_deviations
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import BackboneFit
@@ -37,14 +38,14 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
     own, ratio = (float(v[j]) for v in (fit.modes.natural_frequency, fit.modes.damping_ratio))
     curves = BackboneFit(
         backbone=as_backbone(fit),
-        noise_scale=(fit.noise_scale, fit.noise_scale),
-        level_frequency_std=0.5 * float(fit.level_std[2]) * own,
-        level_damping_std=float(fit.level_std[3]) * ratio,
-        noise_stated=fit.noise_stated,
+        noise_scale=(fit.noise.scale, fit.noise.scale),
+        level_frequency_std=0.5 * float(fit.noise.level_std[2]) * own,
+        level_damping_std=float(fit.noise.level_std[3]) * ratio,
+        noise_stated=fit.noise.stated,
         anchor=None,
     )
-    if not fit.noise_stated:
-        gain, phase = map(float, fit.level_std[:2])
+    if not fit.noise.stated:
+        gain, phase = map(float, fit.noise.level_std[:2])
         wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
             points, curves, level_gain=gain, level_phase=phase, frequency_std=wandering
@@ -77,7 +78,7 @@ def without_bands(fit: JointFit, curves: Sequence[FittedResponse]) -> FitPredict
     modes, sensor = fit.modes, fit.data.sensor
     j = modes.mode_of_interest
     constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
-    linear = with_deviations(modes, fit.unknowns.linear, fit.spread.linear)
+    linear = with_deviations(modes, fit.unknowns.linear, fit.prior.linear)
 
     def of_other_modes(frequency: np.ndarray, force: float) -> np.ndarray:
         load = jnp.full(frequency.shape, force)

@@ -1,8 +1,8 @@
 """Intervals of single unknowns of a joint fit by the profile of its cost."""
 
 from enum import IntEnum
-from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,18 +10,14 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import (
-    BalanceData,
-    Spread,
-    weighing_at,
-)
-from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.force_balance import BalanceProblem, weighting_at
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import (
-    freed_residuals,
+    corrected_residuals,
 )
-from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 
 _PIN = 1e4  # weight, in its own 1σ, with which a profile holds an unknown
 _RISE = 3.84  # of χ² at the ends of a 95 % interval
@@ -42,24 +38,59 @@ END_MESSAGE: dict[IntervalEnd, str] = {
 }
 
 
-class Profile(NamedTuple):
+class Profile(AbstractResult):
     """The best fit's cost against one unknown, the others fitted anew."""
 
-    name: str
+    coordinates = ("value",)
+
+    name: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
     values: Float[np.ndarray, " point"]
     rise: Float[np.ndarray, " point"]  # of χ² over its least value; NaN where the refit failed
     lower: float  # 95 %, where the rise is 3.84; −∞ beyond the values tried, NaN not computed
     upper: float  # likewise, +∞
-    lower_status: IntervalEnd
-    upper_status: IntervalEnd
+    lower_status: IntervalEnd = eqx.field(static=True)
+    upper_status: IntervalEnd = eqx.field(static=True)
+
+    @property
+    def n_failed(self) -> int:
+        """Values at which the refit did not converge."""
+        return int(np.sum(~np.isfinite(self.rise)))
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        return (
+            f"Profile of {self.name} ({self.unit}): {len(self.values)} values from "
+            f"{self.values[0]:.6g} to {self.values[-1]:.6g}, {self.n_failed} refits failed",
+            f"lower end of the 95 % interval {self.lower:.6g} ({END_MESSAGE[self.lower_status]})",
+            f"upper end {self.upper:.6g} ({END_MESSAGE[self.upper_status]})",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        per = ("value",)
+        return {
+            "value": Variable(per, self.values, self.unit, self.name),
+            "rise": Variable(per, self.rise, "1", "rise of χ² over its least value"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {
+            "parameter": self.name,
+            "lower": self.lower,
+            "upper": self.upper,
+            "lower_status": END_MESSAGE[self.lower_status],
+            "upper_status": END_MESSAGE[self.upper_status],
+        }
 
 
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
     """χ² against one unknown, everything else fitted anew at each of its values.
 
     Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile. It
-    takes states for independent, though: where the residuals of neighbours are alike
-    (`fit.neighbour_correlation`), it is too narrow, and ±1.96σ is right.
+    takes states for independent, though: where the residuals of neighbours are correlated
+    (`fit.noise.autocorrelation`), it is too narrow, and ±1.96σ is right.
 
     Arguments: `name` one of `fit.names()`; `reach` in standard deviations on either side.
     Raises `ValueError` for a name that the fit does not have.
@@ -67,14 +98,15 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
     names = fit.names()
     if name not in names:
         raise ValueError(f"the fit has no unknown {name!r}; it has {', '.join(names[:6])}, …")
-    index, (vector, restore) = names.index(name), fit.vector()
-    std = np.sqrt(np.diag(fit.covariance))
+    program = fit.packed()
+    vector, unravel, index = program.vector, program.unravel, int(program.own[names.index(name)])
+    std = np.sqrt(np.diag(program.padded_covariance(fit.covariance)))
     offsets = np.linspace(-reach, reach, n_points | 1)
     values = float(vector[index]) + std[index] * offsets
     cost = np.asarray(
         _pinned(
-            *(vector, restore, fit.data, fit.modes, fit.spread),
-            *(np.array(fit.freed), jnp.asarray(std), np.array(index), jnp.asarray(values)),
+            *(vector, unravel, padded_problem(fit.problem), np.array(fit.corrected)),
+            *(jnp.asarray(std), np.array(index), jnp.asarray(values)),
         )
     )
     middle = len(cost) // 2
@@ -82,7 +114,8 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
     rise = cost - cost[middle]
     below, below_status = _crossing(values[middle::-1], rise[middle::-1])
     above, above_status = _crossing(values[middle:], rise[middle:])
-    return Profile(name, values, rise, below, above, below_status, above_status)
+    ends = (below, above, below_status, above_status)
+    return Profile(name, fit.units()[names.index(name)], values, rise, *ends)
 
 
 def _crossing(values: np.ndarray, rise: np.ndarray) -> tuple[float, IntervalEnd]:
@@ -104,22 +137,20 @@ def _crossing(values: np.ndarray, rise: np.ndarray) -> tuple[float, IntervalEnd]
 @compiled
 def _pinned(
     vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    freed: Array,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    correcting: Array,
     std: Array,
     index: Array,
     values: Array,
 ) -> Float[Array, " value"]:
-    weighing = weighing_at(restore(vector), data, modes, spread)
+    weighting = weighting_at(unravel(vector), problem)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(value: Array) -> Array:
         def residuals(y: Array, _: None = None) -> Array:
             point = vector + y * unit
-            free = freed_residuals(point, restore, data, modes, spread, weighing, freed)
+            free = corrected_residuals(point, unravel, problem, weighting, correcting)
             held = _PIN * (point[index] - value) / unit[index]
             return jnp.append(free, held)
 

@@ -1,8 +1,7 @@
 """Joint fits of resampled states, samples of the posterior, and bands compared with theirs."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,20 +14,19 @@ from snrmjax.identify.inference.fitted_curves import (
     values_with_slopes,
 )
 from snrmjax.identify.inference.sensitivity import sensitivity
+from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import (
-    BalanceData,
-    Spread,
-    weighing_at,
-)
-from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.force_balance import BalanceProblem, weighting_at
+from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import (
-    freed_residuals,
-    on_levels,
-)
-from snrmjax.model.modes import LinearModes
+from snrmjax.identify.joint.residuals import corrected_residuals, on_levels
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import Variable
+
+if TYPE_CHECKING:
+    import arviz
+
+_HERTZ = 2 * np.pi  # rad/s
 
 
 def bootstrap(
@@ -37,7 +35,7 @@ def bootstrap(
     """Unknowns of refits to states drawn with replacement, within every level.
 
     With `levels` whole levels are drawn instead, which needs more of them than a curve has
-    parameters. A refit that fails is NaN.
+    parameters. A refit that does not converge is a row of NaN.
     """
     rng = np.random.default_rng(seed)
     level = np.asarray(fit.data.level)
@@ -50,32 +48,31 @@ def bootstrap(
             for number in range(fit.data.n_levels):
                 mine = np.flatnonzero(level == number)
                 np.add.at(row, rng.choice(mine, size=mine.size), 1.0)
-    vector, restore = fit.vector()
-    std = jnp.asarray(np.sqrt(np.diag(fit.covariance)))
     weights = weights * np.asarray(fit.data.weight)
-    settings = (vector, restore, fit.data, fit.modes, fit.spread, np.array(fit.freed), std)
-    return np.asarray(_resampled(*settings, jnp.asarray(weights)))
+    problem, (vector, unravel, own) = padded_problem(fit.problem), fit.packed()
+    std = np.sqrt(np.diag(fit.packed().padded_covariance(fit.covariance)))
+    every = np.stack([filled(row, len(problem.data.level), 0.0) for row in weights])
+    settings = (vector, unravel, problem, np.array(fit.corrected), jnp.asarray(std))
+    return np.asarray(_resampled(*settings, jnp.asarray(every)))[:, own]
 
 
 @compiled
 def _resampled(
     vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    freed: Array,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    correcting: Array,
     std: Array,
     weights: Array,
 ) -> Float[Array, "sample unknown"]:
-    weighing = weighing_at(restore(vector), data, modes, spread)
+    weighting = weighting_at(unravel(vector), problem)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(weight: Array) -> Array:
-        given = (eqx.tree_at(lambda d: d.weight, data, weight), modes, spread, weighing, freed)
+        given = (unravel, problem.with_data(weight=weight), weighting, correcting)
         found: optx.Solution = optx.least_squares(
-            lambda y, _: freed_residuals(vector + y * unit, restore, *given),
-            *(on_levels(SOLVER, restore, data), jnp.zeros_like(vector)),
+            lambda y, _: corrected_residuals(vector + y * unit, *given),
+            *(on_levels(SOLVER, unravel, problem.data), jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
         )
@@ -90,29 +87,57 @@ def sample_posterior(
 ) -> Float[np.ndarray, "sample unknown"]:
     """Unknowns drawn from exp(−χ²/2) by NUTS (numpyro, an extra: `pip install snrmjax[posterior]`).
 
-    The chain runs in the coordinates in which the fit's covariance is one. Raises `ImportError`
-    that says how to install numpyro where it is missing.
+    The chain runs in the coordinates in which the fit's covariance is one. `inference_data` makes
+    the samples an ArviZ `InferenceData`. Raises `ImportError` that says how to install numpyro
+    where it is missing.
     """
     try:
         from numpyro.infer import MCMC, NUTS
     except ImportError as error:
         raise ImportError("sampling needs numpyro: pip install 'snrmjax[posterior]'.") from error
-    vector, restore = fit.vector()
+    vector, unravel = fit.vector()
     values, directions = np.linalg.eigh(fit.covariance)
     root = jnp.asarray(directions * np.sqrt(np.maximum(values, 0.0)))
-    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
+    weighting = weighting_at(unravel(vector), fit.problem)
 
     def potential(z: Array) -> Array:
         point = vector + root @ z
-        given = (fit.data, fit.modes, fit.spread, weighing, jnp.asarray(fit.freed))
-        residuals = freed_residuals(point, restore, *given)
-        return 0.5 * jnp.sum(residuals**2)
+        given = (fit.problem, weighting, jnp.asarray(fit.corrected))
+        return 0.5 * jnp.sum(corrected_residuals(point, unravel, *given) ** 2)
 
     chain = MCMC(
         NUTS(potential_fn=potential), num_warmup=warmup, num_samples=n_samples, progress_bar=False
     )
     chain.run(jax.random.key(seed), init_params=jnp.zeros(len(vector)))
     return np.asarray(vector + chain.get_samples() @ root.T)
+
+
+def inference_data(
+    fit: JointFit, samples: Float[np.ndarray, "sample unknown"]
+) -> "arviz.InferenceData":
+    """Samples of the unknowns, of a posterior or a bootstrap, as ArviZ's `InferenceData`.
+
+    Each unknown is a variable by its name, with its unit, in one chain. Samples that are not
+    finite, as of refits that failed, are left out.
+    Raises `ImportError` that says how to install ArviZ where it is missing, and `ValueError` for
+    samples of another number of unknowns.
+    """
+    try:
+        import arviz
+    except ImportError as error:
+        message = "`InferenceData` needs ArviZ: pip install 'snrmjax[posterior]'."
+        raise ImportError(message) from error
+    drawn, names = np.asarray(samples), fit.names()
+    if drawn.ndim != 2 or drawn.shape[1] != len(names):
+        raise ValueError(
+            f"`samples` must be (sample, unknown) with {len(names)} unknowns, but has the shape "
+            f"{drawn.shape}."
+        )
+    drawn = drawn[np.all(np.isfinite(drawn), axis=1)]
+    found = arviz.from_dict({name: drawn[None, :, k] for k, name in enumerate(names)})
+    for name, unit in zip(names, fit.units(), strict=True):
+        found.posterior[name].attrs["units"] = unit
+    return found
 
 
 class ComparedBand(NamedTuple):
@@ -126,6 +151,40 @@ class ComparedBand(NamedTuple):
     posterior: float
 
 
+class ComparedBands(AbstractTable[ComparedBand]):
+    """1σ of both curves at some velocities by several ways."""
+
+    n_failed: int  # refits of the bootstrap that did not converge and are left out
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        speeds = [one.velocity for one in self.rows]
+        ratio = [one.bootstrap / one.gauss_newton for one in self.rows]
+        return (
+            f"ComparedBands: 1σ of both curves at {len(set(speeds))} velocities, "
+            f"{min(speeds):.3g} to {max(speeds):.3g} m/s",
+            f"bootstrap over covariance {min(ratio):.3g} to {max(ratio):.3g}",
+            f"{self.n_failed} refits of the bootstrap did not converge and are left out",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; a natural frequency's 1σ in Hz."""
+        unit = [_HERTZ if one.quantity == "natural_frequency" else 1.0 for one in self.rows]
+
+        def way(name: str, meaning: str) -> Variable:
+            values = np.array([getattr(one, name) for one in self.rows]) / unit
+            return self.column(values, "", f"1σ by {meaning}; Hz or 1/s")
+
+        return {
+            "velocity_m_s": self.column([o.velocity for o in self.rows], "m/s", "velocity"),
+            "quantity": self.column([one.quantity for one in self.rows], "", "which curve"),
+            "gauss_newton": way("gauss_newton", "the covariance of the fit"),
+            "implicit": way("implicit", "implicit derivatives"),
+            "bootstrap": way("bootstrap", "refits to resampled states"),
+            "posterior": way("posterior", "samples of the posterior"),
+        }
+
+
 def compare_bands(
     fit: JointFit,
     velocity: Float[np.ndarray, " point"],
@@ -133,18 +192,22 @@ def compare_bands(
     n_samples: int = 200,
     posterior: bool = False,
     seed: int = 0,
-) -> list[ComparedBand]:
+) -> ComparedBands:
     """The band of both curves by covariance, implicit derivatives, bootstrap and NUTS.
 
     The bootstrap knows nothing of errors that a level shares: where those rule, it is narrower.
-    Only the fit's own covariance includes what the residuals of neighbouring states share.
+    Only the fit's own covariance includes the correlation of neighbouring states' residuals.
+    Refits of the bootstrap that do not converge are left out and counted.
     """
     at = np.asarray(velocity, dtype=np.float64)
     values, slopes = values_with_slopes(fit, at)
-    restore, near = fit.vector()[1], jnp.asarray(displacement_near(fit, at))
+    near = jnp.asarray(displacement_near(fit, at))
+    _, unravel, own = fit.packed()
 
     def spread_of(samples: np.ndarray) -> np.ndarray:
-        drawn = np.array(_curves_of(restore, jnp.asarray(samples), jnp.asarray(at), near))
+        whole = np.tile(np.asarray(fit.packed().vector), (len(samples), 1))
+        whole[:, own] = samples
+        drawn = np.array(_curves_of(unravel, jnp.asarray(whole), jnp.asarray(at), near))
         with np.errstate(invalid="ignore"):
             drawn[:, :, 0] = np.sqrt(drawn[:, :, 0])
         return np.nanstd(drawn, axis=0)
@@ -154,22 +217,24 @@ def compare_bands(
         std[:, 0] /= 2 * np.sqrt(values[:, 0])
         return std
 
+    refits = bootstrap(fit, n_samples, seed=seed)
     ways = [
         linear(fit.covariance),
         linear(sensitivity(fit).covariance),
-        spread_of(bootstrap(fit, n_samples, seed=seed)),
+        spread_of(refits),
         spread_of(sample_posterior(fit, n_samples, seed=seed))
         if posterior
         else np.full((len(at), 2), np.nan),
     ]
     names = ("natural_frequency", "modal_damping")
-    return [
+    rows = tuple(
         ComparedBand(float(at[a]), names[c], *(float(way[a, c]) for way in ways))
         for c in range(2)
         for a in range(len(at))
-    ]
+    )
+    return ComparedBands(rows, int(np.sum(~np.all(np.isfinite(refits), axis=1))))
 
 
 @compiled
-def _curves_of(restore: Restore, samples: Array, velocity: Array, near: Array) -> Array:
-    return jax.lax.map(lambda v: curve_values(restore(v), velocity, near), samples)
+def _curves_of(unravel: Unravel, samples: Array, velocity: Array, near: Array) -> Array:
+    return jax.lax.map(lambda v: curve_values(unravel(v), velocity, near), samples)

@@ -13,27 +13,29 @@ from snrmjax.identify.inference.fitted_curves import (
     open_choice,
     values_at_displacement,
 )
+from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
     STATE_ERRORS,
-    BalanceData,
-    Spread,
+    BalanceProblem,
     Unknowns,
     slopes_by_error,
-    weighing_at,
+    weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Restore
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import (
     JointFit,
 )
 from snrmjax.identify.joint.residuals import (
     all_residuals,
-    freed_of_errors,
+    error_corrections,
     whitened,
 )
-from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
+from snrmjax.numerics.result import Variable
+
+_LISTED = 8  # sources on one screen
 
 
 class Sensitivity(NamedTuple):
@@ -53,28 +55,65 @@ class Contribution(NamedTuple):
     kind: str  # of source: what all levels, or all linear parameters, have in common
 
 
+class Contributions(AbstractTable[Contribution]):
+    """Shares of the variance of both bands by source of error, the largest first."""
+
+    coordinates = ("source",)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        listed = [
+            f"{one.source}: {100 * one.frequency_share:.1f} % of the variance of the natural "
+            f"frequency, {100 * one.damping_share:.1f} % of the damping's"
+            for one in self.rows[:_LISTED]
+        ]
+        more = len(self.rows) - len(listed)
+        return (
+            f"Contributions: {len(self.rows)} sources of error",
+            *listed,
+            *((f"and {more} smaller ones",) if more else ()),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+
+        def share(name: str, meaning: str) -> Variable:
+            return self.column([getattr(one, name) for one in self.rows], "1", meaning)
+
+        return {
+            "source": self.column([one.source for one in self.rows], "", "source of error"),
+            "kind": self.column([one.kind for one in self.rows], "", "kind of source"),
+            "frequency_share": share(
+                "frequency_share", "share of the natural frequency's variance"
+            ),
+            "damping_share": share("damping_share", "share of the variance of 2ζω"),
+        }
+
+
 def sensitivity(fit: JointFit) -> Sensitivity:
     """Derivatives of the fit by every measured force, velocity and phase, second order included.
 
     At the minimum of χ²(θ, data) the implicit function theorem gives dθ/dy = −H⁻¹ ∂²χ²/∂θ∂y with
     the whole Hessian H, where Gauss and Newton leave out the residuals' curvature; the covariance
-    of independent errors of the stated size follows. Where states are freed of their errors, they
-    are so anew; else weights count as given.
+    of independent errors of the stated size follows. Where states are corrected for
+    their errors, they are so anew; else weights count as given.
 
-    What the residuals of neighbours have in common is not in it.
+    The correlation of neighbouring states' residuals is not in it.
 
     Returns a `Sensitivity`. One call costs about as much as a fit.
     """
-    vector, restore = fit.vector()
-    settings = (vector, restore, fit.data, fit.modes, fit.spread)
-    hessian, mixed = _second_order(*settings, np.array(fit.freed))
+    program, problem = fit.packed(), padded_problem(fit.problem)
+    settings = (program.vector, program.unravel, problem, np.array(fit.corrected))
+    every, crossed = (np.asarray(part) for part in _second_order(*settings))
+    n, own = len(fit.data.level), program.own
+    hessian, mixed = every[np.ix_(own, own)], crossed[own][:, :n]
     # In units of the unknowns' own curvature: a value at rest may be known a million times worse.
-    curvature = np.diagonal(np.asarray(hessian))
+    curvature = np.diagonal(hessian)
     unit = 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0))
-    scaled = np.asarray(hessian) * np.outer(unit, unit)
+    scaled = hessian * np.outer(unit, unit)
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(unit, unit)
-    p, n = len(vector), len(fit.data.level)
-    by_state = -inverse @ np.asarray(mixed).reshape(p, -1)
+    p = len(own)
+    by_state = -inverse @ mixed.reshape(p, -1)
     n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
     by_bends = inverse @ _bend_slopes(fit).T
     by_prior = np.concatenate([inverse[:, p - n_priors :], by_bends], axis=1)
@@ -89,31 +128,30 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 @compiled
 def _second_order(
     vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    freed: Array,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    correcting: Array,
 ) -> tuple[Array, Array]:
-    weighing = weighing_at(restore(vector), data, modes, spread)
+    data, weighting = problem.data, weighting_at(unravel(vector), problem)
 
     def anew(unknowns: Unknowns, error: Array) -> Array:
-        """Records that err by so much, freed of their likeliest errors again."""
-        velocity = data.velocity * jnp.exp(error[:, 1] + 1j * error[:, 2])
-        records = (data.force * jnp.exp(error[:, 0]), velocity, data.correction - error)
-        erring = eqx.tree_at(lambda d: (d.force, d.velocity, d.correction), data, records)
-        errors, own = freed_of_errors(unknowns, erring, modes, spread)
-        erring = eqx.tree_at(lambda d: d.correction, erring, errors)
-        return whitened(unknowns, erring, modes, spread, own)
+        """Records that err by so much, corrected for their most likely errors again."""
+        erring = problem.with_data(
+            force=data.force * jnp.exp(error[:, 0]),
+            velocity=data.velocity * jnp.exp(error[:, 1] + 1j * error[:, 2]),
+            correction=data.correction - error,
+        )
+        errors, own = error_corrections(unknowns, erring)
+        return whitened(unknowns, erring.with_data(correction=errors), own)
 
     def as_it_is(unknowns: Unknowns, error: Array) -> Array:
-        erring = eqx.tree_at(lambda d: d.correction, data, data.correction + error)
-        return whitened(unknowns, erring, modes, spread, weighing)
+        erring = problem.with_data(correction=data.correction + error)
+        return whitened(unknowns, erring, weighting)
 
     def gradient(vector: Array, error: Array) -> Array:
         def cost(vector: Array) -> Array:
-            unknowns = restore(vector)
-            points = jax.lax.cond(freed, anew, as_it_is, unknowns, error)
+            unknowns = unravel(vector)
+            points = jax.lax.cond(correcting, anew, as_it_is, unknowns, error)
             curves = (unknowns.squared_frequency, unknowns.modal_damping)
             priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
             priors = priors + sum(jnp.sum(c.prior_residuals() ** 2) for c in curves)
@@ -143,22 +181,22 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     return np.concatenate(blocks)
 
 
-def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution]:
+def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error; what the residuals of
-    neighbours have in common adds to it, and what the choice among families leaves open.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. The correlation of
+    neighbouring states' residuals adds to it, and so does the choice among families.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
     """
-    vector, restore = fit.vector()
-    found = _first_order(vector, restore, fit.data, fit.modes, fit.spread)
-    jacobian, by_error = np.asarray(found[0]), np.asarray(found[1])
-    p, n, n_levels = len(vector), len(fit.data.level), fit.data.n_levels
+    program, problem = fit.packed(), padded_problem(fit.problem)
+    found = _first_order(program.vector, program.unravel, problem)
+    p, n, n_levels = len(program.own), len(fit.data.level), fit.data.n_levels
+    jacobian, by_error = np.asarray(found[0])[:, program.own], np.asarray(found[1])[:n]
     inverse = inverse_of(jacobian)
-    points = jacobian[: 2 * n].reshape(n, 2, p)
+    points = jacobian[: 2 * len(problem.data.level)].reshape(-1, 2, p)[:n]
     by_state = np.einsum("pq,siq,sie->pse", inverse, points, by_error) * np.asarray(fit.data.std)
     measured = np.asarray(fit.motion().displacement)
     at = np.linspace(measured.min(), measured.max(), n_amplitudes)
@@ -173,25 +211,25 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
     levels = inverse[:, p - n_linear - n_levels * len(LEVEL_ERRORS) : p - n_linear]
     levels = levels.reshape(p, n_levels, len(LEVEL_ERRORS))
     for k, kind in enumerate(LEVEL_ERRORS):
-        if fit.level_std[k] > 0:
+        if fit.noise.level_std[k] > 0:
             rows += [
                 (f"{kind} of level {m + 1}", f"{kind} of levels", levels[:, m, k : k + 1])
                 for m in range(n_levels)
             ]
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]
-        if fit.spread.linear[k] > 0:
+        if fit.prior.linear[k] > 0:
             rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
-    if np.any(fit.neighbour_correlation > 0):
-        name = "misfits that neighbours share"
+    if np.any(fit.noise.autocorrelation > 0):
+        name = "correlation of neighbouring residuals"
         unit = np.sqrt(np.diagonal(inverse))
         added = (fit.covariance - inverse) / np.outer(unit, unit)
         values, directions = np.linalg.eigh(added)
         rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
-    if fit.rivals:
+    if fit.families.rivals:
         name = "choice of the families"
         rows.append((name, name, np.ones((p, 1))))
         summed.append(np.sum(open_choice(fit, displacement=at) ** 2, axis=0))
@@ -202,16 +240,14 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> list[Contribution
         for (source, kind, columns), share in zip(rows, shares, strict=True)
         if columns.shape[1]
     ]
-    return sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
+    ranked = sorted(listed, key=lambda row: -row.frequency_share - row.damping_share)
+    return Contributions(tuple(ranked))
 
 
 @compiled
-def _first_order(
-    vector: Array, restore: Restore, data: BalanceData, modes: LinearModes, spread: Spread
-) -> tuple[Array, Array]:
+def _first_order(vector: Array, unravel: Unravel, problem: BalanceProblem) -> tuple[Array, Array]:
     """Slopes of the residuals by the unknowns, and of the states' by their own errors."""
-    slopes = slopes_by_error(restore(vector), data, modes, spread)
-    weighing = weighing_at(restore(vector), data, modes, spread)
-    given = (restore, data, modes, spread, weighing)
-    jacobian = jax.jacfwd(lambda v: all_residuals(v, *given))(vector)
-    return jacobian, jnp.sqrt(data.weight)[:, None, None] * (weighing.whiten @ slopes)
+    slopes = slopes_by_error(unravel(vector), problem)
+    weighting = weighting_at(unravel(vector), problem)
+    jacobian = jax.jacfwd(lambda v: all_residuals(v, unravel, problem, weighting))(vector)
+    return jacobian, jnp.sqrt(problem.data.weight)[:, None, None] * (weighting.whiten @ slopes)

@@ -5,8 +5,9 @@ With V the velocity of the nonlinear mode and X = V/(iΩ), a state balances when
 curve, however the response folds.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -64,11 +65,29 @@ class Unknowns(eqx.Module):
     linear: Float[Array, " deviation"]
 
 
-class Spread(eqx.Module):
-    """1σ of what the unknowns give in their own units."""
+class PriorStd(eqx.Module):
+    """Prior standard deviations (1σ) of the unknowns that have one."""
 
-    level: Float[Array, " error"]  # of `LEVEL_ERRORS`
+    level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or estimated
     linear: Float[Array, " deviation"]  # natural frequencies (rad/s), then damping ratios
+
+
+class BalanceProblem(eqx.Module):
+    """Measured states, the linear modes and the priors: all that the force balance needs."""
+
+    data: BalanceData
+    modes: LinearModes
+    prior: PriorStd
+
+    def with_data(self, **fields: Any) -> "BalanceProblem":
+        """The problem with other fields of its data."""
+        return dataclasses.replace(self, data=dataclasses.replace(self.data, **fields))
+
+    @property
+    def modal_constant(self) -> Float[Array, ""]:
+        """A = Φ_r Φᵀb in 1/kg: the acceleration at the sensor per newton of modal force."""
+        r, j = self.data.sensor, self.modes.mode_of_interest
+        return self.modes.mode_shape[r, j] * self.modes.participation[j]
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
@@ -160,30 +179,27 @@ class Motion(eqx.Module):
 
 
 @compiled
-def recorded_motion(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> Motion:
+def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     """`motion_of` the states as they were recorded."""
-    return motion_of(unknowns, data, modes, spread, no_errors(data.level.shape[0]))
+    return motion_of(unknowns, problem, no_errors(problem.data.level.shape[0]))
 
 
 def motion_of(
     unknowns: Unknowns,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
+    problem: BalanceProblem,
     error: Float[Array, "state input"],
 ) -> Motion:
     """What the record says of the mode when it is freed of its errors.
 
     `error` adds to the logarithms of force and velocity and to the phase: for derivatives.
     """
-    level = (unknowns.level * spread.level)[data.level]
+    data, prior = problem.data, problem.prior
+    level = (unknowns.level * prior.level)[data.level]
     gain = jnp.exp(unknowns.log_force_gain + error[:, 0])
     force = data.force * gain + unknowns.force_offset * jnp.min(data.force)
     phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
     velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + 1j * phase)
-    linear = with_deviations(modes, unknowns.linear, spread.linear)
+    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
     residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
     own = velocity - jnp.sum(data.share * residual, axis=1)
     return Motion(own, jnp.abs(own) / data.frequency, force)
@@ -191,23 +207,20 @@ def motion_of(
 
 def force_balance(
     unknowns: Unknowns,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
+    problem: BalanceProblem,
     error: Float[Array, "state input"],
 ) -> Float[Array, "state part"]:
     """Force needed for the measured motion minus the force, over the force: real and imaginary."""
-    motion = motion_of(unknowns, data, modes, spread, error)
-    level = (unknowns.level * spread.level)[data.level]
+    motion = motion_of(unknowns, problem, error)
+    data = problem.data
+    level = (unknowns.level * problem.prior.level)[data.level]
     squared = unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency))
     damping = unknowns.modal_damping(motion.amplitude(unknowns.modal_damping))
     squared = squared * (1 + level[:, 2] + error[:, 3])
     damping = damping * (1 + level[:, 3])
-    r, j = data.sensor, modes.mode_of_interest
-    constant = modes.mode_shape[r, j] * modes.participation[j]
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
-    needed = stiffness * motion.velocity / (1j * omega * constant)
+    needed = stiffness * motion.velocity / (1j * omega * problem.modal_constant)
     # Relative to the recorded force, but with no advantage from a larger gain.
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit
@@ -231,16 +244,14 @@ def error_slopes(
     return jnp.moveaxis(mapped(jax.linearize(balance, at)[1], directions), 0, 2)
 
 
-class Weighing(NamedTuple):
+class Weighting(NamedTuple):
     """What turns a balance into independent residuals of unit variance, state by state."""
 
     whiten: Float[Array, "state part part"]
     offset: Float[Array, "state part"]  # of the balance, from the corrected state to the record
 
 
-def weighing_at(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> Weighing:
+def weighting_at(unknowns: Unknowns, problem: BalanceProblem) -> Weighting:
     """How much every balance weighs, by its slopes at the corrected states.
 
     The balance is straight between a record and its corrected state, which lies on the curves:
@@ -250,14 +261,12 @@ def weighing_at(
     Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
     8 (1987) 1052, doi:10.1137/0908085.
     """
-    slopes = slopes_by_error(unknowns, data, modes, spread)
-    offset = -jnp.einsum("sie,se->si", slopes, data.correction)
-    return Weighing(whitener(slopes, data.std), offset)
+    slopes = slopes_by_error(unknowns, problem)
+    offset = -jnp.einsum("sie,se->si", slopes, problem.data.correction)
+    return Weighting(whitener(slopes, problem.data.std), offset)
 
 
-def nearest_errors(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> Float[Array, "state input"]:
+def nearest_errors(unknowns: Unknowns, problem: BalanceProblem) -> Float[Array, "state input"]:
     """The likeliest errors with which every state balances, from its present correction on.
 
     Each step solves the balance made straight at the last one's end: what is left of the balance
@@ -265,23 +274,22 @@ def nearest_errors(
     """
 
     def step(errors: Array, _: None) -> tuple[Array, None]:
-        erring = eqx.tree_at(lambda d: d.correction, data, errors)
-        slopes = slopes_by_error(unknowns, erring, modes, spread)
-        whiten = whitener(slopes, data.std)
-        balance = force_balance(unknowns, data, modes, spread, errors)
+        slopes = slopes_by_error(unknowns, problem.with_data(correction=errors))
+        whiten = whitener(slopes, problem.data.std)
+        balance = force_balance(unknowns, problem, errors)
         straight = balance - jnp.einsum("sie,se->si", slopes, errors)
         whitened = jnp.einsum("sij,sj->si", whiten, straight)
-        found = -jnp.einsum("sje,sij,si->se", slopes, whiten, whitened) * data.std**2
+        found = -jnp.einsum("sje,sij,si->se", slopes, whiten, whitened) * problem.data.std**2
         return jnp.clip(found, -_FARTHEST, _FARTHEST), None
 
-    return jax.lax.scan(step, data.correction, length=_STEPS)[0]
+    return jax.lax.scan(step, problem.data.correction, length=_STEPS)[0]
 
 
 def slopes_by_error(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
+    unknowns: Unknowns, problem: BalanceProblem
 ) -> Float[Array, "state part input"]:
     """Derivatives of the balance by the states' errors, at the corrected states."""
-    return error_slopes(lambda e: force_balance(unknowns, data, modes, spread, e), data.correction)
+    return error_slopes(lambda e: force_balance(unknowns, problem, e), problem.data.correction)
 
 
 def whitener(

@@ -9,8 +9,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from snrmjax.identify.curves.packed_curve import as_any_family
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Unknowns
+from snrmjax.identify.curves.packed_curve import packed
+from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
+    BalanceData,
+    BalanceProblem,
+    Motion,
+    Unknowns,
+    recorded_motion,
+)
 
 _FEWEST_STATES, _LEVELS = 48, 8  # that there is room for; levels come in so many
 
@@ -18,7 +25,7 @@ FREE = ("force_gain", "force_offset", "instrument_phase")
 """Unknowns of the measurement that a fit may free."""
 
 
-class Restore(eqx.Module):
+class Unravel(eqx.Module):
     """From a vector of free unknowns to all of them."""
 
     unknowns: Unknowns
@@ -40,17 +47,17 @@ class Restore(eqx.Module):
         return end - level.size + np.arange(level.size).reshape(level.shape)
 
 
-class Programmed(NamedTuple):
+class PackedUnknowns(NamedTuple):
     """The free unknowns as compiled programs take them: with curves of one form and size.
 
     `own` says where in the longer vector the fit's own unknowns are; the others move nothing.
     """
 
     vector: Float[Array, " entry"]
-    restore: Restore
+    unravel: Unravel
     own: Int[np.ndarray, " unknown"]
 
-    def spread_out(
+    def padded_covariance(
         self, covariance: Float[np.ndarray, "unknown unknown"]
     ) -> Float[np.ndarray, "entry entry"]:
         """A covariance of the fit's unknowns among all entries of the vector."""
@@ -59,14 +66,14 @@ class Programmed(NamedTuple):
         return full
 
 
-def programmed(
+def packed_unknowns(
     unknowns: Unknowns, free: tuple[str, ...], n_levels: int | None = None
-) -> Programmed:
+) -> PackedUnknowns:
     """Unknowns for a program that serves every family, and so many levels."""
-    whole, present = in_one_form(unknowns), len(unknowns.level)
+    whole, present = with_packed_curves(unknowns), len(unknowns.level)
     if n_levels is not None:
         whole = eqx.tree_at(lambda u: u.level, whole, filled(unknowns.level, n_levels, 0.0))
-    vector = Restore(whole, free).vector()
+    vector = Unravel(whole, free).vector()
     (n, m), (size, other) = (
         (u.squared_frequency.parameters.shape[0], u.modal_damping.parameters.shape[0])
         for u in (unknowns, whole)
@@ -75,18 +82,35 @@ def programmed(
     spare = (len(whole.level) - present) * len(LEVEL_ERRORS)
     rest = (*range(size + other, linear - spare), *range(linear, len(vector)))
     own = [*range(n), *range(size, size + m), *rest]
-    return Programmed(vector, Restore(whole, free), np.array(own))
+    return PackedUnknowns(vector, Unravel(whole, free), np.array(own))
 
 
-def with_room(data: BalanceData) -> BalanceData:
-    """The data with spare states that weigh nothing and spare levels: few sizes compile."""
+def padded_data(data: BalanceData) -> BalanceData:
+    """The data with padding states of no weight and padding levels: few sizes compile."""
     n, levels = len(data.level), data.n_levels
     power = 1 << (n - 1).bit_length()
     size = max(n, _FEWEST_STATES, 3 * power // 4 if n <= 3 * power // 4 else power)
     roomy = jax.tree.map(lambda a: filled(a, size, None), data)
     weight = filled(data.weight, size, 0.0)
-    n_levels = _LEVELS * -(-levels // _LEVELS)
-    return dataclasses.replace(roomy, weight=weight, n_levels=n_levels)
+    return dataclasses.replace(roomy, weight=weight, n_levels=padded_levels(levels))
+
+
+def padded_levels(n_levels: int) -> int:
+    """So many levels have room for these: levels come in eights, so that few sizes compile."""
+    return _LEVELS * -(-n_levels // _LEVELS)
+
+
+def recorded_motion_of(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
+    """`recorded_motion` by a program that serves every family and number of states."""
+    n, padded = len(problem.data.level), padded_problem(problem)
+    whole = packed_unknowns(unknowns, (), padded.data.n_levels).unravel.unknowns
+    motion = recorded_motion(whole, padded)
+    return jax.tree.map(lambda rows: np.asarray(rows)[:n], motion)
+
+
+def padded_problem(problem: BalanceProblem) -> BalanceProblem:
+    """The problem with `padded_data`."""
+    return dataclasses.replace(problem, data=padded_data(problem.data))
 
 
 def filled(rows: Array, size: int, spare: float | None) -> np.ndarray:
@@ -134,7 +158,7 @@ def named_unknowns(
     )
 
 
-def in_one_form(unknowns: Unknowns) -> Unknowns:
+def with_packed_curves(unknowns: Unknowns) -> Unknowns:
     """The same unknowns with both curves as compiled programs take them."""
-    pair = (as_any_family(unknowns.squared_frequency), as_any_family(unknowns.modal_damping))
+    pair = (packed(unknowns.squared_frequency), packed(unknowns.modal_damping))
     return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, pair)

@@ -13,14 +13,12 @@ from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.curves.splines import Spline
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
-    BalanceData,
-    Spread,
+    BalanceProblem,
     Unknowns,
-    recorded_motion,
 )
-from snrmjax.model.modes import LinearModes
+from snrmjax.identify.joint.free_unknowns import recorded_motion_of
 
-_PILOT_SIZE, _PILOT_KNOTS = 4, 10
+_LARGEST_POLYNOMIAL, _MOST_KNOTS = 4, 10
 _APART = 1.5  # ratio of amplitudes that tells one more term of a curve
 
 
@@ -34,13 +32,12 @@ class _Point(NamedTuple):
     weight: np.ndarray
 
 
-def pilot_start(
-    data: BalanceData, modes: LinearModes, spread: Spread, free: tuple[str, ...]
-) -> Unknowns:
+def initial_guess(problem: BalanceProblem, free: tuple[str, ...]) -> Unknowns:
     """Rough unknowns from linear least squares: gain and phase first, then curves."""
+    data = problem.data
     gain, phase = 0.0, 0.0
     if "force_gain" in free or "instrument_phase" in free:
-        factor = _complex_gain(data, modes, complex_too="instrument_phase" in free)
+        factor = _complex_gain(problem, complex_too="instrument_phase" in free)
         gain = float(np.log(abs(factor))) if "force_gain" in free else 0.0
         phase = float(np.angle(factor)) if "instrument_phase" in free else 0.0
     flat = Polynomial(jnp.ones(1), jnp.ones(()), "displacement")
@@ -51,13 +48,13 @@ def pilot_start(
         force_offset=jnp.asarray(0.0),
         instrument_phase=jnp.asarray(phase),
         level=jnp.zeros((data.n_levels, len(LEVEL_ERRORS))),
-        linear=jnp.zeros(spread.linear.shape[0]),
+        linear=jnp.zeros(problem.prior.linear.shape[0]),
     )
-    point = _points(start, data, modes, spread)
+    point = _points(start, problem)
     most = most_parameters(point.speed, data.n_levels)
     sizes: list[tuple[type[AbstractFamily], int]] = []
-    sizes += [(Polynomial, k) for k in range(min(_PILOT_SIZE, most - 1) + 1)]
-    sizes += [(Spline, k) for k in range(3, min(_PILOT_KNOTS, most) + 1)]
+    sizes += [(Polynomial, k) for k in range(min(_LARGEST_POLYNOMIAL, most - 1) + 1)]
+    sizes += [(Spline, k) for k in range(3, min(_MOST_KNOTS, most) + 1)]
     n = len(point.speed)
 
     def curve(values: np.ndarray) -> AbstractFamily:
@@ -77,10 +74,9 @@ def pilot_start(
     )
 
 
-def _complex_gain(data: BalanceData, modes: LinearModes, *, complex_too: bool) -> complex:
+def _complex_gain(problem: BalanceProblem, *, complex_too: bool) -> complex:
     """G of K X/A = G F with K polynomial in the amplitude, by linear least squares."""
-    j, r = modes.mode_of_interest, data.sensor
-    constant = float(modes.mode_shape[r, j] * modes.participation[j])
+    data, constant = problem.data, float(problem.modal_constant)
     omega, velocity, force = (
         np.asarray(part) for part in (data.frequency, data.velocity, data.force)
     )
@@ -98,11 +94,10 @@ def _complex_gain(data: BalanceData, modes: LinearModes, *, complex_too: bool) -
     return gain if gain != 0 else 1.0 + 0.0j
 
 
-def _points(start: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread) -> _Point:
-    motion = recorded_motion(start, data, modes, spread)
+def _points(start: Unknowns, problem: BalanceProblem) -> _Point:
+    motion = recorded_motion_of(start, problem)
     own, force = np.asarray(motion.velocity), np.asarray(motion.force)
-    j, r = modes.mode_of_interest, data.sensor
-    constant = float(modes.mode_shape[r, j] * modes.participation[j])
+    data, constant = problem.data, float(problem.modal_constant)
     omega, std = np.asarray(data.frequency), np.asarray(data.std)
     stiffness = constant * force * 1j * omega / own
     return _Point(

@@ -8,40 +8,57 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.joint.fitting import Fitted, NotFinite, fitted
+from snrmjax.identify.curves.families import parse_family
+from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.joint.fitting import (
+    FIT_MESSAGE,
+    FitSettings,
+    FitStatus,
+    Fitted,
+    fitted,
+)
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
+    BalanceProblem,
     Motion,
-    Spread,
+    PriorStd,
     Unknowns,
     balance_data,
-    recorded_motion,
     stated_level_std,
 )
 from snrmjax.identify.joint.free_unknowns import (
     FREE,
-    Programmed,
-    Restore,
-    in_one_form,
+    PackedUnknowns,
+    Unravel,
     named_unknowns,
-    programmed,
+    packed_unknowns,
+    padded_levels,
+    recorded_motion_of,
 )
-from snrmjax.identify.joint.initial_guess import pilot_start
-from snrmjax.identify.joint.notes import notes_on_neighbours, notes_on_noise, notes_on_reach
+from snrmjax.identify.joint.initial_guess import initial_guess
+from snrmjax.identify.joint.notes import (
+    notes_on_autocorrelation,
+    notes_on_families,
+    notes_on_noise,
+    notes_on_reach,
+)
+from snrmjax.identify.joint.ranking import FamilyCandidate
 from snrmjax.identify.joint.selection import (
-    Candidate,
+    FamilyRequest,
     Selection,
-    parse_family,
+    SelectionStatus,
     select_families,
 )
-from snrmjax.identify.joint.variance_components import Scatter, few_levels_factor
+from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.result import AbstractResult, Variable
 
+_HERTZ = 2 * np.pi  # rad/s
 _ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
-_ROUGHLY = 2, 6  # the same, of a fit that is but the pilot of another
+_ROUGHLY = 2, 6  # the same, of a fit that another one starts from, and of rivals
 _CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
 
 
@@ -49,37 +66,83 @@ class Rival(NamedTuple):
     """The same data fitted with another family of one of the curves, that they could mean too."""
 
     curve: str  # "backbone" or "damping": the one of another family
-    weight: float  # among all families tried, by how they predict what is left out
+    weight: float  # among all families tried, by how well they predict left-out levels
     fit: "JointFit"
 
 
-class JointFit(eqx.Module):
+class FailedRival(NamedTuple):
+    """A family that the data could mean too, whose fit failed: the bands do not include it."""
+
+    curve: str  # "backbone" or "damping"
+    family: str  # with its size and amplitude
+    weight: float
+    status: FitStatus
+
+
+class FamilyChoice(eqx.Module):
+    """Which families were tried, how the choice among them ended, and what it leaves open.
+
+    `rivals` are fits with other families that predict left-out levels about as well: bands of
+    curves and responses include what is left open by the choice.
+    """
+
+    candidates: tuple[FamilyCandidate, ...] = eqx.field(static=True, default=())
+    rivals: tuple[Rival, ...] = ()
+    failed: tuple[FailedRival, ...] = eqx.field(static=True, default=())
+    status: SelectionStatus = eqx.field(static=True, default=SelectionStatus.SETTLED)
+
+
+class NoiseEstimate(eqx.Module):
+    """The random errors of the states and the errors that the states of a level share."""
+
+    scale: float  # by which residuals exceed the stated noise; the noise where none is stated
+    scale_std: float
+    level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
+    autocorrelation: Float[np.ndarray, " part"]  # of neighbours' residuals, 0 if it may be chance
+    stated: bool = eqx.field(static=True)
+
+
+class JointFit(AbstractResult):
     """Two curves, what else was unknown, and how well all of it is known.
 
-    `covariance` belongs to the free unknowns in the order of `names`, and includes what the
-    residuals of neighbouring states have in common; `level_std` to `LEVEL_ERRORS`, stated or found:
-    what was found from few levels counts for more in `spread`, as Student's t does.
-    `rivals` are fits with other families that predict left-out levels about as well: bands of
-    curves and responses include what is left open by the choice, the covariance does not.
+    `covariance` belongs to the free unknowns in the order of `names`, and includes the correlation
+    of neighbouring states' residuals, but not the choice among families. `noise.level_std` belongs
+    to `LEVEL_ERRORS`, stated or estimated: what was estimated from few levels counts for more in
+    `prior`, as Student's t does.
     """
+
+    coordinates = ("parameter",)
 
     unknowns: Unknowns
     covariance: Float[np.ndarray, "unknown unknown"]
-    spread: Spread
-    data: BalanceData
-    modes: LinearModes
-    noise_scale: float  # by which residuals exceed the stated noise; the noise where none is
-    noise_scale_std: float
-    level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
+    problem: BalanceProblem
+    noise: NoiseEstimate
+    families: FamilyChoice
     residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
-    neighbour_correlation: Float[np.ndarray, " part"]  # of residuals, 0 where it may be chance
     drive_known_only: bool = eqx.field(static=True)
-    noise_stated: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
-    candidates: tuple[Candidate, ...] = eqx.field(static=True)
-    rivals: tuple[Rival, ...]
     notes: tuple[str, ...] = eqx.field(static=True)
-    converged: bool = eqx.field(static=True)
+    status: FitStatus = eqx.field(static=True)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit converged."""
+        return self.status == FitStatus.CONVERGED
+
+    @property
+    def data(self) -> BalanceData:
+        """The states as the fit sees them."""
+        return self.problem.data
+
+    @property
+    def modes(self) -> LinearModes:
+        """The linear modes of the structure."""
+        return self.problem.modes
+
+    @property
+    def prior(self) -> PriorStd:
+        """Prior standard deviations, those estimated from the levels included."""
+        return self.problem.prior
 
     @property
     def largest(self) -> tuple[float, float]:
@@ -89,34 +152,37 @@ class JointFit(eqx.Module):
         return float(np.max(np.asarray(motion.displacement))), float(np.max(speed))
 
     @property
-    def freed(self) -> bool:
-        """Whether states are freed of their likeliest errors, as the noise was believed."""
+    def corrected(self) -> bool:
+        """Whether states are corrected for their most likely errors, their noise believed."""
         return bool(np.any(np.asarray(self.data.correction) != 0))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        return recorded_motion(in_one_form(self.unknowns), self.data, self.modes, self.spread)
+        return recorded_motion_of(self.unknowns, self.problem)
 
     def recorded_force(self, force: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """What the test records of a force in N: in N, or in V where only the drive is known."""
-        gain = float(jnp.exp(self.unknowns.log_force_gain))
-        offset = float(self.unknowns.force_offset) * float(jnp.min(self.data.force))
+        gain, offset = self._force_line()
         return (np.asarray(force) - offset) / gain
 
     def force_of_drive(self, drive: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """The force in N that belongs to what a test records (`recorded_force`)."""
-        gain = float(jnp.exp(self.unknowns.log_force_gain))
-        offset = float(self.unknowns.force_offset) * float(jnp.min(self.data.force))
+        gain, offset = self._force_line()
         return np.asarray(drive) * gain + offset
 
-    def vector(self) -> tuple[Float[Array, " unknown"], Restore]:
-        """The free unknowns as a vector, and the way back to all of them."""
-        restore = Restore(self.unknowns, self.free)
-        return restore.vector(), restore
+    def _force_line(self) -> tuple[float, float]:
+        smallest = float(jnp.min(self.data.force))
+        offset = float(self.unknowns.force_offset) * smallest
+        return float(jnp.exp(self.unknowns.log_force_gain)), offset
 
-    def programmed(self) -> Programmed:
+    def vector(self) -> tuple[Float[Array, " unknown"], Unravel]:
+        """The free unknowns as a vector, and the way back to all of them."""
+        unravel = Unravel(self.unknowns, self.free)
+        return unravel.vector(), unravel
+
+    def packed(self) -> PackedUnknowns:
         """The free unknowns as compiled programs take them."""
-        return programmed(self.unknowns, self.free)
+        return packed_unknowns(self.unknowns, self.free, padded_levels(self.data.n_levels))
 
     def names(self) -> tuple[str, ...]:
         """What the free unknowns are called."""
@@ -125,6 +191,57 @@ class JointFit(eqx.Module):
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        squared, damping = self.unknowns.squared_frequency, self.unknowns.modal_damping
+        motion = self.motion()
+        omega = np.sqrt(np.asarray(squared(motion.amplitude(squared))))
+        ratio = np.asarray(damping(motion.amplitude(damping))) / (2 * omega)
+        size = np.abs(np.asarray(motion.velocity))
+        scale = f"{self.noise.scale:.3g} ± {self.noise.scale_std:.1g}"
+        noise = f"{scale} times the stated noise" if self.noise.stated else f"noise {scale}"
+        rivals = len(self.families.rivals)
+        return (
+            f"JointFit: backbone {squared.label}, damping {damping.label}",
+            f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
+            f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
+            f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
+            f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
+            f"residuals: {noise}; {rivals} competing families in the bands",
+            f"status: {FIT_MESSAGE[self.status]}",
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        std, data, per = np.sqrt(np.diag(self.covariance)), self.data, ("parameter",)
+        state, force = ("state",), "V" if self.drive_known_only else "N"
+        measured = np.asarray(data.force)
+        parts = Variable(("state", "part"), self.residuals, "1", "whitened residual")
+        return {
+            "parameter": Variable(per, np.array(self.names()), "", "free unknown"),
+            "value": Variable(per, np.asarray(self.vector()[0]), "", "value, in `unit`"),
+            "std": Variable(per, std, "", "1σ, in `unit`"),
+            "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
+            "level": Variable(state, np.asarray(data.level), "1", "level, counted from 0"),
+            "frequency_hz": Variable(state, np.asarray(data.frequency) / _HERTZ, "Hz", "frequency"),
+            "drive_v" if force == "V" else "force_n": Variable(state, measured, force, "force"),
+            "velocity_m_s": Variable(
+                state, np.abs(np.asarray(self.motion().velocity)), "m/s", "velocity of the mode"
+            ),
+            "residual": parts,
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {
+            "backbone": self.unknowns.squared_frequency.label,
+            "damping": self.unknowns.modal_damping.label,
+            "noise_scale": self.noise.scale,
+            "status": FIT_MESSAGE[self.status],
+            "notes": "\n".join(self.notes),
+        }
 
 
 @on_one_core
@@ -142,23 +259,23 @@ def fit_jointly(
     """Fit both curves to the complex force balance of all states at once.
 
     Levenberg–Marquardt on residuals whitened with the stated noise. Gain and phase errors that a
-    level shares are unknowns with the stated 1σ; where levels scatter more than that allows, a
-    deviation of stiffness and damping from level to level is estimated too (restricted maximum
-    likelihood) and enters the bands. Both families and that scatter are chosen at a first fit that
-    knows no scatter, or at the pilot where that leads to clearly less noise. Where the stated noise
-    is believed, every step frees the states of their likeliest errors (orthogonal distance
-    regression), and what is small in the end are those. The other modes' frequencies and
-    dampings stay inside their stated errors.
+    level shares are unknowns with the stated 1σ. Where levels differ by more than that allows, the
+    level-to-level variance of gain, phase, stiffness and damping is estimated (restricted maximum
+    likelihood) and enters the bands. Families and level-to-level variance are chosen at a first fit
+    without any, or at the initial guess where that leads to clearly less noise. Where the stated
+    noise is believed, every step corrects the states for their most likely errors (orthogonal
+    distance regression). The other modes' frequencies and dampings stay inside their stated errors.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
-    chosen by predicting left-out levels, and so is the family itself for "auto". `free` may name
-    "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only the
-    drive is known. `modes` may be a structure, which also states the 1σ of what the states of a
+    chosen by cross-validation over left-out levels, and so is the family itself for "auto". `free`
+    may name "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only
+    the drive is known. `modes` may be a structure, which also states the 1σ of what the states of a
     level share: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
     `level_phase_std` (rad), where given, stand in place of the first two.
-    Returns a `JointFit`. Raises `ValueError` for too few states, an unknown family or name, and a
-    family with more parameters than there are data.
+    Returns a `JointFit`, whose `status` says whether it converged.
+    Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
+    than there are data, and a fit whose residuals become infinite or undefined.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     """
     level_std = stated_level_std(modes)
@@ -182,98 +299,127 @@ def fit_jointly(
     linear_std = np.concatenate(
         [np.asarray(modes.natural_frequency_std)[keep], np.asarray(modes.damping_ratio_std)[keep]]
     )
-    spread = Spread(jnp.asarray(level_std), jnp.asarray(linear_std))
-    wanted = parse_family(backbone), parse_family(damping)
+    prior = PriorStd(jnp.asarray(level_std), jnp.asarray(linear_std))
+    problem = BalanceProblem(measured, modes, prior)
+    request = FamilyRequest(parse_family(backbone), parse_family(damping), released)
 
-    def select(pilot: Unknowns, data: BalanceData, *, scatter_too: bool) -> Selection:
+    def select(guess: Unknowns, problem: BalanceProblem, *, components_too: bool) -> Selection:
         # Where no noise is stated a smooth curve would bend for levels whose gains differ.
-        smooth, settings = stated or scatter_too, (*wanted, released)
-        given = (data, modes, spread, pilot, *settings)
-        return select_families(*given, scatter_too=scatter_too, smooth=smooth)
+        smooth = stated or components_too
+        given = (problem, guess, request)
+        return select_families(*given, components_too=components_too, smooth=smooth)
 
     def fit_from(
-        chosen: Selection, pilot: Unknowns, data: BalanceData, rounds: tuple[int, int]
+        chosen: Selection, guess: Unknowns, problem: BalanceProblem, rounds: tuple[int, int]
     ) -> Fitted:
-        noisy = eqx.tree_at(lambda d: d.std, data, data.std.at[:, 3].set(chosen.jitter))
-        level = _with_scatter(spread, chosen.scatter, data.n_levels)
-        start = _started(pilot, chosen, level)
-        settings = (modes, level, released, chosen.scatter)
-        return fitted(start, noisy, *settings, stated=stated, robust=robust, rounds=rounds)
+        level = _with_components(prior, chosen.components, measured.n_levels)
+        std = problem.data.std.at[:, 3].set(chosen.jitter)
+        noisy = BalanceProblem(problem.with_data(std=std).data, modes, level)
+        start = _started(guess, chosen, level)
+        return fitted(
+            start, noisy, chosen.components, FitSettings(released, stated, robust, rounds)
+        )
 
-    # What the rough pilot misses would pass for levels that differ: a fit without that comes first.
-    rough = pilot_start(measured, modes, spread, released)
-    begun = fit_from(select(rough, measured, scatter_too=False), rough, measured, _ROUGHLY)
-    pilot, corrected = _as_pilot(begun, measured)
-    chosen = select(pilot, corrected, scatter_too=True)
-    best = fit_from(chosen, pilot, corrected, _ROUNDS)
-    if not best.converged or (stated and best.scatter.contradicts_upward):
-        # Where levels differ so much that no fit without that comes near, the pilot knows better.
-        other = select(rough, measured, scatter_too=True)
-        again = fit_from(other, rough, measured, _ROUNDS)
-        if again.scatter.noise < _CLEARLY_LESS * best.scatter.noise:
+    # What the initial guess misses would pass for levels that differ: a fit without level-to-level
+    # variance comes first.
+    first_guess = initial_guess(problem, released)
+    chosen = select(first_guess, problem, components_too=False)
+    first = _finite(fit_from(chosen, first_guess, problem, _ROUGHLY))
+    guess, corrected = _as_guess(first, problem)
+    chosen = select(guess, corrected, components_too=True)
+    best = _finite(fit_from(chosen, guess, corrected, _ROUNDS))
+    if best.status != FitStatus.CONVERGED or (stated and best.components.contradicts_upward):
+        # Where levels differ so much that no fit without that comes near, the guess is better.
+        other = select(first_guess, problem, components_too=True)
+        again = _finite(fit_from(other, first_guess, problem, _ROUNDS))
+        if again.components.noise < _CLEARLY_LESS * best.components.noise:
             chosen, best = other, again
 
-    def told(found: Fitted, rivals: tuple[Rival, ...]) -> JointFit:
+    def told(found: Fitted, families: FamilyChoice) -> JointFit:
+        components, last = found.components, found.problem
         notes: tuple[str, ...] = ()
-        if not found.converged:
-            notes = ("the fit did not converge: try a simpler family.",)
-        noise = (found.scatter, chosen.jitter, np.asarray(spread.level), measured.n_levels)
-        notes += notes_on_noise(*noise, stated=stated, alike=bool(found.neighbours.any()))
-        notes += notes_on_neighbours(found.neighbours)
-        motion = recorded_motion(in_one_form(found.unknowns), found.data, modes, found.spread)
-        notes += notes_on_reach(motion, np.asarray(found.data.level))
+        if found.status != FitStatus.CONVERGED:
+            notes = (f"the fit has {FIT_MESSAGE[found.status]}; try a simpler family.",)
+        notes += notes_on_families(families.status, families.candidates)
+        if families.failed:
+            notes += (_note_on_failed(families),)
+        noise = (components, chosen.jitter, np.asarray(prior.level), measured.n_levels)
+        notes += notes_on_noise(*noise, stated=stated, alike=bool(found.autocorrelation.any()))
+        notes += notes_on_autocorrelation(found.autocorrelation)
+        motion = recorded_motion_of(found.unknowns, last)
+        notes += notes_on_reach(motion, np.asarray(last.data.level))
         return JointFit(
             unknowns=found.unknowns,
             covariance=found.covariance,
-            spread=found.spread,
-            data=found.data,
-            modes=modes,
-            noise_scale=found.scatter.noise,
-            noise_scale_std=found.scatter.noise_std,
-            level_std=np.asarray(found.scatter.level),
+            problem=last,
+            noise=NoiseEstimate(
+                scale=components.noise,
+                scale_std=components.noise_std,
+                level_std=np.asarray(components.level),
+                autocorrelation=found.autocorrelation,
+                stated=stated,
+            ),
+            families=families,
             residuals=found.residuals,
-            neighbour_correlation=found.neighbours,
             drive_known_only=driven,
-            noise_stated=stated,
             free=released,
-            candidates=chosen.table,
-            rivals=rivals,
             notes=notes,
-            converged=found.converged,
+            status=found.status,
         )
 
-    rivals, (pilot, corrected) = [], _as_pilot(best, measured)
-    for one in chosen.contenders:
-        pair = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
+    rivals, failed = [], []
+    guess, corrected = _as_guess(best, problem)
+    for one in chosen.rivals:
+        pair: list[AbstractFamily] = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
         pair[one.curve == "damping"] = one.family
         other = chosen._replace(squared_frequency=pair[0], modal_damping=pair[1])
-        try:
-            found = fit_from(other, pilot, corrected, _ROUGHLY)
-        except NotFinite:
-            continue  # a family that cannot be fitted is no rival
-        if found.converged:
-            rivals.append(Rival(one.curve, one.weight, told(found, ())))
-    return told(best, tuple(rivals))
+        found = fit_from(other, guess, corrected, _ROUGHLY)
+        if found.status == FitStatus.CONVERGED:
+            alone = FamilyChoice(chosen.table, status=chosen.status)
+            rivals.append(Rival(one.curve, one.weight, told(found, alone)))
+        else:
+            failed.append(FailedRival(one.curve, one.family.label, one.weight, found.status))
+    return told(best, FamilyChoice(chosen.table, tuple(rivals), tuple(failed), chosen.status))
 
 
-def _as_pilot(found: Fitted, measured: BalanceData) -> tuple[Unknowns, BalanceData]:
-    """A fit as another one starts from it: levels in their own units, its states' errors."""
-    raw = found.unknowns.level * found.spread.level
-    pilot = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
-    return pilot, eqx.tree_at(lambda d: d.correction, measured, found.data.correction)
+def _finite(found: Fitted) -> Fitted:
+    if found.status == FitStatus.NOT_FINITE:
+        raise ValueError(
+            "the residuals of the fit became infinite or undefined: try other families."
+        )
+    return found
 
 
-def _started(pilot: Unknowns, chosen: Selection, spread: Spread) -> Unknowns:
-    """The chosen curves, and the pilot's deviations of levels in units of their new 1σ."""
-    unit = jnp.where(spread.level > 0, spread.level, 1.0)
-    level = jnp.where(spread.level > 0, pilot.level / unit, 0.0)
-    pair = (chosen.squared_frequency, chosen.modal_damping)
-    return eqx.tree_at(
-        lambda u: (u.squared_frequency, u.modal_damping, u.level), pilot, (*pair, level)
+def _note_on_failed(families: FamilyChoice) -> str:
+    every = len(families.failed) + len(families.rivals)
+    listed = ", ".join(
+        f"{one.family} of the {one.curve}, weight {100 * one.weight:.0f} %"
+        for one in families.failed
+    )
+    return (
+        f"{len(families.failed)} of {every} competing families could not be fitted ({listed}): the "
+        "bands do not include them."
     )
 
 
-def _with_scatter(spread: Spread, scatter: Scatter, n_levels: int) -> Spread:
-    """Levels' errors as stated, or as found and as much wider as few levels leave open."""
-    found = few_levels_factor(n_levels) * jnp.array(scatter.level)
-    return Spread(jnp.where(spread.level > 0, spread.level, found), spread.linear)
+def _as_guess(found: Fitted, problem: BalanceProblem) -> tuple[Unknowns, BalanceProblem]:
+    """A fit as another one starts from it: levels in their own units, its states' errors."""
+    raw = found.unknowns.level * found.problem.prior.level
+    guess = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
+    return guess, problem.with_data(correction=found.problem.data.correction)
+
+
+def _started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:
+    """The chosen curves, and the guess's deviations of levels in units of their new 1σ."""
+    unit = jnp.where(prior.level > 0, prior.level, 1.0)
+    level = jnp.where(prior.level > 0, guess.level / unit, 0.0)
+    pair = (chosen.squared_frequency, chosen.modal_damping)
+    return eqx.tree_at(
+        lambda u: (u.squared_frequency, u.modal_damping, u.level), guess, (*pair, level)
+    )
+
+
+def _with_components(prior: PriorStd, components: VarianceComponents, n_levels: int) -> PriorStd:
+    """Levels' errors as stated, or as estimated and as much wider as few levels leave open."""
+    found = few_levels_factor(n_levels) * jnp.array(components.level)
+    return PriorStd(jnp.where(prior.level > 0, prior.level, found), prior.linear)

@@ -20,7 +20,7 @@ def along_resonance(
     return [order[level[order] == number] for number in np.unique(level)]
 
 
-def neighbour_correlation(
+def residual_autocorrelation(
     residuals: Float[np.ndarray, "state part"], levels: list[Int[np.ndarray, " place"]]
 ) -> Float[np.ndarray, " part"]:
     """Correlation of a residual with the next one along its level, of both parts.

@@ -1,10 +1,11 @@
-"""What a joint fit makes small, the slopes of it, and the steps that a fit takes on them.
+"""What a joint fit makes small, its slopes, and the steps that a fit takes on them.
 
 Residuals are every state's balance in units of its noise, and the priors. An error of a level
 moves the states of that level alone: one push forward through the residuals serves this error in
 all levels. Of eight levels with four errors each, 32 pushes become four.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,52 +17,53 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
     BalanceData,
-    Spread,
+    BalanceProblem,
+    PriorStd,
     Unknowns,
-    Weighing,
+    Weighting,
     force_balance,
+    motion_of,
     nearest_errors,
-    weighing_at,
+    weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Restore
-from snrmjax.model.modes import LinearModes
+from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
 from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import compiled
 
 _SINGULAR = 1e-13  # of JᵀJ's diagonal, what is added to it: rounding must not make it singular
 
 
 def whitened(
     unknowns: Unknowns,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    weighing: Weighing,
+    problem: BalanceProblem,
+    weighting: Weighting,
 ) -> Float[Array, "state part"]:
     """Residuals of the states, of unit variance where the noise is as stated."""
-    balance = force_balance(unknowns, data, modes, spread, data.correction) + weighing.offset
-    return jnp.sqrt(data.weight)[:, None] * jnp.einsum("sij,sj->si", weighing.whiten, balance)
+    balance = force_balance(unknowns, problem, problem.data.correction) + weighting.offset
+    return jnp.sqrt(problem.data.weight)[:, None] * jnp.einsum(
+        "sij,sj->si", weighting.whiten, balance
+    )
 
 
 def all_residuals(
     vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    weighing: Weighing,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    weighting: Weighting,
 ) -> Float[Array, " residual"]:
     """Whitened residuals of the states, then the priors of levels, linear parameters and curves."""
-    unknowns = restore(vector)
-    points = whitened(unknowns, data, modes, spread, weighing).reshape(-1)
+    unknowns = unravel(vector)
+    points = whitened(unknowns, problem, weighting).reshape(-1)
     curves = (unknowns.squared_frequency, unknowns.modal_damping)
     priors = [unknowns.level.reshape(-1), unknowns.linear, *(c.prior_residuals() for c in curves)]
     return jnp.concatenate([points, *priors])
 
 
-def level_of_residuals(restore: Restore, data: BalanceData) -> Int[Array, " residual"]:
+def level_of_residuals(unravel: Unravel, data: BalanceData) -> Int[Array, " residual"]:
     """Whose deviations move each of `all_residuals`; −1 where it is no level's."""
-    unknowns = restore.unknowns
+    unknowns = unravel.unknowns
     curves = (unknowns.squared_frequency, unknowns.modal_damping)
     n_levels, n_errors = unknowns.level.shape
     nobody = unknowns.linear.size + sum(c.prior_residuals().size for c in curves)
@@ -69,37 +71,31 @@ def level_of_residuals(restore: Restore, data: BalanceData) -> Int[Array, " resi
     return jnp.concatenate([*own, jnp.full(nobody, -1)])
 
 
-def freed_of_errors(
-    unknowns: Unknowns, data: BalanceData, modes: LinearModes, spread: Spread
-) -> tuple[Array, Weighing]:
-    """Corrections that free the states of their likeliest errors, and their weighing there."""
-    errors = nearest_errors(unknowns, data, modes, spread)
-    data = eqx.tree_at(lambda d: d.correction, data, errors)
-    return errors, weighing_at(unknowns, data, modes, spread)
+def error_corrections(unknowns: Unknowns, problem: BalanceProblem) -> tuple[Array, Weighting]:
+    """Corrections of the states for their most likely errors, and their weighting there."""
+    errors = nearest_errors(unknowns, problem)
+    return errors, weighting_at(unknowns, problem.with_data(correction=errors))
 
 
-def freed_residuals(
+def corrected_residuals(
     vector: Array,
-    restore: Restore,
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    weighing: Weighing,
-    freed: Array,
+    unravel: Unravel,
+    problem: BalanceProblem,
+    weighting: Weighting,
+    correcting: Array,
 ) -> Float[Array, " residual"]:
-    """`all_residuals`, with states that are `freed` of their likeliest errors at these unknowns.
+    """`all_residuals`, the states corrected for their most likely errors if `correcting`.
 
     The residuals are then those errors in units of their 1σ, whose slopes need no derivative of
-    the errors themselves. Without `freed` the weighing is the given one.
+    the errors themselves. Otherwise the weighting is the given one.
     """
     errors, own = jax.lax.cond(
-        freed,
-        lambda at: freed_of_errors(restore(at), data, modes, spread),
-        lambda _: (data.correction, weighing),
+        correcting,
+        lambda at: error_corrections(unravel(at), problem),
+        lambda _: (problem.data.correction, weighting),
         jax.lax.stop_gradient(vector),
     )
-    erring = eqx.tree_at(lambda d: d.correction, data, errors)
-    return all_residuals(vector, restore, erring, modes, spread, own)
+    return all_residuals(vector, unravel, problem.with_data(correction=errors), own)
 
 
 class LevelPattern(eqx.Module):
@@ -112,9 +108,9 @@ class LevelPattern(eqx.Module):
     places: Int[Array, "level error"]  # of errors among the unknowns
 
     @classmethod
-    def of(cls, restore: Restore, data: BalanceData) -> "LevelPattern":
+    def of(cls, unravel: Unravel, data: BalanceData) -> "LevelPattern":
         """The pattern of `all_residuals` with these unknowns."""
-        places, n = restore.level_places, restore.vector().size
+        places, n = unravel.level_places, unravel.vector().size
         n_levels, n_errors = places.shape
         push, owner = np.arange(n), np.full(n, -1)
         push[places] = places[0]
@@ -126,7 +122,7 @@ class LevelPattern(eqx.Module):
             seeds=jnp.asarray(seeds),
             push=jnp.asarray(push),
             owner=jnp.asarray(owner),
-            level=level_of_residuals(restore, data),
+            level=level_of_residuals(unravel, data),
             places=jnp.asarray(places),
         )
 
@@ -194,8 +190,85 @@ class NormalSteps(optx.AbstractDescent):
 
 
 def on_levels(
-    solver: optx.AbstractLeastSquaresSolver, restore: Restore, data: BalanceData
+    solver: optx.AbstractLeastSquaresSolver, unravel: Unravel, data: BalanceData
 ) -> optx.AbstractLeastSquaresSolver:
     """A solver for residuals in the order of `all_residuals`, with steps by `NormalSteps`."""
-    steps = NormalSteps(LevelPattern.of(restore, data))
+    steps = NormalSteps(LevelPattern.of(unravel, data))
     return eqx.tree_at(lambda damped: damped.descent, solver, steps)
+
+
+class BalanceSlopes(NamedTuple):
+    """The whitened balance at the initial guess and its slopes, on the host."""
+
+    balance: np.ndarray  # (state, part)
+    by_squared: np.ndarray  # (state, part)
+    by_damping: np.ndarray
+    by_level: np.ndarray  # (state, part, error), in the errors' own units
+    by_other: np.ndarray  # (state, part, unknown): gain, offset, phase, linear deviations
+    displacement: np.ndarray
+    speed: np.ndarray
+    squared: np.ndarray
+    damping: np.ndarray
+
+
+def balance_slopes(unknowns: Unknowns, problem: BalanceProblem) -> BalanceSlopes:
+    """The balance and its slopes at some unknowns and at the states as they are corrected.
+
+    Deviations of levels are in their own units here, not of some 1σ. What has a prior counts from
+    its prior's mean: the balance is that of levels and linear modes without deviations.
+    """
+    n, room = len(problem.data.level), padded_problem(problem)
+    unravel = packed_unknowns(unknowns, (), room.data.n_levels).unravel
+    parts = _slopes(unravel.unknowns, room)
+    return BalanceSlopes(*(np.asarray(part)[:n] for part in parts))
+
+
+@compiled
+def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
+    data = problem.data
+    unit = PriorStd(jnp.ones(len(LEVEL_ERRORS)), problem.prior.linear)
+    problem = dataclasses.replace(problem, prior=unit)
+    weighting = weighting_at(unknowns, problem)
+
+    def balance(level: Array, other: tuple[Array, Array, Array, Array]) -> Array:
+        each = eqx.tree_at(
+            lambda u: (*(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),),
+            unknowns,
+            (*other, unknowns.level + level),
+        )
+        own = force_balance(each, problem, data.correction) + weighting.offset
+        return jnp.einsum("sij,sj->si", weighting.whiten, own)
+
+    other = (
+        *(unknowns.log_force_gain, unknowns.force_offset),
+        *(unknowns.instrument_phase, unknowns.linear),
+    )
+    still = jnp.zeros_like(unknowns.level)
+    # Every level's error moves its own states only: one push forward for all levels.
+    kinds = still.shape[1]
+    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *still.shape))
+    push = jax.vmap(lambda d: jax.jvp(lambda b: balance(b, other), (still,), (d,))[1])
+    by_level = jnp.moveaxis(push(directions), 0, 2)
+    others = jax.jacfwd(lambda o: balance(still, o))(other)
+    columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
+    motion = motion_of(unknowns, problem, data.correction)
+    # The balance is linear in the values of both curves.
+    by_damping = motion.velocity / (problem.modal_constant * motion.force)
+    by_squared = by_damping / (1j * data.frequency)
+    level = unknowns.level[data.level]
+
+    def parts(slope: Array, share: Array) -> Array:
+        both = jnp.stack([slope.real, slope.imag], axis=1) * share[:, None]
+        return jnp.einsum("sij,sj->si", weighting.whiten, both)
+
+    nominal = balance(still, other) - jnp.einsum("sie,se->si", by_level, level)
+    nominal = nominal - jnp.einsum("sio,o->si", others[3], unknowns.linear)
+    return (
+        *(nominal, parts(by_squared, 1 + level[:, 2])),
+        parts(by_damping, 1 + level[:, 3]),
+        by_level,
+        jnp.concatenate(columns, axis=2),
+        *(motion.displacement, jnp.abs(motion.velocity)),
+        unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency)),
+        unknowns.modal_damping(motion.amplitude(unknowns.modal_damping)),
+    )

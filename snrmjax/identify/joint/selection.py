@@ -1,6 +1,7 @@
 """Which family of curves, of which size and amplitude: the one that predicts left-out levels."""
 
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,15 +11,18 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from snrmjax.identify.curves.families import (
+    ARGUMENTS,
     BACKBONE_FAMILIES,
     DAMPING_FAMILIES,
     FAMILIES,
+    Choice,
 )
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, Spread, Unknowns
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, BalanceProblem, Unknowns
 from snrmjax.identify.joint.initial_guess import levels_apart, most_parameters
-from snrmjax.identify.joint.linearisation import BalanceSlopes, balance_slopes
+from snrmjax.identify.joint.ranking import Compared, FamilyCandidate, RivalCurve, Trial, ranked
+from snrmjax.identify.joint.residuals import BalanceSlopes, balance_slopes
 from snrmjax.identify.joint.smoothness import (
     curve_columns,
     moved,
@@ -29,76 +33,40 @@ from snrmjax.identify.joint.smoothness import (
 from snrmjax.identify.joint.variance_components import (
     Bends,
     Linearised,
-    Scatter,
+    VarianceComponents,
     effective_parameters,
-    estimated_scatter,
+    estimated_components,
+    expected_decrease,
     left_out_scores,
     level_columns,
     likeliest_std,
     solved,
 )
-from snrmjax.model.modes import LinearModes
 
-_UNDECIDED = 2.0  # of log predictive density: what a term too many may cost
-_DECISIVE = 4.0  # of log predictive density: what no scatter of scores from level to level excuses
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
-_ROUNDS = 3  # of choosing families and estimating what levels scatter
-_NEGLIGIBLE = 0.03  # weight of a curve that could not widen a band
-_CONTENDERS = 4  # of a curve, at most
+_ROUNDS = 3  # of choosing families and estimating the level-to-level variance
+_STEPS = 4  # of Gauss–Newton for a family that is not linear in its parameters
+_STILL_FALLING = 0.1  # of χ², by which one step more would lower an unfinished fit
 # Times the likeliest size of bends. With that itself bands hold a curve at 95 of 100 amplitudes,
 # but not at each in 95 of 100 tests: where it bends most, smoothing errs about as much as noise.
 _UNDERSMOOTHED = 1.5
 _SMOOTH = "smoothing_spline"
 _STRAIGHT = 1e-7  # of the largest value, a bend that is none
-ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 
 
-class Candidate(NamedTuple):
-    """One family tried, as the table of a report shows it."""
+class SelectionStatus(IntEnum):
+    """How the choice of families and of the level-to-level variance ended."""
 
-    curve: str  # "backbone" or "damping"
-    family: str
-    size: int
-    argument: str
-    parameters: int
-    score: float  # log predictive density of left-out levels, relative to the best
-    score_std: float  # of the difference to the best, from level to level
-    prediction_error: float  # root mean square of left-out residuals over what was foretold
-    chosen: bool
-    weight: float = 0.0  # among all tried of this curve, by their scores; they sum to one
+    SETTLED = 0
+    NOT_SETTLED = 1  # after the last round each still changed the other
 
 
-class Contender(NamedTuple):
-    """A curve that was not taken, though the data could mean it."""
+class FamilyRequest(NamedTuple):
+    """What the user asks of both curves, and which unknowns of the measurement are free."""
 
-    curve: str  # "backbone" or "damping"
-    weight: float
-    family: AbstractFamily
-
-
-class Choice(NamedTuple):
-    """What the user fixed of a family."""
-
-    kind: str  # or "auto"
-    size: int | None
-    argument: Argument | None
-
-
-def parse_family(text: str) -> Choice:
-    """Family, size and amplitude of "spline:5@velocity"; what is not said is None.
-
-    Raises `ValueError` for what is no family.
-    """
-    head, _, argument = text.partition("@")
-    kind, _, size = head.partition(":")
-    if kind not in FAMILIES and kind != "auto":
-        raise ValueError(f"{kind!r} is no family; there are {', '.join(FAMILIES)} and auto.")
-    if size and not size.isdigit():
-        raise ValueError(f"the size of a family must be a whole number, but is {size!r}.")
-    known = {"": None} | {name: name for name in ARGUMENTS}
-    if argument not in known:
-        raise ValueError(f'the amplitude must be "displacement" or "velocity", not {argument!r}.')
-    return Choice(kind, int(size) if size else None, known[argument])
+    backbone: Choice
+    damping: Choice
+    free: tuple[str, ...]
 
 
 class Selection(NamedTuple):
@@ -106,68 +74,73 @@ class Selection(NamedTuple):
 
     squared_frequency: AbstractFamily
     modal_damping: AbstractFamily
-    scatter: Scatter
+    components: VarianceComponents
     jitter: float  # 1σ of relative stiffness from state to state that no stated noise explains
-    table: tuple[Candidate, ...]
-    contenders: tuple[Contender, ...]
+    table: tuple[FamilyCandidate, ...]
+    rivals: tuple[RivalCurve, ...]
+    status: SelectionStatus
 
 
 def select_families(
-    data: BalanceData,
-    modes: LinearModes,
-    spread: Spread,
-    pilot: Unknowns,
-    backbone: Choice,
-    damping: Choice,
-    free: tuple[str, ...],
+    problem: BalanceProblem,
+    guess: Unknowns,
+    request: FamilyRequest,
     *,
-    scatter_too: bool,
+    components_too: bool,
     smooth: bool = True,
 ) -> Selection:
-    """Try families on the balance linearised at the pilot, and take the simplest good one.
+    """Try families on the balance linearised at a guess, and take the simplest good one.
 
-    Levels are left out in turn (every third state where there are fewer than three levels) and
-    predicted with their own errors unknown; the score is the log density of what was measured
-    there. Of the candidates within one standard error of the best, and not clearly worse, the one
-    with the fewest parameters is taken. The pilot's deviations of levels are in their own units;
-    states are taken as `data` corrects them. What levels scatter beyond what is stated is looked
-    for if `scatter_too`, and how the size of bends changes along a smooth curve: a rough pilot does
-    not tell. Without `smooth`, splines with few free knots stand in for smooth ones.
+    Cross-validation: levels are left out in turn (every third state where there are fewer than
+    three levels) and predicted with their own errors unknown; the score is the log density of what
+    was measured there. Of the candidates within one standard error of the best, and not clearly
+    worse, the one with the fewest parameters is taken. The guess's deviations of levels are in
+    their own units; states are taken as the problem corrects them. The level-to-level variance
+    beyond what is stated is estimated if `components_too`, and so is how the size of bends changes
+    along a smooth curve: the initial guess does not determine them. Without `smooth`, splines with
+    few free knots stand in for smoothing splines.
     """
     kinds = [
         tuple("spline" if kind == _SMOOTH and not smooth else kind for kind in those)
         for those in (BACKBONE_FAMILIES, DAMPING_FAMILIES)
     ]
 
-    def workbench(data: BalanceData, at: Unknowns) -> tuple[_Workbench, Scatter, Unknowns]:
-        work = _Workbench(data, spread, balance_slopes(at, data, modes, spread), free)
+    def scoring(problem: BalanceProblem, at: Unknowns) -> tuple[_Scoring, Unknowns]:
+        blank = _Scoring.of(problem, balance_slopes(at, problem), request.free)
         pair = (at.squared_frequency, at.modal_damping)
-        scatter = work.scatter(*pair, look=scatter_too)
-        work.use(scatter)
-        curves = work.bending(pair, scatter.bends, alike=not scatter_too)
-        return work, scatter, _with_curves(at, curves)
+        own = blank.with_components(blank.estimated(*pair, look=components_too))
+        curves = own.bending(pair, own.components.bends, alike=not components_too)
+        return own, _with_curves(at, curves)
 
-    def prepared(at: Unknowns) -> tuple[_Workbench, Scatter, float, Unknowns]:
-        work, scatter, found = workbench(data, at)
-        jitter = work.jitter(found)
+    def prepared(at: Unknowns) -> tuple[_Scoring, float, Unknowns]:
+        own, found = scoring(problem, at)
+        jitter = own.jitter(found)
         if jitter > 0:
-            wandering = data.std.at[:, 3].set(jitter)
-            work, scatter, found = workbench(eqx.tree_at(lambda d: d.std, data, wandering), at)
-        return work, scatter, jitter, found
+            wandering = problem.data.std.at[:, 3].set(jitter)
+            own, found = scoring(problem.with_data(std=wandering), at)
+        return own, jitter, found
 
-    # What the rough pilot misses looks like levels that differ: its scatter serves to choose
+    # What the initial guess misses looks like level-to-level variance: that serves to choose
     # families, and theirs to choose again, until both belong together.
-    work, scatter, jitter, pilot = prepared(pilot)
+    own, jitter, guess = prepared(guess)
+    status = SelectionStatus.NOT_SETTLED
     for _ in range(_ROUNDS):
-        tried = work.compare("backbone", backbone, kinds[0], pilot.modal_damping)
-        other = work.compare("damping", damping, kinds[1], tried.best)
-        before = work
-        work, scatter, jitter, pilot = prepared(_with_curves(pilot, (tried.best, other.best)))
-        if np.array_equal(work.level_std > 0, before.level_std > 0):
+        tried = own.compare("backbone", request.backbone, kinds[0], guess.modal_damping)
+        other = own.compare("damping", request.damping, kinds[1], tried.best)
+        before = own
+        own, jitter, guess = prepared(_with_curves(guess, (tried.best, other.best)))
+        if np.array_equal(own.level_std > 0, before.level_std > 0):
+            status = SelectionStatus.SETTLED
             break
-    pair = (pilot.squared_frequency, pilot.modal_damping)
-    contenders = (*tried.contenders, *other.contenders)
-    return Selection(*pair, scatter, jitter, (*tried.table, *other.table), contenders)
+    return Selection(
+        squared_frequency=guess.squared_frequency,
+        modal_damping=guess.modal_damping,
+        components=own.components,
+        jitter=jitter,
+        table=(*tried.table, *other.table),
+        rivals=(*tried.rivals, *other.rivals),
+        status=status,
+    )
 
 
 _Pair = tuple[AbstractFamily, AbstractFamily]
@@ -190,51 +163,60 @@ def _with_bends(pair: _Pair, sizes: Sequence[float | np.ndarray]) -> list[Abstra
     return [_bent(curve, next(left)) if _is_smooth(curve) else curve for curve in pair]
 
 
-class _Compared(NamedTuple):
-    best: AbstractFamily
-    table: list[Candidate]
-    contenders: list[Contender]
+class _Scoring(NamedTuple):
+    """The linearised balance on which families are tried, with noise and errors of levels."""
 
+    data: BalanceData
+    known: BalanceSlopes
+    common: Float[np.ndarray, "row unknown"]  # slopes by what is no curve's and no level's
+    common_std: Float[np.ndarray, " unknown"]
+    levels: Float[np.ndarray, "row unknown"]  # slopes by the levels' errors
+    stated_std: Float[np.ndarray, " error"]  # of the levels' errors
+    folds: list[np.ndarray]  # rows of every left-out part
+    components: VarianceComponents
 
-def _weights(score: Float[np.ndarray, " family"]) -> Float[np.ndarray, " family"]:
-    """How much each family is to be believed, by the log predictive density of what was left out.
-
-    Reference: pseudo-Bayesian averaging, Yao et al., Bayesian Anal. 13 (2018) 917,
-    doi:10.1214/17-BA1091.
-    """
-    known = np.isfinite(score)
-    share = np.zeros(len(score))
-    share[known] = np.exp(score[known] - np.max(score[known], initial=-np.inf))
-    return share / max(np.sum(share), 1.0)
-
-
-class _Workbench:
-    """The linearised balance, on which families are tried one after the other."""
-
-    def __init__(
-        self, data: BalanceData, spread: Spread, known: BalanceSlopes, free: tuple[str, ...]
-    ):
-        self.data, self.known = data, known
+    @classmethod
+    def of(cls, problem: BalanceProblem, known: BalanceSlopes, free: tuple[str, ...]) -> "_Scoring":
+        """With the noise and the errors of levels as stated."""
+        data, prior = problem.data, problem.prior
         names = ("force_gain", "force_offset", "instrument_phase")
         keep = [k for k, name in enumerate(names) if name in free]
-        n_linear = spread.linear.shape[0]
+        n_linear = prior.linear.shape[0]
         keep += [3 + k for k in range(n_linear)]
-        n = len(data.level)
-        self.common = known.by_other[:, :, keep].reshape(2 * n, -1)
-        self.common_std = np.concatenate([np.full(len(keep) - n_linear, np.inf), np.ones(n_linear)])
-        self.levels = level_columns(known.by_level, np.asarray(data.level), data.n_levels)
-        self.stated_std = np.asarray(spread.level)
-        self.level_std = self.stated_std.copy()
-        self.noise = 1.0
         left_out = np.asarray(data.level)
         if data.n_levels < 3:
             left_out = np.argsort(np.argsort(known.speed)) % 3
-        self.folds = [np.repeat(left_out == k, 2) for k in np.unique(left_out)]
+        stated = np.asarray(prior.level)
+        free_std = np.full(len(keep) - n_linear, np.inf)
+        return cls(
+            data=data,
+            known=known,
+            common=known.by_other[:, :, keep].reshape(2 * len(data.level), -1),
+            common_std=np.concatenate([free_std, np.ones(n_linear)]),
+            levels=level_columns(known.by_level, np.asarray(data.level), data.n_levels),
+            stated_std=stated,
+            folds=[np.repeat(left_out == k, 2) for k in np.unique(left_out)],
+            components=VarianceComponents(1.0, 0.0, tuple(stated.tolist())),
+        )
+
+    def with_components(self, components: VarianceComponents) -> "_Scoring":
+        """The same with another noise and other errors of levels."""
+        return self._replace(components=components)
+
+    @property
+    def noise(self) -> float:
+        """By which residuals exceed the stated noise."""
+        return self.components.noise
+
+    @property
+    def level_std(self) -> Float[np.ndarray, " error"]:
+        """1σ of the levels' errors."""
+        return np.array(self.components.level)
 
     def amplitude(self, argument: Argument) -> np.ndarray:
         return self.known.displacement if argument == "displacement" else self.known.speed
 
-    def problem(self, squared: AbstractFamily, damping: AbstractFamily) -> Linearised:
+    def linearised(self, squared: AbstractFamily, damping: AbstractFamily) -> Linearised:
         """The balance with these curves."""
         n, known = len(self.data.level), self.known
         f, df, f_std = curve_columns(squared, self.amplitude(squared.argument))
@@ -255,9 +237,11 @@ class _Workbench:
             residuals.reshape(-1) / self.noise, slopes / self.noise, std, np.zeros(len(std))
         )
 
-    def scatter(self, squared: AbstractFamily, damping: AbstractFamily, *, look: bool) -> Scatter:
+    def estimated(
+        self, squared: AbstractFamily, damping: AbstractFamily, *, look: bool
+    ) -> VarianceComponents:
         """What noise and levels say beyond these curves, with nothing but the stated known."""
-        problem = self.problem(squared, damping)
+        problem = self.linearised(squared, damping)
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
         std = problem.prior_std.copy()
         std[first:] = np.tile(self.stated_std, self.data.n_levels)
@@ -267,15 +251,15 @@ class _Workbench:
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
         pair = (squared, damping)
         bends = [self.bends(problem, pair, k) for k in range(2) if _is_smooth(pair[k])]
-        return estimated_scatter(raw, index, look=look, bends=bends)
+        return estimated_components(raw, index, look=look, bends=bends)
 
-    def jitter(self, pilot: Unknowns) -> float:
+    def jitter(self, guess: Unknowns) -> float:
         """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
 
         Errors of force and phase move the balance alike along a response; a natural frequency
         that wanders moves it most where the mode is driven hardest.
         """
-        problem = self.problem(pilot.squared_frequency, pilot.modal_damping)
+        problem = self.linearised(guess.squared_frequency, guess.modal_damping)
         left = (problem.residuals + problem.slopes @ solved(problem)).reshape(-1, 2)
         arm = self.known.by_squared * self.known.squared[:, None] / self.noise
         length = np.sum(arm**2, axis=1)
@@ -293,22 +277,18 @@ class _Workbench:
         alone = 2 * len(left) * (np.log(np.sum(size) / (2 * len(left))) + 1)
         return float(np.exp(found.x[1])) if found.fun < alone - _CLEARLY else 0.0
 
-    def use(self, scatter: Scatter) -> None:
-        self.level_std[:] = scatter.level
-        self.noise = scatter.noise
-
     def improved(
         self, squared: AbstractFamily, damping: AbstractFamily, steps: int
     ) -> tuple[AbstractFamily, AbstractFamily, Linearised]:
         """Gauss–Newton on the linearised balance; exact at once for linear families."""
         for _ in range(steps):
-            problem = self.problem(squared, damping)
+            problem = self.linearised(squared, damping)
             change = solved(problem)
             k = squared.parameters.shape[0]
             m = k + damping.parameters.shape[0]
             squared = moved(squared, change[:k])
             damping = moved(damping, change[k:m])
-        problem = self.problem(squared, damping)
+        problem = self.linearised(squared, damping)
         return squared, damping, problem
 
     def smoothed(self, name: str, curve: AbstractFamily, other: AbstractFamily) -> AbstractFamily:
@@ -316,7 +296,7 @@ class _Workbench:
         if not _is_smooth(curve):
             return curve
         pair = (curve, other) if name == "backbone" else (other, curve)
-        problem = self.problem(*pair)
+        problem = self.linearised(*pair)
         bends = self.bends(problem, pair, 0 if name == "backbone" else 1)
         return _bent(curve, likeliest_std(problem, bends))
 
@@ -331,7 +311,7 @@ class _Workbench:
         smooth = {k: c for k, c in enumerate(pair) if isinstance(c, SmoothingSpline)}
         if alike or not smooth:
             return curves
-        problem, seen = self.problem(*curves), (self.known.displacement, self.known.speed)
+        problem, seen = self.linearised(*curves), (self.known.displacement, self.known.speed)
         bends = [self.bends(problem, pair, k) for k in smooth]
         places = [places_of_bends(curve, *seen) for curve in smooth.values()]
         found = (_UNDERSMOOTHED * size for size in sizes_along(problem, bends, places))
@@ -346,14 +326,14 @@ class _Workbench:
 
     def compare(
         self, name: str, choice: Choice, kinds: tuple[str, ...], other: AbstractFamily
-    ) -> _Compared:
+    ) -> Compared:
         known = self.known
         values = known.squared if name == "backbone" else known.damping
         weight = np.linalg.norm(
             known.by_squared if name == "backbone" else known.by_damping, axis=1
         )
-        # Where the pilot's curve was, corrected by what is left: the scattered points themselves.
-        rows = []
+        # Where the guess's curve was, corrected by what is left: the scattered points themselves.
+        trials = []
         arguments = (choice.argument,) if choice.argument else ARGUMENTS
         most = most_parameters(known.speed, self.data.n_levels)
         if name == "damping" and levels_apart(known.speed, np.asarray(self.data.level)):
@@ -373,74 +353,36 @@ class _Workbench:
                     too_many = starts[0].parameters.shape[0] > most
                     if too_many and choice.size is None and (sizes_tried[0] != size):
                         continue
-                    rows.append((kind, size, argument, *self._tried(name, starts, other)))
+                    trials.append(Trial(kind, size, argument, *self._tried(name, starts, other)))
                     if starts[0].parameters.shape[0] == 1 and not choice.argument:
                         break  # a constant has no amplitude
-        if not rows:
+        if not trials:
             raise ValueError(
                 f"the {len(values)} states are too few for the {name} asked for: choose a "
                 "smaller family."
             )
-        scores = np.array([row[4] for row in rows])
-        total = scores.sum(axis=1)
-        best = int(np.argmax(total))
-        apart = scores[best] - scores
-        spread = np.sqrt(len(self.folds)) * np.std(apart, axis=1, ddof=1)
-        sizes = np.array([row[6] for row in rows])
-        # A level that one curve misses by far makes that spread large: it must not excuse it.
-        as_good = (total[best] - total) <= np.minimum(spread, _DECISIVE)
-        as_good[best] = True
-        # Of equally many parameters the one that is listed first, unless another is clearly better:
-        # what the noise decides would widen nobody's band.
-        least = as_good & (sizes == sizes[as_good].min())
-        chosen = int(np.flatnonzero(least & (total >= total[least].max() - _DECISIVE))[0])
-        # Bands know a curve's spread, not the bias of a term too few: one more if data allow.
-        fair = (total[best] - total) <= 2 * spread + _UNDECIDED
-        mine = rows[chosen]
-        larger = [
-            k
-            for k in np.flatnonzero(fair)
-            if (rows[k][0], rows[k][2]) == (mine[0], mine[2]) and sizes[k] > sizes[chosen]
-        ]
-        chosen = int(min(larger, key=lambda k: sizes[k], default=chosen))
-        weight = _weights(total)
-        table = [
-            Candidate(
-                curve=name,
-                family=row[0],
-                size=int(row[1]),
-                argument=row[2],
-                parameters=int(sizes[k]),
-                score=float(total[k] - total[best]),
-                score_std=float(spread[k]),
-                prediction_error=float(row[5]),
-                chosen=k == chosen,
-                weight=float(weight[k]),
-            )
-            for k, row in enumerate(rows)
-        ]
-        ordered = [k for k in np.argsort(-weight) if k != chosen and weight[k] > _NEGLIGIBLE]
-        contenders = [Contender(name, float(weight[k]), rows[k][3]) for k in ordered[:_CONTENDERS]]
-        return _Compared(rows[chosen][3], table, contenders)
+        return ranked(name, trials)
 
     def _tried(
         self, name: str, starts: list[AbstractFamily], other: AbstractFamily
-    ) -> tuple[AbstractFamily, np.ndarray, float, int]:
-        """The best of the improved starts, its score by left-out level, error and parameters."""
+    ) -> tuple[AbstractFamily, np.ndarray, float, int, bool]:
+        """The best of the improved starts: the last five fields of a `Trial`."""
         found = []
         for given in starts:
             start = self.smoothed(name, given, other)
             pair = (start, other) if name == "backbone" else (other, start)
             linear = len(starts) == 1
-            squared, damping, problem = self.improved(*pair, steps=1 if linear else 4)
+            squared, damping, problem = self.improved(*pair, steps=1 if linear else _STEPS)
             cost = float(problem.residuals @ problem.residuals)
             mine = squared if name == "backbone" else damping
             found.append((cost if np.isfinite(cost) else np.inf, mine, problem))
         _, best, problem = min(found, key=lambda row: row[0])
         first = 0 if name == "backbone" else other.parameters.shape[0]
         own = first + np.arange(best.parameters.shape[0])
+        converged = len(starts) == 1 or expected_decrease(problem) < _STILL_FALLING
         return (
             best,
             *left_out_scores(problem, self.folds),
             int(np.ceil(effective_parameters(problem, own))),
+            converged,
         )

@@ -19,7 +19,7 @@ _UPPER = 0.975  # share below the upper end of a 95 % band
 _STIFF = 10.0  # times the smallest bends, of a curve that is straight at first
 
 
-class Scatter(NamedTuple):
+class VarianceComponents(NamedTuple):
     """1σ of what nobody stated."""
 
     noise: float  # by which the residuals exceed the stated noise
@@ -65,13 +65,13 @@ class Bends(NamedTuple):
     ends: tuple[float, float]  # between which their 1σ is
 
 
-def estimated_scatter(
+def estimated_components(
     problem: Linearised,
     index: Int[np.ndarray, "level error"],
     *,
     look: bool = True,
     bends: Sequence[Bends] = (),
-) -> Scatter:
+) -> VarianceComponents:
     """Restricted maximum likelihood of the noise and of what levels share beyond what is stated.
 
     Arguments: `index` says where among the unknowns the levels' errors are; kinds of error whose
@@ -126,7 +126,7 @@ def estimated_scatter(
         cost, other_cost = (float(price[mask[:n_errors]].sum()) for mask in (chosen, kinds))
         if other.value + other_cost < found.value + cost:
             found, unbounded = other, others
-    return Scatter(
+    return VarianceComponents(
         noise=found.noise,
         noise_std=found.noise / np.sqrt(2 * likelihood.dof),
         level=tuple(found.std[:n_errors].tolist()),
@@ -279,8 +279,15 @@ def solved(problem: Linearised) -> Float[np.ndarray, " unknown"]:
     return change
 
 
+def expected_decrease(problem: Linearised) -> float:
+    """By how much `solved` would lower the sum of squares, priors included."""
+    keep, matrix, size = _normal(problem)
+    right = (problem.slopes[:, keep] / size).T @ problem.residuals
+    return float(right @ np.linalg.solve(matrix, right))
+
+
 def left_out_scores(problem: Linearised, folds: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Log predictive density of every left-out part, and the error over what was foretold."""
+    """Log predictive density of every left-out part, and the error in units of its prediction."""
     keep, matrix, size = _normal(problem)
     x = problem.slopes[:, keep] / size
     change = -np.linalg.solve(matrix, x.T @ problem.residuals)

@@ -14,7 +14,7 @@ from snrmjax.identify.curves.families import (
     Spline,
     values_and_slopes,
 )
-from snrmjax.identify.curves.packed_curve import as_any_family
+from snrmjax.identify.curves.packed_curve import packed
 
 AMPLITUDE = np.linspace(0.05, 1.3, 40)
 
@@ -48,7 +48,7 @@ def test_host_values_and_slopes_are_those_of_the_program(kind):
 )
 def test_the_form_for_programs_is_the_same_curve_in_every_derivative(kind, argument):
     curve = member(kind, argument=argument)
-    general, n = as_any_family(curve), curve.parameters.shape[0]
+    general, n = packed(curve), curve.parameters.shape[0]
     at = jnp.asarray([0.02, 0.3, 1.1, 1.5])  # beyond the data too
     other = jnp.full(4, 7.0)
     pair = (at, other) if argument == "displacement" else (other, at)

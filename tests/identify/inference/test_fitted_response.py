@@ -9,7 +9,8 @@ import pytest
 from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
 import snrmjax as sj
-from snrmjax.identify.inference.fitted_response import as_backbone, point_slopes
+from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.inference.located_points import point_slopes
 from snrmjax.io.joint_results import write_next
 
 FORCE = 2.2  # N: folds are there
@@ -155,8 +156,9 @@ def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
 
 
 def test_a_new_level_has_a_wider_band(fit):
-    spread = dataclasses.replace(fit.spread, level=np.array([0.01, 0.0, 0.004, 0.05]))
-    scattering = dataclasses.replace(fit, spread=spread)
+    prior = dataclasses.replace(fit.prior, level=np.array([0.01, 0.0, 0.004, 0.05]))
+    problem = dataclasses.replace(fit.problem, prior=prior)
+    scattering = dataclasses.replace(fit, problem=problem)
     speeds = np.array([0.3, 0.8])
     plain = sj.identify.fitted_values(scattering, speeds)
     wide = sj.identify.fitted_values(scattering, speeds, of_a_new_level=True)
@@ -209,8 +211,8 @@ def test_advice_holds_what_it_promises():
         force_std=np.array([0.003 * one.force]),
     )
     again = sj.fit_jointly(sj.measure.join_steady_states(data, more), modes(), **settings)
-    assert not fit.level_std[1:].any()  # scatter that one fit finds and the other does not
-    assert not again.level_std[1:].any()  # would move the bands too
+    assert not fit.noise.level_std[1:].any()  # scatter that one fit finds and the other does not
+    assert not again.noise.level_std[1:].any()  # would move the bands too
     speeds = np.abs(np.asarray(fit.motion().velocity))
     at = np.linspace(speeds.min(), speeds.max(), 25)
     bands = [

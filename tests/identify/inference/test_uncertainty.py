@@ -1,5 +1,7 @@
 """Uncertainty of a joint fit: derivatives against refits, and its ways against each other."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -23,13 +25,13 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 
     from snrmjax.identify.joint.fitting import SOLVER
-    from snrmjax.identify.joint.force_balance import weighing_at
-    from snrmjax.identify.joint.free_unknowns import Restore
-    from snrmjax.identify.joint.residuals import freed_residuals
+    from snrmjax.identify.joint.force_balance import weighting_at
+    from snrmjax.identify.joint.free_unknowns import Unravel
+    from snrmjax.identify.joint.residuals import corrected_residuals
 
     slopes = sensitivity(fit).by_measurement
-    vector, restore = fit.vector()
-    weighing = weighing_at(restore(vector), fit.data, fit.modes, fit.spread)
+    vector, unravel = fit.vector()
+    weighting = weighting_at(unravel(vector), fit.problem)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def refit(state, kind, change):
@@ -41,17 +43,17 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
             2: ("velocity", factor.astype(complex) ** 1j),
         }[kind]
         data = eqx.tree_at(lambda d: getattr(d, name), fit.data, getattr(fit.data, name) * by)
-        return np.asarray(refitted(data))
+        return np.asarray(refitted(dataclasses.replace(fit.problem, data=data)))
 
     @eqx.filter_jit
-    def refitted(data):
+    def refitted(problem):
         found = optx.least_squares(
-            lambda y, own: freed_residuals(
-                *(vector + y * unit, Restore(fit.unknowns, ()), own, fit.modes, fit.spread),
-                *(weighing, jnp.asarray(True)),
+            lambda y, own: corrected_residuals(
+                *(vector + y * unit, Unravel(fit.unknowns, ()), own, weighting),
+                jnp.asarray(True),
             ),
             *(SOLVER, jnp.zeros_like(vector)),
-            args=data,
+            args=problem,
         )
         return vector + found.value * unit
 
@@ -145,7 +147,7 @@ def test_a_profile_does_not_pass_through_refits_that_failed(fit, monkeypatch, fa
 @pytest.mark.long
 def test_bootstrap_and_posterior_agree_with_the_covariance_for_independent_noise():
     independent = sj.fit_jointly(noisy(3, per_level=25), modes(), **TRUE)
-    assert not independent.level_std.any()  # the bootstrap would not see what levels share
+    assert not independent.noise.level_std.any()  # the bootstrap would not see what levels share
     rows = compare_bands(independent, np.array([0.3, 0.7]), n_samples=150, posterior=True)
     for row in rows:
         assert row.implicit == pytest.approx(row.gauss_newton, rel=0.1)

@@ -10,7 +10,7 @@ from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.joint.residual_autocorrelation import (
     added_covariance,
     along_resonance,
-    neighbour_correlation,
+    residual_autocorrelation,
 )
 
 
@@ -30,21 +30,21 @@ def test_states_of_a_level_are_taken_by_frequency():
 @pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
 def test_the_correlation_of_a_process_is_found(rho):
     rng, levels = np.random.default_rng(1), list(np.arange(30000).reshape(10, 3000))
-    found = neighbour_correlation(drawn(rng, rho, 2, 10, 3000).reshape(2, -1).T, levels)
+    found = residual_autocorrelation(drawn(rng, rho, 2, 10, 3000).reshape(2, -1).T, levels)
     np.testing.assert_allclose(found, rho, atol=0.03)
 
 
 def test_a_slow_misfit_under_noise_counts_by_all_that_it_correlates():
     rng, levels = np.random.default_rng(2), list(np.arange(8000).reshape(20, 400))
     slow = (drawn(rng, 0.9, 20, 400) + rng.normal(size=(20, 400))) / np.sqrt(2)
-    (found,) = neighbour_correlation(slow.reshape(-1, 1), levels)
+    (found,) = residual_autocorrelation(slow.reshape(-1, 1), levels)
     # Means of it scatter as those of a process with half of 0.9's sum of correlations, 10 for 19.
     assert (1 + found) / (1 - found) == pytest.approx(10.0, rel=0.2)
 
 
 def test_white_noise_is_seldom_correlated():
     rng, levels = np.random.default_rng(3), along_resonance(np.arange(80) % 4, np.arange(80.0))
-    parts = neighbour_correlation(rng.normal(size=(80, 2000)), levels)
+    parts = residual_autocorrelation(rng.normal(size=(80, 2000)), levels)
     # 4 standard deviations: one in 30 000 of a long series.
     assert np.sum(parts > 0) <= 2
 
@@ -52,8 +52,8 @@ def test_white_noise_is_seldom_correlated():
 def test_what_is_left_of_exact_states_is_no_matter():
     levels = [np.arange(60)]
     slow = drawn(np.random.default_rng(7), 0.95, 1, 60).T
-    assert neighbour_correlation(slow, levels) > 0
-    assert neighbour_correlation(1e-6 * slow, levels) == 0
+    assert residual_autocorrelation(slow, levels) > 0
+    assert residual_autocorrelation(1e-6 * slow, levels) == 0
 
 
 def test_the_covariance_is_that_of_repeated_straight_lines():

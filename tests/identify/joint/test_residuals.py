@@ -10,9 +10,14 @@ from truth.exact_states import LEVELS, OMEGA, PARTICIPATION, SHAPE, noisy
 
 import snrmjax as sj
 from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import Spread, balance_data, weighing_at
-from snrmjax.identify.joint.free_unknowns import FREE, Restore, programmed, with_room
-from snrmjax.identify.joint.initial_guess import pilot_start
+from snrmjax.identify.joint.force_balance import (
+    BalanceProblem,
+    PriorStd,
+    balance_data,
+    weighting_at,
+)
+from snrmjax.identify.joint.free_unknowns import FREE, Unravel, packed_unknowns
+from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.residuals import (
     LevelPattern,
     NormalSteps,
@@ -28,25 +33,27 @@ def drawn(free, *, room=False):
         *([OMEGA, 3 * OMEGA], [0.012, 0.01], [[SHAPE, 1.5]], [PARTICIPATION, 2.0]),
         std=sj.model.LinearModesStd([1.0, 5.0], [1e-3, 2e-3]),
     )
-    spread = Spread(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3]))
+    prior = PriorStd(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3]))
     data = balance_data(noisy(1, gain=0.01), modes)[0]
-    unknowns = pilot_start(data, modes, spread, ())
-    restore = Restore(unknowns, free)
+    problem = BalanceProblem(data, modes, prior)
+    unknowns = initial_guess(problem, ())
+    unravel = Unravel(unknowns, free)
     if room:
-        data = with_room(data)
-        restore = programmed(unknowns, free, data.n_levels).restore
-    near = restore.vector()
-    weighing = weighing_at(restore(near), data, modes, spread)
+        problem = padded_problem(problem)
+        data = problem.data
+        unravel = packed_unknowns(unknowns, free, data.n_levels).unravel
+    near = unravel.vector()
+    weighting = weighting_at(unravel(near), problem)
 
     def residuals(vector):
-        return all_residuals(vector, restore, data, modes, spread, weighing)
+        return all_residuals(vector, unravel, problem, weighting)
 
-    return residuals, near, restore, data
+    return residuals, near, unravel, problem.data
 
 
 @pytest.mark.parametrize("room", [False, True])
 def test_slopes_are_those_of_every_unknown_alone(room):
-    residuals, near, restore, data = drawn(FREE, room=room)
+    residuals, near, unravel, data = drawn(FREE, room=room)
     rng = np.random.default_rng(0)
     at = near * (1 + 1e-3 * rng.normal(size=near.size)) + 0.1 * rng.normal(size=near.size)
     left, want = (np.asarray(part) for part in jax.jit(_with_slopes(residuals))(at))
@@ -56,7 +63,7 @@ def test_slopes_are_those_of_every_unknown_alone(room):
 
     @jax.jit
     def found(at):
-        pattern, push = LevelPattern.of(restore, data), jax.linearize(residuals, at)[1]
+        pattern, push = LevelPattern.of(unravel, data), jax.linearize(residuals, at)[1]
         pushed = pattern.pushed(push)
         return pattern.jacobian(pushed), *pattern.normal_equations(pushed, jnp.asarray(left))
 
@@ -66,7 +73,7 @@ def test_slopes_are_those_of_every_unknown_alone(room):
     np.testing.assert_allclose(matrix / np.outer(unit, unit), want.T @ want, atol=1e-12)
     np.testing.assert_allclose(right / unit, want.T @ left, atol=1e-12)
     # Levels share their pushes; all kinds of unknowns move something.
-    assert len(LevelPattern.of(restore, data).seeds) == near.size - 4 * (data.n_levels - 1)
+    assert len(LevelPattern.of(unravel, data).seeds) == near.size - 4 * (data.n_levels - 1)
     assert np.sum(size > 0) >= 2 + len(FREE) + 4 * LEVELS + 2
 
 
@@ -75,7 +82,7 @@ def _with_slopes(residuals):
 
 
 def test_the_fit_ends_where_scipy_does():
-    residuals, near, restore, data = drawn(())
+    residuals, near, unravel, data = drawn(())
     unit = 1.0 / jnp.linalg.norm(jax.jit(jax.jacfwd(residuals))(near), axis=0)
 
     @jax.jit
@@ -84,7 +91,7 @@ def test_the_fit_ends_where_scipy_does():
 
     start = np.random.default_rng(1).normal(size=near.size)
     found = optx.least_squares(
-        lambda y, _: of_units(y), on_levels(SOLVER, restore, data), jnp.asarray(start)
+        lambda y, _: of_units(y), on_levels(SOLVER, unravel, data), jnp.asarray(start)
     )
     slopes = jax.jit(jax.jacfwd(of_units))
     tight = {"xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-11}
@@ -99,8 +106,8 @@ def test_the_fit_ends_where_scipy_does():
 
 
 def test_steps_are_those_of_damped_least_squares():
-    _, _, restore, data = drawn(())
-    steps = NormalSteps(LevelPattern.of(restore, data))
+    _, _, unravel, data = drawn(())
+    steps = NormalSteps(LevelPattern.of(unravel, data))
     rng = np.random.default_rng(2)
     slopes, left = rng.normal(size=(30, 6)), rng.normal(size=30)
     slopes[:, 3] = 0.0

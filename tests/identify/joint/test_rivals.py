@@ -9,11 +9,11 @@ import pytest
 from truth.exact_states import modes, noisy
 
 import snrmjax as sj
-from snrmjax.identify.inference.fitted_curves import beyond_estimation, open_choice
-from snrmjax.identify.inference.fitted_response import as_backbone
+from snrmjax.identify.curves.families import ARGUMENTS
+from snrmjax.identify.inference.fitted_curves import as_backbone, beyond_estimation, open_choice
 from snrmjax.identify.inference.sensitivity import contributions
-from snrmjax.identify.joint.joint_fit import Rival
-from snrmjax.identify.joint.selection import ARGUMENTS, _weights
+from snrmjax.identify.joint.joint_fit import FamilyChoice, Rival
+from snrmjax.identify.joint.ranking import _weights
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
 
 FORCE = 2.2  # N
@@ -29,7 +29,7 @@ def fit():
 
 def by_estimation_alone(fit):
     """The same fit, sure of its families."""
-    return eqx.tree_at(lambda f: f.rivals, fit, ())
+    return eqx.tree_at(lambda f: f.families.rivals, fit, ())
 
 
 def test_what_differs_by_more_than_chance_counts_with_its_weight():
@@ -40,7 +40,7 @@ def test_what_differs_by_more_than_chance_counts_with_its_weight():
 
 def test_weights_are_those_of_the_scores(fit):
     for curve in ("backbone", "damping"):
-        mine = [one for one in fit.candidates if one.curve == curve]
+        mine = [one for one in fit.families.candidates if one.curve == curve]
         assert sum(one.weight for one in mine) == pytest.approx(1.0, rel=1e-12)
         best = max(mine, key=lambda one: one.score)
         for one in mine:
@@ -49,24 +49,24 @@ def test_weights_are_those_of_the_scores(fit):
 
 
 def test_rivals_are_fits_of_what_was_tried_and_not_taken(fit):
-    assert len(fit.rivals) >= 2
-    assert {one.curve for one in fit.rivals} == {"damping"}  # the backbone was no choice
+    assert len(fit.families.rivals) >= 2
+    assert {one.curve for one in fit.families.rivals} == {"damping"}  # the backbone was no choice
     taken = type(fit.unknowns.modal_damping), fit.unknowns.modal_damping.argument
-    for one in fit.rivals:
+    for one in fit.families.rivals:
         curve = one.fit.unknowns.modal_damping
         assert (type(curve), curve.argument) != taken or len(curve.parameters) != len(
             fit.unknowns.modal_damping.parameters
         )
         assert curve.argument in ARGUMENTS
         assert one.fit.converged
-        assert one.fit.rivals == ()
+        assert one.fit.families.rivals == ()
         # It was fitted itself, to the same data: χ² is about as small.
         assert np.sum(one.fit.residuals**2) < 1.2 * np.sum(fit.residuals**2)
 
 
 def test_a_family_that_is_given_has_no_rivals():
     given = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
-    assert sj.fit_jointly(noisy(4), modes(), **given).rivals == ()
+    assert sj.fit_jointly(noisy(4), modes(), **given).families.rivals == ()
 
 
 def widened(std, answers, weights):
@@ -88,9 +88,10 @@ def test_bands_of_curves_hold_what_rivals_say(fit, argument):
     found = sj.identify.fitted_values(fit, **at)
     alone = by_estimation_alone(fit)
     answers = [
-        sj.identify.fitted_values(one, **at) for one in (alone, *(r.fit for r in fit.rivals))
+        sj.identify.fitted_values(one, **at)
+        for one in (alone, *(r.fit for r in fit.families.rivals))
     ]
-    weights = [one.weight for one in fit.rivals]
+    weights = [one.weight for one in fit.families.rivals]
     for name in ("natural_frequency", "modal_damping"):
         pairs = [
             (np.asarray(getattr(a, name)), np.asarray(getattr(a, name + "_std"))) for a in answers
@@ -104,9 +105,9 @@ def test_bands_of_a_resonance_and_a_fold_hold_what_rivals_say(fit):
     found = sj.identify.fitted_response(fit, FORCE)[0]
     answers = [
         sj.identify.fitted_response(one, FORCE)[0]
-        for one in (by_estimation_alone(fit), *(r.fit for r in fit.rivals))
+        for one in (by_estimation_alone(fit), *(r.fit for r in fit.families.rivals))
     ]
-    weights = [one.weight for one in fit.rivals]
+    weights = [one.weight for one in fit.families.rivals]
     for kind in ("resonances", "folds"):
         points = [max(getattr(a, kind), key=lambda p: p.velocity) for a in answers]
         mine = max(getattr(found, kind), key=lambda p: p.velocity)
@@ -124,13 +125,18 @@ def test_bands_along_a_response_hold_what_rivals_say(fit):
     place = tip // 2  # on the way up
     omega = ours.frequency[place]
     pairs = [(abs(alone.velocity[place]), alone.velocity_std[place])]
-    for one in fit.rivals:
+    for one in fit.families.rivals:
         theirs = sj.identify.fitted_response(one.fit, FORCE, points_per_side=2000)[0]
         rising = slice(0, np.argmax(np.abs(theirs.velocity)))
         size, at = np.abs(theirs.velocity[rising]), theirs.frequency[rising]
         std = np.interp(omega, at, theirs.velocity_std[rising])
         pairs.append((np.interp(omega, at, size), std))
-    widened(ours.velocity_std[place], pairs, [one.weight for one in fit.rivals])
+    widened(ours.velocity_std[place], pairs, [one.weight for one in fit.families.rivals])
+
+
+def beside(fit, *rivals):
+    """The fit beside some rivals."""
+    return dataclasses.replace(fit, families=FamilyChoice(rivals=rivals))
 
 
 def against(fit, *factors, weight=0.25):
@@ -142,7 +148,7 @@ def against(fit, *factors, weight=0.25):
         return eqx.tree_at(lambda f: f.unknowns.modal_damping.parameters, alone, parameters)
 
     rivals = tuple(Rival("damping", weight, louder(factor)) for factor in factors)
-    return dataclasses.replace(alone, rivals=rivals)
+    return beside(alone, *rivals)
 
 
 def test_rivals_add_up_in_any_order(fit):
@@ -166,7 +172,7 @@ def test_rivals_add_up_in_any_order(fit):
 def test_a_resonance_is_as_uncertain_as_its_rival_is_far(fit, factor):
     mine = sj.identify.fitted_response(by_estimation_alone(fit), FORCE)[0].resonances[0]
     wide = sj.identify.fitted_response(against(fit, factor), FORCE)[0].resonances[0]
-    rival = against(fit, factor).rivals[0].fit
+    rival = against(fit, factor).families.rivals[0].fit
     theirs = sj.identify.fitted_response(rival, FORCE)[0].resonances[0]
     apart = (theirs.velocity - mine.velocity) ** 2
     excess = apart - abs(theirs.velocity_std**2 - mine.velocity_std**2)
@@ -180,7 +186,7 @@ def test_a_band_at_one_velocity_does_not_hang_on_what_else_is_asked(fit):
     vector = np.array(alone.vector()[0])
     vector[1] = -0.4 * vector[0]
     falling = eqx.tree_at(lambda f: f.unknowns, alone, alone.vector()[1](jnp.asarray(vector)))
-    either = dataclasses.replace(alone, rivals=(Rival("backbone", 0.5, falling),))
+    either = beside(alone, Rival("backbone", 0.5, falling))
     at = np.array([0.2, 0.5, 1.25]) * fit.largest[1]
     few, all_three = (open_choice(either, velocity=at[:n])[0] for n in (2, 3))
     np.testing.assert_allclose(all_three[:2], few, rtol=1e-6)
@@ -196,7 +202,7 @@ def test_at_rest_dry_friction_leaves_damping_as_open_as_just_beside(fit):
     )
     parameters = dry.unknowns.modal_damping.parameters.at[1].set(2.0)
     dry = eqx.tree_at(lambda f: f.unknowns.modal_damping.parameters, dry, parameters)
-    either = dataclasses.replace(by_estimation_alone(fit), rivals=(Rival("damping", 0.5, dry),))
+    either = beside(by_estimation_alone(fit), Rival("damping", 0.5, dry))
     at = np.array([0.0, 0.005, 0.01]) * fit.largest[0]
     shift = open_choice(either, displacement=at)[0, :, 1]
     assert shift[2] > 0
@@ -237,5 +243,5 @@ def test_rivals_come_back_from_the_file(fit, tmp_path):
         open_choice(again, displacement=at), open_choice(fit, displacement=at)
     )
     assert [r["weight"] for r in summarise_fit(again, ())["rivals"]] == [
-        one.weight for one in fit.rivals
+        one.weight for one in fit.families.rivals
     ]

@@ -13,7 +13,7 @@ from snrmjax.identify.joint.smoothness import curve_columns, moved, with_sizes
 from snrmjax.identify.joint.variance_components import (
     Bends,
     Linearised,
-    estimated_scatter,
+    estimated_components,
     likeliest_std,
 )
 from snrmjax.io.joint_results import described, read_joint_fit, write_joint_fit
@@ -88,17 +88,17 @@ def test_the_size_of_bends_is_found_without_bias():
 def test_a_rough_curve_does_not_pass_for_levels_that_differ():
     for seed in range(8):
         problem, bends, index = drawn(seed, 0.3, 0.02)
-        assert estimated_scatter(problem, index, bends=[bends]).level == (0.0,)
+        assert estimated_components(problem, index, bends=[bends]).level == (0.0,)
         # A curve without a prior of its own size leaves its bends to the levels.
         stiff = problem._replace(prior_std=np.where(problem.prior_std == 1.0, 1e-3, np.inf))
         stiff.prior_std[index] = 0.0
-        found = estimated_scatter(stiff, index)
+        found = estimated_components(stiff, index)
         assert found.level[0] > 0.05 or found.unbounded == (0,)
 
 
 def test_levels_that_differ_are_found_beside_a_smooth_curve():
     found = [
-        estimated_scatter(problem, index, bends=[bends]).level[0]
+        estimated_components(problem, index, bends=[bends]).level[0]
         for problem, bends, index in (drawn(seed, 1e-4, 0.02, shared=0.2) for seed in range(12))
     ]
     # Of one of them bends would take the place, did they always come first.
@@ -165,5 +165,5 @@ def test_a_smoothing_spline_comes_back_from_its_file(fits, tmp_path):
     curve = fits[0].unknowns.squared_frequency
     same = again.unknowns.squared_frequency
     np.testing.assert_array_equal(same.prior_residuals(), curve.prior_residuals())
-    assert again.freed
+    assert again.corrected
     assert described(same) == f"smoothing_spline:{len(curve.parameters)}@displacement"

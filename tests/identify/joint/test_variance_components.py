@@ -9,7 +9,7 @@ from snrmjax.identify.joint.notes import notes_on_noise
 from snrmjax.identify.joint.variance_components import (
     Linearised,
     _Likelihood,
-    estimated_scatter,
+    estimated_components,
     few_levels_factor,
     level_columns,
 )
@@ -36,7 +36,7 @@ def sample(seed, noise=1.0, shared=0.0):
 
 def test_noise_without_scatter_is_the_residual_of_least_squares():
     problem, index = sample(0, noise=0.3)
-    found = estimated_scatter(problem, index)
+    found = estimated_components(problem, index)
     curve = problem.slopes[:, :2]
     left = problem.residuals - curve @ np.linalg.lstsq(curve, problem.residuals, rcond=None)[0]
     # Restricted likelihood without scatter is the unbiased estimate; its search ends at 1e-2.
@@ -46,7 +46,7 @@ def test_noise_without_scatter_is_the_residual_of_least_squares():
 
 
 def test_scatter_that_is_there_is_found_without_bias():
-    found = [estimated_scatter(*sample(seed, shared=0.02)) for seed in range(1, 25)]
+    found = [estimated_components(*sample(seed, shared=0.02)) for seed in range(1, 25)]
     first = np.array([f.level[0] for f in found])
     # 12 levels, noise of a mean 1/sqrt(20)/50 = 0.0045: each is known to a quarter.
     assert abs(np.mean(first) / 0.02 - 1) < 3 * 0.25 / np.sqrt(24)
@@ -58,9 +58,9 @@ def test_scatter_that_is_there_is_found_without_bias():
 def test_stated_scatter_is_kept_and_one_level_says_nothing():
     problem, index = sample(3, shared=0.02)
     problem.prior_std[index[:, 0]] = 0.05
-    assert estimated_scatter(problem, index).level[0] == 0.05
+    assert estimated_components(problem, index).level[0] == 0.05
     problem, index = sample(3, shared=0.02)
-    assert estimated_scatter(problem, index[:1]).level == (0.0, 0.0)
+    assert estimated_components(problem, index[:1]).level == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("n_levels", [2, 3, 4, 8])
@@ -76,7 +76,7 @@ def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
         rng = np.random.default_rng(seed)
         residuals = rng.normal(size=n) + 50.0 * 0.1 * rng.normal(size=n_levels)[level]
         problem = Linearised(residuals, slopes, std, np.zeros(len(std)))
-        found = estimated_scatter(problem, index)
+        found = estimated_components(problem, index)
         # The mean of balanced levels, whose noise is small beside what they differ by.
         band = np.hypot(few_levels_factor(n_levels) * 50.0 * found.level[0], found.noise / 4.5)
         inside.append(abs(residuals.mean()) < 1.96 * band / np.sqrt(n_levels))
@@ -90,7 +90,7 @@ def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
 
 def test_a_scatter_that_no_test_has_is_none_and_is_said():
     # Levels of one structure do not differ by their whole size: something else is moving them.
-    found = estimated_scatter(*sample(2, shared=2.0))
+    found = estimated_components(*sample(2, shared=2.0))
     assert found.level == (0.0, 0.0)
     assert found.unbounded == (0,)
     of_a_fit = found._replace(level=(0.0,) * len(LEVEL_ERRORS))
@@ -100,7 +100,7 @@ def test_a_scatter_that_no_test_has_is_none_and_is_said():
 
 
 def test_levels_that_differ_by_as_much_as_they_can_are_believed():
-    found = [estimated_scatter(*sample(seed, shared=0.3)) for seed in range(8)]
+    found = [estimated_components(*sample(seed, shared=0.3)) for seed in range(8)]
     # Each is known to a quarter, and counts as 0.3 at most.
     assert np.mean([one.level[0] for one in found]) == pytest.approx(0.26, rel=0.2)
     assert all(one.unbounded == () for one in found)

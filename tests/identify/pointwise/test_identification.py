@@ -94,7 +94,7 @@ class TestMeasuredBeam:
         # the highest, is worth tan(7°)·0.7 % of 80 Hz there.
         np.testing.assert_allclose(values.natural_frequency, frequency, atol=0.1 * HERTZ)
         np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
-        stiffness = fit.level_std[2]
+        stiffness = fit.noise.level_std[2]
         assert 0.5 * stiffness * 80.4 < 0.1  # Hz
 
     def test_the_backbone_softens_and_stiffens(self, found):

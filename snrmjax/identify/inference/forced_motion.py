@@ -1,0 +1,163 @@
+"""The fitted mode under one force: its response curve with bands, by implicit derivatives."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.identify.inference.fitted_curves import beyond_estimation
+from snrmjax.identify.joint.force_balance import Unknowns, with_deviations
+from snrmjax.identify.joint.free_unknowns import Unravel
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.blocks import by_blocks
+from snrmjax.numerics.compiled import compiled
+
+_BLOCK = 256  # points that one program works on
+_ONTO_THE_CURVE = 4  # steps
+
+
+class ForcedMotion(eqx.Module):
+    """A fit's curves under one force; amplitude X and frequency Ω are free.
+
+    The response curve is where |(ω̃² − Ω²) + iΩδ| X = |A|F.
+    """
+
+    unravel: Unravel
+    modes: LinearModes
+    linear_std: Float[Array, " deviation"]
+    constant: Float[Array, ""]  # A, 1/kg
+    force: Float[Array, ""]  # N
+    load: Float[Array, ""]  # |A|F, m/s²
+    sensor: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, fit: JointFit, force: float) -> "ForcedMotion":
+        """A fit under a force in N."""
+        constant = fit.problem.modal_constant
+        return cls(
+            unravel=fit.packed().unravel,
+            modes=fit.modes,
+            linear_std=fit.prior.linear,
+            constant=constant,
+            force=jnp.asarray(float(force)),
+            load=jnp.asarray(abs(float(constant)) * force),
+            sensor=fit.data.sensor,
+        )
+
+    def excess(self, vector: Array, x: Array, omega: Array) -> Float[Array, "*batch"]:
+        """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
+        squared, damping = curves_at(self.unravel(vector), x, omega)
+        size = (squared - omega**2) ** 2 + (omega * damping) ** 2
+        return size * (x / self.load) ** 2 - 1.0
+
+    def velocity(self, vector: Array, x: Array, omega: Array) -> Complex[Array, "*batch"]:
+        """Velocity at the fit's sensor, residual modes included."""
+        unknowns, force = self.unravel(vector), self.force
+        squared, damping = curves_at(unknowns, x, omega)
+        own = 1j * omega * self.constant * force / (squared - omega**2 + 1j * omega * damping)
+        linear = with_deviations(self.modes, unknowns.linear, self.linear_std)
+        rest = residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))
+        return own + rest[..., self.sensor]
+
+
+def curves_at(unknowns: Unknowns, x: Array, omega: Array) -> tuple[Array, Array]:
+    """ω̃² and 2ζ̃ω̃ of a motion of displacement x at a frequency."""
+    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+    speed = x * omega
+    return (
+        squared(squared.amplitude(x, speed)),
+        damping(damping.amplitude(x, speed)),
+    )
+
+
+class BandedCurve(NamedTuple):
+    """Points of a response curve, each with 1σ."""
+
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    frequency_std: Float[np.ndarray, " point"]  # at fixed amplitude
+    velocity: Complex[np.ndarray, " point"]  # m/s
+    velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency
+
+
+class _Banded(NamedTuple):
+    amplitude: np.ndarray
+    frequency: np.ndarray
+    frequency_std: np.ndarray
+    velocity: np.ndarray
+    velocity_std: np.ndarray
+    excess: np.ndarray  # of the curve's equation
+    by_amplitude: np.ndarray  # its slopes
+    by_frequency: np.ndarray
+    through: np.ndarray  # slope of the speed by the amplitude
+
+
+def banded_curve(
+    fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray
+) -> BandedCurve:
+    """The points of a response curve that are nearest to some, with bands."""
+
+    def banded(one: JointFit, x: np.ndarray, omega: np.ndarray, steps: int) -> _Banded:
+        program, motion = one.packed(), ForcedMotion.of(one, force)
+        covariance = jnp.asarray(program.padded_covariance(one.covariance))
+        count = np.array(steps)
+        found = by_blocks(
+            lambda x, omega: _bands(motion, program.vector, covariance, x, omega, count),
+            *(_BLOCK, np.asarray(x), np.asarray(omega)),
+        )
+        return _Banded(*found)
+
+    # The points come from curves drawn anew through knots: steps put them on the fit's own.
+    own = banded(fit, amplitude, frequency, _ONTO_THE_CURVE)
+    values = own.frequency, np.abs(own.velocity)
+    variances = own.frequency_std**2, own.velocity_std**2
+    added = [np.zeros_like(one) for one in variances]
+    for rival in fit.families.rivals:
+        other = banded(rival.fit, own.amplitude, own.frequency, 0)
+        # Where the rival's curve would be, to first order, by the slopes of the fit's own.
+        there = own.frequency - other.excess / own.by_frequency
+        speed = np.abs(other.velocity) - own.through / own.by_amplitude * other.excess
+        answers = ((there, other.frequency_std), (speed, other.velocity_std))
+        for k, (answer, std) in enumerate(answers):
+            given = (values[k], variances[k], answer, std**2)
+            added[k] += beyond_estimation(rival.weight, *given) ** 2
+    wide = [np.sqrt(one + more) for one, more in zip(variances, added, strict=True)]
+    return BandedCurve(own.frequency, wide[0], own.velocity, wide[1])
+
+
+@compiled
+def _bands(
+    motion: ForcedMotion, vector: Array, covariance: Array, x: Array, omega: Array, steps: Array
+) -> tuple[Array, ...]:
+    """The fields of `_Banded`, after so many steps onto the curve."""
+    ones, excess = jnp.ones_like(x), motion.excess
+
+    def by(position: int, x: Array, omega: Array) -> Array:
+        direction = [jnp.zeros_like(vector), 0 * ones, 0 * ones]
+        direction[position] = ones
+        return jax.jvp(excess, (vector, x, omega), tuple(direction))[1]
+
+    def step(_: int, point: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, omega = point
+        first, second = by(1, x, omega) * x, by(2, x, omega) * omega
+        share = excess(vector, x, omega) / (first**2 + second**2)
+        return x - share * first * x, omega - share * second * omega
+
+    x, omega = jax.lax.fori_loop(0, steps, step, (x, omega))
+    by_x, by_omega = by(1, x, omega), by(2, x, omega)
+    by_vector = jax.jacfwd(excess)(vector, x, omega)
+
+    def speed(vector: Array, x: Array) -> Array:
+        return jnp.abs(motion.velocity(vector, x, omega))
+
+    direct = jax.jacfwd(speed)(vector, x)
+    through = jax.jvp(lambda x: speed(vector, x), (x,), (ones,))[1]
+    moved = direct - (through / by_x)[:, None] * by_vector
+    frequency_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", by_vector, covariance, by_vector))
+    velocity_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", moved, covariance, moved))
+    velocity = motion.velocity(vector, x, omega)
+    known = (x, omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std)
+    return *known, excess(vector, x, omega), by_x, by_omega, through

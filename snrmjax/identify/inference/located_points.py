@@ -1,0 +1,209 @@
+"""Resonances and folds of fitted responses, located by Newton's method, with bands."""
+
+from enum import IntEnum
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.inference.fitted_curves import as_backbone, beyond_estimation
+from snrmjax.identify.inference.forced_motion import ForcedMotion, curves_at
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.prediction import predict_response, resonances
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi  # rad/s
+_ITERATIONS = 12
+
+Kind = Literal["resonance", "fold"]
+
+
+class LocatedStatus(IntEnum):
+    """How the search for a resonance or a fold ended."""
+
+    LOCATED = 0
+    NOT_LOCATED = 1  # Newton's method did not converge near where the drawn curve has it
+
+
+class FittedPoint(AbstractResult):
+    """A resonance or a fold of a fitted response, with 1σ.
+
+    One that was not located has the place that the drawn curve has, and NaN for 1σ.
+    """
+
+    force: float  # N
+    frequency: float  # rad/s
+    frequency_std: float
+    velocity: float  # m/s at the fit's sensor, residual modes included
+    velocity_std: float
+    continued: bool  # beyond the measured amplitudes
+    kind: str = "resonance"  # or "fold"
+    status: LocatedStatus = LocatedStatus.LOCATED
+    rivals_without: int = 0  # competing families without such a point: the band leaves them out
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        size, std = self.frequency / _HERTZ, self.frequency_std / _HERTZ
+        status = "located" if self.status == LocatedStatus.LOCATED else "not located"
+        if self.continued:
+            status += ", beyond the measured amplitudes"
+        if self.rivals_without:
+            status += f"; {self.rivals_without} competing families have no such point"
+        return (
+            f"FittedPoint: {self.kind} under {self.force:.4g} N",
+            f"{size:.6g} ± {std:.2g} Hz, {self.velocity:.4g} ± {self.velocity_std:.2g} m/s",
+            f"status: {status}",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+
+        def number(value: float, unit: str, meaning: str) -> Variable:
+            return Variable((), value, unit, meaning)
+
+        return {
+            "force_n": number(self.force, "N", "force"),
+            "frequency_hz": number(self.frequency / _HERTZ, "Hz", "frequency"),
+            "frequency_std_hz": number(self.frequency_std / _HERTZ, "Hz", "1σ of the frequency"),
+            "velocity_m_s": number(self.velocity, "m/s", "velocity"),
+            "velocity_std_m_s": number(self.velocity_std, "m/s", "1σ of the velocity"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {"kind": self.kind, "status": self.status.name.lower()}
+
+
+class Place(NamedTuple):
+    """Where a resonance or a fold is looked for."""
+
+    kind: Kind
+    amplitude: float  # m
+    frequency: float  # rad/s
+
+
+class _Solved(NamedTuple):
+    values: np.ndarray  # frequency, velocity, displacement
+    slopes: np.ndarray  # of them by the fit's unknowns
+
+
+def located(fit: JointFit, force: float, place: Place, ratio: float) -> FittedPoint:
+    """The resonance or fold near a place; rivals' are looked for up to `ratio` of the data."""
+    largest = fit.largest[0] * (1 + 1e-9)
+    found = _solved(fit, force, place)
+    if found is None:
+        return FittedPoint(
+            force=force,
+            frequency=place.frequency,
+            frequency_std=float("nan"),
+            velocity=place.frequency * place.amplitude,
+            velocity_std=float("nan"),
+            continued=place.amplitude > largest,
+            kind=place.kind,
+            status=LocatedStatus.NOT_LOCATED,
+        )
+    values, slopes = found
+    variance = np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes)
+    widened, without = variance, 0
+    near = Place(place.kind, float(values[2]), float(values[0]))
+    for rival in fit.families.rivals:
+        answer = _of_a_rival(rival.fit, force, near, ratio)
+        if answer is None:
+            without += 1
+            continue
+        own = np.einsum("op,pq,oq->o", answer.slopes, rival.fit.covariance, answer.slopes)
+        shift = beyond_estimation(rival.weight, values, variance, answer.values, own)
+        widened = widened + shift**2
+    (omega, speed, x), std = values, np.sqrt(widened)
+    return FittedPoint(
+        force=force,
+        frequency=float(omega),
+        frequency_std=float(std[0]),
+        velocity=float(speed),
+        velocity_std=float(std[1]),
+        continued=bool(x > largest),
+        kind=place.kind,
+        rivals_without=without,
+    )
+
+
+def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
+    """Where a curve turns back in frequency."""
+    steps = np.sign(np.diff(frequency))
+    at = np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
+    return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
+
+
+def _of_a_rival(rival: JointFit, force: float, place: Place, ratio: float) -> _Solved | None:
+    """A rival's resonance or fold that corresponds to one of the fit, and its slopes."""
+    near = _solved(rival, force, place)
+    if near is not None:
+        return near
+    rough = as_backbone(rival, largest_amplitude_ratio=ratio)
+    if place.kind == "resonance":
+        tips = resonances(rough, rival.modes, force, largest_amplitude_ratio=ratio)
+        starts = [Place("resonance", tip.amplitude, tip.frequency) for tip in tips]
+    else:
+        curves = predict_response(rough, rival.modes, force, largest_amplitude_ratio=ratio)
+        starts = [turn for c in curves for turn in turns(c.frequency, c.amplitude)]
+    for start in sorted(starts, key=lambda one: abs(np.log(one.amplitude / place.amplitude))):
+        found = _solved(rival, force, start)
+        if found is not None:
+            return found
+    return None
+
+
+def point_slopes(
+    fit: JointFit, force: float, kind: Kind, point: FittedPoint
+) -> Float[np.ndarray, "output unknown"]:
+    """Derivatives of a resonance's or fold's frequency and velocity by the free unknowns.
+
+    Raises `ValueError` when there is no such point there.
+    """
+    found = _solved(fit, force, Place(kind, point.velocity / point.frequency, point.frequency))
+    if found is None:
+        raise ValueError(f"there is no {kind} near {point.frequency / _HERTZ:.4g} Hz.")
+    return found.slopes[:2]
+
+
+def _solved(fit: JointFit, force: float, place: Place) -> _Solved | None:
+    """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
+    program = fit.packed()
+    unit = jnp.array([place.amplitude, place.frequency])
+    given = (ForcedMotion.of(fit, force), program.vector, unit, np.array(place.kind == "fold"))
+    values, slopes, good = _point_with_slopes(*given)
+    return _Solved(np.asarray(values), np.asarray(slopes)[:, program.own]) if bool(good) else None
+
+
+@compiled
+def _point_with_slopes(
+    motion: ForcedMotion, vector: Array, unit: Array, is_fold: Array
+) -> tuple[Array, Array, Array]:
+    def equations(point: Array, vector: Array) -> Array:
+        x, omega = point * unit
+        excess, slope = jax.jvp(
+            lambda x: motion.excess(vector, x, omega), (x,), (jnp.ones_like(x),)
+        )
+        squared, damping = curves_at(motion.unravel(vector), x, omega)
+        resonance = [squared / omega**2 - 1, omega * damping * x / motion.load - 1]
+        return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
+
+    def step(_: int, point: Array) -> Array:
+        jacobian = jax.jacfwd(equations)(point, vector)
+        return point - jnp.linalg.solve(jacobian, equations(point, vector))
+
+    point = jax.lax.fori_loop(0, _ITERATIONS, step, jnp.ones(2))
+    left = jnp.max(jnp.abs(equations(point, vector)))
+    good = (left < 1e-9) & jnp.all(jnp.abs(point - 1.0) < 0.2)
+    by_vector = jax.jacfwd(equations, argnums=1)(point, vector)
+    along = -jnp.linalg.solve(jax.jacfwd(equations)(point, vector), by_vector)
+
+    def outputs(point: Array, vector: Array) -> Array:
+        x, omega = point * unit
+        return jnp.stack([omega, jnp.abs(motion.velocity(vector, x, omega)), x])
+
+    by_point, direct = jax.jacfwd(outputs, argnums=(0, 1))(point, vector)
+    return outputs(point, vector), by_point @ along + direct, good
