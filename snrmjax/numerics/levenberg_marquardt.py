@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-class FitStatus(StrEnum):
+class MinimisationStatus(StrEnum):
     """How a least-squares fit ended."""
 
     CONVERGED = "converged"  # a further step changes the sum of squares by less than `settled`
@@ -28,7 +28,7 @@ class FitStatus(StrEnum):
     @property
     def found_minimum(self) -> bool:
         """Whether the fit ended at a minimum."""
-        return self in (FitStatus.CONVERGED, FitStatus.STALLED)
+        return self in (MinimisationStatus.CONVERGED, MinimisationStatus.STALLED)
 
 
 class AbstractLinearisation(Protocol):
@@ -75,7 +75,7 @@ class Minimum(NamedTuple, Generic[Linearisation]):
     sum_of_squares: float  # infinite where nothing finite was found
     linearised: Linearisation  # at `point`, or a short last step before it
     last_step: Float[np.ndarray, " unknown"]  # from where it was linearised; zero if evaluated
-    status: FitStatus
+    status: MinimisationStatus
 
 
 def minimise(
@@ -102,12 +102,17 @@ def minimise(
     last_step = np.zeros_like(point)
     square = np.array([_sum_of_squares(one) for one in now])
     damping = np.full(len(point), rule.damping)
-    status = [FitStatus.STEP_LIMIT if np.isfinite(one) else FitStatus.NOT_FINITE for one in square]
+    status = [
+        MinimisationStatus.STEP_LIMIT if np.isfinite(one) else MinimisationStatus.NOT_FINITE
+        for one in square
+    ]
     active = np.isfinite(square)
     for turn in range(rule.steps):
         if turn == rule.screened:
             behind = active & ~(square <= np.sort(square)[min(rule.kept, len(point)) - 1])
-            status = [FitStatus.GIVEN_UP if b else s for b, s in zip(behind, status, strict=True)]
+            status = [
+                MinimisationStatus.GIVEN_UP if b else s for b, s in zip(behind, status, strict=True)
+            ]
             active &= ~behind
         moved = point.copy()
         for t in np.flatnonzero(active):
@@ -119,7 +124,7 @@ def minimise(
             promised = float(residuals @ residuals - after @ after)
             if rule.trust_short_steps and free and promised < rule.settled:
                 point[t], last_step[t], square[t] = moved[t], step, float(after @ after)
-                status[t], active[t] = FitStatus.CONVERGED, False
+                status[t], active[t] = MinimisationStatus.CONVERGED, False
         at = np.flatnonzero(active)
         if not at.size:
             break
@@ -130,11 +135,11 @@ def minimise(
                 point[t], now[t], square[t] = moved[t], new, new_square
                 damping[t] *= rule.eased
                 if lowered <= rule.settled:
-                    status[t], active[t] = FitStatus.CONVERGED, False
+                    status[t], active[t] = MinimisationStatus.CONVERGED, False
             else:
                 damping[t] *= rule.stiffened
                 if damping[t] >= rule.largest_damping:
-                    status[t], active[t] = FitStatus.STALLED, False
+                    status[t], active[t] = MinimisationStatus.STALLED, False
     return [
         Minimum(*row) for row in zip(point, square.tolist(), now, last_step, status, strict=True)
     ]

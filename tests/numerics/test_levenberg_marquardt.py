@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from snrmjax.numerics.levenberg_marquardt import FitStatus, StepRule, minimise
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 
 TIME = np.linspace(0.0, 2.0, 40)
 DATA = 2.0 * np.exp(-1.3 * TIME) + 0.01 * np.random.default_rng(0).normal(size=40)
@@ -45,7 +45,7 @@ def test_every_start_ends_at_scipys_minimum():
         # Where the sum of squares no longer changes a point is known to half the digits.
         np.testing.assert_allclose(end.point, truth.x, rtol=1e-6)
         assert end.sum_of_squares == pytest.approx(2 * truth.cost, rel=1e-12)
-        assert end.status in (FitStatus.CONVERGED, FitStatus.STALLED)
+        assert end.status in (MinimisationStatus.CONVERGED, MinimisationStatus.STALLED)
 
 
 def test_bounds_hold():
@@ -57,23 +57,23 @@ def test_bounds_hold():
 
 def test_each_way_to_end_has_its_status():
     (short,), _ = fitted([[50.0, 0.01]], StepRule(steps=1, settled=1e-14))
-    assert short.status == FitStatus.STEP_LIMIT
+    assert short.status == MinimisationStatus.STEP_LIMIT
     (lost, found), _ = fitted([[1.0, -1.0], [1.0, 1.0]])
-    assert lost.status == FitStatus.NOT_FINITE
+    assert lost.status == MinimisationStatus.NOT_FINITE
     assert lost.sum_of_squares == np.inf
-    assert found.status in (FitStatus.CONVERGED, FitStatus.STALLED)
+    assert found.status in (MinimisationStatus.CONVERGED, MinimisationStatus.STALLED)
     (done,), _ = fitted([[1.0, 1.0]], StepRule(steps=60, settled=1e-3))
-    assert done.status == FitStatus.CONVERGED
+    assert done.status == MinimisationStatus.CONVERGED
     (at_best,), _ = fitted([found.point], StepRule(steps=60, settled=1e-30, largest_damping=1e3))
-    assert at_best.status in (FitStatus.STALLED, FitStatus.CONVERGED)
-    assert not FitStatus.STEP_LIMIT.found_minimum
-    assert FitStatus.STALLED.found_minimum
+    assert at_best.status in (MinimisationStatus.STALLED, MinimisationStatus.CONVERGED)
+    assert not MinimisationStatus.STEP_LIMIT.found_minimum
+    assert MinimisationStatus.STALLED.found_minimum
 
 
 def test_starts_that_fall_behind_are_given_up():
     rule = StepRule(steps=40, settled=1e-14, screened=1, kept=1)
     ends, calls = fitted([[2.0, 1.3], [80.0, 6.0]], rule)
-    assert ends[1].status == FitStatus.GIVEN_UP
+    assert ends[1].status == MinimisationStatus.GIVEN_UP
     assert calls[0] == 2
     assert set(calls[1:]) == {1}
 
@@ -83,7 +83,7 @@ def test_a_step_that_promises_too_little_is_not_evaluated():
     near = best.point * (1 + 1e-6)
     (end,), calls = fitted([near], StepRule(steps=9, settled=1e-6, trust_short_steps=True))
     assert calls == []
-    assert end.status == FitStatus.CONVERGED
+    assert end.status == MinimisationStatus.CONVERGED
     assert np.any(end.last_step)
     np.testing.assert_array_equal(end.point, near + end.last_step)
     # Marquardt's damping leaves a thousandth of the way.

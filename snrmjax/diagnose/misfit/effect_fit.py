@@ -11,7 +11,7 @@ from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.numerics.blocks import over_cores
-from snrmjax.numerics.levenberg_marquardt import FitStatus, StepRule, minimise
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
 
 # Of a fit: an evaluation costs many motions, and rivals far behind need not be known to digits.
 _RULE = StepRule(
@@ -39,7 +39,7 @@ class EffectFit(NamedTuple):
     slopes: Float[np.ndarray, "row parameter"]
     lower: Float[np.ndarray, " parameter"]
     upper: Float[np.ndarray, " parameter"]
-    status: FitStatus = FitStatus.NOT_FITTED
+    status: MinimisationStatus = MinimisationStatus.NOT_FITTED
 
     def of_kind(self, kind: str) -> tuple[float, ...]:
         """The parameters of one of its effects."""
