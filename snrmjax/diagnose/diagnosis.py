@@ -37,7 +37,7 @@ from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 _LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is compared
 _LEAST_STATES = 6
@@ -289,7 +289,7 @@ def _notes_on_answer(
     if refused:
         levels = " and ".join(str(level) for level in refused)
         notes.append(f"without level {levels} the parameters are none that a structure can have.")
-    if not (fit.status.found_minimum or fit.status is FitStatus.NOT_FITTED):
+    if not (fit.status.found_minimum or fit.status is MinimisationStatus.NOT_FITTED):
         notes.append("the fit of the answer itself had not converged when it ended.")
     return notes
 

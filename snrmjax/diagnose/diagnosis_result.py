@@ -15,7 +15,7 @@ from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
 
@@ -32,7 +32,7 @@ class Answer(NamedTuple):
     effects: tuple[str, ...]  # in the order added
     candidates: tuple[tuple[str, ...], ...]  # of every effect: itself, and what fits as well
     parameters: dict[str, Estimate]
-    status: FitStatus
+    status: MinimisationStatus
     completed: Structure | None  # None where no structure can have these parameters
     completed_status: CompletedStatus
     force_gain: float  # acting force over recorded one, where a gain was free; else 1

@@ -20,7 +20,7 @@ from snrmjax.diagnose.search.screening import screened, screened_pairs
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.blocks import over_cores
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 DETECTED = 10.0
 """Gain of Schwarz's criterion from which on an effect counts as detected."""
@@ -47,7 +47,7 @@ class TriedEffect(NamedTuple):
     gain: float  # fall of Schwarz's criterion from what was there before
     chi_square: float
     parameters: dict[str, float]
-    status: FitStatus
+    status: MinimisationStatus
 
 
 class FoundEffects(NamedTuple):
