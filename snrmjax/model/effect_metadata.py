@@ -143,6 +143,25 @@ class Shape(NamedTuple):
         return 3 if self.symmetry is Symmetry.ODD else 2
 
     @property
+    def sentence(self) -> str:
+        """What the effect changes and where it shows, as a report says it.
+
+        >>> Shape(Part.STIFFNESS, Symmetry.ODD, power=2).sentence
+        'It changes the stiffness with the power 2 of the amplitude and shows in harmonic 3.'
+        """
+        if self.part is Part.INSTRUMENTS:
+            return "It changes what is recorded, not the motion."
+        if self.part is Part.TIME:
+            return "It changes in the course of the test, not with the amplitude."
+        power = ""
+        if self.power is not None:
+            power = f" with the power {self.power:g} of the amplitude" if self.power else ""
+            power = power or " at all amplitudes alike"
+        harmonic = self.lowest_harmonic
+        shown = "" if harmonic is None else f" and shows in harmonic {harmonic}"
+        return f"It changes the {self.part}{power}{shown}."
+
+    @property
     def is_drag(self) -> bool:
         """Whether it is damping that grows with the velocity and depends on nothing else."""
         return self.grows and self.argument is Argument.VELOCITY and self.symmetry is Symmetry.ODD

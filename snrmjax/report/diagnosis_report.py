@@ -23,6 +23,7 @@ from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_figures import (
@@ -294,8 +295,9 @@ def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[st
 
 
 def _description(kind: str) -> str:
-    """What an effect is physically, as its class states it."""
-    return EFFECTS[kind].description
+    """What an effect is physically and where it shows, as its class states it."""
+    shape = shape_of(EFFECTS[kind])
+    return f"{EFFECTS[kind].description} {shape.sentence if shape else ''}".strip()
 
 
 def _unit(kind: str, name: str) -> str:

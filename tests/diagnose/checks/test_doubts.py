@@ -1,11 +1,18 @@
 """Answers that a law outside the library could imitate are marked."""
 
+from typing import ClassVar
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
+import snrmjax as sj
 from snrmjax.diagnose.checks.doubts import doubts, wider_than_measured
 from snrmjax.diagnose.misfit.candidates import decide_by
 from snrmjax.diagnose.search.locating import Located
+from snrmjax.model.effects import EFFECTS
+from snrmjax.model.library.confusions import TOLD_BY_THIRD_HARMONIC
 
 
 def grows(part, exponent, std=0.05):
@@ -114,3 +121,39 @@ def test_what_would_decide_is_asked_for_and_nothing_beside_it():
     assert "harmonic 2" in decide_by({"gap_stiffness", "one_sided_stop"}, harmonics=False)
     assert "harmonics" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=False)
     assert "levels" in decide_by({"jenkins_slider", "mode_shape_change"}, harmonics=True)
+
+
+class Valve(sj.model.AbstractMemoryless):
+    """f = c |q̇|^¾ q̇, which states what it may be confused with, and no shape."""
+
+    kind: ClassVar[str] = "valve"
+    confusions: ClassVar = (
+        TOLD_BY_THIRD_HARMONIC,
+        sj.model.Confusion("close the valve", by_itself=True),
+    )
+    imitations: ClassVar = (sj.model.Imitation("a leak does the same.", "seal it"),)
+    coefficient: Array
+
+    def force(self, displacement, velocity):
+        """See `AbstractMemoryless.force`."""
+        speed = jnp.abs(velocity)
+        root = jnp.where(speed > 0, jnp.where(speed > 0, speed, 1.0) ** 1.75, 0.0)
+        return self.coefficient * jnp.sign(velocity) * root
+
+
+def test_a_users_effect_is_doubted_and_told_as_those_of_the_library(monkeypatch):
+    monkeypatch.setitem(EFFECTS, "valve", Valve)
+    asked = decide_by({"valve", "cubic_damping"}, harmonics=True)
+    assert "harmonic 3" in asked
+    assert asked.endswith("close the valve.")
+    both_ways = frozenset({"valve"})
+    (leak,) = doubts(("valve",), grows("damping", 0.75), (2, 3), both_ways)
+    assert leak.reason == "a leak does the same."
+    # The power of its law follows from its force: so does what it acts like, and its direction.
+    power, _ = doubts(("valve",), grows("damping", 2.0), (2, 3), both_ways)
+    assert power.refutes
+    assert "0.75 of valve" in power.reason
+    one_way, *_ = doubts(("valve",), grows("damping", 0.75), (2, 3))
+    assert "one direction" in one_way.reason
+    reasons = [d.reason for d in doubts(("valve", "coulomb_friction"), (), (2, 3), both_ways)]
+    assert any("valve and coulomb_friction" in reason for reason in reasons)
