@@ -1,4 +1,5 @@
-from .calibrate.calibration import CalibratedModel, calibrate_model
+from .calibrate.calibrated_model import CalibratedModel
+from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
 from .inference.fitted_curves import fitted_values

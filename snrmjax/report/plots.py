@@ -8,6 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
+from snrmjax.identify.calibrate.inverse_force import InverseForce
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurements
 from snrmjax.identify.inference.profiles import Profile
@@ -162,3 +164,14 @@ def _(result: Contributions, **settings: Any) -> Figure:
 @plot_result.register
 def _(result: Profile, **settings: Any) -> Figure:
     return joint_figures.profile_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: InverseForce) -> Figure:
+    velocity = np.asarray(result.velocity)[:, 1, 0]
+    return simulation_figures.force_velocity_points(np.asarray(result.force), velocity)
+
+
+@plot_result.register
+def _(result: CalibratedModel) -> Figure:
+    return simulation_figures.residual_columns_figure(result.residuals)

@@ -12,6 +12,7 @@ from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.report.sampling import velocity_of
 from snrmjax.report.style import (
+    BACKGROUND,
     COLUMN,
     CURVE,
     DOT,
@@ -208,4 +209,39 @@ def batch_figure(batch: ResponseBatch) -> Figure:
     title = f"{len(batch.status)} responses"
     name_axes(axes, title, "Frequency (Hz)", f"Velocity amplitude ({unit.name})")
     legend(figure)
+    return figure
+
+
+def force_velocity_points(force: np.ndarray, velocity: np.ndarray) -> Figure:
+    """Size and phase of the force of prescribed motions against their velocity amplitude.
+
+    Arguments: `force` in N and `velocity` in m/s, complex. Returns the figure.
+    Raises `ValueError` when no motion was found.
+    """
+    found = np.isfinite(force) & np.isfinite(velocity)
+    if not found.any():
+        raise ValueError("there is no force to show: no motion was found.")
+    speed, load = np.abs(velocity[found]), force[found]
+    unit, newton = unit_for(speed, "m/s"), unit_for(load, "N")
+    figure, ((upper,), (lower,)) = panels(COLUMN, 5.0, 2, 1)
+    upper.plot(speed / unit.size, np.abs(load) / newton.size, **DOT)
+    lower.plot(speed / unit.size, np.angle(load) / DEGREE, **DOT)
+    lower.sharex(upper)
+    phase_axis(lower)
+    name_axes(upper, "(a) amplitude", "", f"Force ({newton.name})")
+    below = f"Velocity amplitude ({unit.name})"
+    name_axes(lower, "(b) phase relative to the measured force", below, "Phase (°)")
+    return figure
+
+
+def residual_columns_figure(residuals: np.ndarray) -> Figure:
+    """Whitened residuals of all steady states: within ±2 for 95 % where model and noise are right.
+
+    Arguments: `residuals` in units of 1σ, one row a state. Returns the figure.
+    """
+    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
+    axes.plot(np.arange(len(residuals)), residuals, **DOT)
+    for limit in (-2.0, 2.0):
+        axes.axhline(limit, color=BACKGROUND, linestyle="--")
+    name_axes(axes, "residuals", "Steady state", "Residual (1σ)")
     return figure

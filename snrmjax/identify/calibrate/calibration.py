@@ -1,15 +1,14 @@
-"""Parameters of a model fitted to measured steady states, through its harmonic balance.
+"""Parameters of a model fitted to measured steady states, by inverse harmonic balance.
 
-A state is not simulated at its force and frequency, where near a fold there are several answers or
-none. Its frequency and the fundamental of its velocity are held at what was measured, and the
-balance is solved for the rest of the motion and for the force that it needs. That force has one
-value however the response folds; what it misses of the measured one is the residual.
+A steady state is not simulated at its force and frequency, where near a fold there are several
+answers or none. Its frequency and the fundamental of its velocity are prescribed as measured, and
+the harmonic balance is solved for the rest of the motion and for the force: single-valued through
+folds. The residual is the difference of that force from the measured one.
 """
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -17,6 +16,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -36,39 +36,31 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-
-# Rounds of fitting and whitening anew. In the first, what the data say little about stays within
-# about this relative step, and harmonics have this relative error: far from the truth they
-# mislead. The last number is the tolerance, relative and in 1σ.
-_ROUNDS = ((0.1, 1.0, 1e-3), (0.3, 0.1, 1e-3), (np.inf, 0.0, 1e-3), (np.inf, 0.0, 1e-8))
-# Unknowns in units of so many 1σ: the solver's damping, one unit's worth at first, is then light.
-_LIGHT = 30.0
+from snrmjax.numerics.levenberg_marquardt import FitStatus
 
 
-class CalibratedModel(eqx.Module):
-    """A model with fitted parameters, and how well they are known.
+class _Round(NamedTuple):
+    """One round of fitting and whitening anew.
 
-    `residuals` are whitened: of unit variance if noise and model are right; NaN where nothing was
-    measured or the state has no weight. A state's columns are real and imaginary parts of the
-    force, of the other sensors' fundamentals and of the harmonics. `covariance` and `std` are
-    widened by `noise_scale` where no noise is stated or where the residuals contradict it. What a
-    level shares is by how much its velocities were found to be too large and to lead.
+    In the first rounds, far from the truth, what the data say little about stays within a relative
+    step of about `step`, and harmonics, which mislead there, have a relative error of
+    `harmonic_error`. `tolerance` is that of the solver, relative and in 1σ.
     """
 
-    model: Structure  # with the fitted values, and their 1σ where it has a place for them
-    values: Float[np.ndarray, " parameter"]
-    std: Float[np.ndarray, " parameter"]
-    covariance: Float[np.ndarray, "parameter parameter"]
-    residuals: Float[np.ndarray, "state column"]
-    state_converged: Bool[np.ndarray, " state"]
-    level_gain: Float[np.ndarray, " level"]  # relative
-    level_phase: Float[np.ndarray, " level"]  # rad
-    reduced_chi_square: float
-    noise_scale: float  # its root: the residuals over the stated noise
-    names: tuple[str, ...] = eqx.field(static=True)
-    noise_stated: bool = eqx.field(static=True)
-    converged: bool = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    step: float
+    harmonic_error: float
+    tolerance: float
+
+
+_ROUNDS = (
+    _Round(0.1, 1.0, 1e-3),
+    _Round(0.3, 0.1, 1e-3),
+    _Round(np.inf, 0.0, 1e-3),
+    _Round(np.inf, 0.0, 1e-8),
+)
+# Unknowns in units of so many 1σ: the solver's damping, one unit's worth at first, is then light.
+_LIGHT = 30.0
+_STEPS = 60
 
 
 class _Settings(NamedTuple):
@@ -131,24 +123,27 @@ def calibrate_model(
 ) -> CalibratedModel:
     """Fit parameters of a model to measured steady states of all levels at once.
 
-    Minimises the whitened sum of squares of (F_needed − F)/F over the states, F_needed being the
-    complex force that the measured frequency and fundamental velocity need (`inverse_force`), and
-    of what is missed of other sensors and of harmonics with a stated error. The covariance of a
-    state's residuals follows from the stated errors of force, velocity and phase; it is taken anew
-    where a fit ended. Levenberg–Marquardt, with the balance's exact derivatives.
+    Minimises the whitened sum of squares of (F_model − F)/F over the states, F_model being the
+    complex force with which the model has the measured frequency and fundamental velocity
+    (`inverse_force`), and of the differences at other sensors and of harmonics with a stated
+    error. The covariance of a state's residuals follows from the stated errors of force, velocity
+    and phase; it is taken anew where a fit ended. Levenberg–Marquardt (optimistix), with the
+    balance's exact derivatives.
 
     Arguments: `model` gives the start and all that is not fitted; `parameters` are out of
     `parameter_names`. `level_gain_std` (relative) and `level_phase_std` (rad) are 1σ of errors
     that all velocities of a level share: they become unknowns. With `priors` the standard
     deviations that the model states for fitted parameters hold them near their start.
-    Returns a `CalibratedModel`. A state for which no balanced motion is found has no weight and is
-    named in the notes. Where errors of velocity are not stated for all states, equal relative ones
-    are taken for all and their size found from the residuals.
+    Returns a `CalibratedModel`: a fit that did not converge says so in its status and notes. A
+    state for which no balanced motion is found has no weight and is named there too. Where errors
+    of velocity are not stated for all states, equal relative ones are taken for all and their size
+    found from the residuals.
     Raises `ValueError` for unknown or repeated names, for sensors other than the model's, for an
     unknown force or phase, for levels' errors below zero and for too few data.
     Validity: motions with the period of the force. Errors of velocity enter to first order. Inside
     an internal resonance several motions have one fundamental; the one that grows from small
     amplitudes is taken.
+    Not differentiable: differentiate `inverse_force`.
     Reference: the formulation is this package's own.
     """
     names = checked_names(model, parameters)
@@ -187,11 +182,10 @@ def _grown(
     """Solutions for the measured velocities, grown from small amplitudes."""
     model = with_parameters(model, settings.names, parameters)
 
-    def one(*row: Array) -> Array:
-        state = CalibrationStates(*row)
+    def one(state: CalibrationStates) -> Array:
         return state_motion(model, state, state.velocity[0], *settings.held).grown()
 
-    return mapped(one, *states)
+    return mapped(one, states)
 
 
 def _columns(
@@ -227,9 +221,7 @@ def _slopes(
     unknowns: Float[Array, " unknown"],
     near: Float[Array, "state entry"],
 ) -> _Slopes:
-    def one(*row: Array) -> _Slopes:
-        state, start = CalibrationStates(*row[:-1]), row[-1]
-
+    def one(state: CalibrationStates, start: Array) -> _Slopes:
         def both(unknowns: Array, error: Array) -> tuple:
             found = _columns(model, state, settings, aim, unknowns, error, start)
             return found, found
@@ -238,7 +230,7 @@ def _slopes(
         (columns, points), (value, point) = slopes(unknowns, jnp.zeros_like(state.error))
         return _Slopes(point, value, columns[0], columns[1], points[0])
 
-    return mapped(one, *states, near)
+    return mapped(one, states, near)
 
 
 @compiled
@@ -262,13 +254,12 @@ def _fit(
     def residuals(y: Array, _: None = None) -> Array:
         unknowns = start + y * unit
 
-        def one(*row: Array) -> Array:
-            state, begin = CalibrationStates(*row[:-1]), row[-1]
+        def one(state: CalibrationStates, begin: Array) -> Array:
             none = jnp.zeros_like(state.error)
             return _columns(model, state, settings, aim, unknowns, none, begin)[0]
 
         # A state that is lost on the way is NaN: the solver then takes a smaller step.
-        of_states = whitened_columns(whiten, mapped(one, *states, near(y * unit)))
+        of_states = whitened_columns(whiten, mapped(one, states, near(y * unit)))
         rest = jnp.append(aim.misses(unknowns), hold * y * unit)
         return jnp.append(of_states.reshape(-1), rest)
 
@@ -277,7 +268,7 @@ def _fit(
         **limits, linear_solver=lx.QR()
     )
     solution: optx.Solution = optx.least_squares(
-        residuals, solver, jnp.zeros_like(start), max_steps=60, throw=False
+        residuals, solver, jnp.zeros_like(start), max_steps=_STEPS, throw=False
     )
     change = solution.value * unit
     good = jnp.asarray(solution.result == optx.RESULTS.successful)
@@ -289,7 +280,7 @@ class _Fitted(NamedTuple):
     residuals: Float[np.ndarray, "state column"]
     jacobian: Float[np.ndarray, "row unknown"]
     usable: Bool[np.ndarray, " state"]
-    good: bool
+    status: FitStatus
 
 
 def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, aim: _Aim) -> _Fitted:
@@ -297,15 +288,15 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
     subject = (model, states, settings)
     unknowns = jnp.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
     slopes = _slopes(*subject, aim, unknowns, _grown(*subject, aim.values))
-    good, relative = True, np.asarray(aim.values) != 0
-    for turn, (step, doubt, tolerance) in enumerate(_ROUNDS):
+    status, relative = FitStatus.NOT_FITTED, np.asarray(aim.values) != 0
+    for turn, (step, harmonic_error, tolerance) in enumerate(_ROUNDS):
         lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
         if turn and lost.any():
             again = jnp.where(
                 lost[:, None], _grown(*subject, aim.parameters(unknowns)), slopes.points
             )
             slopes = _slopes(*subject, aim, unknowns, again)
-        whiten = state_whitener(states, slopes.by_error, jnp.asarray(doubt))
+        whiten = state_whitener(states, slopes.by_error, jnp.asarray(harmonic_error))
         # Every unknown in its own unit: the solver's damping then treats them alike.
         size = np.linalg.norm(_jacobian(whiten, slopes, aim, unknowns), axis=0)
         unit = jnp.asarray(_LIGHT / np.where(size > 0, size, 1.0))
@@ -313,13 +304,16 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
         unknowns, near, ended = _fit(
             *subject, aim, unknowns, slopes, whiten, unit, hold, jnp.asarray(tolerance)
         )
-        slopes, good = _slopes(*subject, aim, unknowns, near), bool(ended)
+        slopes = _slopes(*subject, aim, unknowns, near)
+        status = FitStatus.CONVERGED if bool(ended) else FitStatus.STEP_LIMIT
+    if not np.any(np.asarray(whiten)):
+        status = FitStatus.NOT_FINITE
     return _Fitted(
         unknowns=np.asarray(unknowns),
         residuals=whitened_columns(*map(np.asarray, (whiten, slopes.columns))),
         jacobian=_jacobian(whiten, slopes, aim, unknowns),
         usable=np.any(np.asarray(whiten) != 0, axis=(1, 2)),
-        good=good,
+        status=status,
     )
 
 
@@ -348,8 +342,8 @@ def _result(
     values = np.asarray(aim.parameters(jnp.asarray(found.unknowns)))
     unit = np.where(np.asarray(aim.values) != 0, np.asarray(aim.values), 1.0)
     covariance = _inverse_of_square(found.jacobian)[:p, :p] * unit * unit[:, None]
-    doubt = float(np.sqrt(2 / max(freedom, 1)))
-    if not chosen.noise_stated or not reduced <= 1 + 3 * doubt:
+    scatter = float(np.sqrt(2 / max(freedom, 1)))  # 1σ of the reduced χ²
+    if not chosen.noise_stated or not reduced <= 1 + 3 * scatter:
         covariance = covariance * reduced
     std = np.sqrt(np.diag(covariance))
     level = found.unknowns[p:].reshape(settings.n_levels, -1) * np.asarray(aim.level_std)
@@ -363,37 +357,40 @@ def _result(
     return CalibratedModel(
         model=with_stated_std(fitted, names, jnp.asarray(std)),
         values=values,
-        std=std,
         covariance=covariance,
         residuals=residuals,
         state_converged=converged,
         level_gain=shared.get("gain", nothing),
         level_phase=shared.get("phase", nothing),
         reduced_chi_square=reduced,
-        noise_scale=float(np.sqrt(reduced)),
         names=names,
         noise_stated=chosen.noise_stated,
-        converged=found.good and freedom > 0,
-        notes=(*chosen.notes, *_notes(chosen, names, found, reduced, 3 * doubt)),
+        status=found.status,
+        notes=(*chosen.notes, *_notes(chosen, names, found, reduced, 3 * scatter)),
     )
 
 
 def _notes(
-    chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, doubt: float
+    chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, margin: float
 ) -> list[str]:
     notes = []
-    if not found.good:
-        notes.append("the fit did not converge: start nearer, or fit fewer parameters.")
+    if found.status == FitStatus.NOT_FINITE:
+        notes.append("no balanced motion was found for any state: nothing was fitted.")
+    elif not found.status.found_minimum:
+        notes.append(
+            f"the fit did not converge within {_STEPS} steps: values and standard deviations are "
+            "not those of a minimum; start nearer, or fit fewer parameters."
+        )
     if not found.usable.all():
         lost = ", ".join(str(k) for k in chosen.rows[~found.usable])
         notes.append(f"no balanced motion was found for the states {lost}: they have no weight.")
     times = f"{np.sqrt(reduced):.2g} times the stated noise"
-    if chosen.noise_stated and not reduced <= 1 + doubt:
+    if chosen.noise_stated and not reduced <= 1 + margin:
         notes.append(
             f"residuals are {times}: it is understated or the model lacks something; the standard "
             "deviations are widened accordingly."
         )
-    if chosen.noise_stated and reduced < 1 - doubt:
+    if chosen.noise_stated and reduced < 1 - margin:
         notes.append(f"residuals are only {times}: it is overstated.")
     blind = [name for name, slope in zip(names, found.jacobian.T, strict=False) if not slope.any()]
     if blind:

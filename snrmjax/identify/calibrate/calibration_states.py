@@ -16,7 +16,7 @@ from snrmjax.numerics.compiled import compiled
 OneKind = TypeVar("OneKind", Array, np.ndarray)
 
 ASSUMED_ERROR = 0.01
-"""Relative and rad, of velocities where nobody stated any noise: a fit then finds its size."""
+"""Relative and rad, of velocities where no noise is stated: a fit then finds its size."""
 
 
 class CalibrationStates(NamedTuple):
@@ -38,7 +38,7 @@ class CalibrationStates(NamedTuple):
 
 
 class ComparedColumns(NamedTuple):
-    """What of the data is used."""
+    """The steady states of a measurement that a model is compared with, and their columns."""
 
     states: CalibrationStates
     rows: Int[np.ndarray, " state"]  # of the data
@@ -53,7 +53,7 @@ class ComparedColumns(NamedTuple):
 def calibration_states(
     model: Structure, data: SteadyStates, harmonic_order: int
 ) -> ComparedColumns:
-    """The states that the reference sensor measured under a known force.
+    """The steady states that the reference sensor measured under a known force.
 
     Where the velocity of some state has no stated error, all get `ASSUMED_ERROR`. Harmonics are
     compared where their error is stated. A velocity of unknown phase, and its harmonics, are real
@@ -132,19 +132,19 @@ def calibration_states(
 def state_whitener(
     states: CalibrationStates,
     by_error: Float[Array, "state column input"],
-    doubt: Float[Array, ""],
+    harmonic_error: Float[Array, ""],
 ) -> Float[Array, "state column column"]:
     """The matrices that make a state's columns independent and of unit variance.
 
-    Arguments: derivatives of the columns with respect to the errors in `states.error`; `doubt`
-    is a further error of the harmonics, relative to their own size. Zero for
+    Arguments: derivatives of the columns with respect to the errors in `states.error`;
+    `harmonic_error` is a further error of the harmonics, relative to their own size. Zero for
     states whose derivatives are not finite: they have no weight.
     """
     good = jnp.all(jnp.isfinite(by_error), axis=(1, 2))[:, None, None]
     scaled = jnp.where(good, by_error, 1.0) * states.error[:, None, :]
     size = jnp.abs(states.harmonics).reshape(len(by_error), -1) / jnp.abs(states.velocity[:, :1])
     wide = jnp.pad(size, ((0, 0), (states.velocity.shape[1], 0)))
-    own = states.own_std**2 + doubt**2 * jnp.repeat(wide, 2, axis=1) ** 2
+    own = states.own_std**2 + harmonic_error**2 * jnp.repeat(wide, 2, axis=1) ** 2
     own = jnp.where(states.known, own, 1.0)
     covariance = scaled @ scaled.transpose(0, 2, 1) + jax.vmap(jnp.diag)(own)
     # Rounding must not make it singular.

@@ -1,6 +1,6 @@
-"""The force that a measured motion needs: one value however the response folds."""
+"""The force of a measured motion by inverse harmonic balance: single-valued through folds."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,31 +9,61 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates, calibration_states
+from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.measure.states import SteadyStates, check_phases
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.prescribed_motion import PrescribedMotion, prescribed_motion
 
 
-class InverseForce(eqx.Module):
-    """Motions with a given fundamental and the forces they need; NaN where none was found."""
+class InverseForce(AbstractResult):
+    """Motions with a prescribed fundamental and their forces; NaN where none was found."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state", "harmonic")
 
     force: Complex[Array, " state"]  # N, as recorded, relative to the phase of the measured force
     velocity: Complex[Array, "state harmonic sensor"]  # m/s, as recorded, h = 0…H
     converged: Bool[Array, " state"]
 
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        found = int(np.sum(np.asarray(self.converged)))
+        return (
+            f"InverseForce: {found} of {len(self.converged)} motions found",
+            f"force {spans(np.abs(np.asarray(self.force)))} N",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        force, velocity = np.asarray(self.force), np.asarray(self.velocity)
+        n, orders = velocity.shape[:2]
+        where = ("state", "harmonic", "sensor")
+        return {
+            "state": Variable(("state",), np.arange(n), "1", "steady state"),
+            "harmonic": Variable(("harmonic",), np.arange(orders), "1", "harmonic order"),
+            "force_re_n": Variable(("state",), force.real, "N", "force in phase with the measured"),
+            "force_im_n": Variable(("state",), force.imag, "N", "force 90° ahead of it"),
+            "velocity_re_m_s": Variable(where, velocity.real, "m/s", "velocity, real part"),
+            "velocity_im_m_s": Variable(where, velocity.imag, "m/s", "velocity, imaginary part"),
+            "converged": Variable(("state",), self.converged, "1", "whether a motion was found"),
+        }
+
 
 def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int = 9) -> InverseForce:
-    """The complex force that measured frequencies and fundamental velocities need.
+    """The complex force with which a model has the measured frequencies and fundamentals.
 
     Solves the harmonic balance for all coefficients and the force, with the velocity's fundamental
-    at the reference sensor held at what was measured: one value however the response folds. The
-    motion is grown from small amplitudes by Newton's method. A differentiable function of the
-    model, by the implicit function theorem: in forward and in reverse mode, once.
+    at the reference sensor prescribed as measured: single-valued through folds. The motion is
+    grown from small amplitudes by Newton's method.
 
-    Returns a `InverseForce`, NaN where no motion was found and for states that the reference sensor
-    did not measure. It is the measured force where model and measurement are right.
+    Arguments: `model`; `data` with forces in N, whose phases the answer is relative to.
+    Returns an `InverseForce`, NaN where no motion was found and for states that the reference
+    sensor did not measure. It is the measured force where model and measurement are right.
+    Differentiable once by the model's parameters, in forward and in reverse mode, by the implicit
+    function theorem; states without a motion have derivatives zero or NaN and leave the others' as
+    they are. By the data it is not: they are prepared on the host.
     Raises `ValueError` for sensors other than the model's and for an unknown force or phase.
 
     >>> import snrmjax as sj
@@ -42,7 +72,7 @@ def inverse_force(model: Structure, data: SteadyStates, *, harmonic_order: int =
     >>> inverse_force(linear, data).force.round(6)
     Array([1.5+0.j], dtype=complex128)
     """
-    check_phases(data, "a needed force")
+    check_phases(data, "an inverse force")
     chosen = calibration_states(model, data, harmonic_order)
     found = _needed(model, chosen.states, chosen.sensors[0], harmonic_order)
     n, rows = data.n_states, chosen.rows
@@ -72,7 +102,7 @@ def state_motion(
 
 
 class StateWithErrors(NamedTuple):
-    """A state whose record is taken to err."""
+    """A steady state whose recorded force, velocities and phases have given errors."""
 
     state: CalibrationStates
     factor: Complex[Array, ""] | float  # of all velocities
@@ -96,7 +126,7 @@ def residual_columns(
     sensors: tuple[int, ...],
     orders: tuple[int, ...],
 ) -> Float[Array, " column"]:
-    """What a state's motion misses of the force, other sensors and harmonics.
+    """Differences of a state's motion from the measured force, other sensors and harmonics.
 
     Arguments: `motion` is that of `erring`, and `point` its solution; `sensors` has the reference
     first; `orders` are the harmonics that are compared.
@@ -119,11 +149,10 @@ def residual_columns(
 def _needed(
     model: Structure, states: CalibrationStates, sensor: int, harmonic_order: int
 ) -> InverseForce:
-    def one(*row: Array) -> InverseForce:
-        state = CalibrationStates(*row)
+    def one(state: CalibrationStates) -> InverseForce:
         held = state_motion(model, state, state.velocity[0], sensor, harmonic_order)
         point = held.solved(held.grown())
         force, velocity = held.recorded(point)
         return InverseForce(force, velocity, jnp.isfinite(jax.lax.stop_gradient(point[-1])))
 
-    return mapped(one, *states)
+    return mapped(one, states)

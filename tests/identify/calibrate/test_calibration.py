@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 import snrmjax as sj
@@ -112,7 +113,7 @@ def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
     np.testing.assert_allclose(found.velocity[:, 2:4, 0], data.harmonics[:, 0], rtol=1e-6)
 
 
-def test_derivatives_of_the_needed_force_are_those_of_central_differences(exact):
+def test_derivatives_of_the_inverse_force_are_those_of_central_differences(exact):
     model, names = curved(make_effect("quadratic_damping", {"coefficient": 0.5})), ("111", "1111")
     names = (*(f"potential.{key}" for key in names), "mode_1.damping_ratio", DRAG)
     _, start = scaled(model, names, 1.0)
@@ -130,7 +131,15 @@ def test_derivatives_of_the_needed_force_are_those_of_central_differences(exact)
     np.testing.assert_allclose(forward, backward, rtol=1e-9, atol=1e-9)
 
 
-def test_the_needed_force_has_slopes_by_the_mode_shape():
+def test_the_inverse_force_says_itself(exact):
+    found = inverse_force(curved(), exact, harmonic_order=ORDER)
+    n = exact.n_states
+    assert repr(found).startswith(f"InverseForce: {n} of {n} motions found")
+    assert found.to_xarray().force_re_n.attrs["units"] == "N"
+    assert isinstance(found.plot(), Figure)
+
+
+def test_the_inverse_force_has_slopes_by_the_mode_shape():
     modes = sj.model.linear_modes([300.0], [0.01], [[2.0]], [3.0])
     data = sj.measure.steady_states([1, 1], [295.0, 305.0], [1.0, 1.0], [0.1 + 0.05j, 0.1 - 0.05j])
 
@@ -161,6 +170,10 @@ def test_exact_data_of_the_flat_beam_give_its_dominant_coefficients():
     np.testing.assert_allclose(found.values, truth, rtol=1e-6)
     assert found.noise_scale < 1e-6
     assert found.model.potential.coefficient_std[20] == found.std[0]
+    assert repr(found).startswith("CalibratedModel: 4 parameters from 12 of 12 steady states")
+    assert "potential.1111 = " in repr(found)
+    np.testing.assert_array_equal(found.to_xarray().parameter, names)
+    assert isinstance(found.plot(), Figure)
 
 
 @pytest.mark.long
@@ -316,7 +329,8 @@ def test_data_that_do_not_do_are_told(exact):
         calibrate_model(curved(), rows(exact, [0]), NAMES)
     with pytest.raises(ValueError, match="sensors"):
         calibrate_model(sj.model.flat_beam(), dataclasses.replace(exact, sensors=("a",)), NAMES)
-    unknown = dataclasses.replace(exact, force=jnp.full(exact.n_states, jnp.nan))
+    nothing = jnp.full(exact.n_states, jnp.nan)
+    unknown = dataclasses.replace(exact, force=nothing, drive=jnp.ones(exact.n_states))
     with pytest.raises(ValueError, match="calibrate_force"):
         calibrate_model(curved(), unknown, NAMES)
     with pytest.raises(ValueError, match="level_gain_std"):
