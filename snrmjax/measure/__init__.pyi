@@ -6,7 +6,7 @@ from .force_calibration import (
     calibrate_force,
     equivalent_force,
 )
-from .harmonic_fit import FitStatus, HarmonicFit, fit_harmonics, phasor_relative_to_force
+from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_relative_to_force
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .records import RecordFit, fit_records, steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
@@ -14,11 +14,11 @@ from .states import OptionalColumns, SteadyStates, join_steady_states, steady_st
 
 __all__ = [
     "EquivalentForce",
-    "FitStatus",
     "ForceCalibration",
     "ForceStatus",
     "ForceVelocityLoop",
     "HarmonicFit",
+    "HarmonicFitStatus",
     "OptionalColumns",
     "RecordFit",
     "SteadyStates",

@@ -13,7 +13,7 @@ from snrmjax.measure.signals import checked_amplitudes, require_orders
 from snrmjax.numerics.finite_slopes import safe_root
 
 
-class FitStatus(IntEnum):
+class HarmonicFitStatus(IntEnum):
     """How the harmonic fit of one record ended."""
 
     SUCCESSFUL = 0
@@ -22,16 +22,16 @@ class FitStatus(IntEnum):
     FREQUENCY_NOT_FOUND = 3  # the refined frequency is not held by the record
 
 
-FIT_MESSAGE: dict[FitStatus, str] = {
-    FitStatus.SUCCESSFUL: "fitted",
-    FitStatus.NOT_FINITE: (
+FIT_MESSAGE: dict[HarmonicFitStatus, str] = {
+    HarmonicFitStatus.SUCCESSFUL: "fitted",
+    HarmonicFitStatus.NOT_FINITE: (
         "a sample is not finite, or the frequency is not finite and positive; remove such samples"
     ),
-    FitStatus.RANK_DEFICIENT: (
+    HarmonicFitStatus.RANK_DEFICIENT: (
         "the samples cannot tell the harmonics apart; record longer (a period or more), sample "
         "faster than twice the highest harmonic, or fit fewer harmonics"
     ),
-    FitStatus.FREQUENCY_NOT_FOUND: (
+    HarmonicFitStatus.FREQUENCY_NOT_FOUND: (
         "the record does not hold a frequency near the given one (within 2/duration in Hz and a "
         "quarter of it); start closer, or record longer if the tone is lost in noise"
     ),
@@ -43,7 +43,7 @@ class HarmonicFit(eqx.Module):
 
     `harmonic_order` starts with 0, the (real) mean. The covariance is that of the real parts of
     all harmonics followed by their imaginary parts; it is NaN when no degree of freedom is left.
-    Everything but `condition` is NaN where `status` is not `FitStatus.SUCCESSFUL`.
+    Everything but `condition` is NaN where `status` is not `HarmonicFitStatus.SUCCESSFUL`.
     """
 
     amplitude: Complex[Array, "*batch harmonic"]  # unit of the record, peak
@@ -230,11 +230,13 @@ def _fit_one(
 
     turned = jax.jacfwd(parts)(unknown) @ root
     real, imag = jnp.split(parts(unknown), 2)
-    status = jnp.where(converged, int(FitStatus.SUCCESSFUL), int(FitStatus.FREQUENCY_NOT_FOUND))
+    status = jnp.where(
+        converged, int(HarmonicFitStatus.SUCCESSFUL), int(HarmonicFitStatus.FREQUENCY_NOT_FOUND)
+    )
     separable = (condition <= max_condition) & (freedom >= 0)
-    status = jnp.where(separable, status, int(FitStatus.RANK_DEFICIENT))
-    status = jnp.where(finite, status, int(FitStatus.NOT_FINITE))
-    good = status == int(FitStatus.SUCCESSFUL)
+    status = jnp.where(separable, status, int(HarmonicFitStatus.RANK_DEFICIENT))
+    status = jnp.where(finite, status, int(HarmonicFitStatus.NOT_FINITE))
+    good = status == int(HarmonicFitStatus.SUCCESSFUL)
 
     def masked(value: Array) -> Array:
         return jnp.where(good, value, jnp.nan)

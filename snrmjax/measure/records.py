@@ -10,8 +10,8 @@ from jaxtyping import Array, Complex, Float, Shaped
 
 from snrmjax.measure.harmonic_fit import (
     FIT_MESSAGE,
-    FitStatus,
     HarmonicFit,
+    HarmonicFitStatus,
     checked_frequency,
     fit_harmonics,
     orders_with_mean,
@@ -99,7 +99,7 @@ def _fit_together(
     std, found = jnp.array(jnp.nan), jnp.array(True)
     if refine:
         alone = fit_harmonics(time, records, frequency, orders, refine_frequency=True)
-        good = alone.status == int(FitStatus.SUCCESSFUL)
+        good = alone.status == int(HarmonicFitStatus.SUCCESSFUL)
         found = jnp.any(good)
         # Rounding is the floor: without it a record free of noise would weigh infinitely.
         variance = alone.frequency_std**2 + (1e-14 * alone.frequency) ** 2
@@ -151,13 +151,15 @@ def steady_state_from_records(
         harmonic_order,
         refine_frequency=refine_frequency,
     )
-    measured = np.asarray(fit.velocity.status) == FitStatus.SUCCESSFUL
+    measured = np.asarray(fit.velocity.status) == HarmonicFitStatus.SUCCESSFUL
     for name, good, status in (
-        ("force_record", fit.force.status == FitStatus.SUCCESSFUL, fit.force.status),
+        ("force_record", fit.force.status == HarmonicFitStatus.SUCCESSFUL, fit.force.status),
         ("velocity_records", measured.any(), fit.velocity.status[0]),
     ):
         if not good:
-            raise ValueError(f"`{name}` cannot be fitted: {FIT_MESSAGE[FitStatus(int(status))]}.")
+            raise ValueError(
+                f"`{name}` cannot be fitted: {FIT_MESSAGE[HarmonicFitStatus(int(status))]}."
+            )
     higher = tuple(order for order in harmonic_order if order != 1)
     state = {name: np.asarray(value)[None] for name, value in _state_of(fit, higher).items()}
     return steady_states(
@@ -176,7 +178,7 @@ def _state_of(fit: RecordFit, higher: tuple[int, ...]) -> dict[str, Array]:
     first = orders.index(1)
     stored = np.asarray([orders.index(order) for order in higher], dtype=int)
     amplitudes = fit.velocity_harmonics
-    good = fit.velocity.status == int(FitStatus.SUCCESSFUL)
+    good = fit.velocity.status == int(HarmonicFitStatus.SUCCESSFUL)
     noisy = [k for k in stored if orders[k] > 1] or list(stored)  # the mean has half an error
     floor = jnp.mean(fit.velocity.complex_std[:, np.asarray(noisy, dtype=int)] ** 2, axis=-1)
     return {

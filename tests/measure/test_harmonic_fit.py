@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.harmonic_fit import FitStatus, fit_harmonics, phasor_relative_to_force
+from snrmjax.measure.harmonic_fit import HarmonicFitStatus, fit_harmonics, phasor_relative_to_force
 from snrmjax.measure.signals import synthesise
 
 OMEGA = 2 * np.pi * 80.0
@@ -47,7 +47,7 @@ class TestFit:
     def test_recovers_exact_harmonics(self, periods):
         time = uneven_times(periods, 120)
         fit = fit_harmonics(time, signal(time), OMEGA, ORDERS)
-        assert fit.status == FitStatus.SUCCESSFUL
+        assert fit.status == HarmonicFitStatus.SUCCESSFUL
         assert fit.harmonic_order == (0, 1, 2, 3)
         # Rounding times the condition number of the fit, below 10.
         np.testing.assert_allclose(fit.amplitude, TRUTH, atol=1e-13)
@@ -130,7 +130,7 @@ class TestFit:
         time = uneven_times(1.0, 7)
         fit = fit_harmonics(time, signal(time), OMEGA, ORDERS)
         assert fit.degrees_of_freedom == 0
-        assert fit.status == FitStatus.SUCCESSFUL
+        assert fit.status == HarmonicFitStatus.SUCCESSFUL
         # Seven random samples: the condition number is in the hundreds.
         np.testing.assert_allclose(fit.amplitude, TRUTH, atol=1e-11)
         assert np.isnan(fit.noise_std)
@@ -150,8 +150,13 @@ class TestFit:
         for refine in (False, True)[: 2 if time.size == N_SAMPLES else 1]:
             fit = fit_harmonics(time, signal(time), OMEGA, ORDERS, refine_frequency=refine)
             # A refined frequency leaves the aliased one, which parts the harmonics a little.
-            assert fit.status in (FitStatus.RANK_DEFICIENT, FitStatus.FREQUENCY_NOT_FOUND)
-            assert refine or (fit.status == FitStatus.RANK_DEFICIENT and fit.condition > 1e6)
+            assert fit.status in (
+                HarmonicFitStatus.RANK_DEFICIENT,
+                HarmonicFitStatus.FREQUENCY_NOT_FOUND,
+            )
+            assert refine or (
+                fit.status == HarmonicFitStatus.RANK_DEFICIENT and fit.condition > 1e6
+            )
             for value in (fit.amplitude, fit.covariance, fit.residual_rms, fit.noise_std):
                 assert np.isnan(value).all()
 
@@ -160,7 +165,7 @@ class TestFit:
         records = np.stack([signal(time)] * 3)
         records[1, 7] = np.nan
         fit = fit_harmonics(time, records, OMEGA, ORDERS)
-        assert fit.status.tolist() == [0, FitStatus.NOT_FINITE, 0]
+        assert fit.status.tolist() == [0, HarmonicFitStatus.NOT_FINITE, 0]
         assert np.isnan(fit.amplitude[1]).all()
         np.testing.assert_allclose(fit.amplitude[::2], [TRUTH, TRUTH], atol=1e-13)  # rounding
 
@@ -188,9 +193,9 @@ class TestFit:
             fit = fit_harmonics(time, y, omega, ORDERS)
             return fit.status, fit.amplitude
 
-        assert compiled(signal(time), OMEGA)[0] == FitStatus.SUCCESSFUL
+        assert compiled(signal(time), OMEGA)[0] == HarmonicFitStatus.SUCCESSFUL
         status, amplitude = compiled(2.0 * signal(time), -1.0)
-        assert status == FitStatus.NOT_FINITE
+        assert status == HarmonicFitStatus.NOT_FINITE
         assert np.isnan(amplitude).all()
         assert len(traces) == 1
 
@@ -275,7 +280,7 @@ class TestRefinedFrequency:
     def test_finds_the_tone_from_a_lobe_away(self, lobes):
         near = OMEGA + 2 * np.pi * lobes / self.duration
         fit = fit_harmonics(self.time, signal(self.time), near, ORDERS, refine_frequency=True)
-        assert fit.status == FitStatus.SUCCESSFUL
+        assert fit.status == HarmonicFitStatus.SUCCESSFUL
         # The solver's tolerance, 1e-8 of 4π/duration = 0.2 Ω.
         np.testing.assert_allclose(fit.frequency, OMEGA, rtol=2e-9)
 
@@ -283,9 +288,9 @@ class TestRefinedFrequency:
         far = OMEGA + 2 * np.pi * 2.6 / self.duration
         noise = np.random.default_rng(10).standard_normal(N_SAMPLES)
         for values, expected in (
-            (signal(self.time), FitStatus.FREQUENCY_NOT_FOUND),
-            (noise, FitStatus.FREQUENCY_NOT_FOUND),
-            (np.zeros(N_SAMPLES), FitStatus.RANK_DEFICIENT),
+            (signal(self.time), HarmonicFitStatus.FREQUENCY_NOT_FOUND),
+            (noise, HarmonicFitStatus.FREQUENCY_NOT_FOUND),
+            (np.zeros(N_SAMPLES), HarmonicFitStatus.RANK_DEFICIENT),
         ):
             fit = fit_harmonics(self.time, values, far, ORDERS, refine_frequency=True)
             assert fit.status == expected

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.harmonic_fit import FitStatus, fit_harmonics
+from snrmjax.measure.harmonic_fit import HarmonicFitStatus, fit_harmonics
 from snrmjax.measure.records import fit_records, steady_state_from_records
 
 OMEGA = 2 * np.pi * 80.0
@@ -146,7 +146,7 @@ class TestRecords:
             steady_state_from_records(1e-3 * self.time, force, velocity, OMEGA)
         noise = np.random.default_rng(17).standard_normal((3, N_SAMPLES))
         fit = fit_records(self.time, noise[0], noise[1:], OMEGA, ORDERS, refine_frequency=True)
-        assert fit.force.status == FitStatus.FREQUENCY_NOT_FOUND
+        assert fit.force.status == HarmonicFitStatus.FREQUENCY_NOT_FOUND
         assert np.isnan(fit.force.frequency_std)
         assert np.isnan(fit.velocity.amplitude).all()
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.model.structures import Structure
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
 
@@ -33,7 +33,7 @@ class CalibratedModel(AbstractResult):
     reduced_chi_square: float
     names: tuple[str, ...] = eqx.field(static=True)
     noise_stated: bool = eqx.field(static=True)
-    status: FitStatus = eqx.field(static=True)
+    status: MinimisationStatus = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
 
     @property

@@ -36,7 +36,7 @@ from snrmjax.model.parameters import (
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
 class _Round(NamedTuple):
@@ -280,7 +280,7 @@ class _Fitted(NamedTuple):
     residuals: Float[np.ndarray, "state column"]
     jacobian: Float[np.ndarray, "row unknown"]
     usable: Bool[np.ndarray, " state"]
-    status: FitStatus
+    status: MinimisationStatus
 
 
 def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, aim: _Aim) -> _Fitted:
@@ -288,7 +288,7 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
     subject = (model, states, settings)
     unknowns = jnp.zeros(len(settings.names) + settings.n_levels * len(settings.shared))
     slopes = _slopes(*subject, aim, unknowns, _grown(*subject, aim.values))
-    status, relative = FitStatus.NOT_FITTED, np.asarray(aim.values) != 0
+    status, relative = MinimisationStatus.NOT_FITTED, np.asarray(aim.values) != 0
     for turn, (step, harmonic_error, tolerance) in enumerate(_ROUNDS):
         lost = ~np.isfinite(np.asarray(slopes.points[:, -1]))
         if turn and lost.any():
@@ -305,9 +305,9 @@ def _fitted(model: Structure, states: CalibrationStates, settings: _Settings, ai
             *subject, aim, unknowns, slopes, whiten, unit, hold, jnp.asarray(tolerance)
         )
         slopes = _slopes(*subject, aim, unknowns, near)
-        status = FitStatus.CONVERGED if bool(ended) else FitStatus.STEP_LIMIT
+        status = MinimisationStatus.CONVERGED if bool(ended) else MinimisationStatus.STEP_LIMIT
     if not np.any(np.asarray(whiten)):
-        status = FitStatus.NOT_FINITE
+        status = MinimisationStatus.NOT_FINITE
     return _Fitted(
         unknowns=np.asarray(unknowns),
         residuals=whitened_columns(*map(np.asarray, (whiten, slopes.columns))),
@@ -374,7 +374,7 @@ def _notes(
     chosen: ComparedColumns, names: tuple[str, ...], found: _Fitted, reduced: float, margin: float
 ) -> list[str]:
     notes = []
-    if found.status == FitStatus.NOT_FINITE:
+    if found.status == MinimisationStatus.NOT_FINITE:
         notes.append("no balanced motion was found for any state: nothing was fitted.")
     elif not found.status.found_minimum:
         notes.append(
