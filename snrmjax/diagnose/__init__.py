@@ -1,4 +1,4 @@
-"""What a model lacks: where it disagrees with measured states, what that is, and the proof."""
+"""What a model lacks: where it disagrees with measured states, and which effects explain it."""
 
 import lazy_loader
 

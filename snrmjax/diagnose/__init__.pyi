@@ -1,4 +1,15 @@
+from .checks.verdict import Verdict
+from .completed_model import CompletedStatus
+from .design.discriminating_test import DiscriminatingTest
 from .diagnosis import diagnose_model
-from .diagnosis_result import Diagnosis
+from .diagnosis_result import Answer, Diagnosis, Estimate
 
-__all__ = ["Diagnosis", "diagnose_model"]
+__all__ = [
+    "Answer",
+    "CompletedStatus",
+    "Diagnosis",
+    "DiscriminatingTest",
+    "Estimate",
+    "Verdict",
+    "diagnose_model",
+]

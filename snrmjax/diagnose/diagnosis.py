@@ -315,11 +315,19 @@ def _unconverged(found: FoundEffects) -> list[float]:
 
 
 def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
-    if not behind:
-        return []
-    tried, near = sum(len(step) for step in found.table), sum(one < AS_GOOD for one in behind)
-    return [
-        f"{len(behind)} of {tried} fits that were compared had not converged when they ended; "
-        f"{near or 'none'} of them came within {AS_GOOD:g} of the best fit of their step by "
-        "Schwarz's criterion, which counts as equal."
-    ]
+    notes, rows = [], [row for step in found.table for row in step]
+    lost = sorted({row.kind for row in rows if row.status is FitStatus.NOT_FINITE})
+    behind = [one for one in behind if np.isfinite(one)]
+    near = sum(one < AS_GOOD for one in behind)
+    if behind:
+        notes.append(
+            f"{len(behind)} of {len(rows)} fits that were compared had not converged when they "
+            f"ended; {near or 'none'} of them came within {AS_GOOD:g} of the best fit of their "
+            "step by Schwarz's criterion, which counts as equal."
+        )
+    if lost:
+        notes.append(
+            f"{', '.join(lost)} could not be fitted: with no starting point does the model have "
+            "the measured motions."
+        )
+    return notes

@@ -9,6 +9,7 @@ import numpy as np
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
+from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
@@ -34,6 +35,7 @@ class LevelResponse(NamedTuple):
     before: PhaseResonance
     after: PhaseResonance
     held_out: bool  # whether the model of `after` was not fitted to the level
+    complete: bool = True  # whether both responses were traced to the end of the range
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
@@ -187,6 +189,13 @@ def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> li
                 simulated_resonance(old, sensor),
                 simulated_resonance(own, sensor),
                 level in simulated.without_level,
+                _complete(old) and _complete(own),
             )
         )
     return rows
+
+
+def _complete(curves: Sequence[ResponseCurve]) -> bool:
+    """Whether a response was traced to the upper end of the range of frequencies."""
+    main = [curve for curve in curves if curve.branch == "main"]
+    return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)

@@ -1,5 +1,6 @@
 """The report of a diagnosis: verdict, effects and their laws, evidence, resonances."""
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -90,6 +91,7 @@ def write_diagnosis(
     figures = diagnosis_figures(found)
     if simulate and found.effects and found.completed is not None:
         predicted, figures["responses"] = with_responses(found, model)
+        found = dataclasses.replace(found, notes=(*found.notes, *_incomplete(predicted)))
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, predicted))
     if found.completed is not None:
         write_model(folder / "model.toml", found.completed)
@@ -118,6 +120,16 @@ def with_responses(diagnosis: Diagnosis, model: Structure) -> tuple[list[LevelRe
     predicted = level_responses(simulated, data, sensor)
     old, new = ([c for one in curves for c in one] for curves in simulated[:2])
     return predicted, comparison_figure(old, new, data, sensor=data.sensors[sensor])
+
+
+def _incomplete(predicted: Sequence[LevelResponse]) -> list[str]:
+    levels = [str(one.level) for one in predicted if not one.complete]
+    if not levels:
+        return []
+    return [
+        f"the simulated responses of level {', '.join(levels)} were not traced to the end of the "
+        "frequency range: a resonance may be missing there."
+    ]
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
@@ -327,7 +339,11 @@ def _tried(row: TriedEffect) -> tuple[str, str, str]:
         f"{_words(name)} {number(value, 3)} {_unit(row.kind, name)}".strip()
         for name, (value, _) in own.items()
     ]
-    return effect_name(row.kind), f"{row.gain:.0f}", ", ".join(values)
+    return (
+        effect_name(row.kind),
+        f"{row.gain:.0f}" if np.isfinite(row.gain) else "not fitted",
+        ", ".join(values),
+    )
 
 
 _PARTS = {

@@ -1,5 +1,7 @@
 """What a diagnosis shows of itself: one screen of text, a labelled data set, a figure."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -7,7 +9,10 @@ from truth.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
+from snrmjax.diagnose.diagnosis import _notes_on_fits, _unconverged
 from snrmjax.diagnose.diagnosis_result import unit_of
+from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.numerics.levenberg_marquardt import FitStatus
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +62,23 @@ def test_fits_that_did_not_converge_are_marked_and_counted(found):
     assert len(notes) == bool(unconverged)
     if notes:
         assert notes[0].startswith(f"{len(unconverged)} of {len(rows)} fits")
+
+
+def test_effects_that_could_not_be_fitted_are_named():
+    def tried(kind, gain, status):
+        return TriedEffect(kind, gain, -gain, {}, status)
+
+    step = (
+        tried("cubic_damping", 50.0, FitStatus.CONVERGED),
+        tried("quadratic_damping", 47.0, FitStatus.STEP_LIMIT),
+        tried("jenkins_slider", 3.0, FitStatus.STEP_LIMIT),
+        tried("one_sided_stop", -np.inf, FitStatus.NOT_FINITE),
+    )
+    found = SimpleNamespace(table=(step,))
+    unconverged, lost = _notes_on_fits(found, _unconverged(found))
+    assert unconverged.startswith("2 of 4 fits")
+    assert "1 of them came within 6" in unconverged
+    assert lost.startswith("one_sided_stop could not be fitted")
 
 
 def test_every_verdict_has_a_sentence_of_its_own():

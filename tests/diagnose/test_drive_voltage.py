@@ -53,7 +53,7 @@ def test_the_python_verb_takes_a_drive_voltage():
 def test_a_drive_voltage_without_phases_is_diagnosed():
     """A joint fit would need the phases, and sends to the diagnosis for want of them."""
     data = without_phases(driven(balanced(quadratic)))
-    with pytest.raises(ValueError, match="diagnosis"):
+    with pytest.raises(ValueError, match="snrmjax diagnose"):
         sj.fit_jointly(data, linear_model())
     found = sj.diagnose_model(linear_model(), data)
     assert "quadratic_damping" in found.candidates[0]

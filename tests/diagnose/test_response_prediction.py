@@ -18,6 +18,7 @@ from snrmjax.diagnose.response_prediction import (
     simulated_resonance,
 )
 from snrmjax.model.effects import EFFECTS, make_effect
+from snrmjax.report.diagnosis_report import _incomplete
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
 FORCES = (1.0, 4.0)
@@ -145,3 +146,17 @@ def test_without_phases_a_resonance_is_the_largest_velocity_over_force():
     side = states(model, phases=(10.0, 30.0, 50.0))
     side = dataclasses.replace(side, phase_std=np.full(side.velocity.shape, np.pi))
     assert np.isnan(measured_resonance(side, 0, 0).frequency)
+
+
+def test_a_response_that_ends_early_is_said():
+    model, data = linear(), states(linear())
+    damped = make_effect("linear_damping_change", {"damping_ratio_change": ZETA})
+    doubled = dataclasses.replace(model, effects=(damped,))
+    found = level_simulations(LevelModels(model, doubled), data, 0)
+    assert all(row.complete for row in level_responses(found, data, 0))
+    (curve,) = found.after[1]
+    found.after[1][0] = dataclasses.replace(curve, status=sj.simulate.CurveStatus.POINT_LIMIT)
+    rows = level_responses(found, data, 0)
+    assert [row.complete for row in rows] == [True, False]
+    (note,) = _incomplete(rows)
+    assert "level 1 were not traced to the end" in note

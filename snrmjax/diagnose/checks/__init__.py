@@ -1,1 +1,1 @@
-"""Whether an answer may be believed: patterns left over, levels left out, doubts."""
+"""Checks of an answer: patterns in the residuals, cross-validation, doubts, the verdict."""

@@ -1,1 +1,1 @@
-"""Which further test would settle what is open."""
+"""Which further test would separate models that fit equally well: optimal design."""

@@ -1,1 +1,1 @@
-"""Where the misfit lies, and which effects explain it."""
+"""Which part of the force balance disagrees, and which effects explain it."""

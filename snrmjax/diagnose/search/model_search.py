@@ -265,13 +265,13 @@ def _promising(
 def _tried(
     misfit: WeightedMisfit, every: dict[str, EffectCandidate], before: EffectFit
 ) -> tuple[WeightedMisfit, list[EffectFit], tuple[TriedEffect, ...]]:
-    """Candidates, the promising ones weighed with the best one's way of passing on errors.
+    """Fits of candidates, those near the best again with errors passed on as the best one does.
 
-    Returns all of them as rows for a report too, in the noise that all share.
+    Returns the misfit so weighted, these fits, and all first fits as rows of the table.
     """
     fits = fit_effects(misfit, [(c, before) for c in _promising(misfit, every, before)])
-    fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     rows = _table(misfit, before, fits)
+    fits = [fit for fit in fits if np.isfinite(fit.chi_square)]
     if not fits:
         return misfit, [], rows
     best = min(fits, key=lambda fit: fit.criterion(misfit.n_rows))
