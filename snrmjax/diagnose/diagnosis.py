@@ -316,7 +316,7 @@ def _unconverged(found: FoundEffects) -> list[float]:
 
 def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     notes, rows = [], [row for step in found.table for row in step]
-    lost = sorted({row.kind for row in rows if row.status is FitStatus.NOT_FINITE})
+    lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
     behind = [one for one in behind if np.isfinite(one)]
     near = sum(one < AS_GOOD for one in behind)
     if behind:

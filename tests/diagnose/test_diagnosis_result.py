@@ -12,7 +12,7 @@ from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
 from snrmjax.diagnose.diagnosis import _notes_on_fits, _unconverged
 from snrmjax.diagnose.diagnosis_result import unit_of
 from snrmjax.diagnose.search.model_search import TriedEffect
-from snrmjax.numerics.levenberg_marquardt import FitStatus
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,10 @@ def test_effects_that_could_not_be_fitted_are_named():
         return TriedEffect(kind, gain, -gain, {}, status)
 
     step = (
-        tried("cubic_damping", 50.0, FitStatus.CONVERGED),
-        tried("quadratic_damping", 47.0, FitStatus.STEP_LIMIT),
-        tried("jenkins_slider", 3.0, FitStatus.STEP_LIMIT),
-        tried("one_sided_stop", -np.inf, FitStatus.NOT_FINITE),
+        tried("cubic_damping", 50.0, MinimisationStatus.CONVERGED),
+        tried("quadratic_damping", 47.0, MinimisationStatus.STEP_LIMIT),
+        tried("jenkins_slider", 3.0, MinimisationStatus.STEP_LIMIT),
+        tried("one_sided_stop", -np.inf, MinimisationStatus.NOT_FINITE),
     )
     found = SimpleNamespace(table=(step,))
     unconverged, lost = _notes_on_fits(found, _unconverged(found))

@@ -264,6 +264,6 @@ def test_amplitudes_count_once():
 def test_what_needs_phases_says_so(verb):
     data = without_phases(balanced(quadratic), slice(0, 2))
     with pytest.raises(
-        ValueError, match=r"needs the phases .* 2 of 45 .*`velocity_m_s`.* diagnosis"
+        ValueError, match=r"needs the phases .* 2 of 45 .*`velocity_m_s`.*`snrmjax diagnose`"
     ):
         verb(linear_model(), data)
