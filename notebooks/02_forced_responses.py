@@ -212,11 +212,11 @@ c.annotate(
     **note,
 )
 c.set(xlim=(1e-6, 2e-1))
-for curve in held:
+for height, curve in zip((7, 16, 26, 36), held, strict=True):
     x, y = curve.frequency / HERTZ, curve.force * 1e3
     d.plot(x, y, color="0.4", linewidth=drawing.LINE)
-    low = int(np.argmin(y))  # the curves' valleys lie apart from one another
-    d.annotate(f"{level(curve)[0]:.2f} m/s", (x[low], y[low]), (-14, -11), **note)
+    at = np.flatnonzero(y < height)[0]
+    d.annotate(f"{level(curve)[0]:.2f} m/s", (x[at], y[at]), (4, 2), **note)
 d.plot(locked.frequency / HERTZ, locked.force * 1e3, "--", color=ORANGE)
 d.set(ylim=(0, 40), xlim=(70, 110))
 drawing.name_axes(a, "(a) flat beam: responses and backbones", HZ, VELOCITY)

@@ -19,8 +19,10 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneFit, BackboneV
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
+from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
+from snrmjax.report.sampling import span_of
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch
@@ -103,9 +105,11 @@ def _(result: Identification, **settings: Any) -> Figure:
 
 @plot_result.register
 def _(result: BackbonePoints) -> Figure:
-    velocity = result.backbone_velocity
     return simulation_figures.amplitudes_figure(
-        *(velocity, result.natural_frequency, result.damping_ratio), result.sensor, joined=False
+        *(result.backbone_velocity, result.natural_frequency, result.damping_ratio),
+        result.sensor,
+        stds=(result.natural_frequency_std, result.damping_ratio_std),
+        joined=False,
     )
 
 
@@ -113,9 +117,7 @@ def _(result: BackbonePoints) -> Figure:
 def _(result: Backbone) -> Figure:
     ends = float(result.smallest), float(result.largest)
     values = result.values(jnp.asarray(np.linspace(*ends, 200)))
-    return simulation_figures.amplitudes_figure(
-        *(values.velocity, values.natural_frequency, values.damping_ratio), result.sensor
-    )
+    return plot_result(values, sensor=result.sensor)
 
 
 @plot_result.register
@@ -124,15 +126,26 @@ def _(result: BackboneFit) -> Figure:
 
 
 @plot_result.register
-def _(result: BackboneValues) -> Figure:
+def _(result: BackboneValues, *, sensor: str = "the sensor") -> Figure:
     return simulation_figures.amplitudes_figure(
-        result.velocity, result.natural_frequency, result.damping_ratio
+        *(result.velocity, result.natural_frequency, result.damping_ratio),
+        sensor,
+        stds=(result.natural_frequency_std, result.damping_ratio_std),
     )
 
 
 @plot_result.register
 def _(result: PredictedResponse) -> Figure:
-    return simulation_figures.motions_figure(result.frequency, result.velocity, joined=True)
+    figure = simulation_figures.motions_figure(
+        *(result.frequency, result.velocity),
+        sensor="the backbone's sensor",
+        joined=True,
+        stable=result.stable,
+        beyond=result.continued,
+    )
+    low, high = span_of(result, "")
+    figure.axes[0].set_xlim(low / HERTZ, high / HERTZ)
+    return figure
 
 
 @plot_result.register

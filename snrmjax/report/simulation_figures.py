@@ -1,6 +1,7 @@
 """Figures of simulated motions: responses, nonlinear modes, batches and virtual tests."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +11,15 @@ from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.report.sampling import velocity_of
+from snrmjax.report.sampling import BAND, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
     COLUMN,
     CURVE,
     DOT,
+    FILL,
     HOLLOW,
+    IDENTIFIED,
     LINE,
     MEASURED,
     PAGE,
@@ -24,6 +27,7 @@ from snrmjax.report.style import (
     SIMULATED,
     Style,
     explain_lines,
+    fit_axis,
     legend,
     marks,
     name_axes,
@@ -32,6 +36,7 @@ from snrmjax.report.style import (
     plain,
     response_line,
     share_frequencies,
+    stars,
     unit_for,
     with_unit,
 )
@@ -116,27 +121,40 @@ def normal_mode_figure(branch: NormalModeBranch, *, sensor: str | None = None) -
 
 
 def motions_figure(
-    frequency: np.ndarray, velocity: np.ndarray, *, sensor: str = "the first sensor", joined: bool
+    frequency: np.ndarray,
+    velocity: np.ndarray,
+    *,
+    sensor: str = "the first sensor",
+    joined: bool,
+    stable: np.ndarray | None = None,
+    beyond: np.ndarray | None = None,
 ) -> Figure:
     """Amplitude and phase of the velocity of motions against their frequency.
 
     Arguments: `frequency` in rad/s, `velocity` the complex fundamental in m/s, of every motion;
-    `joined` draws them as a curve. Returns the figure. Raises `ValueError` without a motion.
+    `joined` draws them as a curve, dashed where it is not `stable` and pale `beyond` the data.
+    Returns the figure. Raises `ValueError` without a motion.
     """
     speeds, omega = np.atleast_1d(velocity), np.atleast_1d(frequency) / HERTZ
     if not np.any(np.isfinite(speeds)):
         raise ValueError("there is no motion to show: none was found.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
-    figure, ((upper,), (lower,)) = panels(COLUMN, 5.0, 2, 1)
-    style: Style = {"color": SIMULATED, **CURVE} if joined else {**DOT, "color": MEASURED}
-    upper.plot(omega, np.abs(speeds) / unit.size, **style)
-    lower.plot(omega, np.angle(speeds) / DEGREE, **style)
+    figure, ((upper,), (lower,)) = panels(COLUMN, 4.4, 2, 1)
+    steady = np.ones(len(speeds), dtype=bool) if stable is None else stable
+    for axes, y in ((upper, np.abs(speeds) / unit.size), (lower, np.angle(speeds) / DEGREE)):
+        if joined:
+            response_line(axes, omega, y, steady, "response", SIMULATED, LINE, beyond)
+        else:
+            axes.plot(omega, y, **{**DOT, "color": MEASURED})
     upper.set_ylim(bottom=0.0)
     share_frequencies(upper, lower)
     phase_axis(lower)
     title = f"(a) amplitude at {plain(sensor)}"
     name_axes(upper, title, "", f"Velocity amplitude ({unit.name})")
     name_axes(lower, "(b) phase", "Frequency (Hz)", "Velocity phase (°)")
+    if joined and not (np.all(steady) and beyond is None):
+        explain_lines(figure)
+        legend(figure)
     return figure
 
 
@@ -161,11 +179,13 @@ def amplitudes_figure(
     damping_ratio: Float[Array | np.ndarray, " point"],
     sensor: str = "the sensor",
     *,
+    stds: tuple[Any, Any] | None = None,
     joined: bool = True,
 ) -> Figure:
     """Natural frequency and damping ratio of a mode against the velocity amplitude.
 
-    Arguments: `velocity` in m/s at `sensor`, `frequency` in rad/s; `joined` draws a curve.
+    Arguments: `velocity` in m/s at `sensor`, `frequency` in rad/s; `stds` the 1σ of frequency
+    and damping ratio, drawn as 95 % bands or bars; `joined` draws a curve.
     Returns the figure. Raises `ValueError` without a finite point.
     """
     speeds = np.asarray(velocity)
@@ -173,16 +193,25 @@ def amplitudes_figure(
         raise ValueError("there is no mode to show: no point is finite.")
     unit = unit_for(speeds[np.isfinite(speeds)], "m/s")
     figure, ((frequencies, dampings),) = panels(PAGE, 3.2, 1, 2)
-    style: Style = {"color": SIMULATED, **CURVE} if joined else {**DOT, "color": MEASURED}
-    for axes, values in (
-        (frequencies, np.asarray(frequency) / HERTZ),
-        (dampings, 100 * np.asarray(damping_ratio)),
+    colour = SIMULATED if stds is None else IDENTIFIED
+    for number, (axes, values, scale) in enumerate(
+        ((frequencies, frequency, 1 / HERTZ), (dampings, damping_ratio, 100.0))
     ):
-        axes.plot(speeds / unit.size, values, **style)
+        x, y = speeds / unit.size, scale * np.asarray(values)
+        error = None if stds is None else BAND * scale * np.asarray(stds[number])
+        if not joined:
+            stars(axes, x, y, "identified, 95 % bars" if error is not None else None, yerr=error)
+        else:
+            axes.plot(x, y, color=colour, **CURVE, label=None if error is None else "curve")
+            if error is not None:
+                axes.fill_between(x, y - error, y + error, color=colour, **FILL, label="95 % band")
         axes.set_xlim(left=0.0)
+        fit_axis(axes, "y", y)
     level = f"Velocity amplitude ({unit.name})"
     name_axes(frequencies, "(a) natural frequency", level, "Natural frequency (Hz)")
-    name_axes(dampings, f"(b) damping, at {plain(sensor)}", level, "Damping ratio (%)")
+    name_axes(dampings, f"(b) damping, at {plain(sensor)}", level, "Damping ratio (% of critical)")
+    if stds is not None:
+        legend(figure)
     return figure
 
 

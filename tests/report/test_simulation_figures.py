@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from truth.beam_forces import FORCES
+from truth.printed_page import unreadable
 
 from snrmjax.io.units import HERTZ
 from snrmjax.report import simulation_figures as plot
@@ -66,3 +68,28 @@ def test_normal_mode_against_frequency_and_energy(mode):
     np.testing.assert_allclose(peak[small], fundamental.get_ydata()[small], rtol=0.01)
     with pytest.raises(ValueError, match="the branch has no point"):
         plot.normal_mode_figure(dataclasses.replace(mode, frequency=np.zeros(0)))
+
+
+def test_results_are_drawn_with_their_errors_and_stability(identification, backbone, predicted):
+    points, curve = identification.points, backbone.plot()
+    stars = identification.points.plot()
+    for figure in (curve, stars):
+        natural, ratio = figure.axes
+        assert natural.get_ylabel() == "Natural frequency (Hz)"
+        assert ratio.get_ylabel() == "Damping ratio (% of critical)"
+        assert unreadable(figure) == []
+    (bars,) = [c for c in stars.axes[1].collections if hasattr(c, "get_segments")]
+    lengths = [np.ptp(segment[:, 1]) for segment in bars.get_segments()]
+    np.testing.assert_allclose(lengths, 2 * 196 * np.asarray(points.damping_ratio_std), rtol=1e-9)
+    corners = curve.axes[1].collections[0].get_paths()[0].vertices
+    end = backbone.values(jnp.asarray([float(backbone.largest)]))
+    at_end = corners[np.isclose(corners[:, 0], float(end.velocity[0]), rtol=1e-9), 1]
+    width = 2 * 196 * float(end.damping_ratio_std[0])
+    assert np.ptp(at_end) == pytest.approx(width, rel=1e-6)
+    (response,) = predicted
+    speeds = response.plot().axes[0]
+    dashed = [line for line in speeds.lines if line.get_linestyle() == "--"]
+    drawn = sum(len(line.get_xdata()) - 1 for line in dashed if len(line.get_xdata()))
+    assert drawn == np.sum(~response.stable) > 0
+    low, high = speeds.get_xlim()
+    assert response.frequency.min() / HERTZ < low < high < response.frequency.max() / HERTZ
