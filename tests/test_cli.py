@@ -221,16 +221,27 @@ def test_a_wrong_model_ends_with_two(files, tmp_path):
     assert not out.exists()
 
 
-def test_a_wrong_range_ends_with_two(files, tmp_path):
-    model, _ = files
-    out = tmp_path / "out"
-    done = run(
-        *("simulate", str(model), "--force", "1e-4", "--from-hz", "80", "--to-hz", "50"),
-        *("--out", str(out)),
-    )
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        (("simulate", "--force", 1, "--from-hz", 80, "--to-hz", 50), ("--from-hz", "80 and 50 Hz")),
+        (("simulate", "--force", -1, "--from-hz", 50, "--to-hz", 80), ("--force", "-1 N")),
+        (("nnm", "--to-hz", -5), ("--to-hz", "-5 Hz")),
+        (("nnm", "--to-hz", 64.78), ("--to-hz", "64.78 Hz")),
+        (("identify", "--predict-force", 0), ("--predict-force", "0 N")),
+    ],
+    ids=lambda value: " ".join(map(str, value)),
+)
+def test_a_wrong_number_ends_with_two_in_the_units_of_the_option(files, tmp_path, command, named):
+    model, data = files
+    name, *options = command
+    where = [data, "--model", model] if name == "identify" else [model]
+    done = run(name, *where, *options, "--out", tmp_path / "out")
     assert done.code == 2
-    assert "Traceback" not in done.stderr
-    assert not out.exists()
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert all(word in line for word in named)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):

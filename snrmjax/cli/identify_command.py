@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import FILES, Out
+from snrmjax.cli.options import FILES, Out, require_positive
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 
@@ -176,6 +176,8 @@ def identify(
 
     given = {name for name in context.params if _was_given(context, name)}
     _check_options(given)
+    require_positive("--predict-force", predict_force or (), "N")
+    require_positive("--predict-drive", predict_drive or (), "V")
     loads = workflow.Loads(tuple(predict_force or ()), tuple(predict_drive or ()), extrapolate)
     with staged(out) as folder:
         structure = read_model(model)
@@ -223,7 +225,7 @@ def _check_options(given: set[str]) -> None:
         if asking and name in given:
             raise ValueError(
                 f"`--{name}` belongs to the curves through points and has no effect on a joint "
-                f"fit, which {' and '.join(asking)} asks for: {remedy}, or leave one of them out."
+                f"fit, which {' and '.join(asking)} asks for ({remedy}): leave one of them out."
             )
     if "robust" in given and not asking:
         raise ValueError("`--robust` belongs to a joint fit: add `--fit auto`, or leave it out.")

@@ -8,7 +8,7 @@ import typer
 
 import snrmjax as sj
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.options import Harmonics, Model, Out
+from snrmjax.cli.options import Harmonics, Model, Out, require_positive
 from snrmjax.io.models import read_model
 from snrmjax.io.units import HERTZ
 from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE
@@ -60,6 +60,12 @@ def simulate(
     from snrmjax.report.figures import save_figure
     from snrmjax.report.simulation_figures import simulated_response_figure
 
+    if not 0 < from_hz < to_hz:
+        raise ValueError(
+            "`--from-hz` must be above zero and below `--to-hz`, but they are "
+            f"{from_hz:g} and {to_hz:g} Hz."
+        )
+    require_positive("--force", force, "N")
     with staged(out) as folder:
         structure = read_model(model)
         _report_equilibria(structure)
@@ -94,6 +100,9 @@ def simulate(
         sensor = _sensor(structure)
         results.write_response(folder / "response.csv", curves, sensor=sensor)
         save_figure(simulated_response_figure(curves, sensor=sensor), folder / "response.png")
+    for curve in curves:
+        say(_headline(curve, sensor))
+    say(f"written to {out}")
 
 
 def nnm(
@@ -125,8 +134,12 @@ def nnm(
     from snrmjax.report.figures import save_figure
     from snrmjax.report.simulation_figures import normal_mode_figure
 
+    require_positive("--to-hz", [to_hz], "Hz")
     with staged(out) as folder:
         structure = read_model(model)
+        linear = float(structure.modes.natural_frequency[structure.modes.mode_of_interest]) / HERTZ
+        if np.isclose(to_hz, linear, rtol=1e-12):
+            raise ValueError(f"`--to-hz` must differ from the linear frequency, {linear:g} Hz.")
         _report_equilibria(structure)
         branch = sj.nonlinear_normal_mode(
             structure, to_hz * HERTZ, harmonic_order=harmonics, tongues=tongues.value
@@ -144,10 +157,26 @@ def nnm(
         sensor = _sensor(structure)
         results.write_normal_mode(folder / "nnm.csv", branch, sensor=sensor)
         save_figure(normal_mode_figure(branch, sensor=sensor), folder / "nnm.png")
+    speed = np.abs(branch.velocity[-1, 1, branch.sensors.index(sensor)])
+    say(f"the mode ends at {branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {sensor}")
+    say(f"written to {out}")
 
 
 def _sensor(structure: sj.model.Structure) -> str:
     return structure.modes.sensors[sj.identify.reference_sensor(structure.modes)]
+
+
+def _headline(curve: sj.simulate.ResponseCurve, sensor: str) -> str:
+    """The largest response of a curve in one line."""
+    speed = np.abs(curve.velocity[:, 1, curve.sensors.index(sensor)])
+    name = "" if curve.branch == "main" else f" ({curve.branch})"
+    if not speed.size:
+        return f"force {curve.force:g} N{name}: no response"
+    top = int(np.argmax(speed))
+    return (
+        f"force {curve.force:g} N{name}: {speed[top]:.4g} m/s at {sensor} at most, at "
+        f"{curve.frequency[top] / HERTZ:.5g} Hz; {len(curve.at_events('fold'))} folds"
+    )
 
 
 def _report_truncation(curves: list[sj.simulate.ResponseCurve], harmonics: int) -> None:

@@ -85,8 +85,10 @@ class Prediction(NamedTuple):
 
     @property
     def load(self) -> str:
-        """The force in words, as it was asked for."""
-        return f"{self.force:g} N" if self.drive is None else f"{self.drive:.6g} V"
+        """The force in words, and its drive voltage where the force is known as one."""
+        if self.drive is None:
+            return f"{self.force:g} N"
+        return f"{self.drive:.5g} V ({self.force:.4g} N)"
 
 
 class Findings(NamedTuple):
@@ -222,8 +224,8 @@ def identify_jointly(
 def _require_drive(data: SteadyStates) -> None:
     if np.any(np.isfinite(np.asarray(data.force))):
         raise ValueError(
-            "--predict-drive is for data with a drive voltage (`drive_v`), but these have the "
-            "force in newtons (`force_n`): use --predict-force."
+            "`--predict-drive` is for data with a drive voltage (`drive_v`), but these have the "
+            "force in newtons (`force_n`): use `--predict-force`."
         )
 
 
@@ -255,7 +257,7 @@ def headline(found: Findings) -> list[str]:
         f"{hertz[k]:.5g} Hz and {ratio[k]:.3g} % of critical damping at {speed[k]:.3g} m/s"
         for k in (0, -1)
     ]
-    lines = [f"backbone: {ends[0]}, {ends[1]}"]
+    lines = [f"backbone: {ends[0]} to {ends[1]}"]
     for one in found.predictions:
         for each in one.resonances:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
