@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from truth.exact_states import damping, modes, noisy, squared
+from truth.joint_fits import exact_fit, noisy_fit
 from truth.printed_page import unreadable
 
 import snrmjax as sj
@@ -23,7 +24,7 @@ TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@v
 @pytest.fixture(scope="module")
 def fit():
     """A fit of noisy states, level gains included."""
-    return sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+    return noisy_fit()
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,7 @@ def test_the_table_of_contributions_sums_to_one_hundred(told, sections):
 
 
 def test_lines_are_the_known_curves():
-    exact = sj.fit_jointly(noisy(), modes(), **TRUE)
+    exact = exact_fit()
     figure = joint_plot.fitted_curves_figure([joint_plot.FitSeries("fit", exact)])
     natural, ratio = figure.axes
     (line,), (ratios,) = natural.lines, ratio.lines

@@ -1,4 +1,8 @@
-"""Curves through values at knots: natural cubic splines of the squared amplitude."""
+"""Curves through values at knots: natural cubic splines in the squared amplitude.
+
+The pointwise curves of `identify_backbone` are another family: PCHIP, cubics that keep the shape
+of the values, in the amplitude itself.
+"""
 
 import itertools
 from typing import Any, ClassVar, NamedTuple
@@ -98,11 +102,11 @@ def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 class SmoothingSpline(Spline):
     """A natural cubic spline with a knot at every level that is as smooth as the data ask for.
 
-    Its bends, what a value differs from the straight line between its neighbours' by, are expected
-    to be of a size that the restricted likelihood finds: one for all while families are compared,
-    then half more than one that changes along the curve (`sizes_along`), with neighbours that are
-    somewhat alike (`likeness`). A band then holds what the curve may do
-    between levels; with few free knots it holds nothing of what they cannot follow. Levels lie
+    Its bends, the differences of a value from the straight line between those at the next knots,
+    have a prior 1σ that restricted maximum likelihood estimates: one for all while families are
+    compared, then 1.5 times one that changes along the curve (`sizes_along`), with adjacent bends
+    correlated (`likeness`). A band then covers what the curve may do between levels; with few free
+    knots it does not cover what they cannot follow. Levels lie
     denser where a curve is rougher, so that bends from level to level are more alike than
     curvature is.
     Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.

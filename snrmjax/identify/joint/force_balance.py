@@ -27,7 +27,7 @@ from snrmjax.numerics.compiled import compiled
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
 
-_STEPS = 4  # towards every state's likeliest errors
+_STEPS = 4  # towards every state's most likely errors
 _FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
 _UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
 
@@ -44,7 +44,7 @@ class BalanceData(eqx.Module):
     velocity: Complex[Array, " state"]  # m/s, what the sensors together say of one of them
     share: Float[Array, "state sensor"]  # of the sensors in it
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
-    weight: Float[Array, " state"]  # 1, or less for what a robust loss mistrusts
+    weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
     correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
     n_levels: int = eqx.field(static=True)
     sensor: int = eqx.field(static=True)  # the one whose motion is meant
@@ -189,7 +189,7 @@ def motion_of(
     problem: BalanceProblem,
     error: Float[Array, "state input"],
 ) -> Motion:
-    """What the record says of the mode when it is freed of its errors.
+    """The mode's motion by the record, corrected for its errors.
 
     `error` adds to the logarithms of force and velocity and to the phase: for derivatives.
     """
@@ -267,7 +267,7 @@ def weighting_at(unknowns: Unknowns, problem: BalanceProblem) -> Weighting:
 
 
 def nearest_errors(unknowns: Unknowns, problem: BalanceProblem) -> Float[Array, "state input"]:
-    """The likeliest errors with which every state balances, from its present correction on.
+    """The most likely errors with which every state balances, from its present correction on.
 
     Each step solves the balance made straight at the last one's end: what is left of the balance
     falls by the ratio of a state's error to the curves' length.

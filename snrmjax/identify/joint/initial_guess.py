@@ -23,7 +23,7 @@ _APART = 1.5  # ratio of amplitudes that tells one more term of a curve
 
 
 class _Point(NamedTuple):
-    """What one state says at the pilot's linear parameters."""
+    """What one state says with the linear parameters of the initial guess."""
 
     displacement: np.ndarray
     speed: np.ndarray

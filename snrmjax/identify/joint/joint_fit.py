@@ -98,7 +98,7 @@ class NoiseEstimate(eqx.Module):
     scale: float  # by which residuals exceed the stated noise; the noise where none is stated
     scale_std: float
     level_std: Float[np.ndarray, " error"]  # gain, phase (rad), relative stiffness and damping
-    autocorrelation: Float[np.ndarray, " part"]  # of neighbours' residuals, 0 if it may be chance
+    autocorrelation: Float[np.ndarray, " part"]  # of successive residuals, 0 if it may be chance
     stated: bool = eqx.field(static=True)
 
 

@@ -37,7 +37,7 @@ def notes_on_families(
 
 
 def notes_on_noise(
-    scatter: VarianceComponents,
+    components: VarianceComponents,
     jitter: float,
     given: Float[np.ndarray, " error"],
     n_levels: int,
@@ -52,20 +52,18 @@ def notes_on_noise(
     neighbouring states are correlated.
     """
     notes = []
-    if stated and scatter.contradicts_upward:
+    size = f"{components.noise:.2g} ± {components.noise_std:.1g}"
+    if stated and components.contradicts_upward:
         notes.append(
-            f"residuals are {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated noise: "
-            "the noise is understated or the model is wrong; the bands are widened accordingly."
+            f"residuals are {size} times the stated noise: the noise is understated or the "
+            "model is wrong; the bands are widened accordingly."
         )
-    if stated and scatter.contradicts_downward:
+    if stated and components.contradicts_downward:
         more = "" if alike else ", and the bands are wider than need be"
-        notes.append(
-            f"residuals are only {scatter.noise:.2g} ± {scatter.noise_std:.1g} times the stated "
-            f"noise: it is overstated{more}."
-        )
-    found_only = np.where(given > 0, 0.0, scatter.level)
+        notes.append(f"residuals are only {size} times the stated noise: it is overstated{more}.")
+    found_only = np.where(given > 0, 0.0, components.level)
     if jitter > 0:
-        jitter = 0.5 * jitter * (1.0 if stated else scatter.noise)
+        jitter = 0.5 * jitter * (1.0 if stated else components.noise)
         notes.append(
             f"the natural frequency varies by {100 * jitter:.2g} % from state to state (1σ), which "
             "the stated noise does not explain; the bands include it."
@@ -76,8 +74,8 @@ def notes_on_noise(
             f"levels differ from one another by {shared} (1σ, estimated), which no stated error "
             "explains; the bands include this level-to-level variance."
         )
-    if scatter.unbounded:
-        names = " and ".join(LEVEL_ERRORS[kind] for kind in scatter.unbounded)
+    if components.unbounded:
+        names = " and ".join(LEVEL_ERRORS[kind] for kind in components.unbounded)
         notes.append(
             f"by how much levels differ in {names} cannot be told from these data: it would "
             "have to be larger than levels of one test can differ. The bands do not include it; "

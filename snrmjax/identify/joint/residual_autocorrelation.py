@@ -1,14 +1,14 @@
-"""What neighbouring states of a level share that no model explains, and what it does to a band.
+"""Autocorrelation of the residuals along a resonance, and what it adds to a band.
 
-Noise of its own in every state averages out over many; what neighbours along a resonance share does
-not. A curve that the data do not follow, or a motion that was not steady, leaves such misfits.
+Independent noise averages out over many states, correlated residuals do not. They are left by a
+curve that the data do not follow, or by a motion that was not steady.
 """
 
 import numpy as np
 from jaxtyping import Float, Int
 
 _CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
-_NOTHING = 0.1  # of the noise: what residuals that are smaller have in common is of no account
+_NOTHING = 0.1  # of the noise: the correlation of smaller residuals does not count
 _LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
 
 
@@ -23,10 +23,10 @@ def along_resonance(
 def residual_autocorrelation(
     residuals: Float[np.ndarray, "state part"], levels: list[Int[np.ndarray, " place"]]
 ) -> Float[np.ndarray, " part"]:
-    """Correlation of a residual with the next one along its level, of both parts.
+    """Autocorrelation at lag one of the residuals along their level, of both parts.
 
-    Where slow misfits hide under noise, neighbours are less alike than their distance from others
-    tells: that of a first-order process with the same sum of correlations counts if it is larger.
+    Under noise of its own, slow misfits have a smaller correlation at lag one than at larger lags:
+    that of a first-order process with the same sum of correlations counts if it is larger.
     Zero where white noise may well have it, or residuals are far below the noise.
     Arguments: whitened `residuals`; `levels` from `along_resonance`.
     Reference: for the sum up to the first negative one, Geyer, Stat. Sci. 7 (1992) 473,

@@ -20,13 +20,15 @@ _STIFF = 10.0  # times the smallest bends, of a curve that is straight at first
 
 
 class VarianceComponents(NamedTuple):
-    """1σ of what nobody stated."""
+    """Estimated 1σ of the noise and of the errors that the states of a level share."""
 
     noise: float  # by which the residuals exceed the stated noise
     noise_std: float
     level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
     bends: tuple[float, ...] = ()  # of the curves whose bends were asked for
-    unbounded: tuple[int, ...] = ()  # kinds of error left out: likeliest at sizes no test has
+    unbounded: tuple[
+        int, ...
+    ] = ()  # kinds of error left out: largest likelihood at a size that no test has
 
     @property
     def contradicts_upward(self) -> bool:

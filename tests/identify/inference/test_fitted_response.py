@@ -6,7 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from truth import joint_fits
 from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
+from truth.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
@@ -19,24 +21,13 @@ FORCE = 2.2  # N: folds are there
 @pytest.fixture(scope="module")
 def fit():
     """A fit of noisy states: stiffness of the displacement, damping of the velocity."""
-    return sj.fit_jointly(
-        noisy(1, gain=0.01),
-        modes(),
-        level_gain_std=0.01,
-        backbone="polynomial:1@displacement",
-        damping="viscous_quadratic@velocity",
-    )
+    return noisy_fit()
 
 
 @pytest.fixture(scope="module")
 def exact_fit():
     """The same of exact states: its curves are the known ones."""
-    return sj.fit_jointly(
-        noisy(),
-        modes(),
-        backbone="polynomial:1@displacement",
-        damping="viscous_quadratic@velocity",
-    )
+    return joint_fits.exact_fit()
 
 
 def moved(fit, vector):

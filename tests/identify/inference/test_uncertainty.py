@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truth.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
+from truth.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference import profiles
@@ -18,7 +19,7 @@ from snrmjax.identify.inference.sensitivity import contributions, sensitivity
 @pytest.fixture(scope="module")
 def fit():
     """A fit of noisy states, level gains included."""
-    return sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+    return noisy_fit()
 
 
 def test_derivatives_by_measurements_are_those_of_refits(fit):

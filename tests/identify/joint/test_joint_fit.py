@@ -21,6 +21,7 @@ from truth.exact_states import (
     stated,
     truth_at,
 )
+from truth.joint_fits import exact_fit, noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family
@@ -42,7 +43,7 @@ SPEEDS = np.linspace(0.2, 0.9, 8)
 @pytest.fixture(scope="module")
 def fit():
     """A fit of noisy states with errors of levels."""
-    return fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+    return noisy_fit()
 
 
 def test_a_structure_states_the_errors_of_its_levels(fit):
@@ -68,7 +69,7 @@ def test_stated_differences_of_frequency_and_damping_between_levels_reach_the_fi
 
 
 def test_exact_states_give_back_the_curves():
-    found = fit_jointly(noisy(), modes(), **TRUE)
+    found = exact_fit()
     values = sj.identify.fitted_values(found, SPEEDS)
     want = truth_at(SPEEDS)
     # The solver stops at 1e-10 of the whitened residuals, whose unit is a per cent.
