@@ -105,6 +105,30 @@ def test_motions_say_what_was_not_found(curve):
     assert isinstance(one.plot(), Figure)
 
 
+def test_tables_have_one_row_a_member():
+    batch, (first, _, _) = RESULTS["batch"][0](), RESULTS["batch"][1]
+    assert repr(batch).startswith(first)
+    table = batch.to_pandas()
+    assert table["member"].tolist() == [0, 1]
+    np.testing.assert_allclose(table["peak_frequency_hz"] * HERTZ, batch.peak_frequency)
+    assert set(table["status"]) == {"upper_end"}
+    assert set(table["n_not_located"]) == {0}
+
+
+def test_steps_that_had_not_settled_are_counted():
+    # Eight cycles are too few for a motion that decays by a tenth in each.
+    simulation = sj.simulate.SweepSimulation("time_integration", 3, 25, cycles_per_step=8)
+    with pytest.raises(ValueError, match="no stable state"):
+        sj.phase_resonance_test(oscillator(), FORCE, *ENDS, simulation=simulation)
+    modes = sj.model.linear_modes([2.0], [0.2], [[1.0]], [1.5])
+    damped = sj.model.structure(modes)
+    simulation = sj.simulate.SweepSimulation("time_integration", 1, 25, cycles_per_step=10)
+    test = sj.phase_resonance_test(damped, 0.01, 1.5, 2.5, simulation=simulation)
+    assert 0 < test.n_unsettled < 50  # of 25 steps up and as many down
+    assert f"steps that had not settled: {test.n_unsettled}" in repr(test)
+    assert test.to_xarray().attrs["steps_not_settled"] == test.n_unsettled
+
+
 def test_a_response_is_labelled_as_its_file_is(curve):
     data = curve.to_xarray()
     np.testing.assert_allclose(data["frequency_hz"], curve.frequency / HERTZ)

@@ -20,8 +20,10 @@ def stepped_states(
     *,
     cycles_per_step: int,
     harmonic_order: int,
-) -> tuple[VisitedStates, list[tuple[int, float]]]:
+) -> tuple[VisitedStates, list[tuple[int, float]], int]:
     """Settled states near resonance of sweeps up and down at every force, and the jumps.
+
+    The last number says how many steps had not settled when the next one came.
 
     Arguments: `up` the frequencies of a sweep in rad/s, `limits` of |phase| in rad.
     """
@@ -36,9 +38,10 @@ def stepped_states(
             harmonic_order=harmonic_order,
         )
 
-    parts, jumps = [], []
+    parts, jumps, n_unsettled = [], [], 0
     for level, motion in enumerate(over_cores(swept, range(len(forces)))):
         coefficients, good = np.asarray(motion.coefficients), np.asarray(motion.converged)
+        n_unsettled += int(np.sum(~good))
         phase = np.where(good, mode_phase(model, coefficients), np.nan)
         height = np.where(good, np.linalg.norm(coefficients[:, 1:3], axis=(1, 2)), 0.0)
         rows: list[int] = []
@@ -61,7 +64,7 @@ def stepped_states(
                 coefficients=coefficients[chosen],
             )
         )
-    return VisitedStates(*map(np.concatenate, zip(*parts, strict=True))), jumps
+    return VisitedStates(*map(np.concatenate, zip(*parts, strict=True))), jumps, n_unsettled
 
 
 def _jumps(model: Structure, steps: np.ndarray, phase: np.ndarray, settled: np.ndarray) -> list:

@@ -65,6 +65,7 @@ class VirtualTest(AbstractResult):
     jumps: tuple[tuple[int, float], ...]  # (level, frequency in rad/s) where a branch ended
     curves: tuple[ResponseCurve | ControlledCurve, ...]  # the exact responses behind the test
     n_missing: int = 0  # states aimed at that the test did not reach, or that were not found
+    n_unsettled: int = 0  # steps of a time integration that had not settled: none is recorded
 
     def summary(self) -> tuple[str, ...]:
         """How many states, levels and jumps, and the ranges."""
@@ -72,13 +73,17 @@ class VirtualTest(AbstractResult):
         levels = len(np.unique(np.asarray(states.level)))
         velocity = np.abs(np.asarray(states.velocity)[:, 0])
         lines = [
-            f"virtual test: {states.n_states} steady states on {levels} levels",
+            f"virtual test: {states.n_states} steady states on {levels} level{'s' * (levels != 1)}",
             f"force {range_text(np.asarray(states.force), 'N')}",
             f"frequency {range_text(np.asarray(states.frequency), 'Hz', HERTZ)}",
             f"velocity fundamental {range_text(velocity, 'm/s')}, sensor {states.sensors[0]}",
             f"jumps: {len(self.jumps)}; exact responses: {len(self.curves)}",
         ]
-        return (*lines, f"states not reached: {self.n_missing}") if self.n_missing else tuple(lines)
+        if self.n_missing:
+            lines.append(f"states not reached: {self.n_missing}")
+        if self.n_unsettled:
+            lines.append(f"steps that had not settled: {self.n_unsettled}")
+        return tuple(lines)
 
     def variables(self) -> dict[str, Variable]:
         """The steady states, by the names of their file's columns."""
@@ -100,7 +105,8 @@ class VirtualTest(AbstractResult):
 
     def attributes(self) -> dict[str, str | float | int]:
         """How often the test jumped, and how many states it missed."""
-        return {"jumps": len(self.jumps), "states_not_reached": self.n_missing}
+        counts = {"states_not_reached": self.n_missing, "steps_not_settled": self.n_unsettled}
+        return {"jumps": len(self.jumps), **counts}
 
 
 def phase_resonance_test(
@@ -134,7 +140,8 @@ def phase_resonance_test(
     Arguments: `forces` in N, frequencies in rad/s; `recording` has the random errors and the
     harmonics recorded beside the fundamental; `simulation` how the motions are computed.
     Returns a `VirtualTest`; its steady states carry the stated standard deviations, and
-    `n_missing` counts states aimed at that could not be computed.
+    `n_missing` counts states aimed at that could not be computed, `n_unsettled` steps of a time
+    integration that had not settled.
     Raises `ValueError` for an empty range of the indicator, for one that no stable state falls
     into, and for harmonics, errors or steps that make no sense.
     Reference: Kwarta & Allen, sections 1.2 and 3.1.
@@ -154,19 +161,20 @@ def phase_resonance_test(
         found = _along_curves(model, loads, (low, high), limits, points_per_level, harmonic_order)
     else:
         up = np.linspace(low, high, steps_per_sweep)
-        states, jumps = stepped_states(
+        states, jumps, n_unsettled = stepped_states(
             *(model, loads, up, limits, points_per_level),
             cycles_per_step=cycles_per_step,
             harmonic_order=harmonic_order,
         )
-        found = _Visited(states, jumps, (), 0)
+        found = _Visited(states, jumps, (), 0, n_unsettled)
     if not len(found.states.level):
         raise ValueError(
             "no stable state has an appropriation indicator in the range asked for; widen "
             "`appropriation` or the frequency range, or take more steps."
         )
     recorded = recorded_states(model, found.states, recording)
-    return VirtualTest(recorded, tuple(found.jumps), found.curves, found.n_missing)
+    counts = (found.n_missing, found.n_unsettled)
+    return VirtualTest(recorded, tuple(found.jumps), found.curves, *counts)
 
 
 class _Visited(NamedTuple):
@@ -176,6 +184,7 @@ class _Visited(NamedTuple):
     jumps: list[tuple[int, float]]
     curves: tuple[ResponseCurve, ...]
     n_missing: int
+    n_unsettled: int = 0
 
 
 def _along_curves(
