@@ -101,7 +101,6 @@ def write_diagnosis(
         save_figures(folder, figures),
         predicted,
         done={"data": f"{title}.csv", "model": model.name},
-        response_held=holds_response(found.data, predicted),
     )
     write_report(folder / "report.html", report)
     return found
@@ -150,16 +149,14 @@ def diagnosis_report(
     predicted: Sequence[LevelResponse] = (),
     *,
     done: Mapping[str, str] | None = None,
-    response_held: bool = False,
 ) -> Report:
     """The report of a diagnosis.
 
     Arguments: `figures` by the names that `diagnosis_figures` gives them, and `responses`;
-    `predicted` resonances of the levels; `done` names the inputs; `response_held` says that the
-    levels hold the response and not the force, as `holds_response` finds.
+    `predicted` resonances of the levels; `done` names the inputs.
     """
     captions = {**_CAPTIONS}
-    if response_held:
+    if holds_response(diagnosis.data, predicted):
         captions["responses"] += _HELD_RESPONSE
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
