@@ -248,7 +248,8 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     Numbers are written in full, so that reading gives them back exactly, angular frequencies and
     phases to one rounding of the unit conversion. Columns that nobody stated are left out.
 
-    Arguments: `data` with either the forces or the drive voltages of all states.
+    Arguments: `data` with the forces of all states, or with the drive voltages of all where no
+    force is known. Voltages beside known forces are left out: a file has one of both.
     Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
     """
     host: SteadyStates = jax.tree.map(np.asarray, data)
@@ -262,13 +263,14 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
         "frequency_hz": _texts(in_unit(float(f), HERTZ) for f in host.frequency[state]),
     }
     has_force, has_drive = ~np.isnan(host.force), ~np.isnan(host.drive)
-    if np.all(has_force) and not np.any(has_drive):
+    if np.all(has_force):
         columns["force_n"] = _texts(host.force[state])
     elif np.all(has_drive) and not np.any(has_force):
         columns["drive_v"] = _texts(host.drive[state])
     else:
         raise ValueError(
-            "steady states to be written must have either all forces or all drive voltages."
+            "steady states to be written must have all forces or, where no force is known, all "
+            "drive voltages."
         )
     columns["velocity_re_m_s"] = _texts(host.velocity.real[state, sensor])
     columns["velocity_im_m_s"] = _texts(host.velocity.imag[state, sensor])

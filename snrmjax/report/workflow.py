@@ -243,7 +243,8 @@ def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> lis
         notes += [f"response at {one.load}: {each.note}" for each in one.responses if each.note]
         if len(one.resonances) > 1:
             notes.append(
-                f"{len(one.resonances)} resonances at {one.load}: the damping allows several."
+                f"{len(one.resonances)} resonances at {one.load}: damping that falls with "
+                "amplitude allows several."
             )
     return notes
 

@@ -1,5 +1,6 @@
 """Tables: round trips, what is accepted, what is refused and in which words."""
 
+import dataclasses
 import os
 import re
 from pathlib import Path
@@ -34,7 +35,7 @@ def read(tmp_path, content, sensors=None):
 
 def same(one: SteadyStates, other: SteadyStates) -> bool:
     """Equal to the last bit, but for what passes through Hz or degrees: there one rounding."""
-    for name in SteadyStates.__dataclass_fields__:
+    for name in (field.name for field in dataclasses.fields(SteadyStates)):
         a, b = getattr(one, name), getattr(other, name)
         if name == "notes":
             continue  # about the file, not of the states
@@ -640,6 +641,14 @@ def test_numbers_of_a_file_stay_as_they_are(tmp_path):
     assert {line.split(",")[6] for line in lines} == {"0.7"}
 
 
+def test_a_known_force_is_written_in_place_of_its_drive_voltage(tmp_path):
+    calibrated = one_state(drive=np.array([2.5]))
+    write_steady_states(tmp_path / "beam.csv", calibrated)
+    back = read_steady_states(tmp_path / "beam.csv")
+    assert back.force.tolist() == [1.0]
+    assert np.isnan(back.drive).all()
+
+
 def one_state(**changes):
     arguments = {
         "level": np.array([1]),
@@ -653,8 +662,11 @@ def one_state(**changes):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (one_state(force=np.array([np.nan])), "all forces or all drive voltages"),
-        (one_state(drive=np.array([1.0])), "all forces or all drive voltages"),
+        (one_state(force=np.array([np.nan])), "must have all forces or"),
+        (
+            join_steady_states(one_state(), one_state(force=[np.nan], drive=[1.0])),
+            "must have all forces or",
+        ),
         (one_state(measured=np.array([[False]])), "measured by a sensor"),
         (one_state(frequency=np.array([-1.0])), "`frequency_hz` must be positive"),
         (one_state(frequency=np.array([np.nan])), "`frequency_hz` must be a number"),
