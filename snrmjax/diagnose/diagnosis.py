@@ -28,7 +28,7 @@ from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.detection_limits import detection_limits
-from snrmjax.diagnose.search.locating import located
+from snrmjax.diagnose.search.locating import locate_misfit
 from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects, find_effects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.states import SteadyStates
@@ -79,10 +79,10 @@ def diagnose_model(
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)
     given, levels_note = model, ""
-    # Beside a gain that is unknown no joint fit tells what levels scatter.
-    tells = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
+    # Beside an unknown gain no joint fit can estimate the level-to-level variance.
+    estimable = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
     silent = not predictions.chosen.noise_stated and not states_level_errors(model)
-    if silent and tells and predictions.chosen.n_levels > 2:
+    if silent and estimable and predictions.chosen.n_levels > 2:
         model, levels_note = with_level_variance(model, data)
         if levels_note:
             predictions = predictions_of(model, data, force_gain_std)
@@ -105,7 +105,7 @@ def diagnose_model(
             "radian are taken, which is what the answer leaves; how well it fits is no proof then."
         )
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
-    free = located(misfit, found.baseline)
+    free = locate_misfit(misfit, found.baseline)
     neighbours = neighbour_noise(misfit, fit)
     levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
     judgement = judge(found, neighbours, free.parts, levels)
@@ -205,7 +205,7 @@ def _with_noise_found(
     least = max(float(np.sqrt(neighbours.variance)), _LEAST_NOISE)
     predictions = predictions.with_errors_scaled(least)
     misfit = weighted_misfit(predictions)
-    free = located(misfit, baseline_fit(misfit))
+    free = locate_misfit(misfit, baseline_fit(misfit))
     factor = float(np.sqrt(max(free.chi_square / max(free.freedom, 1), 1.0)))
     size = least
     for _ in range(_ROUNDS):

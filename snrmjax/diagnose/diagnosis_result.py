@@ -1,6 +1,6 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -117,8 +117,9 @@ class Diagnosis(AbstractResult):
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         lines = [f"Diagnosis: {self.verdict_sentence}"]
         for name, (value, std) in self.parameters.items():
-            unit = unit_of(name)
-            lines.append(f"{name} = {value:.4g} ± {std:.2g}{f' {unit}' if unit else ''}")
+            stated = unit_of(name)
+            unit = "" if stated == "1" else stated
+            lines.append(f"{name} = {value:.4g} ± {std:.2g} {unit}".rstrip())
         lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
         lines += [
             f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"
@@ -129,8 +130,8 @@ class Diagnosis(AbstractResult):
             lines.append(f"to decide: {self.decide_by}")
         tried = sum(len(step) for step in self.table)
         lines.append(
-            f"status: fit {self.answer.status.value}, completed model "
-            f"{self.answer.completed_status.value}; {self.checks.unconverged_fits} of {tried} "
+            f"status: fit {_words(self.answer.status)}, completed model "
+            f"{_words(self.answer.completed_status)}; {self.checks.unconverged_fits} of {tried} "
             "compared fits unconverged"
         )
         return tuple(lines)
@@ -148,12 +149,16 @@ class Diagnosis(AbstractResult):
         names = list(self.parameters)
         of_row, of_part, of_parameter = ("candidate",), ("part",), ("parameter",)
         return {
-            "candidate": Variable(of_row, [row.kind for row in rows], "", "effect compared"),
+            "candidate": Variable(of_row, _texts(row.kind for row in rows), "", "effect compared"),
             "step": Variable(of_row, [number for number, _ in tried], "1", "step of the search"),
             "gain": Variable(of_row, [r.gain for r in rows], "1", "fall of Schwarz's criterion"),
             "chi_square": Variable(of_row, [r.chi_square for r in rows], "1", "χ² that is left"),
-            "fit_status": Variable(of_row, [r.status.value for r in rows], "", "end of the fit"),
-            "part": Variable(of_part, [p.part for p in self.located], "", "part of the misfit"),
+            "fit_status": Variable(
+                of_row, _texts(r.status.value for r in rows), "", "end of the fit"
+            ),
+            "part": Variable(
+                of_part, _texts(p.part for p in self.located), "", "part of the misfit"
+            ),
             "velocity_low_m_s": Variable(of_part, ranges[:, 0], "m/s", "lowest velocity affected"),
             "velocity_high_m_s": Variable(
                 of_part, ranges[:, 1], "m/s", "highest velocity affected"
@@ -161,14 +166,14 @@ class Diagnosis(AbstractResult):
             "p_value": Variable(of_part, [p.p_value for p in self.located], "1", "by chance"),
             "exponent": Variable(of_part, exponent[:, 0], "1", "power of amplitude"),
             "exponent_std": Variable(of_part, exponent[:, 1], "1", "1σ of the power"),
-            "parameter": Variable(of_parameter, names, "", "parameter of an effect"),
+            "parameter": Variable(of_parameter, _texts(names), "", "parameter of an effect"),
             "value": Variable(
                 of_parameter, [p.value for p in self.parameters.values()], "unit", "in `unit`"
             ),
             "value_std": Variable(
                 of_parameter, [p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"
             ),
-            "unit": Variable(of_parameter, [unit_of(name) for name in names], "", "of the value"),
+            "unit": Variable(of_parameter, _texts(map(unit_of, names)), "", "of the value"),
         }
 
     def attributes(self) -> Mapping[str, str | float | int]:
@@ -189,3 +194,12 @@ def unit_of(parameter: str) -> str:
     """The unit of a parameter, named by its effect and itself; "" where none is stated."""
     kind, _, name = parameter.partition(".")
     return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""
+
+
+def _texts(texts: Iterable[str]) -> np.ndarray:
+    """Texts as an array of texts, without any of them too."""
+    return np.array(list(texts), dtype=np.str_)
+
+
+def _words(status: MinimisationStatus | CompletedStatus) -> str:
+    return status.value.replace("_", " ")

@@ -162,7 +162,7 @@ def diagnosis_report(
     return Report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
-        result=verdict_sentence(diagnosis),
+        result=readable_verdict(diagnosis),
         summary=_key_numbers(diagnosis, predicted),
         notes=[_readable(note) for note in diagnosis.notes],
         sections=[
@@ -182,7 +182,7 @@ def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bo
     return bool(np.mean(~same) > _RESPONSE_CONTROLLED)
 
 
-def verdict_sentence(diagnosis: Diagnosis) -> str:
+def readable_verdict(diagnosis: Diagnosis) -> str:
     """What a diagnosis says in one plain sentence, with the effects' names in words."""
     return _readable(diagnosis.verdict_sentence)
 

@@ -181,7 +181,7 @@ def test_limits_and_losing_candidates_are_folded_away(drag, pictures):
     ],
 )
 def test_each_verdict_is_one_plain_sentence(drag, verdict, words):
-    sentence = told.verdict_sentence(dataclasses.replace(drag[2], verdict=verdict))
+    sentence = told.readable_verdict(dataclasses.replace(drag[2], verdict=verdict))
     assert words in sentence
     assert sentence.endswith(".")
     assert "_" not in sentence
@@ -192,7 +192,7 @@ def test_rivals_are_told_where_there_are_some(drag):
     unclear = dataclasses.replace(
         drag[2], verdict="ambiguous", answer=drag[2].answer._replace(candidates=rivals)
     )
-    assert told.verdict_sentence(unclear).startswith(
+    assert told.readable_verdict(unclear).startswith(
         "The model lacks quadratic damping, cubic damping or Jenkins slider, and these data cannot "
         "tell which"
     )

@@ -55,12 +55,12 @@ def verdict_sentence(
     before and after it in units of noise.
     """
     found = " and ".join(group[0] for group in classes)
-    falls = f"the misfit falls from {before:#.2g} to {after:#.2g} times the noise"
+    falls = f"the misfit falls from {_times(before)} to {_times(after)} times the noise"
     with_it = "with them" if len(classes) > 1 else "with it"
     if verdict is Verdict.NOTHING_MISSING:
         return (
             "Nothing is missing that these data could show: the model as given fits them to "
-            f"{after:#.2g} times the noise."
+            f"{_times(after)} times the noise."
         )
     if verdict is Verdict.NOISE_REJECTED:
         return (
@@ -79,6 +79,10 @@ def verdict_sentence(
         f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
         "same effect (see the notes)."
     )
+
+
+def _times(misfit: float) -> str:
+    return f"{misfit:.1f}" if misfit < 10 else f"{misfit:.0f}"
 
 
 def _alternatives(group: Sequence[str]) -> str:

@@ -348,7 +348,7 @@ def _difference(
         " and ".join(kind for kind in own if kind not in its) for own, its in (kinds, kinds[::-1])
     )
     if not mine.size:
-        return "velocity", f"{one} against {other}, which has no such motion"
+        return "velocity", f"with {one} there is such a motion, with {other} there is none"
     at = mine[np.argmin(np.abs(np.angle(velocity[mine])))]
     if option.floor is not None:
         places = [HARMONICS.index(h) for h in option.orders]

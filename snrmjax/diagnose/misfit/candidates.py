@@ -1,4 +1,4 @@
-"""Every effect as a candidate: where its fit starts, and what tells it from the others."""
+"""Every effect as a candidate: where its fit starts, and what separates it from others."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -14,7 +14,7 @@ class EffectCandidate(NamedTuple):
 
     kind: str
     starts: tuple[tuple[float, ...], ...]
-    unit: tuple[float, ...]  # a step that is plainly seen
+    unit: tuple[float, ...]  # a change that is clearly detectable
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     strength_order: int = 1  # power of its strength with which the fundamental changes

@@ -98,7 +98,7 @@ class Predictions:
     chosen: ComparedColumns
     sizes: Sizes
     states: CalibrationStates  # with room for harmonics that were not measured
-    compared: programs.Compared
+    compared: programs.ComparedMotion
     own_columns: Int[np.ndarray, " column"]  # those of `states` that the data have
     level_numbers: Int[np.ndarray, " state"]
     force_gain_std: float
@@ -119,12 +119,12 @@ class Predictions:
         turned = self.chosen._replace(states=states._replace(velocity=states.velocity * turn))
         return dataclasses.replace(self, chosen=turned)
 
-    def weighed(
+    def whitened_for(
         self,
         by_error: Float[np.ndarray, "state column input"],
         phasors: Complex[np.ndarray, "state part"],
     ) -> Measured:
-        """The states with the whitening of a model that passes errors on so and has the phasors."""
+        """The states with the whitening of a model with these phasors that passes on errors so."""
         chosen = self.chosen
         if self.sizes.alone.any():
             own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
@@ -206,7 +206,7 @@ class Predictions:
                     programs.Wanted(*asked[:2]),
                     self._stored,
                     programs.Trials(*parts),
-                    programs.Rows(*asked[2:]),
+                    programs.StateTrials(*asked[2:]),
                 )
                 return [np.asarray(a)[: len(some), self.own_columns] for a in found]
 
@@ -227,7 +227,7 @@ class Predictions:
 def predictions_of(
     model: Structure, data: SteadyStates, force_gain_std: float = 0.0
 ) -> Predictions:
-    """Predictions of a model for measured states, ready to be asked for.
+    """Predictions of a model for measured states, ready to be evaluated.
 
     The baseline's motions are found here. `force_gain_std` is the relative 1σ of a gain that all
     forces share.
@@ -235,7 +235,7 @@ def predictions_of(
     model = dataclasses.replace(model, name="")  # its name would be a part of the programs
     chosen = calibration_states(model, data, programs.HARMONICS)
     columns, orders, own_columns = _widened(chosen)
-    compared = programs.Compared(chosen.sensors, orders, programs.HARMONICS)
+    compared = programs.ComparedMotion(chosen.sensors, orders, programs.HARMONICS)
 
     def motions(*rows: Array) -> tuple[Array, Array]:
         return programs.grown(model, CalibrationStates(*rows), compared)
@@ -299,7 +299,7 @@ def _has_quick_formula(name: str) -> bool:
 def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...], np.ndarray]:
     """The states as the programs take them, their harmonics, and which columns are the states' own.
 
-    Harmonics that the states lack have room: further states that are asked for have them, and one
+    Harmonics that the states lack have room: the states of a further test have them, and one
     program answers for both.
     """
     n, n_sensors = chosen.states.velocity.shape

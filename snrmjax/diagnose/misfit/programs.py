@@ -45,7 +45,7 @@ _NOTHING = 1e-9  # relative difference of columns that solutions may have by cha
 _CLOSE, _CLOSER = 1e-5, 1e-8  # step of a motion's solution that is the last one, and for slopes
 
 
-class Compared(NamedTuple):
+class ComparedMotion(NamedTuple):
     """What of a motion is compared with the measured one, and with how many harmonics it moves."""
 
     sensors: tuple[int, ...]  # the reference first
@@ -55,7 +55,7 @@ class Compared(NamedTuple):
 
 @compiled
 def grown(
-    model: Structure, states: CalibrationStates, compared: Compared
+    model: Structure, states: CalibrationStates, compared: ComparedMotion
 ) -> tuple[Float[Array, "row entry"], Float[Array, "row entry entry"]]:
     """Motions grown from small amplitudes, NaN where none was found, and inverse Jacobians."""
 
@@ -91,7 +91,7 @@ class Settings(NamedTuple):
     """What is compiled into a program beside the structure."""
 
     names: tuple[str, ...]  # of all parameters of the structure
-    compared: Compared
+    compared: ComparedMotion
     own: int  # how many effects are the baseline's: the first ones
     quick: bool  # whether friction is taken by formulas for cycles that turn only twice
 
@@ -103,7 +103,7 @@ class Wanted(NamedTuple):
     directions: Int[Array, ""]  # how many of the directions have slopes
 
 
-class Rows(NamedTuple):
+class StateTrials(NamedTuple):
     """The state and the trial of every row, by their numbers."""
 
     state: Int[Array, " row"]
@@ -117,7 +117,7 @@ def missed(
     wanted: Wanted,
     stored: Stored,
     trials: Trials,
-    rows: Rows,
+    rows: StateTrials,
 ) -> tuple[Float[Array, "row column"], Float[Array, "row column direction"]]:
     """The misfit of every row, and its slopes along the wanted directions, else zero.
 

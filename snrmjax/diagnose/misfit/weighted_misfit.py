@@ -199,7 +199,7 @@ def _weighted(
     passed_on: ErrorPropagation,
     starts: StartChanges,
 ) -> WeightedMisfit:
-    measured = predictions.weighed(passed_on.by_error, passed_on.phasors)
+    measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
     shared = np.concatenate([own, gain], axis=2) if np.any(gain) else own

@@ -43,7 +43,7 @@ class FreeFit(NamedTuple):
         return chi_square_p_value(self.chi_square, self.freedom)
 
 
-def located(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
+def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     """Fit free curves of stiffness and damping to the force, and test every part by itself.
 
     Where sizes alone are compared, states off resonance determine the stiffness and those near it
@@ -119,7 +119,7 @@ def power_of_answer(
     if misfit.predictions.chosen.phase_unknown.any():
         return None  # sizes are not linear in what an answer changes
     alone = baseline._replace(rows=baseline.rows - fit.rows)
-    powers = [one.exponent for one in located(misfit, alone).parts if one.part == part]
+    powers = [one.exponent for one in locate_misfit(misfit, alone).parts if one.part == part]
     return powers[0] if powers else None
 
 

@@ -8,7 +8,7 @@ import pytest
 from snrmjax.diagnose.checks.doubts import doubts
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.search.locating import located, power_of_amplitude, power_of_answer
+from snrmjax.diagnose.search.locating import locate_misfit, power_of_amplitude, power_of_answer
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
 OWN, SHARED = 0.05, 0.3  # 1σ of every knot, and of an offset that all have in common
@@ -104,7 +104,7 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     law = by_linear[:, 0] * np.repeat(change, 2)
     nothing = EffectFit((), (), none, 0.0, left - law, no_slopes, none, none)
     fit = nothing._replace(kinds=("quadratic_stiffness",), rows=left)
-    parts = located(misfit, nothing).parts
+    parts = locate_misfit(misfit, nothing).parts
     (part,) = (one for one in parts if one.part == "stiffness")
     own = power_of_answer(misfit, nothing, fit, "stiffness")
     assert power_of_answer(misfit, nothing, fit, "damping") is None
