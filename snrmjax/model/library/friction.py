@@ -261,10 +261,13 @@ class IwanMicroslip(AbstractSliders):
     ) -> Float[Array, " time"]:
         """See `AbstractForce.quick_cycle_force`: Masing's rule between two turning points."""
         high, low, falling = _turning_points(displacement)
-        backbone = 0.5 * (high - low)
+        half_range = 0.5 * (high - low)
         gone = jnp.where(falling, high - displacement, displacement - low) / 2
-        branch = self._lost(backbone) - 2 * self._lost(gone)
-        return jnp.where(falling, -branch, branch)
+        branch = self._lost(half_range) - 2 * self._lost(gone)
+        # All sliders that slip are centred on the middle of the cycle.
+        safe = jnp.where(half_range > 0, half_range, 1.0)
+        mean = self.exponent * self._lost(half_range) / safe * 0.5 * (high + low)
+        return jnp.where(falling, -branch, branch) - mean
 
     def _lost(self, stretch: Array) -> Array:
         """The force c x^p that slip has taken from the backbone."""
