@@ -16,7 +16,7 @@ LINES = 150
 
 @pytest.fixture
 def own_files(tmp_path, monkeypatch):
-    """`model.toml` of the README and `measured.csv`: a virtual test of the structure it describes."""
+    """`model.toml` of the README and `measured.csv`: a virtual test of that structure."""
     (model,) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
     (tmp_path / "model.toml").write_text(model, encoding="utf-8")
     structure = sj.read_model(tmp_path / "model.toml")
