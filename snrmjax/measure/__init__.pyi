@@ -1,11 +1,5 @@
-from .force_calibration import (
-    EquivalentForce,
-    ForceCalibration,
-    ForceStatus,
-    apply_calibration,
-    calibrate_force,
-    equivalent_force,
-)
+from .equivalent_force import EquivalentForce, ForceStatus, equivalent_force
+from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
 from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_relative_to_force
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .records import RecordFit, fit_records, steady_state_from_records

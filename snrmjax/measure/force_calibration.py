@@ -1,284 +1,52 @@
-"""Force from drive voltage: the equivalent force of low-level responses and its line."""
+"""Force from drive voltage: a straight line through the forces of several voltages."""
 
 import dataclasses
-from enum import IntEnum
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
+from jaxtyping import Array, Float, Shaped
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.modes import LinearModes, linear_response
+from snrmjax.numerics.result import AbstractResult, Variable
 
 
-class ForceStatus(IntEnum):
-    """How the search for the equivalent force of one level ended."""
-
-    SUCCESSFUL = 0
-    TOO_FEW = 1  # fewer measured numbers than unknowns
-    NOT_CONVERGED = 2  # no fit, or the measured numbers do not determine the unknowns
-    NEGATIVE = 3  # the best force is negative: a sensor or the force is wired the other way round
-
-
-FORCE_MESSAGE: dict[ForceStatus, str] = {
-    ForceStatus.SUCCESSFUL: "found",
-    ForceStatus.TOO_FEW: "fewer measured numbers than unknowns; adjust less, or measure more",
-    ForceStatus.NOT_CONVERGED: (
-        "the linear response does not fit, or the states do not determine what is adjusted; check "
-        "the modes and the band, or adjust something else"
-    ),
-    ForceStatus.NEGATIVE: (
-        "the best force is negative; turn the sign of the sensor or of its mode shape, or adjust "
-        "the phase"
-    ),
-}
-
-ADJUSTABLE = ("natural_frequency", "damping_ratio", "phase")
-
-
-class EquivalentForce(eqx.Module):
-    """Force with which the linear structure answers as measured, one entry a level.
-
-    NaN where `status` is not `ForceStatus.SUCCESSFUL`. `force_covariance` contains, besides the
-    random errors, the error that all levels share because `damping_ratio_std` of the mode of
-    interest scales every force; `force_std` is its diagonal's root.
-    """
-
-    level: Int[Array, " level"]
-    drive: Float[Array, " level"]  # V
-    force: Float[Array, " level"]  # N
-    force_covariance: Float[Array, "level level"]  # N²
-    natural_frequency: Float[Array, " level"]  # rad/s, of the mode of interest
-    natural_frequency_std: Float[Array, " level"]  # rad/s, 0 where not adjusted
-    damping_ratio: Float[Array, " level"]
-    damping_ratio_std: Float[Array, " level"]  # 0 where not adjusted
-    phase: Float[Array, " level"]  # rad, by which the measured velocities lead the model's
-    phase_std: Float[Array, " level"]  # rad, 0 where not adjusted
-    misfit: Float[Array, " level"]  # rms residual: in stated σ, or in m/s where none is stated
-    status: Int[Array, " level"]
-
-    @property
-    def force_std(self) -> Float[Array, " level"]:
-        """1σ of the forces in N."""
-        return jnp.sqrt(jnp.diagonal(self.force_covariance))
-
-
-def equivalent_force(
-    data: SteadyStates,
-    modes: LinearModes,
-    *,
-    adjust: tuple[str, ...] = ("natural_frequency",),
-) -> EquivalentForce:
-    """Force magnitude of every level, from its measured low-amplitude response.
-
-    Minimises Σ |V_meas − F e^{iψ} H(Ω; ω_j, ζ_j)|² over F > 0 and what `adjust` names, H the
-    linear response to a unit force; weighted along and across V_meas with `velocity_std` and
-    `phase_std` where every measured velocity states both, else with equal weights and the noise
-    taken from the residual. By a scan and Levenberg–Marquardt over ω_j and ζ_j, with F and ψ
-    eliminated. Stated errors too small for the misfit are enlarged by it.
-
-    Arguments: `data`, whose `level` groups the states of equal `drive` (V); `modes`, the linear
-    model; `adjust`, any of "natural_frequency" (ω_j), "damping_ratio" (ζ_j), both of the mode of
-    interest, and "phase" (ψ, common to the level).
-    Returns `EquivalentForce`, with a status per level: see `FORCE_MESSAGE` for what to try.
-    Raises `ValueError` for an unknown name in `adjust`, a sensor that the model lacks, or a level
-    whose drives differ.
-    Validity: levels so low that the response is linear; the force is what the given mode shapes,
-    participations and (unless adjusted) damping make of the velocity.
-    Reference: Kwarta & Allen, section 4.1 and Eq. (23).
-    """
-    unknown = [name for name in adjust if name not in ADJUSTABLE]
-    if unknown:
-        raise ValueError(f"`adjust` must name some of {ADJUSTABLE}, but names {unknown[0]!r}.")
-    missing = [name for name in data.sensors if name not in modes.sensors]
-    if missing:
-        raise ValueError(
-            f"`data` has sensor {missing[0]!r}, but `modes` has only {', '.join(modes.sensors)}."
-        )
-    rows = np.asarray([modes.sensors.index(name) for name in data.sensors])
-    seen = dataclasses.replace(
-        modes,
-        mode_shape=modes.mode_shape[rows],
-        rigid_body_shape=modes.rigid_body_shape[rows],
-        sensors=data.sensors,
-    )
-    levels = np.unique(np.asarray(data.level))
-    members = np.asarray(data.level)[None, :] == levels[:, None]
-    drive = np.array([_common_drive(data, level) for level in levels])
-    stated = data.measured & (data.velocity_std > 0) & (data.phase_std > 0)
-    use_stated = jnp.all(stated == data.measured)
-    adjusted = ("natural_frequency" in adjust, "damping_ratio" in adjust, "phase" in adjust)
-    best, std, covariance, misfit, status = _fit_levels(
-        seen, data, jnp.asarray(members), use_stated, adjusted
-    )
-    return EquivalentForce(
-        level=jnp.asarray(levels),
-        drive=jnp.asarray(drive),
-        force=best[:, 0],
-        force_covariance=covariance,
-        natural_frequency=best[:, 1],
-        natural_frequency_std=std[:, 1],
-        damping_ratio=best[:, 2],
-        damping_ratio_std=std[:, 2],
-        phase=best[:, 3],
-        phase_std=std[:, 3],
-        misfit=misfit,
-        status=status,
-    )
-
-
-def _common_drive(data: SteadyStates, level: int) -> float:
-    drive = np.asarray(data.drive)[np.asarray(data.level) == level]
-    if np.any(drive != drive[0]) and not np.all(np.isnan(drive)):
-        different = drive[np.argmax(drive != drive[0])]
-        raise ValueError(
-            f"`drive` must be the same for all states of a level, but level {level} has "
-            f"{drive[0]:g} V and {different:g} V."
-        )
-    return float(drive[0])
-
-
-@eqx.filter_jit
-def _fit_levels(
-    modes: LinearModes,
-    data: SteadyStates,
-    members: Bool[Array, "level state"],
-    use_stated: Bool[Array, ""],
-    adjusted: tuple[bool, bool, bool],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Force, ω_j, ζ_j and ψ of every level, their std, the force covariance, misfit and status."""
-    # One after the other: a batch would wait for its slowest level, and compile for longer.
-    best, std, shared, misfit, status = jax.lax.map(
-        lambda member: _fit_level(modes, data, member, use_stated, adjusted), members
-    )
-    good = status == int(ForceStatus.SUCCESSFUL)
-    covariance = jnp.diag(std[:, 0] ** 2) + shared @ shared.T
-    covariance = jnp.where(good[:, None] & good, covariance, jnp.nan)
-
-    def masked(value: Array) -> Array:
-        return jnp.where(good[:, None], value, jnp.nan)
-
-    return masked(best), masked(std), covariance, jnp.where(good, misfit, jnp.nan), status
-
-
-def _fit_level(
-    modes: LinearModes,
-    data: SteadyStates,
-    member: Bool[Array, " state"],
-    use_stated: Bool[Array, ""],
-    adjusted: tuple[bool, bool, bool],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """The unknowns are (F, ω_j, ζ_j, ψ); F and ψ are linear, so that only ω_j and ζ_j iterate."""
-    j = modes.mode_of_interest
-    natural, damping = modes.natural_frequency[j], modes.damping_ratio[j]
-    used = member[:, None] & data.measured
-    n_used = jnp.sum(used)
-    measured = jnp.where(used, data.velocity, 0.0)
-    size = jnp.sqrt(jnp.sum(jnp.abs(measured) ** 2) / jnp.maximum(n_used, 1))
-    size = jnp.where(size > 0, size, 1.0)
-    direction = jnp.where(jnp.abs(measured) > 0, measured, 1.0)
-    direction = direction / jnp.abs(direction)
-    weigh = used & use_stated
-    along = jnp.where(weigh, data.velocity_std, size)
-    across = jnp.where(weigh, data.phase_std * jnp.abs(measured), size)
-
-    def weighted(velocity: Complex[Array, "state sensor"]) -> Float[Array, " number"]:
-        turned = jnp.where(used, velocity / direction, 0.0)
-        return jnp.concatenate([(turned.real / along).ravel(), (turned.imag / across).ravel()])
-
-    def unit_response(mode: Float[Array, " 2"]) -> Complex[Array, "state sensor"]:
-        adapted = dataclasses.replace(
-            modes,
-            natural_frequency=modes.natural_frequency.at[j].set(mode[0]),
-            damping_ratio=modes.damping_ratio.at[j].set(mode[1]),
-        )
-        return linear_response(adapted, data.frequency, jnp.ones_like(data.frequency))
-
-    def deviation(unknown: Float[Array, " 4"]) -> Float[Array, " number"]:
-        force = unknown[0] * jnp.exp(1j * unknown[3])
-        return weighted(force * unit_response(unknown[1:3]) - measured)
-
-    target = weighted(measured)
-
-    def eliminated(mode: Float[Array, " 2"]) -> tuple[Float[Array, " 4"], Float[Array, " number"]]:
-        """The unknowns and deviations with the best F and ψ, as F e^{iψ} = a + ib."""
-        unit = unit_response(mode)
-        real = weighted(unit)
-        if not adjusted[2]:
-            a = real @ target / (real @ real)
-            return jnp.stack([a, *mode, 0.0]), a * real - target
-        imag = weighted(1j * unit)
-        across_real = imag - (real @ imag / (real @ real)) * real
-        b = across_real @ target / (across_real @ imag)
-        a = real @ (target - b * imag) / (real @ real)
-        best = jnp.stack([jnp.hypot(a, b), *mode, jnp.arctan2(b, a)])
-        return best, a * real + b * imag - target
-
-    frequencies, ratios = natural[None], damping[None]
-    lowest = jnp.min(jnp.where(member, data.frequency, jnp.inf))
-    highest = jnp.max(jnp.where(member, data.frequency, -jnp.inf))
-    if adjusted[0]:
-        frequencies = jnp.append(jnp.linspace(lowest, highest, 128), natural)
-    if adjusted[1]:
-        ratios = jnp.maximum(damping, 1e-4) * 2.0 ** jnp.arange(-3.0, 4.0)
-    grid = jnp.stack(jnp.meshgrid(frequencies, ratios), axis=-1).reshape(-1, 2)
-    misfits = jax.lax.map(lambda mode: jnp.sum(eliminated(mode)[1] ** 2), grid)
-    start = grid[jnp.nanargmin(misfits)]
-    iterated = np.flatnonzero(adjusted[:2])
-
-    def mode_of(step: Float[Array, " iterated"]) -> Float[Array, " 2"]:
-        full = jnp.zeros(2).at[iterated].set(step)
-        return start * jnp.stack([1 + start[1] * full[0], jnp.exp(full[1])])
-
-    mode, found = start, jnp.all(jnp.isfinite(measured))
-    if iterated.size:
-        solution: optx.Solution = optx.least_squares(
-            lambda step, _: eliminated(mode_of(step))[1],
-            optx.LevenbergMarquardt(rtol=1e-6, atol=1e-7),
-            jnp.zeros(iterated.size),
-            max_steps=128,
-            throw=False,
-        )
-        mode = mode_of(solution.value)
-        found &= jnp.asarray(solution.result == optx.RESULTS.successful)
-    best, remaining = eliminated(mode)
-    scale = jnp.where(best == 0, 1.0, best).at[3].set(1.0)
-    sensitivity = jax.jacfwd(deviation)(best) * scale
-    free = np.array([True, *adjusted])
-    orthogonal, upper = jnp.linalg.qr(sensitivity[:, free])
-    singular = jnp.linalg.svd(upper, compute_uv=False)
-    inverse = jax.scipy.linalg.solve_triangular(upper, jnp.eye(upper.shape[0]))
-    freedom = 2 * n_used - upper.shape[0]
-    squares = jnp.sum(remaining**2)
-    misfit = jnp.where(freedom > 0, jnp.sqrt(squares / jnp.maximum(freedom, 1)), jnp.nan)
-    # Stated errors that do not explain the misfit are too small for the model: enlarge them.
-    at_least_one = jnp.maximum(1.0, jnp.nan_to_num(misfit, nan=1.0))
-    enlarged = jnp.where(use_stated, at_least_one, misfit)
-    spread = jnp.linalg.norm(inverse, axis=1) * enlarged
-    std = jnp.zeros(4).at[free].set(jnp.abs(scale[free]) * spread)
-    # What the stated errors of ω_j and ζ_j, where they are held, do to the force of every level.
-    held = jnp.stack([modes.natural_frequency_std[j], modes.damping_ratio_std[j]])
-    held = jnp.where(jnp.asarray(adjusted[:2]), 0.0, held) / scale[1:3]
-    shared = -scale[0] * (inverse @ (orthogonal.T @ sensitivity[:, 1:3]))[0] * held
-    found &= (mode[0] > 0.5 * lowest) & (mode[0] < 2 * highest) & jnp.all(jnp.isfinite(best))
-    status = jnp.where(best[0] > 0, int(ForceStatus.SUCCESSFUL), int(ForceStatus.NEGATIVE))
-    determined = singular[-1] > 1e-9 * singular[0]
-    status = jnp.where(found & determined, status, int(ForceStatus.NOT_CONVERGED))
-    status = jnp.where(freedom >= 0, status, int(ForceStatus.TOO_FEW))
-    return best, std, shared, misfit * jnp.where(use_stated, 1.0, size), status
-
-
-class ForceCalibration(eqx.Module):
+class ForceCalibration(AbstractResult):
     """The line F = gain · drive + offset, and how well it is known."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("term",)
 
     gain: Float[Array, ""]  # N/V
     offset: Float[Array, ""]  # N
     covariance: Float[Array, "2 2"]  # of gain and offset; NaN = unknown
     residual_std: Float[Array, ""]  # N, scatter about the line, NaN with two points
     misfit: Float[Array, ""]  # the same in stated σ, NaN where none is stated
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        std = np.sqrt(np.diag(np.asarray(self.covariance)))
+        return (
+            "ForceCalibration: force = gain · drive + offset",
+            f"gain {float(self.gain):.6g} ± {std[0]:.2g} N/V (1σ)",
+            f"offset {float(self.offset):.4g} ± {std[1]:.2g} N (1σ)",
+            f"scatter about the line {float(self.residual_std):.3g} N",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        std = np.sqrt(np.diag(np.asarray(self.covariance)))
+        covariance = np.asarray(self.covariance)
+        terms, line = np.array(["gain", "offset"]), np.array([self.gain, self.offset])
+        across = ("term", "other_term")
+        return {
+            "term": Variable(("term",), terms, "", "term of the line"),
+            "value": Variable(("term",), line, "N/V and N", "value"),
+            "std": Variable(("term",), std, "N/V and N", "its 1σ"),
+            "covariance": Variable(across, covariance, "products of N/V and N", "covariance"),
+            "residual_std_n": Variable((), np.asarray(self.residual_std), "N", "scatter"),
+        }
 
     def force(self, drive: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Force in N at a drive in V."""
@@ -313,6 +81,7 @@ def calibrate_force(
     Arguments: `drive` in V; `force` in N; `force_std` its 1σ in N, independent, or in its place
     `force_covariance` in N², which may hold errors that all levels share.
     Returns `ForceCalibration`; with two points and no stated errors its covariance is NaN.
+    Differentiable by all of them, except for the scatter of points exactly on a line.
     Raises `ValueError` for fewer than two different drives, numbers that are not finite, standard
     deviations that are not positive, or a covariance that is not positive definite.
     Reference: Kwarta & Allen, section 4.1, Figs. 15c and 15d.
@@ -403,6 +172,8 @@ def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> Stea
     errors are correlated: `ForceCalibration.force_covariance` has the whole of it.
 
     Arguments: `data`; `calibration`, in N and V. Returns `SteadyStates`; `drive` is kept.
+    Differentiable by the drives and the calibration; a drive for which the line gives no positive
+    force leaves the derivatives of the other states as they are.
     Raises `ValueError` when no state has a drive, or when the line gives a force that is not
     positive (NaN when traced): such a drive lies below the range that the line can be used in.
     Reference: Kwarta & Allen, section 4.1.
@@ -428,8 +199,9 @@ def apply_calibration(data: SteadyStates, calibration: ForceCalibration) -> Stea
                 f"{force[row]:g} N; a force must be positive."
             )
     force = jnp.where(unusable, jnp.nan, force)
+    std = jnp.where(unusable, jnp.nan, calibration.force_std(drive))
     return dataclasses.replace(
         data,
         force=jnp.where(driven, force, data.force),
-        force_std=jnp.where(driven, calibration.force_std(drive), data.force_std),
+        force_std=jnp.where(driven, std, data.force_std),
     )

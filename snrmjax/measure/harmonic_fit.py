@@ -1,6 +1,7 @@
 """Harmonics of measured time records: their least-squares fit and its errors."""
 
 from enum import IntEnum
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -11,6 +12,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
 
 from snrmjax.measure.signals import checked_amplitudes, require_orders
 from snrmjax.numerics.finite_slopes import safe_root
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_SHOWN = 8
 
 
 class HarmonicFitStatus(IntEnum):
@@ -38,13 +42,15 @@ FIT_MESSAGE: dict[HarmonicFitStatus, str] = {
 }
 
 
-class HarmonicFit(eqx.Module):
+class HarmonicFit(AbstractResult):
     """Harmonics of a record, x(t) = Re Σ X_k e^{ikΩ(t − reference_time)}, and their errors.
 
     `harmonic_order` starts with 0, the (real) mean. The covariance is that of the real parts of
     all harmonics followed by their imaginary parts; it is NaN when no degree of freedom is left.
     Everything but `condition` is NaN where `status` is not `HarmonicFitStatus.SUCCESSFUL`.
     """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("record", "harmonic")
 
     amplitude: Complex[Array, "*batch harmonic"]  # unit of the record, peak
     covariance: Float[Array, "*batch parameter parameter"]  # unit of the record, squared
@@ -57,6 +63,42 @@ class HarmonicFit(eqx.Module):
     status: Int[Array, "*batch"]
     degrees_of_freedom: int = eqx.field(static=True)
     harmonic_order: tuple[int, ...] = eqx.field(static=True)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        status = np.ravel(np.asarray(self.status))
+        found = np.unique(np.asarray(self.frequency)[np.asarray(self.status) == 0]) / (2 * np.pi)
+        failed = sorted({HarmonicFitStatus(int(one)) for one in status if one})
+        at_first = np.asarray(self.harmonic_order) == 1
+        fundamental = np.ravel(np.abs(np.asarray(self.amplitude)[..., at_first]))
+        return (
+            f"HarmonicFit: {len(status)} records, harmonics "
+            f"{', '.join(map(str, self.harmonic_order))}",
+            f"{int(np.sum(status == 0))} fitted"
+            + (f" at {found.min():.6g} to {found.max():.6g} Hz" if found.size else ""),
+            *(f"fundamental amplitude {size:.4g}" for size in fundamental[:_SHOWN]),
+            *(f"{int(np.sum(status == one))}: {FIT_MESSAGE[one]}" for one in failed),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; all records in one row."""
+        shape = (-1, len(self.harmonic_order))
+        amplitude = np.asarray(self.amplitude).reshape(shape)
+        std = np.asarray(self.complex_std).reshape(shape)
+        both, unit = ("record", "harmonic"), "unit of the record"
+        status = np.ravel(np.asarray(self.status))
+        names = np.array([HarmonicFitStatus(int(one)).name.lower() for one in status], dtype=str)
+        frequency = np.ravel(np.asarray(self.frequency)) / (2 * np.pi)
+        orders = np.array(self.harmonic_order)
+        return {
+            "record": Variable(("record",), np.arange(len(status)), "1", "record"),
+            "harmonic": Variable(("harmonic",), orders, "1", "harmonic order"),
+            "amplitude_re": Variable(both, amplitude.real, unit, "amplitude, real part"),
+            "amplitude_im": Variable(both, amplitude.imag, unit, "amplitude, imaginary part"),
+            "complex_std": Variable(both, std, unit, "rms of the complex error"),
+            "frequency_hz": Variable(("record",), frequency, "Hz", "fundamental frequency"),
+            "status": Variable(("record",), names, "", "how the fit ended"),
+        }
 
     def harmonic(self, order: int) -> Complex[Array, "*batch"]:
         """Amplitude of one harmonic, in the unit of the record."""
@@ -131,6 +173,8 @@ def fit_harmonics(
     or the tone stands out by less than five standard deviations, NOT_FINITE for NaN;
     `FIT_MESSAGE` says what to try.
     Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
+    Differentiable by time, signal and frequency; a record without a fit leaves the derivatives of
+    the others as they are. `condition` has no derivative.
     Validity: the standard deviations assume independent errors of equal size from sample to
     sample; correlated noise (filters, oversampling) makes the true ones larger.
     Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).
@@ -194,7 +238,12 @@ def _fit_one(
     duration = jnp.max(time) - jnp.min(time)
     finite = jnp.all(jnp.isfinite(record)) & jnp.all(jnp.isfinite(time))
     finite &= jnp.isfinite(frequency) & (frequency > 0)
-    values = jnp.where(finite, record, 0.0)
+    # A record that cannot be fitted is a tone: everything is regular, and masked at the end.
+    timed = jnp.isfinite(centred)
+    centred = jnp.where(jnp.all(timed), centred, jnp.linspace(-0.5, 0.5, time.size))
+    duration = jnp.where(jnp.all(timed), duration, 1.0)
+    frequency = jnp.where(jnp.isfinite(frequency) & (frequency > 0), frequency, 1.0 / duration)
+    values = jnp.where(finite, record, jnp.cos(frequency * centred))
     omega, converged = frequency, jnp.array(True)
     if refine:
         # Two lobes of the record, but never so far that a harmonic is taken for the fundamental.
@@ -301,8 +350,11 @@ def _refined_frequency(
     orders: tuple[int, ...],
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Frequency within `reach` that leaves the smallest residual, and whether it was found."""
-    size = jnp.linalg.norm(values - jnp.mean(values))
-    scaled = values / jnp.where(size > 0, size, 1.0)
+    size = safe_root(jnp.sum((values - jnp.mean(values)) ** 2))
+    # Nothing at all has no frequency: what is found for a tone instead is refused.
+    moving = size > 0
+    tone = jnp.cos(frequency * time)
+    scaled = jnp.where(moving, values / jnp.where(moving, size, 1.0), tone)
 
     def residual(shift: Float[Array, ""], record: tuple[Array, ...]) -> Float[Array, " sample"]:
         # Normal equations: the residual feels an error of the amplitudes in second order only.
@@ -323,7 +375,7 @@ def _refined_frequency(
         max_steps=64,
         throw=False,
     )
-    found = (solution.result == optx.RESULTS.successful) & (jnp.abs(solution.value) < 1)
+    found = (solution.result == optx.RESULTS.successful) & (jnp.abs(solution.value) < 1) & moving
     return frequency + solution.value * reach, jnp.asarray(found)
 
 

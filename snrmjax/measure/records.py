@@ -65,7 +65,8 @@ def fit_records(
 
     Arguments: `time` in s; `force_record` in N; `velocity_records` in m/s, one row a sensor (a
     vector is one sensor); `frequency` in rad/s; `harmonic_order` must contain 1; the others as in
-    `fit_harmonics`. Returns `RecordFit`, with a status for each record as in `fit_harmonics`.
+    `fit_harmonics`. Returns `RecordFit`, differentiable as `fit_harmonics` is,
+    with a status for each record as in `fit_harmonics`.
     Raises `ValueError` for wrong shapes, orders or a frequency that is not positive.
     Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).
     """
@@ -132,7 +133,9 @@ def steady_state_from_records(
 
     Arguments: as in `fit_records`, with the `level` the state belongs to and names of the
     sensors; harmonic 0 is kept when `harmonic_order` lists it.
-    Returns `SteadyStates` with one state. `phase_std` contains the phase error of the force;
+    Returns `SteadyStates` with one state, to be joined with others by `join_steady_states` and
+    written by `sj.io.write_steady_states`; without derivatives (`fit_records` has them).
+    `phase_std` contains the phase error of the force;
     `harmonic_std` is the rms over the harmonics. A sensor whose fit failed has `measured` False.
     Raises `ValueError` when the force or every velocity cannot be fitted, with the reason.
     Reference: Kwarta & Allen, section 3.1 (the multi-sine fit named above their Eq. (20)).

@@ -20,6 +20,9 @@ from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import HERTZ
+from snrmjax.measure.equivalent_force import EquivalentForce
+from snrmjax.measure.force_calibration import ForceCalibration
+from snrmjax.measure.harmonic_fit import HarmonicFit
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
 from snrmjax.report.sampling import span_of
@@ -188,3 +191,25 @@ def _(result: InverseForce) -> Figure:
 @plot_result.register
 def _(result: CalibratedModel) -> Figure:
     return simulation_figures.residual_columns_figure(result.residuals)
+
+
+@plot_result.register
+def _(result: HarmonicFit) -> Figure:
+    amplitude = np.abs(np.asarray(result.amplitude)).reshape(-1, len(result.harmonic_order))
+    return simulation_figures.bars_figure(
+        result.harmonic_order, amplitude, "Harmonic order", "Amplitude (unit of the record)"
+    )
+
+
+@plot_result.register
+def _(result: EquivalentForce) -> Figure:
+    return simulation_figures.line_figure(
+        *map(np.asarray, (result.drive, result.force, result.force_std))
+    )
+
+
+@plot_result.register
+def _(result: ForceCalibration, *, largest_drive: float = 1.0) -> Figure:
+    drive = jnp.asarray(np.linspace(0.0, largest_drive, 50))
+    given = map(np.asarray, (drive, result.force(drive), result.force_std(drive)))
+    return simulation_figures.line_figure(*given, joined=True)

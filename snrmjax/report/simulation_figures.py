@@ -274,3 +274,40 @@ def residual_columns_figure(residuals: np.ndarray) -> Figure:
         axes.axhline(limit, color=BACKGROUND, linestyle="--")
     name_axes(axes, "residuals", "Steady state", "Residual (1σ)")
     return figure
+
+
+def line_figure(
+    drive: np.ndarray, force: np.ndarray, std: np.ndarray, *, joined: bool = False
+) -> Figure:
+    """Force against drive voltage with 95 % errors.
+
+    Arguments: `drive` in V, `force` and its 1σ `std` in N; `joined` draws a line and its band.
+    Returns the figure. Raises `ValueError` without a finite force.
+    """
+    if not np.any(np.isfinite(force)):
+        raise ValueError("there is no force to show: none was found.")
+    newton = unit_for(force[np.isfinite(force)], "N")
+    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
+    wide = 1.96 * np.nan_to_num(std)
+    if joined:
+        axes.plot(drive, force / newton.size, color=SIMULATED, **CURVE)
+        ends = (force - wide) / newton.size, (force + wide) / newton.size
+        axes.fill_between(drive, *ends, color=SIMULATED, **FILL)
+    else:
+        axes.errorbar(drive, force / newton.size, yerr=wide / newton.size, **DOT)
+    name_axes(axes, "force, 95 %", "Drive (V)", f"Force ({newton.name})")
+    return figure
+
+
+def bars_figure(orders: Sequence[int], amplitudes: np.ndarray, below: str, beside: str) -> Figure:
+    """Amplitudes of the harmonics of every record, on a logarithmic axis.
+
+    Returns the figure. Raises `ValueError` without a finite amplitude.
+    """
+    good = amplitudes[np.all(np.isfinite(amplitudes), axis=1)]
+    if not good.size:
+        raise ValueError("there is no harmonic to show: no record was fitted.")
+    figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
+    axes.semilogy(orders, np.maximum(good.T, 1e-300), **DOT)
+    name_axes(axes, f"{len(good)} records", below, beside)
+    return figure

@@ -10,12 +10,8 @@ import scipy.optimize
 import scipy.stats
 
 import snrmjax  # noqa: F401
-from snrmjax.measure.force_calibration import (
-    ForceStatus,
-    apply_calibration,
-    calibrate_force,
-    equivalent_force,
-)
+from snrmjax.measure.equivalent_force import ForceStatus, equivalent_force
+from snrmjax.measure.force_calibration import apply_calibration, calibrate_force
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import LinearModesStd, RigidBodyModes, linear_modes
 

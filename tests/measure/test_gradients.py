@@ -1,0 +1,126 @@
+"""Derivatives of every function of `sj.measure` that promises them, with failed members too."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truth.derivatives import check_derivatives, numbers
+
+import snrmjax as sj
+
+ORDERS = (0, 1, 2, 3)
+OMEGA = 2 * np.pi * 20.0
+TIME = np.linspace(0.0, 0.21, 64)
+RNG = np.random.default_rng(3)
+AMPLITUDES = RNG.normal(size=(3, 4)) + 1j * RNG.normal(size=(3, 4))
+RECORDS = np.asarray(sj.measure.synthesise(AMPLITUDES.real + 0j, ORDERS, OMEGA, TIME))
+RECORDS = RECORDS + 0.01 * RNG.normal(size=RECORDS.shape)
+
+
+def moved(relative):
+    """Twelve complex amplitudes, changed in size by twelve numbers."""
+    return AMPLITUDES * (1 + relative.reshape(3, 4))
+
+
+def of_signals(relative):
+    amplitudes = moved(relative[:12])
+    time = TIME[:5]
+    loop = sj.measure.force_velocity_loop(2.0, amplitudes, ORDERS, n_points=5)
+    return numbers(
+        sj.measure.synthesise(amplitudes, ORDERS, OMEGA * (1 + relative[12]), time),
+        sj.measure.peak_amplitude(amplitudes, ORDERS),
+        # But for the fundamental, which is real then.
+        sj.measure.phasor_relative_to_force(amplitudes, amplitudes[:, 1], ORDERS)[:, 2:],
+        loop.velocity,
+        loop.mean_power,
+    )
+
+
+def test_signals():
+    check_derivatives(of_signals, 13)
+
+
+def of_indicators(relative, data):
+    velocity = data.velocity * (1 + relative[:3, None] + 1j * relative[3:6, None])
+    changed = dataclasses.replace(data, velocity=velocity)
+    return numbers(
+        sj.measure.appropriation_of(changed),
+        sj.measure.mode_indicator(velocity),
+        sj.measure.nnm_appropriation(changed.harmonics * (1 + 1j * relative[6]), (2, 3)),
+    )
+
+
+@pytest.mark.parametrize("broken", [None, 0.0, np.nan])
+def test_indicators(broken):
+    velocity = AMPLITUDES[:, :2].copy()
+    measured = np.ones((3, 2), dtype=bool)
+    if broken is not None:
+        velocity[1], measured[1] = broken, False
+    data = sj.measure.steady_states(
+        [1, 1, 1],
+        np.full(3, OMEGA),
+        np.ones(3),
+        velocity,
+        sensors=("a", "b"),
+        measured=measured,
+        harmonics=RNG.normal(size=(3, 2, 2)) + 1j * RNG.normal(size=(3, 2, 2)),
+        harmonic_order=(2, 3),
+    )
+    # State 1 fails, but for its harmonics, which count.
+    check_derivatives(of_indicators, 7, data, failed=[] if broken is None else [1, 4])
+
+
+def moved_records(relative, records):
+    """Records with other sizes and, all of them, with more of a harmonic."""
+    shape = 1 + relative[3] * jnp.cos(3 * OMEGA * TIME)
+    return jnp.where(jnp.isnan(records), jnp.nan, RECORDS * (1 + relative[:3, None]) * shape)
+
+
+def of_fits(relative, records):
+    frequency = OMEGA * (1 + 1e-3 * relative[4])
+    fit = sj.measure.fit_harmonics(TIME, moved_records(relative, records), frequency, (1, 2, 3))
+    stated = (fit.covariance[..., 1, 1], fit.amplitude_std[..., 1:], fit.phase_std[..., 1:])
+    return numbers(fit.amplitude, *stated, fit.noise_std, fit.residual_rms)
+
+
+def of_refined_fits(relative, records):
+    given = (TIME, moved_records(relative, records), OMEGA * (1 + 1e-3 * relative[4]), (1, 2, 3))
+    fit = sj.measure.fit_harmonics(*given, refine_frequency=True)
+    return numbers(fit.amplitude, fit.frequency, fit.frequency_std)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+@pytest.mark.parametrize("function", [of_fits, of_refined_fits])
+def test_harmonic_fits(function, broken):
+    records = RECORDS.copy()
+    if broken:
+        records[1, 5] = np.nan
+    check_derivatives(function, 5, records, failed=[1] if broken else [])
+
+
+def of_calibrations(relative, drive, data):
+    line = sj.measure.calibrate_force(
+        drive * (1 + relative[:4]), np.array([1.0, 2.1, 2.9, 4.2]) * (1 + relative[4:8])
+    )
+    newtons = np.array([1.0, 2.1, 2.9, 4.2])
+    stated = sj.measure.calibrate_force(drive, newtons * (1 + relative[4:8]), 0.1 * newtons)
+    moved = dataclasses.replace(data, drive=data.drive * (1 + relative[8:]))
+    forces = sj.measure.apply_calibration(moved, line)
+    return numbers(
+        *(line.gain, line.offset, line.covariance, line.residual_std, stated.gain, stated.misfit),
+        *(line.force_std(drive), forces.force, forces.force_std),
+    )
+
+
+def test_calibrations_with_a_drive_that_is_too_small():
+    drive = np.array([0.01, 0.02, 0.03, 0.04])
+    # The second drive is below zero of the line: no force; the third has none, but a force.
+    data = sj.measure.steady_states(
+        [1, 1, 1],
+        np.full(3, OMEGA),
+        [np.nan, np.nan, 2.0],
+        np.ones(3),
+        drive=[0.02, -0.5, np.nan],
+    )
+    check_derivatives(of_calibrations, 11, drive, data, failed=[9, 10])
