@@ -256,7 +256,7 @@ for one in advice:
 responses = [
     sj.identify.fitted_response(with_levels, f)[0] for f in sorted({a.force for a in advice})
 ]
-show(plot.advice_figure(responses, advice, "midspan"), "next_measurements")
+show(plot.next_measurements_figure(responses, advice, sensor="midspan"), "next_measurements")
 
 # %%
 headline |= {

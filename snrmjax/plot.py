@@ -16,9 +16,9 @@ from snrmjax.report.figures import (
 )
 from snrmjax.report.joint_figures import (
     FitSeries,
-    advice_figure,
     contributions_figure,
     fitted_curves_figure,
+    next_measurements_figure,
     profile_figure,
     residuals_figure,
 )
@@ -33,7 +33,6 @@ from snrmjax.report.simulation_figures import (
 __all__ = [
     "DampingSeries",
     "FitSeries",
-    "advice_figure",
     "backbone_figure",
     "batch_figure",
     "candidates_figure",
@@ -46,6 +45,7 @@ __all__ = [
     "misfit_figure",
     "modal_damping_figure",
     "motions_figure",
+    "next_measurements_figure",
     "normal_mode_figure",
     "profile_figure",
     "residuals_figure",

@@ -1,4 +1,4 @@
-"""Figures of joint fits: curves with bands, residuals, what bands are made of, and advice."""
+"""Figures of joint fits: curves with bands, residuals, parts of the bands, where to measure next."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -233,13 +233,13 @@ def profile_figure(profile: Profile) -> Figure:
     return figure
 
 
-def advice_figure(
-    responses: Sequence[FittedResponse], advice: Sequence[NextMeasurement], sensor: str
+def next_measurements_figure(
+    responses: Sequence[FittedResponse], measurements: Sequence[NextMeasurement], *, sensor: str
 ) -> Figure:
-    """Where the advised states lie on the fitted responses, numbered by rank.
+    """Where to measure next: states on the responses that a fit predicts, numbered by rank.
 
-    Arguments: `responses` of the advised forces, drawn above a quarter of their peaks and as far
-    as an advised state is from them; `sensor` is what the axis names.
+    Arguments: `responses` under the forces of the `measurements`, drawn above a quarter of their
+    peaks and as far as a measurement is from them; `sensor` is what the axis names.
     Returns the figure. Raises `ValueError` when there is no response.
     """
     if not responses:
@@ -252,11 +252,11 @@ def advice_figure(
         [one.velocity[[np.argmax(np.abs(one.velocity))]] for one in responses]
     )
     sign = 1.0 if np.sum(resonant.real) >= 0 else -1.0
-    drives = {one.force: one.drive for one in advice if one.drive is not None}
+    drives = {one.force: one.drive for one in measurements if one.drive is not None}
     for curve in responses:
         colour = SERIES[forces.index(curve.force) % len(SERIES)]
         size = np.abs(curve.velocity)
-        mine = [one.velocity for one in advice if one.force == curve.force]
+        mine = [one.velocity for one in measurements if one.force == curve.force]
         near = size >= min([0.25 * size.max(), *(0.8 * v for v in mine)])
         drive = drives.get(curve.force)
         name = with_unit(curve.force, "N") if drive is None else with_unit(drive, "V")
@@ -265,11 +265,11 @@ def advice_figure(
         for axes, y in ((speeds, size[near] / unit.size), (phases, turn)):
             pieces = (curve.stable[near], name, colour, LINE, curve.continued[near])
             response_line(axes, x, y, *pieces)
-    for one in advice:
+    for one in measurements:
         marks(speeds, one.frequency / HERTZ, one.velocity / unit.size, {**HOLLOW, "clip_on": True})
         turn = np.angle(sign * np.exp(1j * one.phase)) / DEGREE
         marks(phases, one.frequency / HERTZ, turn, HOLLOW)
-    for ranks, first in _together(advice):
+    for ranks, first in _together(measurements):
         at = (first.frequency / HERTZ, first.velocity / unit.size)
         text = ", ".join(map(str, ranks))
         offset: dict[str, Any] = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
@@ -288,10 +288,10 @@ def advice_figure(
     return figure
 
 
-def _together(advice: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
+def _together(measurements: Sequence[NextMeasurement]) -> list[tuple[list[int], NextMeasurement]]:
     """Ranks whose marks would hide one another, with the first of them."""
     groups: list[tuple[list[int], NextMeasurement]] = []
-    for one in advice:
+    for one in measurements:
         for ranks, first in groups:
             near = abs(one.frequency / first.frequency - 1) < 0.005
             if near and abs(one.velocity / first.velocity - 1) < 0.03:

@@ -16,9 +16,9 @@ from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
 from snrmjax.report.joint_figures import (
     FitSeries,
-    advice_figure,
     contributions_figure,
     fitted_curves_figure,
+    next_measurements_figure,
     residuals_figure,
 )
 from snrmjax.report.style import PrintedFigure, unit_for
@@ -74,7 +74,7 @@ def joint_figures(told: ReportedFit, points: BackbonePoints) -> dict[str, Figure
     }
     if told.advice:
         sensor = told.fit.modes.sensors[told.fit.data.sensor]
-        figures["next"] = advice_figure(told.responses, told.advice, sensor)
+        figures["next"] = next_measurements_figure(told.responses, told.advice, sensor=sensor)
     return figures
 
 

@@ -46,8 +46,10 @@ def plot_result(result: object, **settings: Any) -> Figure:
 
 
 @plot_result.register
-def _(result: NextMeasurements, **settings: Any) -> Figure:
-    return joint_figures.advice_figure(result.responses, result.rows, result.sensor, **settings)
+def _(result: NextMeasurements) -> Figure:
+    return joint_figures.next_measurements_figure(
+        result.responses, result.rows, sensor=result.sensor
+    )
 
 
 @plot_result.register
@@ -168,8 +170,8 @@ def _(result: JointFit, **settings: Any) -> Figure:
 
 
 @plot_result.register
-def _(result: FittedResponse, **settings: Any) -> Figure:
-    return joint_figures.advice_figure([result], [], result.sensor, **settings)
+def _(result: FittedResponse) -> Figure:
+    return joint_figures.next_measurements_figure([result], [], sensor=result.sensor)
 
 
 @plot_result.register

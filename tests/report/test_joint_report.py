@@ -172,7 +172,7 @@ def test_advised_states_are_marked_and_listed(told, figures, sections):
 def test_states_that_lie_together_share_a_label(told):
     first = told.advice[0]
     advice = [first, first._replace(rank=2, frequency=1.001 * first.frequency)]
-    figure = joint_plot.advice_figure(told.responses, advice, "tip")
+    figure = joint_plot.next_measurements_figure(told.responses, advice, sensor="tip")
     assert [text.get_text() for text in figure.axes[0].texts] == ["1, 2"]
 
 
@@ -194,7 +194,7 @@ def test_nothing_to_show_is_an_error():
     for draw, named in (
         (joint_plot.contributions_figure, "nothing to show"),
         (joint_plot.fitted_curves_figure, "no fit"),
-        (lambda rows: joint_plot.advice_figure(rows, [], "tip"), "no response"),
+        (lambda rows: joint_plot.next_measurements_figure(rows, [], sensor="tip"), "no response"),
     ):
         with pytest.raises(ValueError, match=named):
             draw([])
