@@ -1,4 +1,4 @@
-"""Figures of joint fits: curves with bands, residuals, parts of the bands, where to measure next."""
+"""Figures of joint fits: curves with bands, residuals, parts of bands, where to measure next."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
