@@ -49,7 +49,7 @@ def diagnose(
     Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what cannot
     be told.
     """
-    from snrmjax.report.diagnosis_report import write_diagnosis
+    from snrmjax.report.diagnosis_report import verdict_sentence, write_diagnosis
 
     several = len(data) > 1
     if len({path.stem for path in data}) < len(data):
@@ -72,9 +72,15 @@ def diagnose(
             warn(f"{path.name}: {error}")
             refused.append(path.name)
             continue
+        if not several:
+            for note in found.notes:
+                warn(note)
         effects = f" ({', '.join(found.effects)})" if found.effects else ""
         say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
+        say(f"  {verdict_sentence(found)}")
         if found.decide_by:
             say(f"  what would decide: {found.decide_by}")
+    if not several:
+        say(f"written to {out}: open {out / 'report.html'}")
     if refused:
         raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
