@@ -182,7 +182,7 @@ def main() -> None:
             ],
             simulated=responses,
         )
-        plot.save_figure(figure, folder / "curved_responses.png")
+        plot.save_figure(folder / "curved_responses.png", figure)
 
 
 if __name__ == "__main__":

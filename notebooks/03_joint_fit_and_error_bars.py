@@ -57,7 +57,7 @@ def show(figure, name):
     """Return the figure to the notebook; as a script, write it into the folder given."""
     if FIGURES is not None:
         FIGURES.mkdir(parents=True, exist_ok=True)
-        plot.save_figure(figure, FIGURES / f"{name}.png", dots_per_inch=150)
+        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
     return figure
 
 

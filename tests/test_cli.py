@@ -324,6 +324,7 @@ def test_diagnose_writes_the_verdict_the_model_and_the_report(tmp_path):
     assert (out / "report.html").stat().st_size > 1000
     assert list(out.glob("*.png"))
     assert "blind_03.csv: none\n" in done.stderr
+    assert "Nothing is missing that these data could show" in done.stderr
 
 
 def test_diagnose_refuses_too_few_states(files, tmp_path):
@@ -616,6 +617,7 @@ def test_predictions_go_as_far_as_asked(files, tmp_path):
 
 def test_every_writer_takes_the_path_first():
     writers = [getattr(sj.io, name) for name in sj.io.__all__ if name.startswith("write_")]
+    writers.append(sj.plot.save_figure)
     assert len(writers) >= 10
     for writer in writers:
         first, second, *others = inspect.signature(writer).parameters.values()

@@ -3,6 +3,7 @@
 Each imports what it needs by itself: none waits for the imports of another.
 """
 
+import inspect
 import os
 import sys
 
@@ -26,21 +27,26 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-app.command(epilog="Example: snrmjax demo --out demo, then open demo/report.html.")(demo)
-app.command(
-    epilog="Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
-    "--out result"
-)(simulate)
-app.command(epilog="Example: snrmjax nnm beam.toml --to-hz 110 --out result")(nnm)
-app.command(
-    epilog="Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 --out "
-    "result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain --next "
-    "5 --out result"
-)(identify)
-app.command(
-    epilog="Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
-    "snrmjax diagnose sets/*.csv --model model.toml --out results"
-)(diagnose)
+_EXAMPLES = {
+    demo: "Example: snrmjax demo --out demo, then open demo/report.html.",
+    simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
+    "--out result",
+    nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
+    identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
+    "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
+    "--next 5 --out result",
+    diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
+    "snrmjax diagnose sets/*.csv --model model.toml --out results",
+}
+
+
+def _unwrapped(text: str) -> str:
+    """Paragraphs on one line each: the width of the terminal wraps them."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+
+
+for _command, _examples in _EXAMPLES.items():
+    app.command(help=_unwrapped(inspect.getdoc(_command) or ""), epilog=_examples)(_command)
 
 
 def main() -> None:

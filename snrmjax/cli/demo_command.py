@@ -62,5 +62,5 @@ def demo(out: Out) -> None:
         found = found._replace(truth=branch, simulated=tuple(curves))
         done = {"data": "a virtual test with seeded noise", "model": model.name}
         workflow.write_findings(folder, found, "The chain on the flat beam", done)
-        save_figure(simulated_response_figure(curves), folder / "response.png")
+        save_figure(folder / "response.png", simulated_response_figure(curves))
     say(f"done: open {out / 'report.html'}")

@@ -49,7 +49,7 @@ def diagnose(
     Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what cannot
     be told.
     """
-    from snrmjax.report.diagnosis_report import verdict_sentence, write_diagnosis
+    from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
 
     several = len(data) > 1
     if len({path.stem for path in data}) < len(data):
@@ -77,7 +77,7 @@ def diagnose(
                 warn(note)
         effects = f" ({', '.join(found.effects)})" if found.effects else ""
         say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
-        say(f"  {verdict_sentence(found)}")
+        say(f"  {readable_verdict(found)}")
         if found.decide_by:
             say(f"  what would decide: {found.decide_by}")
     if not several:

@@ -110,8 +110,8 @@ def identify(
     knots: Annotated[
         int | None,
         typer.Option(
-            help="Knots of each curve. Default: up to 60, as smooth as predicts left-out levels "
-            "best.",
+            help="Knots of each curve. Default: up to 60, and as smooth as predicts left-out "
+            "levels best.",
             min=2,
             rich_help_panel=_CURVES,
         ),
@@ -166,11 +166,11 @@ def identify(
 ) -> None:
     """Identify backbone and damping from measured steady states, and predict responses.
 
-    State by state with curves through the points, or by one joint fit of all states (asked for by
-    --fit, --free or --next), which knows errors that the states of a level share.
+    State by state with curves through the points, or by one joint fit of all states, which knows
+    errors that the states of a level share (asked for by --fit, --free or --next).
 
-    Writes points.csv, backbone.csv, summary.json, figures and report.html; prediction.csv with
-    --predict-force or --predict-drive; fit.json with a joint fit; next.csv with --next.
+    Writes points.csv, backbone.csv, summary.json, figures and report.html; with predictions
+    also prediction.csv, with a joint fit fit.json, with --next also next.csv.
     """
     from snrmjax.report import workflow
 

@@ -99,7 +99,7 @@ def simulate(
             raise ValueError("no response was found in this range; start farther from resonance.")
         sensor = _sensor(structure)
         results.write_response(folder / "response.csv", curves, sensor=sensor)
-        save_figure(simulated_response_figure(curves, sensor=sensor), folder / "response.png")
+        save_figure(folder / "response.png", simulated_response_figure(curves, sensor=sensor))
     for curve in curves:
         say(_headline(curve, sensor))
     say(f"written to {out}")
@@ -156,7 +156,7 @@ def nnm(
             warn(f"the mode {STATUS_MESSAGE[branch.status]}.")
         sensor = _sensor(structure)
         results.write_normal_mode(folder / "nnm.csv", branch, sensor=sensor)
-        save_figure(normal_mode_figure(branch, sensor=sensor), folder / "nnm.png")
+        save_figure(folder / "nnm.png", normal_mode_figure(branch, sensor=sensor))
     speed = np.abs(branch.velocity[-1, 1, branch.sensors.index(sensor)])
     say(f"the mode ends at {branch.frequency[-1] / HERTZ:.5g} Hz, {speed:.3g} m/s at {sensor}")
     say(f"written to {out}")

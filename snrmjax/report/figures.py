@@ -82,7 +82,7 @@ class DampingSeries(NamedTuple):
     backbone: Backbone | None = None
 
 
-def save_figure(figure: Figure, path: FilePath, *, dots_per_inch: float = 220.0) -> None:
+def save_figure(path: FilePath, figure: Figure, *, dots_per_inch: float = 220.0) -> None:
     """Write a figure as a PNG, whole or not at all.
 
     Raises `ValueError` when `path` does not end in .png or cannot be written.
