@@ -6,6 +6,7 @@ Each imports what it needs by itself: none waits for the imports of another.
 import inspect
 import os
 import sys
+from collections.abc import Callable
 
 import jax
 import platformdirs
@@ -27,7 +28,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-_EXAMPLES = {
+_EXAMPLES: dict[Callable[..., None], str] = {
     demo: "Example: snrmjax demo --out demo, then open demo/report.html.",
     simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
     "--out result",
