@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
 
+P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
 
@@ -64,6 +66,18 @@ def numbers_as_arrays(tree: T) -> T:
     Python's numbers into it.
     """
     return jax.tree.map(_number, tree)
+
+
+def jitted(function: Callable[P, R]) -> Callable[P, R]:
+    """`eqx.filter_jit` of a function whose floating-point numbers are arguments of the program."""
+    inside = eqx.filter_jit(function)
+
+    @wraps(function)
+    def call(*arguments: P.args, **named: P.kwargs) -> R:
+        traceable, settings = numbers_as_arrays((arguments, named))
+        return inside(*traceable, **settings)
+
+    return call
 
 
 def _number(leaf: Any) -> Any:

@@ -1,10 +1,12 @@
 """Programs take floating-point numbers as arguments: other values do not compile anew."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.numerics.compiled import compiled, numbers_as_arrays
+import snrmjax as sj
+from snrmjax.numerics.compiled import compiled, jitted, numbers_as_arrays
 
 
 @compiled
@@ -40,3 +42,43 @@ def test_numbers_as_arrays_leaves_everything_else():
     assert isinstance(found["d"], np.complex128)
     assert found["b"] == (1, True, None, "text")
     assert found["c"] is tree["c"]
+
+
+class Line(eqx.Module):
+    """A straight line, evaluated by a method that is compiled."""
+
+    slope: float
+    name: str = eqx.field(static=True, default="line")
+
+    @jitted
+    def at(self, place, *, offset=0.0):
+        """Its height."""
+        return self.slope * place + offset
+
+
+def test_methods_take_floats_as_arguments(compilations):
+    first = Line(2.0).at(3.0, offset=1.0)
+    assert len(compilations) > 0
+    assert float(first) == 7.0
+    del compilations[:]
+    for k in (0.5, 1.5, -2.5):
+        assert float(Line(k).at(2 * k, offset=k)) == pytest.approx(2 * k**2 + k, rel=1e-14)
+    assert len(compilations) == 0
+
+
+def test_a_backbone_at_other_amplitudes_compiles_nothing(compilations):
+    beam, hertz = sj.model.flat_beam(), 2 * np.pi
+    test = sj.phase_resonance_test(
+        *(beam, np.linspace(1e-3, 6e-3, 4), 60 * hertz, 110 * hertz),
+        points_per_level=4,
+        simulation=sj.simulate.SweepSimulation(harmonic_order=3),
+    )
+    backbone = sj.identify_backbone(test.steady_states, beam.modes).fit.backbone
+    methods = (backbone.natural_frequency, backbone.damping_ratio, backbone.velocity)
+    for method in methods:
+        method(2e-4)
+    del compilations[:]
+    for amplitude in (2.1e-4, 2.3e-4, 2.6e-4):
+        for method in methods:
+            assert np.isfinite(method(amplitude))
+    assert len(compilations) == 0

@@ -25,6 +25,7 @@ from snrmjax.identify.pointwise.curve_fit import (
 from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
+from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.least_squares import ErrorSizes
 from snrmjax.numerics.result import AbstractResult, Variable
 
@@ -130,25 +131,25 @@ class Backbone(AbstractResult):
         ends = float(self.smallest), float(self.largest)
         return self.values(jnp.asarray(np.linspace(*ends, _SAMPLES)))
 
-    @eqx.filter_jit
+    @jitted
     def natural_frequency(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ω̃ in rad/s."""
         squared = self.squared_frequency(amplitude)
         return jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
 
-    @eqx.filter_jit
+    @jitted
     def damping_ratio(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ζ̃ as a fraction of critical."""
         return self.modal_damping(amplitude) / (2 * self.natural_frequency(amplitude))
 
-    @eqx.filter_jit
+    @jitted
     def velocity(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Velocity amplitude in m/s on the backbone, where Ω = ω̃."""
         if self.argument == "velocity":
             return jnp.asarray(amplitude)
         return amplitude * self.natural_frequency(amplitude)
 
-    @eqx.filter_jit
+    @jitted
     def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
         """All that the backbone says at some amplitudes, with standard deviations (1σ).
 

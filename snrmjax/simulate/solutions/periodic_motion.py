@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from snrmjax.model.structures import Structure, simulated_structure
 from snrmjax.numerics.blocks import mapped
-from snrmjax.numerics.compiled import numbers_as_arrays
+from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
 from snrmjax.simulate.balance.harmonics import velocity_phasors
@@ -107,10 +106,10 @@ def periodic_motion(
     target = None if value is None else jnp.asarray(value, dtype=jnp.float64)
     near = tuple(jnp.asarray(part, dtype=jnp.float64) for part in start)
     load = jnp.asarray(force, dtype=jnp.float64)
-    return _periodic_motion(numbers_as_arrays(model), load, near, condition, target, iterations)
+    return _periodic_motion(model, load, near, condition, target, iterations)
 
 
-@eqx.filter_jit
+@jitted
 def _periodic_motion(
     model: Structure,
     force: Float[Array, ""],

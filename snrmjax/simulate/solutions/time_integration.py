@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.compiled import jitted
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonics import harmonic_basis, velocity_phasors
 from snrmjax.simulate.balance.labelled import HERTZ, range_text
@@ -265,7 +266,7 @@ class _Settling(NamedTuple):
     n_cycles: Int[Array, ""]
 
 
-@eqx.filter_jit
+@jitted
 def _stepped(
     model: Structure,
     force: Float[Array, ""],
