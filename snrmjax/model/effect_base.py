@@ -33,7 +33,7 @@ Bounds = list[tuple[float, float]]
 
 
 class AbstractEffect(eqx.Module):
-    """One physical effect, defined once: its equation and all that other rooms ask about it.
+    """One physical effect, defined once: its equation, and what a diagnosis must know about it.
 
     Effects act on the mode of interest alone: on its modal coordinate q, its linear terms, or
     what is recorded of it. A nonlinearity that couples modes belongs in the potential.
@@ -43,22 +43,32 @@ class AbstractEffect(eqx.Module):
     without it has none. Fields with a default are settings of the computation, which no file
     holds.
 
-    Only `kind` must be stated. What a force does not state of its `shape` is computed from the
-    force (see `effect_shape`).
+    Only `kind`, the name in files, must be stated. Beside it a class may state
+
+    - `description`: what the effect is physically, in one sentence that reports print;
+    - `shape`: which part of the force balance it changes, its symmetry and its power of amplitude;
+      of a force that states none it is computed (see `shape_of`);
+    - `confusions`: other effects that the same data may show, and the measurement that separates
+      them;
+    - `imitations`: what outside the library does the same;
+    - `acts_like`: two effects of one answer with the same entry may be one law that the library
+      lacks; forces without an entry act like others that change the same part;
+    - `is_linear`: a linear structure remains linear with it;
+    - `like_force_gain`: a gain of all forces does the same;
+    - `only_phase`: amplitudes do not show it;
+    - `searched`: whether a diagnosis looks for it by itself, or only as an alternative to an
+      answer.
     """
 
     kind: ClassVar[str]
-    description: ClassVar[str] = ""  # what it is physically: one sentence
+    description: ClassVar[str] = ""
     shape: ClassVar[Shape | None] = None
     confusions: ClassVar[tuple[Confusion, ...]] = ()
     imitations: ClassVar[tuple[Imitation, ...]] = ()
-    # Two effects of one answer that act alike may stand for one law that the library lacks.
-    # Forces that state nothing act like others that change the same part of the balance.
     acts_like: ClassVar[str | None] = None
-    is_linear: ClassVar[bool] = False  # a linear structure stays linear with it
-    like_force_gain: ClassVar[bool] = False  # all that it does, a gain of all forces does as well
-    only_phase: ClassVar[bool] = False  # amplitudes do not show it
-    # A diagnosis adds it to an answer only as an alternative to what was found, not by itself.
+    is_linear: ClassVar[bool] = False
+    like_force_gain: ClassVar[bool] = False
+    only_phase: ClassVar[bool] = False
     searched: ClassVar[bool] = True
 
     @classmethod

@@ -27,7 +27,7 @@ from snrmjax.numerics.rules import NOT_NEGATIVE
 _ODD = Shape(Part.STIFFNESS, Symmetry.ODD, Argument.DISPLACEMENT)
 _EVEN = Shape(Part.STIFFNESS, Symmetry.EVEN, Argument.DISPLACEMENT, strength_order=2)
 _OF_A_GAP = Prior(0.0, 1.2, lambda scales: scales.largest)
-_SHARES = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude, at which a contact is looked for
+_SHARES = (0.3, 0.55, 0.75, 0.9)  # of the largest amplitude: gaps from which a fit begins
 
 
 def _contact_starts(scales: MotionScales, share: float) -> Starts:
