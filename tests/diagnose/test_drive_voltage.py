@@ -46,8 +46,14 @@ def check(found):
     assert np.isfinite(np.asarray(found.data.force)).all()
 
 
-def test_the_python_verb_takes_a_drive_voltage():
-    check(sj.diagnose_model(linear_model(), driven(balanced(quadratic))))
+@pytest.fixture(scope="module")
+def of_volts():
+    """The diagnosis of states with a drive voltage, by the Python verb."""
+    return sj.diagnose_model(linear_model(), driven(balanced(quadratic)))
+
+
+def test_the_python_verb_takes_a_drive_voltage(of_volts):
+    check(of_volts)
 
 
 def test_a_drive_voltage_without_phases_is_diagnosed():
@@ -60,13 +66,12 @@ def test_a_drive_voltage_without_phases_is_diagnosed():
     assert any("the model as given" in note for note in found.notes)
 
 
-def test_command_and_verb_agree(tmp_path):
-    data = driven(balanced(quadratic))
+def test_command_and_verb_agree(tmp_path, of_volts):
+    data, found = driven(balanced(quadratic)), of_volts
     write_steady_states(tmp_path / "driven.csv", data)
     write_model(tmp_path / "linear.toml", linear_model())
     diagnose([tmp_path / "driven.csv"], tmp_path / "linear.toml", tmp_path / "out", responses=False)
     told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    found = sj.diagnose_model(linear_model(), data)
     assert told["effects"] == list(found.effects)
     assert told["notes"] == list(found.notes)
     for name, (value, std) in found.parameters.items():

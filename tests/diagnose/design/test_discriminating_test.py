@@ -93,7 +93,7 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
     assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), shared) < 1e-9
 
 
-def test_design_points_obey_the_law_that_foretells_them():
+def test_design_points_obey_the_law_that_predicts_them():
     predictions = predictions_of(linear_model(), measured())
     misfit, scales = weighted_misfit(predictions), scales_of(predictions)
     found = find_effects(misfit, scales, ("cubic_damping",))
