@@ -23,7 +23,7 @@ from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, co
 from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
 from snrmjax.diagnose.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
-from snrmjax.diagnose.misfit.amplitudes import what_is_lost
+from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
@@ -110,7 +110,7 @@ def diagnose_model(
     levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
     judgement = judge(found, neighbours, free.parts, levels)
     test = None
-    # Without phases the first thing to measure is these.
+    # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
         test = recommended_test(found)
     parameters = _estimates(misfit, fit)
@@ -143,7 +143,7 @@ def diagnose_model(
         )
     chosen = misfit.predictions.chosen
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
-    notes += [*what_is_lost(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
+    notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
     notes += _notes_on_answer(model, completed, refused, fit)
     notes += _notes_on_fits(found, unconverged)
     return Diagnosis(

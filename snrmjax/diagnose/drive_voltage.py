@@ -31,12 +31,17 @@ def driven_by_voltage(data: SteadyStates) -> bool:
 def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
     """The states with a force by a first value of the unknown gain, which must stay free.
 
-    A joint fit of smooth curves gives it; where phases are unknown, which a joint fit needs, the
-    force that the model needs for the measured motions does, in the median over the states.
+    It is that of a joint fit of smooth curves. A joint fit needs phases: where some are unknown,
+    the gain is the median, over the states, of the force that the model needs for the measured
+    motion over the drive voltage.
+
+    Raises `ValueError` where the model has no such motions, and what `fit_jointly` raises.
     """
     if np.any(np.asarray(data.phase_unknown)):
         in_volts = eqx.tree_at(lambda d: d.force, data, data.drive)
         needed = weighted_misfit(predictions_of(model, in_volts, FREE_GAIN_STD)).baseline.force
+        if not np.any(np.isfinite(needed)):
+            raise ValueError("the model has no motion of the measured amplitude for any state.")
         gain = float(np.median(np.abs(needed)[np.isfinite(needed)]))
         found, by = eqx.tree_at(lambda d: d.force, data, gain * data.drive), "the model as given"
     else:

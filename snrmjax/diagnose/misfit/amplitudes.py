@@ -115,7 +115,7 @@ def sizes_of(chosen: ComparedColumns) -> Sizes:
     return Sizes(measured, by_error, noise, known[:, ::2] & ~known[:, 1::2])
 
 
-def what_is_lost(
+def notes_without_phases(
     chosen: ComparedColumns, phase: Float[np.ndarray, " state"], levels: np.ndarray
 ) -> list[str]:
     """Notes on what a diagnosis cannot find without phases.

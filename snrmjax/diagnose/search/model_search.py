@@ -165,9 +165,9 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     if _gain(misfit, nothing, best) <= DETECTED:
         return FoundEffects(misfit, nothing, nothing, (), tuple(table))
     pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
-    twins: list[EffectFit] = []
+    simple_pairs: list[EffectFit] = []
     if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
-        twins = _pairs(misfit, every, most=len(best.values))
+        simple_pairs = _pairs(misfit, every, most=len(best.values))
     if _is_below(misfit, best, _DOUBTFUL):
         pairs += _pairs(misfit, every)
     lowest = min(singles, key=lambda fit: fit.criterion(misfit.n_rows))
@@ -177,7 +177,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         misfit, best, nothing, (_class(misfit, singles, best.kinds[0]),), tuple(table)
     )
     if single:
-        as_simple = _simplest(misfit, [best, *twins])
+        as_simple = _simplest(misfit, [best, *simple_pairs])
         if as_simple is best:
             return of_one
         pair = as_simple
