@@ -42,7 +42,6 @@ from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.report import style as drawing
 from snrmjax.report.sampling import contributions_by_kind
-from snrmjax.report.workflow import corrected
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -303,7 +302,7 @@ else:
     gain = np.exp(float(hung.unknowns.log_force_gain))
     print(f"{' and '.join(taken(hung))}; gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
     remarks(hung)
-    points = sj.identify.identify_points(corrected(data, hung), model.modes)
+    points = sj.identify.identify_points(sj.identify.corrected_states(data, hung), model.modes)
     series = [plot.FitSeries("fit", hung, points)]
     show(plot.fitted_curves_figure(series), "suspended_beam")
     show(plot.residuals_figure(hung), "suspended_residuals")

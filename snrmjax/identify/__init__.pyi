@@ -2,6 +2,7 @@ from .calibrate.calibrated_model import CalibratedModel
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
+from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response
 from .inference.located_points import FittedPoint, LocatedStatus
@@ -87,6 +88,7 @@ __all__ = [
     "closed_form",
     "compare_bands",
     "contributions",
+    "corrected_states",
     "fit_backbone",
     "fit_jointly",
     "fitted_response",
