@@ -402,12 +402,13 @@ def phasor_relative_to_force(
 
     Arguments: `response` in any unit, one column a harmonic of `orders`; `force` the phasor F₁ of
     the force fundamental on the same time axis, in N. Returns the unit of `response`; NaN where
-    the force is zero. Raises `ValueError` when `orders` does not fit.
+    the force is zero; differentiable. Raises `ValueError` when `orders` does not fit.
     Reference: Kwarta & Allen, section 3.1, below Eq. (20).
 
     >>> phasor_relative_to_force(jnp.array([1j, 1.0 + 0j]), jnp.array(2j), (1, 2)).real.round(12)
     Array([ 1., -1.], dtype=float64)
     """
+    orders = require_orders("orders", orders)
     amplitudes = checked_amplitudes("response", response, orders)
     forces = jnp.asarray(force)
     phase = jnp.where(jnp.abs(forces) > 0, jnp.angle(forces), jnp.nan)
@@ -432,8 +433,8 @@ def checked_frequency(
 
 def orders_with_mean(harmonic_order: tuple[int, ...]) -> tuple[int, ...]:
     """Harmonic orders with the mean, 0, first, or a `ValueError` when none is above 0."""
-    require_orders("harmonic_order", harmonic_order)
-    positive = tuple(int(order) for order in harmonic_order if order > 0)
+    orders = require_orders("harmonic_order", harmonic_order)
+    positive = tuple(order for order in orders if order > 0)
     if not positive:
         raise ValueError(
             f"`harmonic_order` must contain a harmonic above 0, but is {harmonic_order}."

@@ -24,7 +24,7 @@ def nnm_appropriation(
     Arguments: `velocity_amplitudes` in m/s (any unit), one column a harmonic of `orders`; a vector
     is taken as one sensor. NaN means not measured: such entries are left out, and so is a harmonic
     that is exactly zero at every sensor, and harmonic 0, which has no phase.
-    Returns a number from 0 to 1; NaN when no harmonic counts.
+    Returns a number from 0 to 1; NaN when no harmonic counts. Differentiable.
     Raises `ValueError` when `orders` does not fit.
     Validity: every harmonic weighs the same, however small it is; harmonics that are only noise
     pull Δ towards one half.
@@ -33,6 +33,7 @@ def nnm_appropriation(
     >>> nnm_appropriation(jnp.array([1.0 + 1.0j, 0.01j]), (1, 2)).round(12)
     Array(0.75, dtype=float64)
     """
+    orders = require_orders("orders", orders)
     amplitudes = jnp.asarray(velocity_amplitudes)
     if amplitudes.ndim == 1:
         amplitudes = amplitudes[None]
@@ -41,8 +42,7 @@ def nnm_appropriation(
             f"`velocity_amplitudes` must end in an axis of {len(orders)} harmonics, as many as "
             f"`orders` {orders} names, but has shape {jnp.shape(velocity_amplitudes)}."
         )
-    require_orders("orders", orders)
-    return _appropriation(amplitudes, tuple(orders))
+    return _appropriation(amplitudes, orders)
 
 
 @eqx.filter_jit
@@ -64,7 +64,7 @@ def mode_indicator(velocity: Complex[Array, "*batch sensor"]) -> Float[Array, "*
     Σ(Re V)² / Σ|V|² with velocities relative to a cosine force.
 
     Arguments: `velocity` in m/s (any unit), one entry a sensor; NaN entries are left out.
-    Returns a number from 0 to 1; NaN when every sensor is zero or NaN.
+    Returns a number from 0 to 1; NaN when every sensor is zero or NaN. Differentiable.
     Reference: Kwarta & Allen, Eq. (21).
 
     >>> mode_indicator(jnp.array([3.0 + 4.0j])).round(12)
@@ -80,7 +80,7 @@ def appropriation_of(data: SteadyStates, *, significance: float = 0.0) -> Float[
 
     Arguments: `data`; `significance`: a higher harmonic counts when its rms over the sensors is
     at least that many times their stated `harmonic_std` (harmonics without one always count).
-    Returns one number per state; NaN for a state that no sensor measured.
+    Returns one number per state; NaN for a state that no sensor measured. Differentiable.
     Reference: Kwarta & Allen, Eq. (20).
 
     >>> from snrmjax.measure.states import steady_states

@@ -17,6 +17,7 @@ from snrmjax.measure.harmonic_fit import (
     orders_with_mean,
     phasor_relative_to_force,
 )
+from snrmjax.measure.signals import require_orders
 from snrmjax.measure.states import SteadyStates, steady_states
 
 
@@ -78,6 +79,7 @@ def fit_records(
                 f"`{name}` must have samples of shape {times.shape}, as `time` has, "
                 f"but has {record.shape}."
             )
+    harmonic_order = require_orders("harmonic_order", harmonic_order)
     if 1 not in harmonic_order:
         raise ValueError(
             f"`harmonic_order` must contain the fundamental, 1, but is {harmonic_order}."
@@ -163,7 +165,7 @@ def steady_state_from_records(
             raise ValueError(
                 f"`{name}` cannot be fitted: {FIT_MESSAGE[HarmonicFitStatus(int(status))]}."
             )
-    higher = tuple(order for order in harmonic_order if order != 1)
+    higher = tuple(int(order) for order in harmonic_order if order != 1)
     state = {name: np.asarray(value)[None] for name, value in _state_of(fit, higher).items()}
     return steady_states(
         np.array([level]),

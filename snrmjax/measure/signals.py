@@ -1,12 +1,13 @@
 """Signals made of harmonics: their synthesis, their peaks and their loops with the force."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 
 def synthesise(
@@ -18,11 +19,13 @@ def synthesise(
     """Signal of given harmonics, x(t) = Re Σ_k X_k e^{ikΩt}.
 
     Arguments: `amplitudes` in any unit, one column a harmonic of `orders`; `frequency` Ω in rad/s;
-    `time` in s. Returns the unit of `amplitudes`. Raises `ValueError` when `orders` does not fit.
+    `time` in s. Returns the unit of `amplitudes`; differentiable.
+    Raises `ValueError` when `orders` does not fit.
 
     >>> synthesise(jnp.array([2.0, 1j]), (0, 1), 1.0, jnp.array([0.0, jnp.pi / 2])).round(12)
     Array([2., 1.], dtype=float64)
     """
+    orders = require_orders("orders", orders)
     values = checked_amplitudes("amplitudes", amplitudes, orders)
     angle = jnp.outer(jnp.asarray(orders, dtype=float), frequency * jnp.asarray(time))
     return values.real @ jnp.cos(angle) - values.imag @ jnp.sin(angle)
@@ -43,6 +46,7 @@ def peak_amplitude(
     >>> peak_amplitude(jnp.array([3.0 + 4.0j]), (1,)).round(12)
     Array(5., dtype=float64)
     """
+    orders = require_orders("orders", orders)
     return _peak(checked_amplitudes("amplitudes", amplitudes, orders), orders)
 
 
@@ -108,6 +112,7 @@ def force_velocity_loop(
     >>> force_velocity_loop(2.0, jnp.array([0.5 + 0.1j]), (1,)).mean_power
     Array(0.5, dtype=float64)
     """
+    orders = require_orders("orders", orders)
     values = checked_amplitudes("velocity_amplitudes", velocity_amplitudes, orders)
     if 1 not in orders:
         raise ValueError(f"`orders` must contain the fundamental, 1, but is {orders}.")
@@ -131,12 +136,16 @@ def checked_amplitudes(
             f"`{name}` must end in an axis of {len(orders)} harmonics, as many as `orders` "
             f"{orders} names (one at least), but has shape {values.shape}."
         )
-    require_orders("orders", orders)
     return values
 
 
-def require_orders(name: str, orders: tuple[int, ...]) -> None:
-    """Refuse harmonic orders that are doubled, negative or not whole, with a `ValueError`."""
-    whole = all(isinstance(order, int | np.integer) and order >= 0 for order in orders)
-    if not whole or len(set(orders)) != len(orders):
-        raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {orders}.")
+def require_orders(name: str, orders: Sequence[int] | Int[np.ndarray, " order"]) -> tuple[int, ...]:
+    """Harmonic orders as a tuple, or a `ValueError` where some are doubled, negative or not whole.
+
+    Lists and arrays of them are as good.
+    """
+    given = tuple(np.asarray(orders).tolist()) if isinstance(orders, np.ndarray) else tuple(orders)
+    whole = all(isinstance(order, int | np.integer) and order >= 0 for order in given)
+    if not whole or len(set(given)) != len(given):
+        raise ValueError(f"`{name}` must be distinct whole numbers from 0 on, but is {given}.")
+    return tuple(int(order) for order in given)

@@ -35,6 +35,7 @@ def averaged_force(
 
     Arguments: `force` f(q, q̇) in kg^1/2 m/s²; `amplitude` Q in kg^1/2 m, not zero; `frequency`
     Ω in rad/s. Returns 1/s² and 1/s. First order in f: harmonics of the response are neglected.
+    Differentiable by amplitude, frequency and what `force` depends on.
     Reference: Kwarta & Allen, Eqs. (9a) and (9b); (9b) as printed contradicts their Eq. (8) for
     linear damping and is corrected here, and (9a) is the first-order root of Δ(ω̃²).
 
@@ -63,7 +64,8 @@ def averaged_effect(
     the error of friction falls with the square of the step.
 
     Arguments: `amplitude` Q in kg^1/2 m, not zero; `frequency` Ω in rad/s. Returns 1/s² and 1/s.
-    First order in the force: harmonics of the response are neglected.
+    First order in the force: harmonics of the response are neglected. Differentiable by all of
+    them and by the effect's parameters.
     Reference: Kwarta & Allen, Eqs. (9a) and (9b), corrected as `averaged_force` says.
 
     >>> from snrmjax.model.effects import make_effect
@@ -102,7 +104,8 @@ def averaged_response(
     P = Q [ω₀² + Δ(ω̃²) − Ω² + iΩ(2ζω₀ + Δ(2ζ̃ω̃))]: the complex form of Eq. (8).
 
     Arguments: `natural_frequency` and `frequency` in rad/s, `amplitude` in kg^1/2 m. Returns
-    kg^1/2 m/s². Reference: Kwarta & Allen, Eq. (8), with the phase of their Eq. (13).
+    kg^1/2 m/s²; differentiable as `averaged_force` is.
+    Reference: Kwarta & Allen, Eq. (8), with the phase of their Eq. (13).
     """
     average = averaged_force(force, amplitude, frequency)
     stiffness = natural_frequency**2 + average.stiffness

@@ -194,7 +194,7 @@ def linear_response(
     """Velocity of the whole linear structure at every sensor.
 
     Arguments: `frequency` Ω in rad/s, `force` in N. Returns phasors e^{+iΩt} relative to the
-    force, in m/s; exact for a linear structure with modal damping.
+    force, in m/s; exact for a linear structure with modal damping. Differentiable.
     Reference: Kwarta & Allen, Eq. (23), turned by +90° (the paper forces with a sine).
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])

@@ -112,3 +112,18 @@ class TestSaying:
 def test_a_column_that_does_not_exist_is_refused():
     with pytest.raises(TypeError, match=r"no column 'phase_error', but measured, velocity_std"):
         sj.measure.steady_states([1], [OMEGA], [1.0], [0.1], phase_error=[0.1])
+
+
+def test_lists_and_arrays_are_alike():
+    amplitudes, orders = [1.0 + 1.0j, 0.1j], (1, 2)
+    for given in ([1, 2], np.array([1, 2])):
+        for verb in (sj.measure.peak_amplitude, sj.measure.nnm_appropriation):
+            as_list, as_array = verb(amplitudes, given), verb(np.array(amplitudes), orders)
+            np.testing.assert_array_equal(as_list, as_array)
+    time = np.linspace(0.0, 0.5, 200)
+    record = np.cos(OMEGA * time)
+    fit = sj.measure.fit_records(list(time), list(record), [list(record)], OMEGA, [1, 3])
+    np.testing.assert_allclose(fit.force.harmonic(1), 1.0, rtol=1e-9)
+    points = sj.identify.invert_phasor([6.0], [500.0], [0.6 + 0.0j], [0.0])
+    np.testing.assert_allclose(points.natural_frequency, [500.0])
+    np.testing.assert_allclose(sj.identify.closed_form([6.0], [500.0], [0.6 + 0.0j])[1], [0.01])

@@ -147,7 +147,7 @@ class Backbone(AbstractResult):
         """Velocity amplitude in m/s on the backbone, where Ω = ω̃."""
         if self.argument == "velocity":
             return jnp.asarray(amplitude)
-        return amplitude * self.natural_frequency(amplitude)
+        return jnp.asarray(amplitude) * self.natural_frequency(amplitude)
 
     @jitted
     def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:

@@ -74,15 +74,15 @@ def closed_form(
 
     Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s², `frequency` Ω in rad/s, `mode_velocity` in
     m/s relative to the force. Returns rad/s and a ratio; NaN where ω̃² is not positive.
+    Differentiable; a member without an answer leaves the derivatives of the others as they are.
     It is the start and the test of the Newton solve. Reference: Kwarta & Allen, Eq. (18).
 
     >>> omega, zeta = closed_form(jnp.array(6.0), jnp.array(500.0), jnp.array(0.6 + 0.0j))
     >>> float(omega), float(zeta)
     (500.0, 0.01)
     """
-    return _from_polar(
-        modal_constant, frequency, _length(mode_velocity), *_direction(mode_velocity)
-    )
+    given = jnp.asarray(modal_constant), jnp.asarray(frequency)
+    return _from_polar(*given, _length(mode_velocity), *_direction(mode_velocity))
 
 
 def invert_phasor(
@@ -101,10 +101,12 @@ def invert_phasor(
 
     Arguments: `modal_constant` A = Φ_r Φᵀb F in m/s²; `frequency` Ω in rad/s; `velocity` V and
     `residual_velocity` V_lin + V_RB in m/s, phasors relative to the force.
-    Returns `SnrmPoints`. Differentiable (implicitly, through the two equations).
+    Returns `SnrmPoints`. Differentiable in forward and reverse mode (by the implicit function
+    theorem); a member without an answer leaves the derivatives of the others as they are.
     Reference: Kwarta & Allen, Eqs. (12), (17), (18).
     """
-    return _invert_phasor(modal_constant, frequency, velocity, residual_velocity)
+    given = (modal_constant, frequency, velocity, residual_velocity)
+    return _invert_phasor(*map(jnp.asarray, given))
 
 
 @jax.jit
@@ -156,7 +158,7 @@ def invert_amplitude_phase(
     and the smaller in `alternative_…`.
 
     Arguments: `amplitude` v = |V| in m/s, `mode_phase` φ in rad relative to the force (0 at
-    resonance; the paper's angle plus 90°). Others as `invert_phasor`.
+    resonance; the paper's angle plus 90°). Others as `invert_phasor`. Differentiable as that is.
     Reference: Kwarta & Allen, Eqs. (12), (17), (18).
 
     >>> a = jnp.array
@@ -164,15 +166,15 @@ def invert_amplitude_phase(
     >>> p.natural_frequency, p.damping_ratio
     (Array([500.], dtype=float64), Array([0.01], dtype=float64))
     """
-    nan = jnp.full(jnp.shape(amplitude), jnp.nan)
+    size, phase = jnp.asarray(amplitude), jnp.asarray(mode_phase)
     return _invert(
-        modal_constant,
-        frequency,
-        amplitude,
-        jnp.cos(mode_phase),
-        jnp.sin(mode_phase),
-        residual_velocity,
-        nan,
+        jnp.asarray(modal_constant),
+        jnp.asarray(frequency),
+        size,
+        jnp.cos(phase),
+        jnp.sin(phase),
+        jnp.asarray(residual_velocity),
+        jnp.full(size.shape, jnp.nan),
     )
 
 
