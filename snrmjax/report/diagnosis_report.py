@@ -74,7 +74,7 @@ _CAPTIONS = {
 }
 _HELD_RESPONSE = (
     " These levels hold the response, not the force: lines of constant force meet a level at its "
-    "resonance only, and pale dots were measured under other forces than the line's."
+    "resonance only, and pale dots were measured under forces between those of the lines."
 )
 
 
