@@ -1,6 +1,7 @@
 """Uncertainty of a joint fit: derivatives against refits, and its ways against each other."""
 
 import dataclasses
+import sys
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,12 @@ from truth.joint_fits import noisy_fit
 import snrmjax as sj
 from snrmjax.identify.inference import profiles
 from snrmjax.identify.inference.profiles import IntervalEnd, profile
-from snrmjax.identify.inference.resampling import bootstrap, compare_bands
+from snrmjax.identify.inference.resampling import (
+    ComparedBand,
+    ComparedBands,
+    bootstrap,
+    compare_bands,
+)
 from snrmjax.identify.inference.sensitivity import contributions, sensitivity
 
 
@@ -125,6 +131,7 @@ def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
     ("failed", "end", "status"),
     [
         ([8], 2.0, IntervalEnd.BRACKETED),  # within: neighbours bracket the end all the same
+        ([9], 1.75, IntervalEnd.BRACKETED),  # between χ² of 0.96 at 1 and of 8.64 at 3
         ([12], 2.0, IntervalEnd.BRACKETED),  # beyond it
         ([*range(9, 15)], np.nan, IntervalEnd.NOT_COMPUTED),
         ([], np.inf, IntervalEnd.BEYOND_REACH),
@@ -165,3 +172,36 @@ def test_a_bootstrap_of_levels_sees_their_scatter():
     good = np.all(np.isfinite(found), axis=1)
     assert np.mean(good) > 0.5
     assert np.std(found[good, 3]) > np.std(inside[:, 3])
+
+
+def test_samples_become_inference_data(fit, monkeypatch):
+    pytest.importorskip("arviz")
+    value, std = np.asarray(fit.vector()[0]), np.sqrt(np.diag(fit.covariance))
+    samples = value + std * np.random.default_rng(0).normal(size=(50, len(value)))
+    samples[3] = np.nan  # a refit that failed
+    posterior = sj.identify.inference_data(fit, samples).posterior
+    viscous = posterior["damping.viscous"]
+    assert viscous.attrs["units"] == "1/s"
+    assert viscous.sizes == {"chain": 1, "draw": 49}
+    np.testing.assert_array_equal(viscous.values[0], np.delete(samples[:, 2], 3))
+    with pytest.raises(ValueError, match="unknowns"):
+        sj.identify.inference_data(fit, samples[:, :2])
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(ImportError, match="posterior"):
+        sj.identify.inference_data(fit, samples)
+
+
+def test_a_profile_says_itself_and_is_drawn(fit, monkeypatch):
+    monkeypatch.setattr(profiles, "_pinned", lambda *_: 3.84 * (np.arange(-7, 8) / 2) ** 2)
+    found = profile(fit, "damping.viscous", n_points=15, reach=7.0)
+    assert "between two computed values" in repr(found)
+    assert found.to_xarray()["value"].attrs["units"] == "1/s"
+    assert list(found.to_pandas()["rise"]) == list(found.rise)
+    assert found.plot().axes
+
+
+def test_compared_bands_are_a_table():
+    rows = (ComparedBand(0.3, "natural_frequency", 2 * np.pi, 6.0, 6.0, np.nan),)
+    table = ComparedBands(rows, 2).to_pandas()
+    assert table["gauss_newton"][0] == pytest.approx(1.0)  # Hz
+    assert "2 refits" in repr(ComparedBands(rows, 2))
