@@ -15,15 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snrmjax.identify.pointwise.inversion import (
-    STATUS_MESSAGE,
     CramersRule,
-    PointStatus,
-    SnrmPoints,
     closed_form,
     invert_amplitude_phase,
     invert_one,
     invert_phasor,
 )
+from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus, SnrmPoints
 from snrmjax.model.modes import LinearModes, residual_velocity
 
 N = 20500  # more than the package solves at a time
