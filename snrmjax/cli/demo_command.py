@@ -3,7 +3,7 @@
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.cli.console import say, staged
+from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.options import Out
 from snrmjax.io.models import write_model
 from snrmjax.io.tables import write_steady_states
@@ -63,4 +63,8 @@ def demo(out: Out) -> None:
         done = {"data": "a virtual test with seeded noise", "model": model.name}
         workflow.write_findings(folder, found, "The chain on the flat beam", done)
         save_figure(folder / "response.png", simulated_response_figure(curves))
-    say(f"done: open {out / 'report.html'}")
+    for note in found.notes:
+        warn(note)
+    for line in workflow.headline(found):
+        say(line)
+    say(f"written to {out}: open {out / 'report.html'}")

@@ -46,8 +46,8 @@ def diagnose(
     Writes diagnosis.json, figures, report.html and model.toml, the completed model; of several
     files each into a folder of its own name.
 
-    Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what cannot
-    be told.
+    Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what
+    these data cannot decide.
     """
     from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
 

@@ -246,7 +246,7 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     """Write steady states as the CSV that `read_steady_states` reads, one row a state and sensor.
 
     Numbers are written in full, so that reading gives them back exactly, angular frequencies and
-    phases to one rounding of the unit conversion. Columns that nobody stated are left out.
+    phases to one rounding of the unit conversion. Columns in which nothing is stated are left out.
 
     Arguments: `data` with the forces of all states, or with the drive voltages of all where no
     force is known. Voltages beside known forces are left out: a file has one of both.

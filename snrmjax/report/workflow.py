@@ -102,7 +102,7 @@ class Findings(NamedTuple):
     values: BackboneValues  # of the curves, from the smallest to the largest measured amplitude
     settings: dict[str, str]  # in words, for the summary and the report
     fitted: ReportedFit | None = None
-    advice: NextMeasurements | None = None  # none where nobody asked
+    advice: NextMeasurements | None = None  # None: no advice was asked for
     truth: NormalModeBranch | None = None
     simulated: tuple[ResponseCurve, ...] = ()
 
@@ -217,8 +217,8 @@ def identify_jointly(
     fitted = reported_fit(fit, tuple(advice or ()))
     ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
-    told = (data, model, found, tuple(predictions), tuple(notes), values, words)
-    return Findings(*told, fitted, advice)
+    fields = (data, model, found, tuple(predictions), tuple(notes), values, words)
+    return Findings(*fields, fitted, advice)
 
 
 def _require_drive(data: SteadyStates) -> None:
