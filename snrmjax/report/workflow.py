@@ -217,7 +217,7 @@ def identify_jointly(
     fitted = reported_fit(fit, tuple(advice or ()))
     ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
-    fields = (data, model, found, tuple(predictions), tuple(notes), values, words)
+    fields = (data, model, found, tuple(predictions), tuple(dict.fromkeys(notes)), values, words)
     return Findings(*fields, fitted, advice)
 
 

@@ -1,0 +1,30 @@
+"""Points beside a joint fit: errors that the states of a level share move them as far as said."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from truth.exact_states import modes, noisy
+
+import snrmjax as sj
+from snrmjax.identify.pointwise.identification import errors_from_scatter
+
+NO_NOISE = SimpleNamespace(noise_scale=(0.0, 0.0), level_frequency_std=0.0, level_damping_std=0.0)
+
+
+@pytest.mark.parametrize(
+    ("shared", "factor"),
+    [({"level_gain": 1e-3}, np.exp(1e-3)), ({"level_phase": 1e-3}, np.exp(1e-3j))],
+    ids=["gain", "phase"],
+)
+def test_points_have_the_errors_that_their_level_shares(shared, factor):
+    data = noisy()
+    points = sj.identify.identify_points(data, modes())
+    wrong = dataclasses.replace(data, velocity=data.velocity * factor)
+    moved = sj.identify.identify_points(wrong, modes())
+    said = errors_from_scatter(points, NO_NOISE, **shared)
+    change = np.abs(np.asarray(moved.natural_frequency - points.natural_frequency))
+    std = np.asarray(said.natural_frequency_std)
+    # First order in a thousandth.
+    np.testing.assert_allclose(std, change, rtol=0.01, atol=2e-3 * change.max())
