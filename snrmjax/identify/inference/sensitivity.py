@@ -100,19 +100,18 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 
     The correlation of neighbouring states' residuals is not in it.
 
-    Returns a `Sensitivity`. One call costs about as much as a fit.
+    Returns a `Sensitivity`. One call costs about as much as a fit; its program is compiled anew
+    for another number of states, or another family.
     """
-    program, problem = fit.packed(), padded_problem(fit.problem)
-    settings = (program.vector, program.unravel, problem, np.array(fit.corrected))
-    every, crossed = (np.asarray(part) for part in _second_order(*settings))
-    n, own = len(fit.data.level), program.own
-    hessian, mixed = every[np.ix_(own, own)], crossed[own][:, :n]
+    vector, unravel = fit.vector()
+    given = (vector, unravel, fit.problem, np.array(fit.corrected))
+    hessian, mixed = (np.asarray(part) for part in _second_order(*given))
     # In units of the unknowns' own curvature: a value at rest may be known a million times worse.
     curvature = np.diagonal(hessian)
     unit = 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0))
     scaled = hessian * np.outer(unit, unit)
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) * np.outer(unit, unit)
-    p = len(own)
+    p, n = len(vector), len(fit.data.level)
     by_state = -inverse @ mixed.reshape(p, -1)
     n_priors = fit.data.n_levels * len(LEVEL_ERRORS) + len(fit.unknowns.linear)
     by_bends = inverse @ _bend_slopes(fit).T

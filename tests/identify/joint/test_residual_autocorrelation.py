@@ -81,7 +81,7 @@ def test_no_band_becomes_narrower():
     assert more.max() > 1
 
 
-def test_bands_hold_curves_under_misfits_that_neighbours_share():
+def test_bands_cover_curves_whose_neighbouring_residuals_are_correlated():
     level, omega, force, velocity = exact(per_level=25)
     speeds = np.linspace(0.3, 0.9, 4)
     natural, modal_damping = truth_at(speeds)
@@ -95,7 +95,7 @@ def test_bands_hold_curves_under_misfits_that_neighbours_share():
         found = np.stack([values.natural_frequency, values.modal_damping])
         std = np.stack([values.natural_frequency_std, values.modal_damping_std])
         scores.append(np.abs(found - want) / std)
-        notes += any("neighbours" in note for note in fit.notes)
+        notes += any("neighbouring states" in note for note in fit.notes)
     assert notes == 30
     # As if every state were apart, 85 % would be inside, for all that the fits take for levels
     # that differ.

@@ -16,7 +16,7 @@ from snrmjax.identify.joint.force_balance import (
     balance_data,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import FREE, Unravel, packed_unknowns
+from snrmjax.identify.joint.free_unknowns import FREE, Unravel, packed_unknowns, padded_problem
 from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.residuals import (
     LevelPattern,
