@@ -1,19 +1,19 @@
-"""How true simulated responses are: against integration in time and another harmonic balance.
+"""How accurate simulated responses are: against time integration and another harmonic balance.
 
 Run: python benchmarks/simulator_accuracy.py [--points N] [--stability N]
 
-The truth is that of the tests (tests/simulate/conftest.py): the equations of motion written again
-in NumPy, integrated by SciPy's Dormand-Prince method of order 8 with rtol 1e-12, and a harmonic
-balance by sampling whose folds and peaks are found by brentq. Seven curves: the flat beam at four
-forces (60-120 Hz), the monostable curved beam at three (20-150 Hz).
+The reference is that of the tests (tests/truth/periodic_motions.py): the equations of motion
+written again in NumPy, integrated by SciPy's Dormand-Prince method of order 8 with rtol 1e-12, and
+a harmonic balance by sampling whose folds and peaks are found by brentq. Seven curves: the flat
+beam at four forces (60-120 Hz), the monostable curved beam at three (20-150 Hz).
 
-closure: how far the motion of a point misses its start after one period, over its size, for
-points all along each curve and 9 to 63 harmonics. An unstable motion grows on the way: its miss
-counts over its largest multiplier.
 events: the largest relative error in the frequency of all folds, peaks and phase resonances, and
 how many were lost, for largest steps from 0.003 to 0.3.
-stability: whether the verdict agrees with the multipliers of the map over one period, taken by
-differences, on N stable and N unstable points. One JSON line each.
+stability: whether stable and unstable points are told apart as the multipliers of the map over one
+period do (slopes by differences), on N points of either kind.
+closure: how far the motion of a point is from its start after one period, over its size, for
+points all along each curve and 9 to 63 harmonics. An unstable motion grows in this period, so its
+distance is divided by its largest multiplier. One JSON line each.
 """
 
 import argparse
@@ -27,8 +27,8 @@ import numpy as np
 import snrmjax as sj
 from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "simulate"))
-from conftest import NumpyBalance, TimeDomain, initial_state, spectrum_distance
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from truth.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
 
 HERTZ = 2 * np.pi
 KINDS = ("fold", "peak", "phase_resonance")
@@ -52,7 +52,7 @@ def responses(beam: str, **settings: object) -> list[sj.simulate.ResponseCurve]:
 
 
 def closure(n_points: int) -> None:
-    """Motions against one period in time, by harmonics."""
+    """Motions against one period of time integration, by number of harmonics."""
     for beam, (model, _, _) in CURVES.items():
         for order in (9, 15, 31, 45, 63):
             for curve in responses(beam, harmonic_order=order):
@@ -115,7 +115,7 @@ def events() -> None:
 
 
 def stability(n_each: int) -> None:
-    """Verdicts against multipliers of the map over one period."""
+    """Stability against the multipliers of the map over one period."""
     settings = {
         "harmonic_order": 31,
         "steps": sj.simulate.StepControl(largest=0.01, angle=0.02, max_points=8000),
@@ -157,7 +157,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=24, help="of each curve, for the closure")
-    parser.add_argument("--stability", type=int, default=200, help="points of each verdict")
+    parser.add_argument(
+        "--stability", type=int, default=200, help="stable points, and unstable ones"
+    )
     options = parser.parse_args()
     events()
     stability(options.stability)
