@@ -33,9 +33,6 @@ import numpy as np
 from scipy.stats import chi2
 
 import snrmjax as sj
-from snrmjax.identify.calibrate.calibration import calibrate_model
-from snrmjax.model.beams import FLAT_BEAM_FORCES
-from snrmjax.model.parameters import parameter_value, with_parameters
 
 HERTZ = 2 * np.pi
 AMPLITUDE, PHASE, FORCE, HARMONIC = 0.01, np.radians(0.7), 0.003, 1e-3
@@ -63,7 +60,7 @@ def exact_test(
 ) -> sj.measure.SteadyStates:
     """The states as they are."""
     return sj.phase_resonance_test(
-        beam, FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0),
+        beam, sj.model.FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ, appropriation=(0.5, 1.0),
         points_per_level=points,
         recording=sj.simulate.Recording(keep_harmonics=harmonics),
     ).steady_states  # fmt: skip
@@ -101,7 +98,8 @@ def run(name: str, case: Case, options: argparse.Namespace) -> dict:
     """All seeds of one case."""
     beam = sj.model.flat_beam()
     names = (*LINEAR, *(f"potential.{key}" for key in case.coefficients))
-    truth = np.array([float(parameter_value(beam, name)) for name in names])
+    known = sj.model.parameter_values(beam)
+    truth = np.array([known[name] for name in names])
     exact = exact_test(beam, options.points, case.harmonics)
     values, std, inside, spread, chi, seconds = [], [], [], [], [], []
     off = contradicted = 0
@@ -110,9 +108,9 @@ def run(name: str, case: Case, options: argparse.Namespace) -> dict:
         data = measured(exact, case, random)
         share = options.start * random.choice([-1, 1], size=len(names))
         share[: len(LINEAR)] = 0.0
-        start = with_parameters(beam, names, jnp.asarray(truth * (1 + share)))
+        start = sj.model.with_parameters(beam, names, jnp.asarray(truth * (1 + share)))
         before = time.perf_counter()
-        found = calibrate_model(start, data, names, level_gain_std=case.level_gain)
+        found = sj.calibrate_model(start, data, names, level_gain_std=case.level_gain)
         seconds.append(time.perf_counter() - before)
         off += not found.converged or not found.state_converged.all()
         if any("it is understated or" in note for note in found.notes):

@@ -15,8 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
-from snrmjax.report import figures as plot
 
 HERTZ = 2 * np.pi
 TONGUE_HZ = (87.3, 90.4)  # where the flat beam's mode exchanges energy with its second one
@@ -154,35 +152,35 @@ def main() -> None:
     flat, curved = sj.model.flat_beam(), sj.model.curved_beam()
     data = flat_test()
     branch = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
-    responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 55 * HERTZ, 115 * HERTZ)
+    responses = sj.forced_response(flat, sj.model.FLAT_BEAM_FORCES, 55 * HERTZ, 115 * HERTZ)
     for argument in ("displacement", "velocity"):
         result, _ = study(flat, data, argument, branch, responses, TONGUE_HZ)
         print(json.dumps(result))
     data = curved_test()
     branch = sj.nonlinear_normal_mode(curved, 125 * HERTZ)
-    responses = sj.forced_response(curved, CURVED_BEAM_FORCES, 25 * HERTZ, 140 * HERTZ)
+    responses = sj.forced_response(curved, sj.model.CURVED_BEAM_FORCES, 25 * HERTZ, 140 * HERTZ)
     result, backbone = study(curved, data, "displacement", branch, responses, (0.0, 0.0))
     print(json.dumps(result))
     if len(sys.argv) > 1:
         folder = Path(sys.argv[1])
         folder.mkdir(parents=True, exist_ok=True)
-        figure = plot.response_figure(
+        figure = sj.plot.response_figure(
             backbone,
             [
                 part
-                for force in CURVED_BEAM_FORCES
+                for force in sj.model.CURVED_BEAM_FORCES
                 for part in sj.identify.predict_response(
                     backbone, curved.modes, force, from_frequency=25 * HERTZ
                 )
             ],
             [
                 r
-                for f in CURVED_BEAM_FORCES
+                for f in sj.model.CURVED_BEAM_FORCES
                 for r in sj.identify.resonances(backbone, curved.modes, f)
             ],
             simulated=responses,
         )
-        plot.save_figure(folder / "curved_responses.png", figure)
+        sj.plot.save_figure(folder / "curved_responses.png", figure)
 
 
 if __name__ == "__main__":

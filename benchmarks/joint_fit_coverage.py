@@ -23,10 +23,6 @@ from typing import NamedTuple
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.identify.inference.fitted_curves import fitted_values
-from snrmjax.identify.inference.fitted_response import fitted_response
-from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.model.modes import residual_velocity
 
 HERTZ = 2 * np.pi
 ERRORS = {"amplitude": 0.01, "phase": np.radians(0.7), "force": 0.003, "gain": 0.01}
@@ -105,7 +101,7 @@ def truth_of(case: Case) -> Truth:
         case.model, 1.05 * case.forces[-1], harmonic_order=HARMONICS, steps=fine
     )
     # The nonlinear mode is what the sensor sees beside the other modes' linear response.
-    others = residual_velocity(modes, locked.frequency, locked.force)
+    others = sj.model.residual_velocity(modes, locked.frequency, locked.force)
     speed = np.abs(np.asarray(locked.velocity)[:, 1, 0] - np.asarray(others)[:, 0])
     damping = constant * np.asarray(locked.force) / speed
     # By displacement: a softening backbone can have a velocity more than once.
@@ -157,13 +153,13 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
     own = ERRORS["amplitude"] * rng.normal(size=n) + 1j * ERRORS["phase"] * rng.normal(size=n)
     velocity = truth.velocity * np.exp(gain + own)
     force = truth.force * np.exp(ERRORS["force"] * rng.normal(size=n))
-    fit = fit_jointly(
+    fit = sj.fit_jointly(
         recorded(case, truth, force, velocity, ERRORS),
         case.model.modes,
         level_gain_std=ERRORS["gain"] if level_known else 1e-9,
         **FAMILY,
     )
-    values = fitted_values(fit, displacement=truth.at)
+    values = sj.identify.fitted_values(fit, displacement=truth.at)
     frequency = (values.natural_frequency - truth.natural_frequency) / values.natural_frequency_std
     damping = (values.modal_damping - truth.damping) / values.modal_damping_std
     row = {
@@ -177,7 +173,7 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
         ],
         "notes": list(fit.notes),
     }
-    curves = fitted_response(fit, case.foretold)
+    curves = sj.identify.fitted_response(fit, case.foretold)
     tips = sorted((p for c in curves for p in c.resonances), key=lambda p: -p.velocity)
     if tips:
         row["resonance_frequency"] = (tips[0].frequency - truth.resonance[0]) / tips[

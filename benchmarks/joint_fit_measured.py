@@ -26,13 +26,9 @@ from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_with_slopes
-from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.joint.fitting import _solve
 from snrmjax.identify.joint.force_balance import weighting_at
-from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import all_residuals
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
 from snrmjax.numerics.compiled import compiled
 
 HERTZ = 2 * np.pi
@@ -50,8 +46,8 @@ def _plain(value: object) -> object:
 
 def load(folder: Path, table: str) -> tuple[sj.measure.SteadyStates, sj.model.Structure]:
     """Data and model of one beam."""
-    model = read_model(folder / "model.toml")
-    return read_steady_states(folder / table, model), model
+    model = sj.read_model(folder / "model.toml")
+    return sj.read_steady_states(folder / table, model), model
 
 
 def only(data: sj.measure.SteadyStates, rows: np.ndarray) -> sj.measure.SteadyStates:
@@ -119,7 +115,7 @@ def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
         )
 
 
-def describe(name: str, fit: JointFit, seconds: float) -> None:
+def describe(name: str, fit: sj.identify.JointFit, seconds: float) -> None:
     """What a fit of all levels says."""
     at = np.linspace(0.0, fit.largest[1], 6)
     values = sj.identify.fitted_values(fit, at)
@@ -177,7 +173,7 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
     """A fit with given families, SciPy on the same residuals, and all derivatives."""
     settings = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
 
-    def fit_once() -> JointFit:
+    def fit_once() -> sj.identify.JointFit:
         return sj.fit_jointly(data, model.modes, **settings)
 
     fit = fit_once()
@@ -196,7 +192,7 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
 
     def derivatives() -> np.ndarray:
         slopes = values_with_slopes(fit, at)[1]
-        return np.einsum("acp,pse->acse", slopes, sensitivity(fit).by_measurement)
+        return np.einsum("acp,pse->acse", slopes, sj.identify.sensitivity(fit).by_measurement)
 
     def solve() -> np.ndarray:
         near = jnp.asarray(vector + start * unit)

@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from truth.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
@@ -33,8 +32,12 @@ from truth.periodic_motions import NumpyBalance, TimeDomain, initial_state, spec
 HERTZ = 2 * np.pi
 KINDS = ("fold", "peak", "phase_resonance")
 CURVES = {
-    "flat": (sj.model.flat_beam(), FLAT_BEAM_FORCES, (60 * HERTZ, 120 * HERTZ)),
-    "curved": (sj.model.curved_beam("monostable"), CURVED_BEAM_FORCES, (20 * HERTZ, 150 * HERTZ)),
+    "flat": (sj.model.flat_beam(), sj.model.FLAT_BEAM_FORCES, (60 * HERTZ, 120 * HERTZ)),
+    "curved": (
+        sj.model.curved_beam("monostable"),
+        sj.model.CURVED_BEAM_FORCES,
+        (20 * HERTZ, 150 * HERTZ),
+    ),
 }
 BAR = 1e-7  # of the closure
 

@@ -73,12 +73,11 @@ def lu_seconds(size: int, count: int) -> float:
 
 def one_size(harmonics: int, n_modes: int) -> dict:
     """Cost of the curve of one size."""
-    from snrmjax.simulate.continuation.continuation import StepControl
     from snrmjax.simulate.continuation.curve_tracing import response_balances, trace_from_rest
 
     model, force, before = chain(n_modes), 1.0, peak_memory()
     balances = response_balances([model], np.array([force]), harmonics, None)
-    ends, steps = jnp.asarray([60.0, 110.0]) * HZ, StepControl()
+    ends, steps = jnp.asarray([60.0, 110.0]) * HZ, sj.simulate.StepControl()
 
     def trace() -> list:
         return trace_from_rest(balances, np.arange(1), ends, steps, downward=False)

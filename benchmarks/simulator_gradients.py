@@ -21,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.model.beams import FLAT_BEAM_FORCES
 
 HERTZ = 2 * np.pi
-MODEL, FORCE, ENDS = sj.model.flat_beam(), FLAT_BEAM_FORCES[-1], (60 * HERTZ, 120 * HERTZ)
+MODEL, FORCE, ENDS = sj.model.flat_beam(), sj.model.FLAT_BEAM_FORCES[-1], (60 * HERTZ, 120 * HERTZ)
 SETTINGS = {"stability": False}
 STEPS = (3e-3, 1e-3, 3e-4, 1e-4, 3e-5)
 

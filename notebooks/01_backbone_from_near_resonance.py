@@ -33,7 +33,6 @@ import numpy as np
 
 import snrmjax as sj
 from snrmjax import plot
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -58,7 +57,7 @@ def show(figure, name):
 # %%
 flat = sj.model.flat_beam()
 flat_mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
-flat_responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
+flat_responses = sj.forced_response(flat, sj.model.FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
 show(plot.normal_mode_figure(flat_mode), "flat_mode")
 
 # %% [markdown]
@@ -119,11 +118,13 @@ print(f"velocity:     median {np.median(by_velocity):.4f} %, worst {by_velocity.
 # %%
 backbone = found.fit.backbone
 resonances = [
-    r for force in FLAT_BEAM_FORCES for r in sj.identify.resonances(backbone, flat.modes, force)
+    r
+    for force in sj.model.FLAT_BEAM_FORCES
+    for r in sj.identify.resonances(backbone, flat.modes, force)
 ]
 predicted = [
     response
-    for force in FLAT_BEAM_FORCES
+    for force in sj.model.FLAT_BEAM_FORCES
     for response in sj.identify.predict_response(backbone, flat.modes, force)
 ]
 show(
@@ -203,21 +204,21 @@ curved_errors = errors_percent(curved_found.points, curved_mode, (0.0, 0.0))
 print(f"points: median {np.median(curved_errors):.3f} %, worst {curved_errors.max():.3f} %")
 
 # %%
-curved_responses = sj.forced_response(curved, CURVED_BEAM_FORCES, 25 * HERTZ, 140 * HERTZ)
+curved_responses = sj.forced_response(curved, sj.model.CURVED_BEAM_FORCES, 25 * HERTZ, 140 * HERTZ)
 curved_backbone = curved_found.fit.backbone
 show(
     plot.response_figure(
         curved_backbone,
         [
             response
-            for force in CURVED_BEAM_FORCES
+            for force in sj.model.CURVED_BEAM_FORCES
             for response in sj.identify.predict_response(
                 curved_backbone, curved.modes, force, from_frequency=25 * HERTZ
             )
         ],
         [
             r
-            for force in CURVED_BEAM_FORCES
+            for force in sj.model.CURVED_BEAM_FORCES
             for r in sj.identify.resonances(curved_backbone, curved.modes, force)
         ],
         simulated=curved_responses,

@@ -39,8 +39,7 @@ import numpy as np
 
 import snrmjax as sj
 from snrmjax import plot
-from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES
-from snrmjax.report import style as drawing
+from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
 BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]
@@ -89,8 +88,8 @@ def draw(axes, curve, colour, name, events=tuple(EVENTS)):
 
 # %%
 flat, curved = sj.model.flat_beam(), sj.model.curved_beam()
-flat_responses = sj.forced_response(flat, FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ)
-curved_responses = sj.forced_response(curved, CURVED_BEAM_FORCES, 20 * HERTZ, 150 * HERTZ)
+flat_responses = sj.forced_response(flat, sj.model.FLAT_BEAM_FORCES, 60 * HERTZ, 120 * HERTZ)
+curved_responses = sj.forced_response(curved, sj.model.CURVED_BEAM_FORCES, 20 * HERTZ, 150 * HERTZ)
 for curve in (*flat_responses, *curved_responses):
     print(f"{curve.force * 1e3:.4g} mN, {len(curve.frequency)} points, {curve.status.name}")
     for k in np.flatnonzero(curve.event):
@@ -141,7 +140,7 @@ spine = sj.nonlinear_normal_mode(flat, 105 * HERTZ, tongues="skip")
 (tongue,) = mode.tongues
 fine = sj.simulate.StepControl(largest=0.01)
 damped = sj.simulate.damped_normal_mode(flat, 0.7, steps=fine)
-locked = sj.simulate.phase_controlled(flat, FLAT_BEAM_FORCES[-1], steps=fine)
+locked = sj.simulate.phase_controlled(flat, sj.model.FLAT_BEAM_FORCES[-1], steps=fine)
 held = [
     sj.simulate.response_controlled(flat, v, 70 * HERTZ, 110 * HERTZ)
     for v in (0.15, 0.3, 0.45, 0.6)
@@ -243,7 +242,7 @@ show(figure, "three_backbones")
 # numbers also needs no program compiled again.
 
 # %%
-weakest = CURVED_BEAM_FORCES[0]
+weakest = sj.model.CURVED_BEAM_FORCES[0]
 coefficients = sj.model.curved_beam("as_printed").potential.coefficient
 bistable = eqx.tree_at(lambda beam: beam.potential.coefficient, curved, coefficients)
 wells = [e for e in sj.model.equilibria(bistable) if e.stable]

@@ -38,10 +38,7 @@ import numpy as np
 
 import snrmjax as sj
 from snrmjax import plot
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
-from snrmjax.report import style as drawing
-from snrmjax.report.sampling import contributions_by_kind
+from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -223,9 +220,9 @@ for name, fit in fits.items():
 
 # %%
 shares = sj.identify.contributions(with_levels)
-for row in contributions_by_kind(shares):
+for row in shares.by_kind():
     print(f"{row.source:26s} {100 * row.frequency_share:5.1f} % {100 * row.damping_share:5.1f} %")
-show(plot.contributions_figure(shares), "contributions")
+show(shares.plot(), "contributions")
 
 # %% [markdown]
 # Three ways to the same band, as 1σ in rad/s and 1/s: from the fit's covariance; from the exact
@@ -286,9 +283,9 @@ headline |= {
 # %%
 def measured(name):
     """Data and model of a measured beam."""
-    model = read_model(MEASURED / name / "model.toml")
+    model = sj.read_model(MEASURED / name / "model.toml")
     (table,) = (MEASURED / name).glob("*.csv")
-    return read_steady_states(table, model), model
+    return sj.read_steady_states(table, model), model
 
 
 if MEASURED is None:

@@ -31,11 +31,7 @@ from pathlib import Path
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
-from snrmjax.model.effects import make_effect
-from snrmjax.report import diagnosis_report
-from snrmjax.report import figures as plot
+from snrmjax import plot
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -93,7 +89,7 @@ modes = sj.model.linear_modes(
     std=sj.model.LinearModesStd([0.001 * OMEGA], [0.05 * ZETA]),
 )
 model = sj.model.structure(modes)
-hidden = make_effect("one_sided_stop", {"stiffness": 0.12 * OMEGA**2, "gap": 3e-4 / SHAPE})
+hidden = sj.model.make_effect("one_sided_stop", {"stiffness": 0.12 * OMEGA**2, "gap": 3e-4 / SHAPE})
 truth = sj.model.structure(
     sj.model.linear_modes([OMEGA], [ZETA], [[SHAPE]], [SHAPE]), effects=(hidden,)
 )
@@ -123,20 +119,22 @@ headline["the level left out is predicted to within its noise"] = found.gap.inte
 # responses of both models over the measured states, and what each effect would explain by itself.
 
 # %%
-figures = diagnosis_report.diagnosis_figures(found)
-predicted, figures["responses"] = diagnosis_report.with_responses(found, model)
-show(figures["residuals"], "residuals")
+show(found.plot(), "residuals")
 
 # %%
-show(figures["responses"], "responses")
-for row in predicted:
+predicted = sj.diagnose.predict_levels(found, model)
+show(
+    plot.comparison_figure(predicted.before, predicted.after, test.steady_states),
+    "responses",
+)
+for row in predicted.levels:
     print(
         f"level {row.level}{', left out' if row.held_out else ''}: resonance measured "
         f"{row.measured.frequency:.3f} Hz, {row.measured.velocity:.4f} m/s; before "
         f"{row.before.frequency:.3f} Hz, {row.before.velocity:.4f} m/s; completed "
         f"{row.after.frequency:.3f} Hz, {row.after.velocity:.4f} m/s"
     )
-left_out = [row for row in predicted if row.held_out]
+left_out = [row for row in predicted.levels if row.held_out]
 headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
     abs(row.after.frequency - row.measured.frequency) < 0.1
     and abs(row.after.velocity / row.measured.velocity - 1) < 0.02
@@ -144,7 +142,7 @@ headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
 )
 
 # %%
-show(figures["candidates"], "candidates")
+show(plot.candidates_figure(found), "candidates")
 
 # %% [markdown]
 # The completed model is a model like any other. Its resonance at the largest force, against the
@@ -201,13 +199,12 @@ headline["the program asks for harmonics"] = "harmonic" in (blurred.decide_by or
 if MEASURED is None:
     print("skipped: no measured data in shared/data")
 else:
-    linear = read_model(MEASURED / "brake_reuss_beam" / "model.toml")
+    linear = sj.read_model(MEASURED / "brake_reuss_beam" / "model.toml")
     table = MEASURED / "brake_reuss_beam" / "response_controlled.csv"
-    data = read_steady_states(table, linear)
+    data = sj.read_steady_states(table, linear)
     joint = sj.diagnose_model(linear, data)
     report(joint)
-    figures = diagnosis_report.diagnosis_figures(joint)
-    show(figures["residuals"], "brake_reuss_residuals")
+    show(joint.plot(), "brake_reuss_residuals")
     headline["damping is located to grow"] = any(p.part == "damping" for p in joint.located)
     headline["level held out: gap closed by two thirds or more"] = (
         joint.gap.interpolated.after < 0.33 * joint.gap.interpolated.before

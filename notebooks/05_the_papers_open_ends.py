@@ -33,11 +33,7 @@ from scipy.stats import t as student
 
 import snrmjax as sj
 from snrmjax import plot
-from snrmjax.measure.force_calibration import calibrate_force
-from snrmjax.measure.signals import peak_amplitude
-from snrmjax.model.beams import FLAT_BEAM_FORCES
-from snrmjax.report import diagnosis_report
-from snrmjax.report import style as drawing
+from snrmjax.plot import style as drawing
 
 HERTZ = 2 * np.pi
 FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
@@ -113,7 +109,7 @@ lines, intercepts, shares = {}, {}, {}
 figure, grid = drawing.panels(drawing.PAGE, 3.4, 1, 2)
 for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=True):
     newtons = 1e-4 * np.array(tenths)
-    line = calibrate_force(volts, newtons)
+    line = sj.measure.calibrate_force(volts, newtons)
     missing = -float(line.offset)
     twice = student.ppf(0.975, len(volts) - 2)  # few points: not 2
     half_width = twice * float(jnp.sqrt(line.covariance[1, 1]))
@@ -178,7 +174,7 @@ truth = sj.model.structure(first, sj.model.polynomial_potential({"1111": CUBIC},
 model = stated(
     truth, sj.model.polynomial_potential({"1111": CUBIC}, 1, coefficient_std={"1111": 0.02 * CUBIC})
 )
-forces = np.geomspace(FLAT_BEAM_FORCES[0], FLAT_BEAM_FORCES[-1], 6)
+forces = np.geomspace(sj.model.FLAT_BEAM_FORCES[0], sj.model.FLAT_BEAM_FORCES[-1], 6)
 friction = 0.1 * forces[0] * float(first.participation[0]) * np.pi / 4
 rubbing = dataclasses.replace(
     truth, effects=(sj.model.make_effect("coulomb_friction", {"force": friction}),)
@@ -477,7 +473,7 @@ def read(states, quantity):
     velocity = states.velocity
     if quantity == "peak":
         signal = jnp.concatenate([velocity[:, :, None], states.harmonics], axis=2)
-        velocity = velocity * peak_amplitude(signal, (1, *HARMONICS)) / jnp.abs(velocity)
+        velocity = velocity * sj.measure.peak_amplitude(signal, (1, *HARMONICS)) / jnp.abs(velocity)
     return dataclasses.replace(
         states,
         velocity=velocity,
@@ -538,8 +534,7 @@ headline["both: held-out and top level predicted to within their noise"] = all(
 )
 
 # %%
-figures = diagnosis_report.diagnosis_figures(soft)
-show(figures["residuals"], "peak_residuals")
+show(soft.plot(), "peak_residuals")
 
 # %% [markdown]
 # No damping law is named. The true stiffness does not fit amplitudes that were misread, and that
@@ -559,7 +554,7 @@ free = stated(
 )
 misled = sj.diagnose_model(free, read(full["softening"], "peak"))
 report(misled)
-show(sj.plot.candidates_figure(misled), "peak_candidates")
+show(plot.candidates_figure(misled), "peak_candidates")
 by_kind = gains(misled)
 law = next(row for row in misled.table[0] if row.kind.endswith("_damping"))
 print(f"best damping law: {law.kind}, gain {law.gain:.0f}", law.parameters)

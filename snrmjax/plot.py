@@ -1,5 +1,6 @@
 """Figures of what was measured, identified, simulated and diagnosed."""
 
+from snrmjax.report import style
 from snrmjax.report.diagnosis_figures import (
     candidates_figure,
     comparison_figure,
@@ -52,4 +53,5 @@ __all__ = [
     "response_figure",
     "save_figure",
     "simulated_response_figure",
+    "style",
 ]

@@ -3,6 +3,7 @@ from .completed_model import CompletedStatus
 from .design.discriminating_test import DiscriminatingTest
 from .diagnosis import diagnose_model
 from .diagnosis_result import Answer, Diagnosis, Estimate
+from .response_prediction import LevelPredictions, LevelResponse, predict_levels
 
 __all__ = [
     "Answer",
@@ -10,6 +11,9 @@ __all__ = [
     "Diagnosis",
     "DiscriminatingTest",
     "Estimate",
+    "LevelPredictions",
+    "LevelResponse",
     "Verdict",
     "diagnose_model",
+    "predict_levels",
 ]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
@@ -36,6 +37,28 @@ class LevelResponse(NamedTuple):
     after: PhaseResonance
     held_out: bool  # whether the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
+
+
+class LevelPredictions(NamedTuple):
+    """Resonances of every level, and the responses that were simulated under their forces."""
+
+    levels: list[LevelResponse]
+    before: list[ResponseCurve]  # of the model as given
+    after: list[ResponseCurve]  # of the completed one
+
+
+def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
+    """Simulates every level's response with the model as given and with the completed one.
+
+    Arguments: `model` as it was diagnosed. Raises `ValueError` where there is no completed model.
+    """
+    if diagnosis.completed is None:
+        raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
+    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
+    models = LevelModels(model, diagnosis.completed, diagnosis.checks.completed_without)
+    simulated = level_simulations(models, data, sensor, diagnosis.answer.force_gain)
+    before, after = ([c for one in curves for c in one] for curves in simulated[:2])
+    return LevelPredictions(level_responses(simulated, data, sensor), before, after)
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:

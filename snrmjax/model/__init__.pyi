@@ -1,5 +1,5 @@
 from .averaging import averaged_effect, averaged_force, averaged_response
-from .beams import curved_beam, flat_beam
+from .beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .effect_base import (
     AbstractForce,
     AbstractHysteresis,
@@ -22,12 +22,22 @@ from .effect_metadata import (
 )
 from .effect_shape import shape_of
 from .effects import EFFECTS, make_effect, register_effect
-from .modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes, linear_response
+from .modes import (
+    LinearModes,
+    LinearModesStd,
+    RigidBodyModes,
+    linear_modes,
+    linear_response,
+    residual_velocity,
+)
+from .parameters import parameter_values, with_parameters
 from .potential import PolynomialPotential, polynomial_potential, potential_from_force_table
 from .structures import Structure, equilibria, structure
 
 __all__ = [
+    "CURVED_BEAM_FORCES",
     "EFFECTS",
+    "FLAT_BEAM_FORCES",
     "AbstractForce",
     "AbstractHysteresis",
     "AbstractKinked",
@@ -58,9 +68,12 @@ __all__ = [
     "linear_response",
     "make_effect",
     "parameter",
+    "parameter_values",
     "polynomial_potential",
     "potential_from_force_table",
     "register_effect",
+    "residual_velocity",
     "shape_of",
     "structure",
+    "with_parameters",
 ]

@@ -11,13 +11,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.response_prediction import (
-    LevelModels,
-    LevelResponse,
-    PhaseResonance,
-    level_responses,
-    level_simulations,
-)
+from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.io.diagnosis_results import summarise_diagnosis
@@ -111,14 +105,9 @@ def with_responses(diagnosis: Diagnosis, model: Structure) -> tuple[list[LevelRe
 
     Raises `ValueError` where there is no completed model.
     """
-    if diagnosis.completed is None:
-        raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
-    models = LevelModels(model, diagnosis.completed, diagnosis.checks.completed_without)
-    simulated = level_simulations(models, data, sensor, diagnosis.answer.force_gain)
-    predicted = level_responses(simulated, data, sensor)
-    old, new = ([c for one in curves for c in one] for curves in simulated[:2])
-    return predicted, comparison_figure(old, new, data, sensor=data.sensors[sensor])
+    levels, before, after = predict_levels(diagnosis, model)
+    return levels, comparison_figure(before, after, data, sensor=data.sensors[sensor])
 
 
 def _incomplete(predicted: Sequence[LevelResponse]) -> list[str]:

@@ -11,14 +11,13 @@ from matplotlib.ticker import PercentFormatter
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.inference.profiles import Profile
-from snrmjax.identify.inference.sensitivity import Contribution
+from snrmjax.identify.inference.sensitivity import Contribution, Contributions
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
     BAND,
     BackboneSamples,
-    contributions_by_kind,
     fit_residuals,
     sample_fit,
     velocity_of,
@@ -194,7 +193,7 @@ def contributions_figure(rows: Sequence[Contribution]) -> Figure:
     """
     if not rows:
         raise ValueError("there is nothing to show: `rows` is empty.")
-    kinds = contributions_by_kind(rows)
+    kinds = Contributions(tuple(rows)).by_kind()
     large = [row for row in kinds if max(row.frequency_share, row.damping_share) >= _LEAST_SHARE]
     small = [row for row in kinds if row not in large]
     names = [row.source for row in large]

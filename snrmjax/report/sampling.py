@@ -1,13 +1,11 @@
 """What figures read off results: sampled curves, phasors and phases, in the figures' units."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.inference.fitted_curves import fitted_values
-from snrmjax.identify.inference.sensitivity import Contribution
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
@@ -98,26 +96,6 @@ def fit_residuals(fit: JointFit) -> FitResiduals:
         parts=fit.residuals,
         rms=float(np.sqrt(np.mean(fit.residuals**2))),
     )
-
-
-def contributions_by_kind(rows: Sequence[Contribution]) -> list[Contribution]:
-    """Contributions to a band with those of one kind together, largest first.
-
-    >>> row = Contribution("gain of level 1", 0.2, 0.1, "gain of levels")
-    >>> contributions_by_kind([row, row._replace(source="gain of level 2")])[0][:3]
-    ('gain of levels', 0.4, 0.2)
-    """
-    kinds = list(dict.fromkeys(row.kind for row in rows))
-    together = [
-        Contribution(
-            kind,
-            sum(row.frequency_share for row in rows if row.kind == kind),
-            sum(row.damping_share for row in rows if row.kind == kind),
-            kind,
-        )
-        for kind in kinds
-    ]
-    return sorted(together, key=lambda row: -row.frequency_share - row.damping_share)
 
 
 def velocity_of(

@@ -74,6 +74,26 @@ class Contributions(AbstractTable[Contribution]):
             *((f"and {more} smaller ones",) if more else ()),
         )
 
+    def by_kind(self) -> "Contributions":
+        """The same with the sources of one kind together, the largest first.
+
+        >>> gain = Contribution("gain of level 1", 0.2, 0.1, "gain of levels")
+        >>> rows = gain, gain._replace(source="gain of level 2")
+        >>> Contributions(rows).by_kind()[0][:3]
+        ('gain of levels', 0.4, 0.2)
+        """
+        together = [
+            Contribution(
+                kind,
+                sum(row.frequency_share for row in self.rows if row.kind == kind),
+                sum(row.damping_share for row in self.rows if row.kind == kind),
+                kind,
+            )
+            for kind in dict.fromkeys(row.kind for row in self.rows)
+        ]
+        together.sort(key=lambda row: -row.frequency_share - row.damping_share)
+        return Contributions(tuple(together))
+
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
 
