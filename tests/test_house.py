@@ -189,6 +189,16 @@ def test_the_rooms_are_there_and_all_files_are_seen():
         assert room not in set(itertools.chain(below, *(SUB_ROOMS.get(b, ()) for b in below)))
 
 
+def test_each_public_name_is_defined_once():
+    places = {}
+    for module, path, _ in MODULES:
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name[0] != "_":
+                places.setdefault(node.name, []).append(module)
+    assert len(places) > 300
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
 BROKEN = {
     "snrmjax.model.modes": [
         ("from snrmjax.measure.states import SteadyStates", "model imports"),

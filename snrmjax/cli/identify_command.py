@@ -183,7 +183,7 @@ def identify(
         structure = read_model(model)
         measured = read_steady_states(data, structure)
         if given & _ASK_FOR_FIT:
-            settings = workflow.FitSettings(
+            settings = workflow.JointFitSettings(
                 fit or "auto", tuple(free or ()), robust=robust, further=further or 0
             )
             found = workflow.identify_jointly(measured, structure, settings, loads)

@@ -56,7 +56,7 @@ class CurveSettings:
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class JointFitSettings:
     """What is asked of a joint fit: families, free unknowns of the instruments, further states."""
 
     families: str = "auto"  # BACKBONE[,DAMPING]
@@ -157,7 +157,7 @@ def identify_by_points(
 
 
 def identify_jointly(
-    data: SteadyStates, model: Structure, settings: FitSettings, loads: Loads
+    data: SteadyStates, model: Structure, settings: JointFitSettings, loads: Loads
 ) -> Findings:
     """Fit both curves to all states at once, predict responses from the fit, advise further states.
 

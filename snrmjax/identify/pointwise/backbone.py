@@ -17,6 +17,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     AbstractPointwiseCurve,
     CurveFit,
     LeftOut,
+    PointSample,
     fit_curve,
     log_slope,
     place_knots,
@@ -317,15 +318,13 @@ def _fit_pair(
             moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
             std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
             std = np.maximum(std * far, 1e-12 * np.max(np.abs(values[component])))
-            sample = (amplitude, values[component], std)
+            sample = PointSample(amplitude, values[component], std, level)
             smoothing, sizes = 1e-6, AS_STATED
             if not first:
                 weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
-                smoothing, sizes = _best_smoothing(family, knots, weights, *sample, level, fixed)
+                smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
             used = sizes._replace(noise_scale=1.0) if stated else sizes
-            best = fit_curve(
-                family, knots, smoothing, *sample, level, fixed_first=fixed, sizes=used
-            )
+            best = fit_curve(family, knots, smoothing, sample, fixed_first=fixed, sizes=used)
             # The error of the amplitude matters along the slope: known after a first fit.
             slope = log_slope(best.curve, amplitude)
         return best, sizes
@@ -337,10 +336,7 @@ def _best_smoothing(
     family: CurveFamily,
     knots: np.ndarray,
     weights: tuple[float, ...],
-    amplitude: np.ndarray,
-    values: np.ndarray,
-    std: np.ndarray,
-    level: np.ndarray,
+    points: PointSample,
     fixed: float | None,
 ) -> tuple[float, ErrorSizes]:
     """The weight of the roughness penalty that predicts left-out levels best, and their errors.
@@ -349,11 +345,10 @@ def _best_smoothing(
     the bias that smoothing gives it. As good is a score within its own standard error, √(2/levels)
     of it, that also differs from the best, level by level, by no more than that difference's.
     """
-    if len(np.unique(level)) < 3:
+    if len(np.unique(points.level)) < 3:
         # One or two levels: leave out every third point in turn instead.
-        level = np.argsort(np.argsort(amplitude)) % 3
-    sample = (amplitude, values, std, level, fixed)
-    tried = [predict_left_out(family, knots, weight, *sample) for weight in weights]
+        points = points._replace(level=np.argsort(np.argsort(points.amplitude)) % 3)
+    tried = [predict_left_out(family, knots, weight, points, fixed) for weight in weights]
     best = min(tried, key=lambda one: one.score)
     # Levels that no curve predicts must not decide here either.
     fair = np.argsort(best.squares)[: -(-3 * len(best.squares) // 4)]

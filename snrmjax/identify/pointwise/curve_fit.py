@@ -119,6 +119,15 @@ def _slopes(curve: AbstractPointwiseCurve, amplitude: Array) -> Float[Array, "po
     return jax.jacfwd(at)(curve.values)
 
 
+class PointSample(NamedTuple):
+    """Scattered points of one quantity against amplitude, and whose errors are partly shared."""
+
+    amplitude: Float[np.ndarray, " point"]
+    values: Float[np.ndarray, " point"]
+    std: Float[np.ndarray, " point"]  # 1σ, or relative sizes where the scale is not known
+    level: np.ndarray  # (point,): points of one level share a part of their errors
+
+
 def place_knots(
     amplitude: Float[np.ndarray, " point"], level: np.ndarray, n_knots: int
 ) -> Float[np.ndarray, " knot"]:
@@ -150,10 +159,7 @@ def fit_curve(
     kind: str,
     knots: Float[np.ndarray, " knot"],
     smoothing: float,
-    amplitude: Float[np.ndarray, " point"],
-    values: Float[np.ndarray, " point"],
-    std: Float[np.ndarray, " point"],
-    level: np.ndarray,
+    points: PointSample,
     *,
     fixed_first: float | None = None,
     sizes: ErrorSizes = AS_STATED,
@@ -162,12 +168,12 @@ def fit_curve(
 
     Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `smoothing` weighs the
     bending of the curve in its abscissa against the points (relative to what a knot knows on
-    average); `std` 1σ of the values, or their relative sizes when the scale is not known;
-    `level` groups points whose errors are partly shared. `fixed_first` pins the value at the
-    first knot. `sizes` scale the two parts of the covariance.
+    average). `fixed_first` pins the value at the first knot. `sizes` scale the two parts of the
+    covariance.
     Returns `CurveFit`.
     """
-    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    amplitude, level = points.amplitude, points.level
+    problem = _problem(kind, knots, smoothing, points, fixed_first)
     at_knots, _, slopes = _settle(problem)
     free, n = problem.free, len(knots)
     result = penalised_least_squares(
@@ -207,11 +213,10 @@ def _problem(
     kind: str,
     knots: np.ndarray,
     smoothing: float,
-    amplitude: np.ndarray,
-    values: np.ndarray,
-    std: np.ndarray,
+    points: PointSample,
     fixed_first: float | None,
 ) -> _Problem:
+    amplitude, values, std, _ = points
     unit = float(np.max(np.abs(values)))
     target, spread = np.asarray(values) / unit, np.asarray(std) / unit
     information = np.sum(1.0 / spread**2) / len(knots)
@@ -276,10 +281,7 @@ def predict_left_out(
     kind: str,
     knots: Float[np.ndarray, " knot"],
     smoothing: float,
-    amplitude: Float[np.ndarray, " point"],
-    values: Float[np.ndarray, " point"],
-    std: Float[np.ndarray, " point"],
-    level: np.ndarray,
+    points: PointSample,
     fixed_first: float | None = None,
 ) -> LeftOut:
     """Leave out every level in turn and predict it from a curve through the others.
@@ -289,7 +291,8 @@ def predict_left_out(
     Points outside the amplitudes of the other levels are left aside: they would be continued,
     not interpolated.
     """
-    problem = _problem(kind, knots, smoothing, amplitude, values, std, fixed_first)
+    amplitude, values, std, level = points
+    problem = _problem(kind, knots, smoothing, points, fixed_first)
     at_knots, current, slopes = _settle(problem)
     errors, spreads = [], []
     for one in np.unique(level):

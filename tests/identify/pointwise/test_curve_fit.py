@@ -15,6 +15,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     CurveFit,
     PchipCurve,
     PiecewiseLinear,
+    PointSample,
     _linearised,
     _slopes,
     fit_curve,
@@ -185,7 +186,7 @@ class TestFit:
     @both_kinds
     def test_exact_points_give_exact_values(self, kind, values):
         amplitude, truth, level = sample(kind, values)
-        fit = fit_curve(kind, KNOTS, 0.0, amplitude, truth, 0.1 * np.ones(60), level)
+        fit = fit_curve(kind, KNOTS, 0.0, PointSample(amplitude, truth, 0.1 * np.ones(60), level))
         # Gauss-Newton steps end below 1e-9 of the largest value.
         np.testing.assert_allclose(fit.curve.values, values, atol=1e-8 * np.abs(values).max())
         np.testing.assert_array_equal(fit.curve.knots, KNOTS)
@@ -195,11 +196,15 @@ class TestFit:
     def test_a_first_value_that_is_known(self, kind):
         amplitude, truth, level = sample(kind)
         std = 0.1 * np.ones(60)
-        fit = fit_curve(kind, KNOTS, 0.0, amplitude, truth, std, level, fixed_first=3.0)
+        fit = fit_curve(
+            kind, KNOTS, 0.0, PointSample(amplitude, truth, std, level), fixed_first=3.0
+        )
         np.testing.assert_allclose(fit.curve.values, VALUES, atol=1e-8 * VALUES.max())
         assert not np.asarray(fit.covariance)[0].any()
         assert not np.asarray(fit.covariance)[:, 0].any()
-        wrong = fit_curve(kind, KNOTS, 0.0, amplitude, truth, std, level, fixed_first=5.0)
+        wrong = fit_curve(
+            kind, KNOTS, 0.0, PointSample(amplitude, truth, std, level), fixed_first=5.0
+        )
         np.testing.assert_allclose(wrong.curve.values[0], 5.0, rtol=1e-15)
         assert abs(float(wrong.curve.values[1]) - 4.0) > 1e-3  # the next one gives way
 
@@ -208,7 +213,7 @@ class TestFit:
         amplitude, truth, level = sample("piecewise_linear")
         rng = np.random.default_rng(2)
         values, std = truth + 0.1 * rng.normal(size=60), rng.uniform(0.05, 0.2, 60)
-        fit = fit_curve("piecewise_linear", KNOTS, 1e-3, amplitude, values, std, level)
+        fit = fit_curve("piecewise_linear", KNOTS, 1e-3, PointSample(amplitude, values, std, level))
         hats = np.stack([np.interp(amplitude, KNOTS, column) for column in np.eye(6)], axis=1)
         # ∫(g″)² over the knots scaled to 0…1, g″ from the parabola through three neighbours,
         # against what the points tell about one knot on average.
@@ -228,7 +233,7 @@ class TestFit:
     def test_much_smoothing_is_a_line_in_the_abscissa(self, kind):
         amplitude, truth, level = sample(kind)
         std = np.random.default_rng(2).uniform(0.05, 0.2, 60)
-        fit = fit_curve(kind, KNOTS, 1e9, amplitude, truth, std, level)
+        fit = fit_curve(kind, KNOTS, 1e9, PointSample(amplitude, truth, std, level))
         power = 2 if kind == "spline" else 1
         line = np.polyfit(amplitude**power, truth, 1, w=1 / std)
         # The curve gives way by 1e-9 of its bending, the spline once more where it is flat.
@@ -243,7 +248,9 @@ class TestFit:
         knots = place_knots(amplitude, level, 60)
         assert len(knots) == 60
         values = 1e4 * (1 + 0.5 * (amplitude / 1000) ** 2)
-        fit = fit_curve("spline", knots, smoothing, amplitude, values, np.ones(120), level)
+        fit = fit_curve(
+            "spline", knots, smoothing, PointSample(amplitude, values, np.ones(120), level)
+        )
         truth = 1e4 * (1 + 0.5 * (knots / 1000) ** 2)
         # Rounding times the ratio of the penalty and the points.
         np.testing.assert_allclose(fit.curve.values, truth, rtol=1e-4)
@@ -260,10 +267,12 @@ class TestFit:
             error = 1.5 * std * rng.normal(size=60) + 0.05 * rng.normal(size=6)[level]
             found.append(
                 np.asarray(
-                    fit_curve(kind, KNOTS, 1e-6, amplitude, truth + error, std, level).curve.values
+                    fit_curve(
+                        kind, KNOTS, 1e-6, PointSample(amplitude, truth + error, std, level)
+                    ).curve.values
                 )
             )
-        fit = fit_curve(kind, KNOTS, 1e-6, amplitude, truth, std, level, sizes=sizes)
+        fit = fit_curve(kind, KNOTS, 1e-6, PointSample(amplitude, truth, std, level), sizes=sizes)
         # 400 draws know a standard deviation to 3.5 %; four of them, and the spline's curvature.
         np.testing.assert_allclose(
             np.sqrt(np.diag(fit.covariance)), np.std(found, axis=0, ddof=1), rtol=0.15
@@ -273,9 +282,12 @@ class TestFit:
         amplitude, truth, level = sample("spline")
         noisy = truth + 0.1 * np.random.default_rng(4).normal(size=60)
         std = 0.1 * np.ones(60)
-        plain = fit_curve("spline", KNOTS, 1e-3, amplitude, noisy, std, level)
+        plain = fit_curve("spline", KNOTS, 1e-3, PointSample(amplitude, noisy, std, level))
         scaled = fit_curve(
-            "spline", 1e-6 * KNOTS, 1e-3, 1e-6 * amplitude, 1e5 * noisy, 1e5 * std, level
+            "spline",
+            1e-6 * KNOTS,
+            1e-3,
+            PointSample(1e-6 * amplitude, 1e5 * noisy, 1e5 * std, level),
         )
         # Gauss-Newton steps end below 1e-9 of the largest value.
         np.testing.assert_allclose(scaled.curve.values, 1e5 * plain.curve.values, rtol=1e-7)
@@ -287,7 +299,10 @@ class TestLeftOut:
         amplitude = np.linspace(0.2, 2.0, 40)
         level, values = np.repeat(np.arange(8), 5), 2.0 + 3.0 * amplitude
         left = predict_left_out(
-            "piecewise_linear", np.array([0.2, 2.0]), 0.0, amplitude, values, np.ones(40), level
+            "piecewise_linear",
+            np.array([0.2, 2.0]),
+            0.0,
+            PointSample(amplitude, values, np.ones(40), level),
         )
         assert left.score < 1e-20  # rounding
         assert left.sizes.noise_scale < 1e-10
@@ -299,8 +314,8 @@ class TestLeftOut:
         level = np.array([0, 0, 1, 1, 2, 2])
         values = np.array([1.0, 1.0, 1.6, 1.4, 1.0, 1.0])
         std = np.full(6, 0.1)
-        arguments = ("piecewise_linear", np.array([1.0, 4.0]), 0.0, amplitude, values, std)
-        left = predict_left_out(*arguments, level)
+        arguments = ("piecewise_linear", np.array([1.0, 4.0]), 0.0)
+        left = predict_left_out(*arguments, PointSample(amplitude, values, std, level))
         # Levels 0 and 2 are predicted by the line through the others: 1.0 at 1 and 4 from
         # themselves and 1.5 ± 0.1 between; done by numpy.
         squares = []
@@ -316,15 +331,19 @@ class TestLeftOut:
         level, values = np.repeat(np.arange(8), 5), np.where(np.arange(40) // 5 == 4, 60.0, 10.0)
         knots = amplitude[2::5].copy()
         knots[0], knots[-1] = 0.2, 2.0
-        arguments = ("piecewise_linear", knots, 1e-8, amplitude)
-        left = predict_left_out(*arguments, values, np.ones(40), level)
+        arguments = ("piecewise_linear", knots, 1e-8)
+        points = PointSample(amplitude, values, np.ones(40), level)
+        left = predict_left_out(*arguments, points)
         # The level itself misses by 50, its neighbours by less; a mean would be 50²/8 or more.
         assert left.score < 50**2 / 8
 
     def test_levels_that_only_a_continued_curve_reaches_are_left_aside(self):
         amplitude, level = np.array([1.0, 1.1, 2.0, 2.1]), np.array([0, 0, 1, 1])
         left = predict_left_out(
-            "piecewise_linear", np.array([1.0, 2.1]), 0.0, amplitude, amplitude, np.ones(4), level
+            "piecewise_linear",
+            np.array([1.0, 2.1]),
+            0.0,
+            PointSample(amplitude, amplitude, np.ones(4), level),
         )
         assert left.score == np.inf
         assert left.sizes == AS_STATED
