@@ -3,22 +3,23 @@
 Run: python benchmarks/calibration.py [--seeds 100] [--points 10] [--start 0.3]
 
 Exact steady states of four levels (harmonic balance, 9 harmonics, stable states within 45° of
-resonance) get the errors of a careful test: 1 % amplitude, 0.7° phase and 0.3 % force at random.
-Every seed fits the natural frequency and the damping of the first mode together with the dominant
-coefficients of the potential, which start 30 % off, up or down by chance; all others are known.
+resonance) get the errors of a careful test: 1 % of amplitude, 0.7° of phase and 0.3 % of force, at
+random. Every seed fits the natural frequency and the damping of the first mode together with the
+dominant coefficients of the potential, which start 30 % too large or too small by chance; all
+others are known.
 
-Dominant are, of all 55, those that a greedy choice by Fisher information at the truth keeps: in
-the order of the 1σ that each would have alone, the next is taken if no relative 1σ of those taken
-then exceeds 20 % (`relative_std` shows it). From fundamentals these are 1111 and 1112, of which
-harmonic 3, known to 1 mm/s, tells the second ten times better. A third case gives every level a
-gain error of 1 % and makes these unknowns. The last fits 1122 too, which only harmonic 5 tells,
-through the internal resonance of 1:5: from 30 % off the resonance lies at the wrong states, and
-many fits end in another minimum. `contradicted` counts fits whose own χ² says that something is
-wrong; shares are of the others.
+The dominant ones of all 55 coefficients are those that a greedy choice by Fisher information at the
+truth keeps: in the order of the 1σ that each would have alone, the next is taken if no relative 1σ
+of those taken then exceeds 20 % (see `relative_std`). From fundamentals these are 1111 and 1112;
+harmonic 3, known to 1 mm/s, determines the second ten times better. A third case gives every level
+a gain error of 1 % and makes the gains unknowns. The last case fits 1122 too, which only harmonic 5
+determines, through the internal resonance 1:5. A start 30 % off moves this resonance to other
+states, and many fits end in another minimum. `contradicted` counts fits whose χ² rejects the model
+or the stated noise; shares are of the other fits.
 
-A JSON line for each case: how often each parameter, and all together (their ellipsoid), lie within
-two standard deviations (95.4 % expected, give or take 2.1 in 100 tests); the scatter of the
-estimates over their stated standard deviation; the mean of the reduced χ²; the first call, with
+One JSON line a case: how often each parameter, and all together (their ellipsoid), lie within two
+standard deviations (95.4 % expected, give or take 2.1 in 100 tests); the scatter of the estimates
+over their stated standard deviation; the mean of the reduced χ²; seconds of the first call, with
 compilation, and the median of the others.
 """
 
@@ -123,6 +124,8 @@ def run(name: str, case: Case, options: argparse.Namespace) -> dict:
         distance = miss @ np.linalg.solve(found.covariance, miss)
         spread.append(distance < chi2.ppf(0.9545, len(names)))
         chi.append(found.reduced_chi_square)
+    if not values:
+        return {"case": name, "states": exact.n_states, "contradicted": contradicted}
     deviation = np.sqrt(np.mean(np.square(values), axis=0))
 
     def by_name(numbers: np.ndarray) -> dict:

@@ -1,10 +1,10 @@
-"""How well points off resonance give the backbone, the resonances and the responses.
+"""How accurately points off resonance give the backbone, the resonances and the responses.
 
 Run: python benchmarks/identification_accuracy.py [folder for figures]
 
 Flat beam: states 25° to 65° off resonance only, no noise. Curved beam: states near resonance
-through softening, minimum and stiffening. The truth is the 9-harmonic nonlinear normal mode and
-the harmonic-balance response. Prints one JSON line a beam and argument of the backbone.
+through softening, minimum and stiffening. The reference is the nonlinear normal mode with 9
+harmonics and the response by harmonic balance. One JSON line a beam and argument of the backbone.
 """
 
 import json

@@ -3,10 +3,10 @@
 Run: python benchmarks/inversion_speed.py [number of measurements]
 
 Random measurements, a residual linear part between 0 and 3 times the response, both signs of the
-modal constant; one in ten is an edge case: a phase within 1e-9° of 0°, −90° or −180° in the
-paper's reference, no force, NaN. Every answer is put back into Eqs. (12) and (17) of the paper,
-written here in NumPy. Prints one JSON line: sizes, times (median of 7, compile time apart), worst
-errors, and how many members neither have a value nor say why.
+modal constant. One in ten is an edge case: a phase within 1e-9° of 0°, −90° or −180° in the paper's
+reference, no force, NaN. Every answer is put back into Eqs. (12) and (17) of the paper, written
+here in NumPy. One JSON line: sizes, seconds (median of 7, compilation apart), largest errors, and
+for how many members value and status disagree.
 """
 
 import json

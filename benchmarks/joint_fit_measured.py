@@ -1,17 +1,17 @@
-"""Joint fits of the two measured beams, judged by levels that they have not seen.
+"""Joint fits of the two measured beams, judged by levels that were left out of them.
 
 Run: python benchmarks/joint_fit_measured.py --data FOLDER
 
 FOLDER holds `brake_reuss_beam` and `suspended_beam` with a CSV and a `model.toml` each.
 
-Brake-Reuss beam: fitted to six of its eight levels, every pair of levels foretold in turn; the
-velocity at phase resonance under the force of the held-out level and its resonance frequency
-against what that level's own states say (its points nearest to resonance). Suspended beam: force
-gain and phase free; frequency and damping from zero to the largest velocity; two halves of the
-levels fitted apart, compared in units of their bands. Both: whitened residuals, and what the
-program says. Then the speed of a fit of all 328 points against `scipy.optimize.least_squares`
-with finite differences on the same residuals, of the fit's own solver on these from the same
-start, and of the derivative of the fitted curves by every measurement. One JSON line each.
+Brake-Reuss beam: fitted to six of its eight levels, each pair of levels predicted in turn; the
+velocity and frequency at phase resonance under the force of a left-out level are compared with
+that level's own states, interpolated to resonance. Suspended beam: force gain and phase free;
+frequency and damping from zero to the largest velocity; two halves of the levels fitted
+separately, compared in units of their bands. Both: whitened residuals and the notes of the fit.
+Then speed: a fit of all 328 points; `scipy.optimize.least_squares` with finite differences on the
+same residuals, and the fit's own solver from the same start; the derivative of the fitted curves
+by every measurement. One JSON line each.
 """
 
 import argparse
@@ -50,16 +50,6 @@ def load(folder: Path, table: str) -> tuple[sj.measure.SteadyStates, sj.model.St
     return sj.read_steady_states(folder / table, model), model
 
 
-def only(data: sj.measure.SteadyStates, rows: np.ndarray) -> sj.measure.SteadyStates:
-    """Some of the states."""
-    index = np.flatnonzero(rows)
-    plain = {"harmonic_order", "sensors"}
-    parts = {k: v if k in plain else np.asarray(v)[index] for k, v in vars(data).items()}
-    return sj.measure.SteadyStates(
-        **{k: v if k in plain else jnp.asarray(v) for k, v in parts.items()}
-    )
-
-
 def at_resonance(data: sj.measure.SteadyStates, level: int) -> tuple[float, float, float]:
     """Frequency, velocity and force of a level where the phase passes zero, by interpolation."""
     mine = np.asarray(data.level) == level
@@ -70,13 +60,13 @@ def at_resonance(data: sj.measure.SteadyStates, level: int) -> tuple[float, floa
 
 
 def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
-    """Every pair of levels foretold by the other six."""
+    """Every pair of levels predicted by the other six."""
     levels = np.unique(np.asarray(data.level)).tolist()
     rows, times = [], []
     for pair in itertools.combinations(levels, 2):
         keep = ~np.isin(np.asarray(data.level), pair)
         begin = time.perf_counter()
-        fit = sj.fit_jointly(only(data, keep), model.modes)
+        fit = sj.fit_jointly(data.select(keep), model.modes)
         times.append(time.perf_counter() - begin)
         inside = set(levels[1:-1])
         for level in pair:
@@ -98,17 +88,17 @@ def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
     for name, chosen in (("inside", table[:, 1] == 1), ("ends", table[:, 1] == 0)):
         part = table[chosen]
         tell(
-            measurement="held-out levels",
+            measurement="left-out levels",
             beam="brake_reuss",
             levels=name,
-            foretold=len(part),
+            predicted=len(part),
             velocity_error_median=np.nanmedian(np.abs(part[:, 2])),
             velocity_error_largest=np.nanmax(np.abs(part[:, 2])),
             within_5_per_cent=np.mean(np.abs(part[:, 2]) < 0.05),
             frequency_error_median_hz=np.nanmedian(np.abs(part[:, 3])),
             frequency_error_largest_hz=np.nanmax(np.abs(part[:, 3])),
             within_0_15_hz=np.mean(np.abs(part[:, 3]) < 0.15),
-            # A held-out level has a gain of its own, as large as the fit leaves it open.
+            # A left-out level has a gain error of its own, of the estimated 1σ.
             velocity_inside_95=np.mean(np.abs(part[:, 2]) < 1.96 * part[:, 4]),
             velocity_std_median=np.nanmedian(part[:, 4]),
             not_found=int(np.isnan(part[:, 2]).sum()),
@@ -116,14 +106,14 @@ def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
 
 
 def describe(name: str, fit: sj.identify.JointFit, seconds: float) -> None:
-    """What a fit of all levels says."""
+    """Curves, noise and notes of a fit of all levels."""
     at = np.linspace(0.0, fit.largest[1], 6)
     values = sj.identify.fitted_values(fit, at)
     tell(
         measurement="fit",
         beam=name,
         seconds=seconds,
-        families=[f"{c.family}:{c.size}@{c.argument}" for c in fit.families.candidates if c.chosen],
+        families=[fit.unknowns.squared_frequency.label, fit.unknowns.modal_damping.label],
         velocity=at,
         natural_frequency_hz=np.asarray(values.natural_frequency) / HERTZ,
         natural_frequency_std_hz=np.asarray(values.natural_frequency_std) / HERTZ,
@@ -140,7 +130,7 @@ def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple
     """Odd and even levels fitted apart, where both have amplitudes."""
     fits, ends = [], []
     for odd in (True, False):
-        part = only(data, (np.asarray(data.level) % 2 == 1) == odd)
+        part = data.select((np.asarray(data.level) % 2 == 1) == odd)
         fit = sj.fit_jointly(part, model.modes, free=free)
         fits.append(fit)
         ends.append((np.abs(np.asarray(fit.motion().velocity)).min(), fit.largest[1]))

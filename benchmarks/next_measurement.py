@@ -1,14 +1,14 @@
-"""Does the advice on the next measurements pay?
+"""Do the advised next measurements narrow the bands more than evenly spread ones?
 
 Run: python benchmarks/next_measurement.py [--tests 100] [--seed 0]
 
 One mode with stiffening and with damping that rises with velocity, known exactly. Four levels of
-five noisy states are fitted jointly; then ten more states are measured where the fit advises, and
-ten that are spread evenly over the same forces, in three ways: ten forces with phases from 45°
-lead to 45° lag in turn (which takes a controller that holds a phase), ten forces with frequencies
-evenly between the ends of each response, and a grid of five forces and two frequencies. With the
-same noise, the fit is repeated. The mean relative band of both curves after over before says what
-each ten are worth. One JSON line.
+five noisy states are fitted jointly. Then ten more states are measured where `next_measurements`
+advises, or ten that are spread evenly over the same forces, in three ways: ten forces with phases
+from 45° lead to 45° lag (which takes a controller that holds a phase), ten forces with frequencies
+evenly between the ends of each response, and a grid of five forces and two frequencies. The fit is
+repeated with the same noise, and the mean relative bands of both curves after and before are
+compared. One JSON line.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def band(fit: sj.identify.JointFit, at: np.ndarray) -> float:
 
 
 def advised(fit: sj.identify.JointFit) -> list[Row]:
-    """Ten states where the fit wants them; equal forces are one level."""
+    """Ten states as the fit advises; equal forces are one level."""
     advice = sj.next_measurements(fit, 10)
     level = {force: 10 + k for k, force in enumerate(dict.fromkeys(one.force for one in advice))}
     return [
@@ -117,18 +117,8 @@ def advised(fit: sj.identify.JointFit) -> list[Row]:
 
 def even(way: str) -> list[Row]:
     """Ten states spread evenly."""
-    turns = [
-        0,
-        5,
-        1,
-        6,
-        2,
-        7,
-        3,
-        8,
-        4,
-        9,
-    ]  # so that force and place on the response do not go along
+    # So that force and place on the response are not correlated.
+    turns = [0, 5, 1, 6, 2, 7, 3, 8, 4, 9]
     forces = np.linspace(FORCES[0], FORCES[-1], 5 if way == "grid" else 10)
     if way == "phases":
         phases = np.radians(np.linspace(45, -45, 10))[turns]

@@ -1,12 +1,12 @@
-"""What a response curve costs against harmonics and modes, and ten thousand curves at once.
+"""Cost of a response curve against harmonics and modes, and of ten thousand curves at once.
 
 Run: python benchmarks/simulator_cost.py [--out FOLDER] [--members 10000]
 
 A chain of Duffing-like modes (natural frequencies 80, 176, 272, … Hz, damping 1 %, a quartic
-potential that couples neighbours) under one force: seconds a point of the bare continuation and of
-the whole verb without stability (medians of five warm runs), memory of the process, and what its
-LU factorisations alone would cost. Every size runs in a process of its own. One JSON line each,
-and with --out a figure.
+potential that couples neighbours) under one force: seconds a point of the continuation alone and of
+`forced_response` without stability (medians of five warm runs), memory of the process, and the
+seconds that its LU factorisations alone would take. Every size runs in a process of its own. One
+JSON line each, and with --out a figure.
 """
 
 import argparse

@@ -1,14 +1,14 @@
-"""Derivatives of folds and peaks: their errors and what they cost in forward solves.
+"""Derivatives of folds and peaks: their errors, and their cost in forward solves.
 
 Run: python benchmarks/simulator_gradients.py
 
-The flat beam at 1.334e-2 N: the peak's velocity and the frequencies of both folds by all 55
-coefficients of the potential, four frequencies and four damping ratios, each relative to its own
-value, by reverse and forward differentiation and by central differences of fourth order in
-relative steps of 3e-3 to 3e-5, for every derivative that of the neighbouring steps which agree
-best with each other (a narrow tongue needs small ones). A parameter whose derivative is above
-1e-6 of the largest is judged by its own size. The motions at 20 velocities likewise. A forward
-solve is a warm `forced_response(stability=False)` of the whole curve. One JSON line each.
+The flat beam at 1.334e-2 N: the peak's velocity and the frequencies of both folds, differentiated
+by all 55 coefficients of the potential, four frequencies and four damping ratios, each relative to
+its own value, in reverse and forward mode. They are compared with central differences of fourth
+order in relative steps of 3e-3 to 3e-5; of these every derivative takes the step that agrees best
+with the next one (a narrow tongue needs small steps). The error of a derivative above 1e-6 of the
+largest is relative to its own size. The same for the motions at 20 velocities. A forward solve is
+a warm `forced_response(stability=False)` of the whole curve. One JSON line each.
 """
 
 import json

@@ -17,8 +17,8 @@
 # test tends to fall off the branch. Kwarta and Allen's inverse method does without: **one** steady
 # state near resonance, with its phase, gives one point of the backbone and one of the damping.
 #
-# This notebook tells their argument on the two numerical beams of the paper, says where a point
-# belongs on the backbone, and settles the question that their Appendix B leaves open: why does the
+# This notebook follows their argument on the two numerical beams of the paper, says where a point
+# belongs on the backbone, and answers the question that their Appendix B leaves open: why does the
 # damping of the curved beam, which is linear by construction, seem to rise to 47 1/s?
 #
 # Conventions: phase is that of the velocity relative to the force, 0° at resonance (the paper's
@@ -49,16 +49,17 @@ def show(figure, name):
 # %% [markdown]
 # ## The flat beam stiffens
 #
-# Four modes, 55 coefficients of one quartic potential. Its nonlinear normal mode, followed by
-# harmonic balance with nine harmonics, is the truth here. Between 87.5 and 90.2 Hz it makes an
-# excursion, the tongue of a 1:5 internal resonance with the second mode: no single-mode method
-# can see that, and errors below are counted outside it.
+# Four modes, 55 coefficients of one quartic potential. Its nonlinear normal mode, computed by
+# harmonic balance with nine harmonics, is the reference. Between 87.5 and 90.2 Hz it leaves the
+# backbone on the tongue of a 1:5 internal resonance with the second mode. A method with a single
+# mode cannot show that, and the errors below are those outside it.
 
 # %%
 flat = sj.model.flat_beam()
 flat_mode = sj.nonlinear_normal_mode(flat, 105 * HERTZ)
 flat_responses = sj.forced_response(flat, sj.model.FLAT_BEAM_FORCES, 60 * HERTZ, 110 * HERTZ)
-show(plot.normal_mode_figure(flat_mode), "flat_mode")
+print(flat_mode)
+show(flat_mode.plot(), "flat_mode")
 
 # %% [markdown]
 # A virtual phase-resonance test: the force is raised step by step, the frequency stepped along
@@ -74,10 +75,8 @@ flat_test = sj.phase_resonance_test(
     points_per_level=4,
 )
 found = sj.identify_backbone(flat_test.steady_states, flat.modes)
-show(
-    plot.backbone_figure(found.points, found.fit.backbone, truth=flat_mode, modes=flat.modes),
-    "flat_backbone",
-)
+print(found)
+show(found.plot(truth=flat_mode, modes=flat.modes), "flat_backbone")
 
 # %% [markdown]
 # ### Where a point lies on the backbone
@@ -110,10 +109,10 @@ print(
 print(f"velocity:     median {np.median(by_velocity):.4f} %, worst {by_velocity.max():.4f} %")
 
 # %% [markdown]
-# ### Responses nobody measured
+# ### Responses that were not measured
 #
-# From these states alone: the resonance and the whole response at the paper's four forces, the
-# unstable part included, over harmonic balance.
+# From these states alone: the resonance and the whole response at the paper's four forces, with
+# the unstable part, and the same by harmonic balance for comparison.
 
 # %%
 backbone = found.fit.backbone
@@ -166,8 +165,8 @@ for model in (curved, printed):
         print(f"   q = {e.displacement[0]:.3g} kg^1/2 m, {'stable' if e.stable else 'unstable'}")
 
 # %% [markdown]
-# The stable side changes from lag to lead where the frequency is lowest: there the test has to go
-# near resonance and in fine steps, as the authors of the paper found too.
+# The stable side of resonance changes from lag to lead where the frequency is lowest. There the
+# test has to go close to resonance and in fine steps, as the authors of the paper found too.
 
 # %%
 WINDOWS = [  # forces in N, degrees off resonance
@@ -192,12 +191,8 @@ for forces, (nearest, farthest) in WINDOWS:
 curved_data = sj.measure.join_steady_states(*parts)
 curved_mode = sj.nonlinear_normal_mode(curved, 125 * HERTZ)
 curved_found = sj.identify_backbone(curved_data, curved.modes)
-show(
-    plot.backbone_figure(
-        curved_found.points, curved_found.fit.backbone, truth=curved_mode, modes=curved.modes
-    ),
-    "curved_backbone",
-)
+print(curved_found)
+show(curved_found.plot(truth=curved_mode, modes=curved.modes), "curved_backbone")
 
 # %%
 curved_errors = errors_percent(curved_found.points, curved_mode, (0.0, 0.0))
@@ -231,13 +226,14 @@ show(
 #
 # The damping of both beams is linear: 2ζω₀ = 40.7 1/s for the curved one. Appendix B finds that
 # the identified 2ζ̃ω̃ falls a little where the beam softens and rises to about 47 1/s where it
-# stiffens, and suspects the harmonics. It is the harmonics, in two ways.
+# stiffens, and suspects the harmonics. They are the cause, in two ways.
 #
-# *Energy.* At resonance the force feeds in what damping takes out, ½FV₁ = c⟨q̇²⟩. With the
-# fundamental, 2ζ̃ω̃ = F/V₁ = c·2⟨q̇²⟩/V₁²: the harmonics' share of the kinetic energy on top.
+# *Energy.* At resonance the power of the force equals that of the damping, ½FV₁ = c⟨q̇²⟩. With the
+# fundamental as the amplitude, 2ζ̃ω̃ = F/V₁ = c·2⟨q̇²⟩/V₁²: larger than c by the harmonics' share
+# of the kinetic energy.
 #
-# *What is put in for the amplitude.* If the **peak** of the velocity signal is put in, 2ζ̃ω̃ is
-# smaller or larger by V₁/v_peak as well.
+# *The measure of amplitude.* If the **peak** of the velocity signal is taken instead, 2ζ̃ω̃ changes
+# by the factor V₁/v_peak as well.
 #
 # Far into stiffening only the cubic spring matters, and its free motion is the elliptic cosine
 # with modulus k² = ½. Its numbers give both limits in closed form.
@@ -270,9 +266,9 @@ show(
 )
 
 # %% [markdown]
-# The peak reading falls below the linear value in softening and tends to 47 to 48 1/s in
-# stiffening: the paper's curve. The sharp spike at the lowest frequency is there in both: around
-# it the second harmonic is as large as the fundamental.
+# With the peak, damping falls below the linear value in softening and tends to 47 to 48 1/s in
+# stiffening: the paper's curve. Both have the sharp spike at the lowest frequency, where the second
+# harmonic is as large as the fundamental.
 #
 # And the bistable reading? In its first well it only softens. Its large orbits go through both
 # wells, where again only the cubic spring matters. To reach them, large states of the monostable
@@ -319,8 +315,8 @@ printed_damping = {
 print({key: f"{value:.2f} 1/s" for key, value in printed_damping.items()})
 
 # %% [markdown]
-# So 47 1/s is no property of the beam. It is linear damping, 40.7 1/s, read with the peak of a
-# signal whose waveform is no longer a sine. With the fundamental it stays within a few per cent of
+# So 47 1/s is not a property of the beam. It is linear damping, 40.7 1/s, computed with the peak of
+# a signal that is no longer a sine. With the fundamental it stays within a few per cent of
 # the linear value outside the neighbourhood of the minimum.
 
 # %%

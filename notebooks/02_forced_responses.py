@@ -10,18 +10,18 @@
 # ---
 
 # %% [markdown]
-# # Forced responses: folds, backbones, isolated loops, and what they hinge on
+# # Forced responses: folds, backbones, isolated loops, and what they depend on
 #
 # The response of a nonlinear structure to a sine force has folds where a sweep jumps, motions that
-# no sweep from rest reaches, and a tip that wants a name. This notebook computes them for the two
-# numerical beams of Kwarta and Allen, by harmonic balance:
+# no sweep from rest reaches, and a tip that several backbones claim to pass through. This notebook
+# computes them for the two numerical beams of Kwarta and Allen, by harmonic balance:
 #
 # 1. whole responses with their unstable parts, folds and bifurcations;
 # 2. backbones: three definitions, and which of them passes through the resonances;
 # 3. motions apart from the main curve: another well, a branch cut off by the range, a true loop;
-# 4. how many harmonics it takes, and whether the estimated error can be believed;
-# 5. what the peak and the jump hinge on, by exact derivatives;
-# 6. two hundred scattered beams, and whether those derivatives predicted the scatter.
+# 4. how many harmonics are needed, and whether the estimated error is right;
+# 5. what the peak and the jump depend on, by exact derivatives;
+# 6. two hundred scattered beams, and whether those derivatives predict the scatter.
 #
 # Conventions: frequencies in rad/s in the code and in Hz in print and figures; amplitudes are those
 # of the velocity's fundamental harmonic at midspan. The first call of a kind takes seconds, in
@@ -84,7 +84,8 @@ def draw(axes, curve, colour, name, events=tuple(EVENTS)):
 # The flat beam (four modes) stiffens: from the third force on its peak leans over, and two folds
 # bound a range with three motions. The curved beam (one mode) softens, then stiffens: at the lowest
 # force it leans to the left, at the others to the right, with superharmonic resonances below.
-# `forced_response` follows each curve around its folds and locates what happens on the way.
+# `forced_response` follows each curve around its folds and locates folds, peaks, phase resonances
+# and bifurcations on the way.
 
 # %%
 flat, curved = sj.model.flat_beam(), sj.model.curved_beam()
@@ -114,7 +115,7 @@ drawing.explain_lines(figure)
 show(figure, "forced_responses")
 
 # %% [markdown]
-# Between the folds the middle motion is unstable, as textbooks have it. The curved beam adds
+# Between the folds the middle motion is unstable, as in textbooks. The curved beam adds
 # *period doublings* (a Floquet multiplier through −1): the motion that repeats every cycle gives
 # way to one that repeats every second cycle, with half-order lines in the spectrum. At the largest
 # force a sweep downwards meets one at 139 Hz, long before the fold at 55 Hz.
@@ -282,7 +283,7 @@ print(
 # given amplitude needs then rises, falls and rises again: three amplitudes share one force. The
 # lowest belongs to the main curve, the upper two to a closed loop above it, which no sweep from
 # rest enters. The phase-locked curve goes through all three; the search starts from it. (With
-# `known=[]` the search is told of no curve and returns the main one too.)
+# `known=[]` the search is given no curve and returns the main one too.)
 #
 # Habib, Cirillo & Kerschen, Nonlinear Dyn. 93 (2018) 979, doi:10.1007/s11071-018-4240-z.
 
@@ -326,9 +327,9 @@ show(figure, "isolated_responses")
 # %% [markdown]
 # ## 4. How many harmonics
 #
-# Every curve estimates its own error: `truncation` is the share of the velocity that the harmonics
-# left out would have. The truth here is the same motion, at the same force and frequency, solved
-# again with 31 harmonics.
+# Every curve has an estimate of its own error: `truncation` is the share of the velocity in the
+# harmonics that were left out. The reference is the same motion, at the same force and frequency,
+# solved again with 31 harmonics.
 
 
 # %%
@@ -358,12 +359,12 @@ for order, error in errors.items():
     print(f"curved beam, {order:2d} harmonics: median error {np.nanmedian(error):.0e}")
 print(f"flat beam,    9 harmonics: median error {np.nanmedian(flat_error):.0e}")
 ratio = (middle.truncation / errors[9])[errors[9] > 1e-7]
-believed = np.quantile(ratio, (0.05, 0.95))
-print(f"estimate over truth at nine of ten motions: {believed[0]:.2f} to {believed[1]:.2f}")
+spread = np.quantile(ratio, (0.05, 0.95))
+print(f"estimate over truth at nine of ten motions: {spread[0]:.2f} to {spread[1]:.2f}")
 
 # %% [markdown]
-# Motions solved at one frequency say nothing of folds that are not there with fewer harmonics: for
-# that the curve is followed anew. For the flat beam the phase resonance alone is enough.
+# Motions at given frequencies do not show which folds are missing with fewer harmonics: for that
+# the curve is followed again. For the flat beam the phase resonance is enough.
 
 # %%
 (crude,) = sj.forced_response(
@@ -400,11 +401,11 @@ show(figure, "harmonics")
 
 # %% [markdown]
 # For the tip of the flat beam's curve one harmonic is good to 0.2 %, three to 0.001 %. The curved
-# beam needs more: one harmonic makes the tip 3 % too high and knows nothing of the superharmonic
-# resonance that folds back at 40.7 Hz; nine still miss some 5 % at 20 Hz. The estimate can be
-# believed, and up to such errors: at nine motions of ten it is within a tenth of the truth.
+# beam needs more: one harmonic makes the tip 3 % too high and misses the superharmonic resonance
+# that folds back at 40.7 Hz; with nine the error is still some 5 % at 20 Hz. The estimated
+# error is right even there: for nine motions of ten it is within a tenth of the true one.
 #
-# ## 5. What the peak and the jump hinge on
+# ## 5. What the peak and the jump depend on
 #
 # Each of these results is a function of the model's numbers: 55 coefficients, four frequencies,
 # four damping ratios. JAX differentiates functions exactly, not by differences: `jacrev` makes of a
@@ -460,14 +461,15 @@ for axes, row, title in zip(both, sensitivity, titles, strict=True):
 show(figure, "sensitivity")
 
 # %% [markdown]
-# The peak velocity hinges on the first mode's damping alone, of which 2ζω counts: no stiffness
-# matters by more than a hundredth. Where the curve jumps is decided by the first mode's frequency,
-# its damping, and *one* of the 55 coefficients. Three numbers of 63 are what a test must get right.
+# The peak velocity depends on the first mode's damping alone, through 2ζω: no stiffness changes it
+# by more than a hundredth of its own change. Where the curve jumps is decided by the first mode's
+# frequency, its damping, and *one* of the 55 coefficients. Three numbers of 63 are what a test must
+# get right.
 #
 # ## 6. Two hundred beams
 #
 # Every coefficient and damping ratio is scattered by 3 %, and the whole response of each beam is
-# followed: one call, over all cores. The derivatives, computed once, foretell every beam's peak and
+# followed: one call, over all cores. The derivatives, computed once, predict every beam's peak and
 # jump with one multiplication.
 
 # %%
@@ -527,7 +529,7 @@ headline = {
     "branch below 24.16 Hz is on the curve from 10 Hz": abs(turn / HERTZ - 24.156) < 2e-3
     and same_fold < 1e-6,
     "closed loop four times above the main curve": level(loop).max() > 4 * level(below).max(),
-    "estimated error within 10 % of the true one": 0.9 < believed[0] <= believed[1] < 1.1,
+    "estimated error within 10 % of the true one": 0.9 < spread[0] <= spread[1] < 1.1,
     "peak falls by 0.99 % per % of damping": abs(sensitivity[0, len(keys) + 4] + 0.99) < 5e-3,
     "200 beams predicted within 0.1 % of scatter": np.all(
         batch.status == sj.simulate.CurveStatus.UPPER_END

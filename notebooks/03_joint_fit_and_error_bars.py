@@ -12,28 +12,27 @@
 # %% [markdown]
 # # Curves with error bars: the joint fit, on two computed tests and two measured beams
 #
-# Notebook 01 makes one point of the backbone of every measured state. Here all states together make
-# two smooth curves, natural frequency and damping against amplitude, with bands:
+# Notebook 01 computes one point of the backbone from every measured state. Here all states together
+# give two smooth curves, natural frequency and damping against amplitude, with 95 % bands:
 #
-# 1. 32 near-resonant states of eight force levels against 85 states along one response: who knows
-#    what, and how well;
-# 2. what a band is made of, whether it can be believed, and which state to measure next;
+# 1. 32 near-resonant states of eight force levels against 85 states along one response: what each
+#    test determines, and how well;
+# 2. what a band is made of, whether its width is right, and which state to measure next;
 # 3. a suspended beam, measured: the force is known only as a voltage;
-# 4. the Brake–Reuss beam, measured: levels that contradict one another, and levels held out.
+# 4. the Brake–Reuss beam, measured: levels that contradict one another, and levels left out.
 #
-# The fit asks every state for its force balance, (ω̃² − Ω²) + iΩ·2ζ̃ω̃ times displacement over
-# modal constant equals force, at the motion as it was measured: nothing is solved for along the
-# response, so folds and unstable parts do no harm. Residuals are divided by their noise and made
+# The residual of a state is that of its force balance: (ω̃² − Ω²) + iΩ·2ζ̃ω̃ times displacement
+# over modal constant should equal the force, at the motion as it was measured. No response is
+# computed, so folds and unstable parts do no harm. Residuals are divided by their noise and made
 # independent ("whitened"). Errors that all states of a level have in common are unknowns too.
 #
-# The first call of a kind compiles its program, for seconds; MATLAB users may think of `codegen`.
-# With `JAX_COMPILATION_CACHE_DIR` set to a folder it is kept for the next time.
+# The first call of a kind compiles its program, which takes seconds. With
+# `JAX_COMPILATION_CACHE_DIR` set to a folder, programs are kept for the next time.
 
 # %%
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import snrmjax as sj
@@ -57,22 +56,11 @@ def show(figure, name):
     return figure
 
 
-def taken(fit):
-    """The families of a fit, as the command takes them."""
-    return [f"{c.family}:{c.size}@{c.argument}" for c in fit.families.candidates if c.chosen]
-
-
-def remarks(fit):
-    """What the program says about a fit."""
-    for note in fit.notes or ("nothing to remark",):
-        print("  -", note)
-
-
 # %% [markdown]
 # ## 1. Few states near resonance, or many along one response
 #
-# Kwarta and Allen set the 31 near-resonant states of their curved beam against the 85 that it took
-# them to measure *one* response. Here both kinds of test are made of the flat beam, with nine
+# Kwarta and Allen compare the 31 near-resonant states of their curved beam with the 85 that they
+# needed to measure *one* response. Here both tests are simulated with the flat beam, with nine
 # harmonics and the same noise: 1 % of amplitude, 0.7° of phase, 0.3 % of force. The first has eight
 # levels of four states each, 33° to 45° off resonance. The second has 85 states along the response
 # to the largest force, from 82° off resonance to as near as a stepped sine gets before it jumps.
@@ -97,13 +85,11 @@ along = sj.phase_resonance_test(
 tests = {"32 near resonance": near, "85 along one response": along}
 fits = {name: sj.fit_jointly(t.steady_states, flat.modes) for name, t in tests.items()}
 for name, fit in fits.items():
-    speed = np.abs(np.asarray(fit.motion().velocity))
-    print(f"{name}: {' and '.join(taken(fit))}, {speed.min():.2f} to {speed.max():.2f} m/s")
-    remarks(fit)
+    print(f"{name}:", fit)
 
 # %% [markdown]
-# The truth is the damped normal mode. (Its undamped sister makes an excursion between 87.5 and
-# 90.2 Hz, the tongue of notebook 01; damping leaves little of it.)
+# The truth is the damped normal mode. (The undamped one has a tongue between 87.5 and 90.2 Hz, see
+# notebook 01; with damping little of it is left.)
 
 # %%
 show(
@@ -135,10 +121,10 @@ width, inside = {}, {}
 print("   v in m/s   true Hz, %    then Hz and % with 95 % of either test")
 rows = {name: at_velocities(fit, velocity) for name, fit in fits.items()}
 for k in (0, 7, 14, 20, 24):
-    told = "".join(
+    columns = "".join(
         f"   {v[0, k]:.2f} ± {b[0, k]:.2f}, {v[1, k]:.3f} ± {b[1, k]:.3f}" for v, b in rows.values()
     )
-    print(f"   {velocity[k]:.3f}      {true[0, k]:.2f}, {true[1, k]:.3f}{told}")
+    print(f"   {velocity[k]:.3f}      {true[0, k]:.2f}, {true[1, k]:.3f}{columns}")
 for name, (values, bands) in rows.items():
     width[name] = bands.mean(axis=1)
     inside[name] = np.mean(np.abs(values - true) < bands, axis=1)
@@ -148,7 +134,7 @@ for name, (values, bands) in rows.items():
     )
 
 # %% [markdown]
-# The curves are too good for the figure. Less the truth, they show who knows what.
+# The curves are too close together to compare. Their differences from the truth show more.
 
 # %%
 figure, ((left, right),) = drawing.panels(drawing.PAGE, 3.2, 1, 2)
@@ -184,21 +170,24 @@ for exact in sj.forced_response(flat, [2.669e-3, 1.334e-2], *ends):
         )
 
 # %% [markdown]
-# So 32 states near resonance know as much as 85 along one response: the same mean band of
-# frequency, a narrower one of damping. What they know differs. Each knows best what it measured
-# where the phase is steep: the eight levels know small amplitudes four times as well, and stop at
-# the largest amplitude that a test 33° off resonance reaches. The one response knows its own tip,
-# ten times as well, and small amplitudes only from its feet, where the phase hardly moves.
+# So 32 states near resonance determine the curves as well as 85 along one response: the same mean
+# band of frequency, a narrower one of damping. But at other amplitudes. Each test is best where it
+# measured near resonance: the eight levels have a band four times narrower at small amplitudes, and
+# end at the largest amplitude that a test 33° off resonance reaches. The one response has a band
+# ten times narrower at its own tip, and knows small amplitudes only from states far from resonance,
+# where the phase hardly changes.
 #
-# Random noise is not all. Let the force's gain be good to 1 % a level:
+# Random noise is not the only error. Let the gain of every level be known to 1 % only:
 
 # %%
 share = {}
 for name, fit in fits.items():
-    backbone, damping = taken(fit)
-    data = tests[name].steady_states
     with_gain = sj.fit_jointly(
-        data, flat.modes, backbone=backbone, damping=damping, level_gain_std=0.01
+        tests[name].steady_states,
+        flat.modes,
+        backbone=fit.unknowns.squared_frequency.label,  # the families that were chosen
+        damping=fit.unknowns.modal_damping.label,
+        level_gain_std=0.01,
     )
     share[name] = at_velocities(with_gain, velocity)[1].mean(axis=1) / width[name]
     print(
@@ -209,11 +198,11 @@ for name, fit in fits.items():
         with_levels = with_gain
 
 # %% [markdown]
-# Eight levels have eight gains to find. Yet the one response suffers less: its states far from
-# resonance, where inertia is all, weigh the gain against the known modal mass. What it cannot
-# know is whether a second level would agree, and the program says so above.
+# Eight levels have eight unknown gains. The one response suffers less: far from resonance inertia
+# balances the force, so that its states there determine the gain by the known modal mass. What it
+# cannot show is whether a second level would agree: see the note of its fit above.
 #
-# ## 2. What the band is made of, whether to believe it, and what to measure next
+# ## 2. What the band is made of, whether its width is right, and what to measure next
 #
 # The width of a band follows from derivatives of the fit by every single measured number. Their
 # squares, times the variances, add up to the band's: the shares below.
@@ -227,8 +216,8 @@ show(shares.plot(), "contributions")
 # %% [markdown]
 # Three ways to the same band, as 1σ in rad/s and 1/s: from the fit's covariance; from the exact
 # derivatives of the fit, second order included; and from refits to states drawn with replacement
-# (bootstrap). The last needs no theory but many states: with four a level it is rough, by a factor
-# of two. (`posterior=True` adds a fourth way, sampling by NUTS.)
+# (bootstrap). The last makes fewest assumptions, but needs many states: with four a level it is
+# rough, by a factor of two. (`posterior=True` adds a fourth way, sampling by NUTS.)
 
 # %%
 ways = sj.identify.compare_bands(few, np.array([0.1, 0.35, 0.6]), n_samples=100)
@@ -239,8 +228,9 @@ for one in ways:
     )
 
 # %% [markdown]
-# And what next? Every stable state of the fitted responses is a candidate. Ranked is by how much
-# narrower the bands of both curves become, each given the ones before it.
+# And what to measure next? Every stable state of the fitted responses is a candidate. They are
+# ranked by how much narrower they make the bands of both curves, each given the ones before it
+# (optimal design).
 
 # %%
 advice = sj.next_measurements(with_levels, 5)
@@ -249,17 +239,14 @@ for one in advice:
         f"{one.rank}. {1e3 * one.force:.2f} mN at {one.frequency / HERTZ:.2f} Hz, bands at "
         f"{100 * one.expected_band_ratio:.1f} %: {one.reason}"
     )
-responses = [
-    sj.identify.fitted_response(with_levels, f)[0] for f in sorted({a.force for a in advice})
-]
-show(plot.next_measurements_figure(responses, advice, sensor="midspan"), "next_measurements")
+show(advice.plot(), "next_measurements")
 
 # %%
 headline |= {
-    "85 states along one response know no more of the frequency than 32 near resonance, twofold": (
+    "32 states near resonance: band of frequency at most twice that of 85 along one response": (
         width["32 near resonance"][0] < 2 * width["85 along one response"][0]
     ),
-    "nor of the damping": (width["32 near resonance"][1] < 2 * width["85 along one response"][1]),
+    "and of damping": width["32 near resonance"][1] < 2 * width["85 along one response"][1],
     "shares sum to the whole variance": abs(sum(s.frequency_share for s in shares) - 1) < 1e-9
     and abs(sum(s.damping_share for s in shares) - 1) < 1e-9,
     "covariance and derivatives agree within 10 %": all(
@@ -271,34 +258,33 @@ headline |= {
 # ## 3. A suspended beam whose force is a voltage
 #
 # Measured by Brack and colleagues (Nature Physics 18 (2022) 952): a beam hung in vacuum, 42.8 Hz,
-# four drive levels of 40 states each. The gain from voltage to force and the turn of phase in the
+# four drive levels of 40 states each. The gain from voltage to force and the phase shift of the
 # instruments are unknowns of the fit. The stated noise is the scatter of ten readings at one
-# setting; the residuals are sixteen times as large, and those of neighbouring states are alike: the
-# program widens the bands for both and says so.
+# setting. The residuals are sixteen times as large, and those of neighbouring states are
+# correlated: the bands are widened for both, as the notes say.
 #
 # The measurements of sections 3 and 4 are not part of this project. Without them, in a folder
 # `shared/data` beside it, these sections are skipped and say so.
 
 
 # %%
-def measured(name):
+def measured(name, table):
     """Data and model of a measured beam."""
     model = sj.read_model(MEASURED / name / "model.toml")
-    (table,) = (MEASURED / name).glob("*.csv")
-    return sj.read_steady_states(table, model), model
+    return sj.read_steady_states(MEASURED / name / table, model), model
 
 
 if MEASURED is None:
     print("skipped: no measured data in shared/data")
 else:
-    data, model = measured("suspended_beam")
+    data, model = measured("suspended_beam", "lock_in_stepped_sine.csv")
     hung = sj.fit_jointly(data, model.modes, free=("force_gain", "instrument_phase"))
     std = np.sqrt(np.diag(hung.covariance))
     place = hung.names().index("instrument_phase")
     turn = np.degrees([hung.unknowns.instrument_phase, std[place]])
     gain = np.exp(float(hung.unknowns.log_force_gain))
-    print(f"{' and '.join(taken(hung))}; gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
-    remarks(hung)
+    print(hung)
+    print(f"gain {gain:.4f} N/V, phase {turn[0]:.2f} ± {turn[1]:.2f}°")
     points = sj.identify.identify_points(sj.identify.corrected_states(data, hung), model.modes)
     series = [plot.FitSeries("fit", hung, points)]
     show(plot.fitted_curves_figure(series), "suspended_beam")
@@ -309,45 +295,46 @@ else:
 #
 # A bolted lap joint near 80 Hz (Chen et al., MSSP 166 (2022) 108401): stepped sines at eight held
 # amplitudes. The joint dissipates more the more it slips, and levels repeat only to 0.1 Hz or so.
-# Nobody stated any noise: the fit finds it. The single states of a level do not agree with one
-# another, in damping by up to a factor of two. A phase that is off by 5° for a whole level would do
-# that, and the fit says so; its residuals still bend with the phase, so it is not the whole story.
+# No noise is stated: the fit estimates it. The single states of a level disagree, in damping by up
+# to a factor of two. A phase error of 5° for a whole level would explain that, and the fit
+# estimates such an error; but its residuals still vary with the phase, so this is not the whole
+# explanation.
 
 # %%
 if MEASURED is None:
     print("skipped: no measured data in shared/data")
 else:
-    data, model = measured("brake_reuss_beam")
+    data, model = measured("brake_reuss_beam", "response_controlled.csv")
     bolted = sj.fit_jointly(data, model.modes)
-    print(" and ".join(taken(bolted)))
-    remarks(bolted)
+    print(bolted)
     points = sj.identify.identify_points(data, model.modes)
     series = [plot.FitSeries("fit", bolted, points)]
     show(plot.fitted_curves_figure(series), "brake_reuss_beam")
     show(plot.residuals_figure(bolted), "brake_reuss_residuals")
 
 # %% [markdown]
-# Levels 4 and 7 are now left out, and predicted by the other six. Dots are their single states.
+# Levels 4 and 7 are now left out, and predicted by the other six (cross-validation). Dots are their
+# single states.
 #
-# Mind the bands of this fit. Six levels leave too little to tell how far natural frequencies differ
-# from level to level: its remarks name gain and phase only, and its bands are far too narrow. All
-# eight levels together tell 0.07 %. That is the yardstick, in brackets below. Where levels are
-# few, do not believe bands without an estimate of what levels scatter.
+# Note the bands of this fit. Six levels are too few to estimate the level-to-level variance of the
+# natural frequency: its notes name gain and phase only, and its bands are far too narrow. With all
+# eight levels it is 0.07 %, by which the predictions are judged below (in brackets). Where levels
+# are few, a band without level-to-level variance is too narrow.
 
 # %%
 if MEASURED is None:
     print("skipped: no measured data in shared/data")
 else:
     out = np.isin(np.asarray(data.level), (4, 7))
-    six = sj.fit_jointly(jax.tree.map(lambda column: column[~out], data), model.modes)
-    unseen = jax.tree.map(lambda column: column[out], points)
+    six = sj.fit_jointly(data.select(~out), model.modes)
+    print(six)
+    unseen = sj.identify.identify_points(data.select(out), model.modes)
     series = [plot.FitSeries("fit of the other six levels", six, unseen)]
     show(plot.fitted_curves_figure(series), "levels_held_out")
     close = np.abs(np.angle(np.asarray(unseen.mode_velocity))) < np.radians(45)
     at = np.asarray(unseen.backbone_velocity)
     predicted = sj.identify.fitted_values(six, at)
     yardstick = sj.identify.fitted_values(bolted, at, of_a_new_level=True)
-    remarks(six)
     for level in (4, 7):
         rows = close & (np.asarray(unseen.level) == level)
 

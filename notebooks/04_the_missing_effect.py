@@ -10,19 +10,19 @@
 # ---
 
 # %% [markdown]
-# # The missing effect: find where model and data disagree, name it, add it, prove it
+# # The missing effect: where model and data disagree, what is missing, and how to check it
 #
-# A model that was made of a linear test meets measurements at larger amplitudes, and disagrees.
-# `diagnose_model` (on the command line `snrmjax diagnose`) says where, names what is missing, adds
-# it, and checks the completed model on a level that it left out:
+# A model from a linear test disagrees with measurements at larger amplitudes. `diagnose_model` (on
+# the command line `snrmjax diagnose`) says where, names the effect that is missing, adds it, and
+# checks the completed model on a level that was left out of the fit:
 #
-# 1. a hidden effect, from the first disagreement to the closed gap;
-# 2. two effects that the fundamental cannot tell apart, settled by the measurement that the
-#    program asks for;
+# 1. an effect that the model lacks, from the first disagreement to the completed model;
+# 2. two effects that the fundamental cannot distinguish, and the measurement that does;
 # 3. a bolted beam, measured: what the linear model of the Brake–Reuss beam lacks.
 #
-# It compares forces, not responses: the measured motion is put into the model, which says what
-# force it would need. A motion needs one force, however the response folds.
+# Forces are compared, not responses: the measured motion is prescribed to the model, and the force
+# that it needs is compared with the one that acted (inverse harmonic balance). This force is
+# unique, also where the response folds.
 
 # %%
 import sys
@@ -51,33 +51,25 @@ def show(figure, name):
 
 
 def report(found):
-    """What a diagnosis says."""
-    print("verdict:", found.verdict)
+    """A diagnosis, with the parts of the model that disagree and the notes."""
+    print(found)
     for part in found.located:
         power = f", power {part.exponent:.2f} ± {part.exponent_std:.2f}" if part.exponent else ""
         low, high = part.velocity_range
         print(f"  located: {part.part}, {low:.3g} to {high:.3g} m/s{power}")
-    for effect, rivals in zip(found.effects, found.candidates, strict=True):
-        print(f"  {effect}; the data cannot tell it from: {', '.join(rivals[1:]) or 'none other'}")
-    for name, (value, std) in found.parameters.items():
-        print(f"    {name} = {value:.4g} ± {std:.2g}")
-    out = found.gap.interpolated
-    print(f"  gap {found.gap.before:.2f} to {found.gap.after:.2f} units of noise", end="")
-    print(f"; level {out.level}, held out: {out.before:.2f} to {out.after:.2f}" if out else "")
     for note in found.notes:
-        print("  -", note)
-    if found.decide_by:
-        print("  what would decide:", found.decide_by)
+        print("  note:", note)
 
 
 # %% [markdown]
-# ## 1. From the first disagreement to the closed gap
+# ## 1. From the first disagreement to the completed model
 #
 # The structure has a mode at 79 Hz with half a per cent of damping, and a stop 0.3 mm away on one
-# side, which nobody knows of. The model has what a linear test found, with its errors. The test:
-# five levels, eight states each, 1 % of amplitude, 0.7° of phase, 0.3 % of force, and the second
-# and third harmonics with their noise floor. (These data come from the simulator that also judges
-# them; `benchmarks/blind_sets` makes sets by an integrator that shares nothing with it.)
+# side, which the model lacks. The model has the results of a linear test, with their errors. The
+# test: five levels, eight states each, errors of 1 % in amplitude, 0.7° in phase and 0.3 % in
+# force, and the second and third harmonics with their noise floor. (These data come from the same
+# simulator as the predictions below; `benchmarks/blind_sets` makes sets with an independent
+# integrator.)
 
 # %%
 OMEGA, ZETA, SHAPE = 79.0 * HERTZ, 0.005, 2.0
@@ -115,8 +107,9 @@ for name, true in (("stiffness", 0.12 * OMEGA**2), ("gap", 3e-4 / SHAPE)):
 headline["the level left out is predicted to within its noise"] = found.gap.interpolated.after < 1.4
 
 # %% [markdown]
-# Every measured state, before and after: the misfit of the force in units of its noise. Then the
-# responses of both models over the measured states, and what each effect would explain by itself.
+# Every measured state, with the model as given and with the completed one: the misfit of the force
+# in units of its noise. Then the responses of both models over the measured states, and what each
+# effect would explain by itself.
 
 # %%
 show(found.plot(), "residuals")
@@ -145,12 +138,12 @@ headline["resonances of levels left out predicted within 0.1 Hz and 2 %"] = all(
 show(plot.candidates_figure(found), "candidates")
 
 # %% [markdown]
-# The completed model is a model like any other. Its resonance at the largest force, against the
-# truth's and that of the model as it was:
+# The completed model is a model like any other. Its resonance at the largest force, compared with
+# those of the true structure and of the model as given:
 
 # %%
 peaks = {}
-for name, one in (("truth", truth), ("before", model), ("completed", found.completed)):
+for name, one in (("truth", truth), ("as given", model), ("completed", found.completed)):
     curve = sj.forced_response(one, [largest], 74 * HERTZ, 86 * HERTZ, harmonic_order=7)[0]
     at = int(np.argmax(np.abs(curve.velocity[:, 1, 0])))
     peaks[name] = curve.frequency[at] / HERTZ, float(np.abs(curve.velocity[at, 1, 0]))
@@ -161,10 +154,10 @@ headline["the completed model's peak within 0.1 Hz and 2 %"] = (
 )
 
 # %% [markdown]
-# ## 2. An ambiguous case, settled by the measurement that the program asks for
+# ## 2. An ambiguous case, decided by the measurement that the diagnosis asks for
 #
 # The same states, but only their fundamentals were recorded. A stop on one side and a gap on both
-# do the same to a fundamental, which is said, with what would settle it.
+# sides change the fundamental alike. The diagnosis says so, and which measurement decides.
 
 # %%
 states = test.steady_states
@@ -182,18 +175,18 @@ report(blurred)
 headline["without harmonics it is ambiguous, the truth in the class"] = (
     blurred.verdict == "ambiguous" and "one_sided_stop" in rivals and "gap_stiffness" in rivals
 )
-headline["the program asks for harmonics"] = "harmonic" in (blurred.decide_by or "")
+headline["the diagnosis asks for harmonics"] = "harmonic" in (blurred.decide_by or "")
 
 # %% [markdown]
-# With the harmonics, as in part 1, one effect of the class is left: the loop is closed.
+# With the harmonics, as in part 1, one effect of the class is left.
 
 # %% [markdown]
 # ## 3. The Brake–Reuss beam, measured
 #
 # Two beams bolted at a lap joint; eight levels of constant response, 41 states each. The model is
-# the linear test's: 80.37 Hz and 0.15 %. Neither noise nor errors of levels are stated: the program
-# finds both. Runs differ, as the joint fit of notebook 03 says too, by 3 % of gain and 5° of phase,
-# and the mode itself from run to run.
+# the linear test's: 80.37 Hz and 0.15 %. Neither noise nor errors of levels are stated: both are
+# estimated. The levels vary, as the joint fit of notebook 03 finds too, by 3 % in gain and 5° in
+# phase, and natural frequency and damping vary from level to level.
 
 # %%
 if MEASURED is None:
@@ -206,17 +199,17 @@ else:
     report(joint)
     show(joint.plot(), "brake_reuss_residuals")
     headline["damping is located to grow"] = any(p.part == "damping" for p in joint.located)
-    headline["level held out: gap closed by two thirds or more"] = (
+    headline["level left out: misfit reduced by two thirds or more"] = (
         joint.gap.interpolated.after < 0.33 * joint.gap.interpolated.before
     )
 
 # %% [markdown]
-# Why believe it? The first thing it finds is no nonlinearity: a residual receptance of
-# −6.0 µm/N at the drive point, of the sign and size of a free beam's rigid-body motion, which a
-# linear baseline of one mode leaves out. It shows in the raw data: apparent damping falls along
-# every level, by 0.2 to 0.3 of itself per hertz at 0.17 % and at 0.73 % alike, as a residual
-# receptance makes it and an error of phase does not. What grows with amplitude beside it is
-# damping; with one mode and no harmonics several laws fit that, and the answer is marked ambiguous.
+# Is this plausible? The first effect found is not a nonlinearity: a residual receptance of −6.0
+# µm/N at the drive point, of the sign and size of a free beam's rigid-body motion, which a linear
+# model of one mode leaves out. It is visible in the raw data: apparent damping falls along every
+# level, by 0.2 to 0.3 of itself per hertz at 0.17 % and at 0.73 % alike. A residual receptance does
+# that, an error of phase does not. Beside it damping grows with amplitude. With one mode and no
+# harmonics several laws fit that, so the answer is marked ambiguous.
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

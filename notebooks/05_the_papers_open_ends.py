@@ -10,7 +10,7 @@
 # ---
 
 # %% [markdown]
-# # The paper's two open ends, diagnosed
+# # The paper's two open questions, diagnosed
 #
 # Kwarta and Allen leave two questions about damping open. In their measurements the identified
 # damping "does not intersect" the linear one at low amplitude and is adjusted by hand (section
@@ -18,9 +18,10 @@
 # What does the diagnosis say?
 #
 # 1. The first: their force is a straight line of the drive voltage, with an intercept. Could an
-#    error there do it? Could the program tell it from friction? Do the printed numbers decide?
-# 2. The second: amplitudes read as peaks instead of fundamentals. Which damping law would that
-#    pass for?
+#    error of this line be the cause? Can the diagnosis distinguish it from friction? Are the
+#    printed numbers enough to decide?
+# 2. The second: amplitudes read as peaks instead of fundamentals. Which damping law would be
+#    identified by mistake?
 
 # %%
 import dataclasses
@@ -50,26 +51,14 @@ def show(figure, name):
 
 
 def report(found):
-    """What a diagnosis says."""
-    print("verdict:", found.verdict)
+    """A diagnosis, with the parts of the model that disagree and the notes."""
+    print(found)
     for part in found.located:
         power = f", power {part.exponent:.2f} ± {part.exponent_std:.2f}" if part.exponent else ""
         low, high = part.velocity_range
         print(f"  located: {part.part}, {low:.3g} to {high:.3g} m/s{power}")
-    for effect, rivals in zip(found.effects, found.candidates, strict=True):
-        print(f"  {effect}; the data cannot tell it from: {', '.join(rivals[1:]) or 'none other'}")
-    for name, (value, std) in found.parameters.items():
-        print(f"    {name} = {value:.4g} ± {std:.2g}")
-    inner, outer = found.gap.interpolated, found.gap.extrapolated
-    print(
-        f"  gap {found.gap.before:.2f} to {found.gap.after:.2f} units of noise", end="; held out: "
-    )
-    print(f"level {inner.level} {inner.before:.2f} to {inner.after:.2f}", end=", ")
-    print(f"level {outer.level} {outer.before:.2f} to {outer.after:.2f}")
     for note in found.notes:
-        print("  -", note)
-    if found.decide_by:
-        print("  what would decide:", found.decide_by)
+        print("  note:", note)
 
 
 def stated(model, potential):
@@ -148,17 +137,17 @@ headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
 headline["both beyond 95 % of their own error"] = all(c > half for c, half in intercepts.values())
 
 # %% [markdown]
-# Damping is force over velocity: what the force errs by, relatively, damping errs by. An intercept
-# that is *left out* makes the recorded force too large and damping rise towards low amplitude; one
-# that is *taken off though it is not there* makes it fall. Both go as 1/F.
+# Damping is force over velocity, so a relative error of the force is that of the damping. An
+# intercept that is *left out* makes the recorded force too large and damping rise towards low
+# amplitude; one that is *taken off though it is not there* makes it fall. Both go as 1/F.
 #
-# ### Virtual tests of a beam whose force misses the intercept
+# ### Virtual tests of a beam with the intercept left out of the force
 #
 # The flat beam's first mode with its own cubic stiffness, 79.02 Hz and 5 % of linear damping; six
 # levels over the paper's range of forces, frequency stepped up and down, **integrated in time**
 # until settled. The same with friction in place of the error: Coulomb's force takes off as much as
-# a tenth of the lowest force does at resonance. What is recorded of these motions differs: which
-# phases, 1 % of noise in amplitude, 0.7° in phase, 0.3 % in force, and what the force lacks.
+# a tenth of the lowest force does at resonance. Records of these motions differ in their
+# phases and in the error of the force; noise is 1 % in amplitude, 0.7° in phase and 0.3 % in force.
 
 # %%
 flat = sj.model.flat_beam().modes
@@ -229,8 +218,8 @@ def recorded(states, nearest, farthest, *, missing=0.0, seed=1, per_level=6, sid
 
 # %% [markdown]
 # The paper's flat beam was measured 18° to 34° off resonance (indicators 0.68 to 0.91). What its
-# method makes of such states when the force misses an intercept of 6, 10 and 15 % of the lowest
-# force, and of the opposite error (lines: what 1/F foretells):
+# method finds from such states when an intercept of 6, 10 and 15 % of the lowest force is left out
+# of the force, and with the opposite error (lines: the prediction by 1/F):
 
 # %%
 linear = float(2 * first.damping_ratio[0] * first.natural_frequency[0])
@@ -257,11 +246,11 @@ headline["damping at the lowest level errs by the share left out, within 2 %"] =
 )
 
 # %% [markdown]
-# ### What the diagnosis says: tuned to resonance, as in the paper, and farther off
+# ### The diagnosis of states tuned to resonance, as in the paper, and farther off
 #
-# At resonance, within 4°, a force error and friction do the same: both are in the class, and the
-# program asks for the states that would part them. They are had a few degrees farther off: a
-# wrong force is wrong along the *force*, friction acts along the *velocity*.
+# At resonance, within 4°, a force error and friction have the same effect: both are candidates, and
+# the diagnosis asks for states that separate them. These are farther off resonance, where a force
+# error is in phase with the *force*, but friction with the *velocity*.
 
 # %%
 WINDOWS = {  # degrees off resonance: from, to
@@ -286,16 +275,16 @@ BOTH = {"coulomb_friction", "force_offset_error"}
 OFFSET, FRICTION = (("force_offset_error",),), (("coulomb_friction",),)
 tuned = [one for (window, _), one in found.items() if window == "tuned to resonance"]
 apart = {key: one for key, one in found.items() if key[0] != "tuned to resonance"}
-headline["tuned to resonance: ambiguous, both in the class"] = all(
+headline["tuned to resonance: ambiguous, both are candidates"] = all(
     one.verdict == "ambiguous" and set(one.candidates[0]) == BOTH for one in tuned
 )
-headline["there the program asks for 30° and more off"] = all(
+headline["there the diagnosis asks for states 30° and more off resonance"] = all(
     one.discriminating_test is not None
     and one.discriminating_test.kind == "off_resonance"
     and round(one.discriminating_test.phase[0]) >= 30
     for one in tuned
 )
-headline["18° to 34° and 30° to 60°: an offset is named alone, friction alone"] = all(
+headline["18° to 34° and 30° to 60°: an offset is identified alone, friction alone"] = all(
     one.candidates == (FRICTION if what == "friction" else OFFSET)
     for (_, what), one in apart.items()
 )
@@ -314,16 +303,16 @@ nothing = sj.diagnose_model(model, recorded(motions["beam"], 18, 34))
 headline["a right force: nothing is missing"] = nothing.verdict == "none"
 
 # %% [markdown]
-# How far off is far enough? What the criterion gains by the offset less what it gains by friction,
-# over three noises each; inside the grey band the program does not decide. (The states tuned to
-# resonance are fewer: the frequency steps leave no more of them.)
+# How far off resonance is enough? Below is the gain of Schwarz's criterion by the offset less that
+# by friction, for three draws of the noise each; inside the grey band the diagnosis does not
+# decide. (There are fewer states tuned to resonance: the frequency steps leave no more of them.)
 
 # %%
 figure, grid = drawing.panels(drawing.COLUMN, 3.4, 1, 1)
 axes = grid[0, 0]
 BINS = ((0, 4), (6, 14), (18, 34), (30, 60))
-PARTED = (("10 % left out", "beam", 0.1), ("friction of that size", "beam with friction", 0.0))
-for number, (label, motion, share) in enumerate(PARTED):
+SEPARATED = (("10 % left out", "beam", 0.1), ("friction of that size", "beam with friction", 0.0))
+for number, (label, motion, share) in enumerate(SEPARATED):
     for place, (nearest, farthest) in enumerate(BINS):
         differences = []
         for seed in range(2, 5):
@@ -341,9 +330,9 @@ for number, (label, motion, share) in enumerate(PARTED):
         ends = f"{min(differences):.1f} to {max(differences):.1f}"
         print(f"{label}, {nearest}° to {farthest}°: {ends}")
         if nearest >= 18:
-            headline[f"{label}, {nearest}° to {farthest}°: told rightly under every noise"] = (
-                min(differences) > 6 if share else max(differences) < -6
-            )
+            headline[
+                f"{label}, {nearest}° to {farthest}°: identified under every draw of the noise"
+            ] = min(differences) > 6 if share else max(differences) < -6
 axes.axhspan(-6, 6, color="0.88", zorder=0, label="not decided")
 axes.set_yscale("symlog", linthresh=10)
 axes.set_yticks([-100, -10, 0, 10, 100], ["−100", "−10", "0", "10", "100"])
@@ -353,9 +342,10 @@ drawing.name_axes(axes, "", "states, degrees off resonance", "gain: offset less 
 show(figure, "offset_or_friction")
 
 # %% [markdown]
-# States of one side only, the stable one, lean on the linear test. With a natural frequency known
-# to 1.2 % only, as far as the paper's two values for the flat beam lie apart (97.45 Hz in Tab. 6;
-# 35.79 Hz are "37.16 %" of 96.3 Hz), the small offset cannot be told from friction.
+# With states on one side of resonance only, the stable one, the answer depends on the linear test.
+# If the natural frequency is known to 1.2 % only, the difference of the paper's two values for the
+# flat beam (97.45 Hz in Tab. 6; 35.79 Hz are "37.16 %" of 96.3 Hz), the small offset cannot be
+# distinguished from friction.
 
 # %%
 print(f"linear frequency by the shift: {35.79 / 0.3716:.2f} Hz")
@@ -377,22 +367,22 @@ one_sided = {
 }
 for share, several in one_sided.items():
     print(f"{100 * share:.0f} % left out, one side:", [one.candidates for one in several])
-headline["one side, frequency vague: the offset is in the class"] = all(
+headline["one side, frequency uncertain: the offset is a candidate"] = all(
     "force_offset_error" in one.candidates[0] for several in one_sided.values() for one in several
 )
 
 # %% [markdown]
-# ### Which intercept would the paper's misfit need?
+# ### Which intercept would explain the paper's damping?
 #
 # Appendix B prints its sign for the flat beam: without the adjustment there is "a noticeable *drop*
-# in the low amplitudes range". A drop wants a recorded force that is too small, by a true offset
+# in the low amplitudes range". A drop needs a recorded force that is too small, by a true offset
 # f₀ = F·d/(1 − d) for a drop d at force F. An intercept that was left out would make it *rise*.
-# That sign no friction has, so the program names it even from states at resonance:
+# No friction has this sign, so the offset is identified even from states at resonance:
 
 # %%
 opposite = sj.diagnose_model(model, recorded(motions["beam"], 0, 4, missing=-0.15 * forces[0]))
 report(opposite)
-headline["a drop: the offset is named even at resonance"] = (
+headline["a drop: the offset is identified even at resonance"] = (
     opposite.verdict == "named" and opposite.candidates == OFFSET
 )
 
@@ -416,14 +406,15 @@ headline["the line's own error does not: 3 % at most"] = own < 0.03
 headline["the test's states would find the offset to 1 % of the lowest force"] = precision < 0.01
 
 # %% [markdown]
-# **Judgement: the printed numbers do not decide it, and they speak against the simplest story.**
+# **Conclusion: the printed numbers do not decide it, and they contradict the simplest
+# explanation.**
 #
-# - *For*: an intercept of this size, wrong as a whole, errs by as much as matters, as 1/F, and only
-#   at low amplitude.
-# - *Against the intercept left out*: the sign. It would lift the flat beam's damping; the paper
+# - *For*: leaving out an intercept of this size makes an error as large as the one seen, as 1/F and
+#   therefore only at low amplitude.
+# - *Against the intercept left out*: the sign. It would raise the flat beam's damping; the paper
 #   sees a drop. For the curved beam no sign is printed.
 # - *Against an error of the line*: its points were found with the linear damping, so that inside
-#   the range of the calibration the method gives back the linear damping, to the width of the band
+#   the range of the calibration the method returns the linear damping, to the width of the band
 #   in the first figure. The flat beam's lowest validated force lies inside. A drop there means that
 #   the force in the test was not that of the calibration at the same voltage, by up to the
 #   intercept: the drive behaved differently, or the line was used for voltages to which it did not
@@ -431,19 +422,20 @@ headline["the test's states would find the offset to 1 % of the lowest force"] =
 # - *On its size*: that response curves with and without the adjustment hardly differ, the lowest at
 #   1.066 mN included, allows a few per cent there: about 50 µN for 5 %, a third of the intercept.
 #   The drop itself is drawn, not printed.
-# - The paper suspects a mode shape that changes with amplitude. Such a change is nothing at low
-#   amplitude by definition: it cannot keep damping from its linear value there.
+# - The paper suspects a mode shape that changes with amplitude. Such a change vanishes at low
+#   amplitude by definition: it cannot change the damping there.
 #
 # What would decide: the test's own rows (voltage, frequency, velocity, phase) with the model of
 # the linear test. Some thirty states near resonance give the offset to about 1 % of the lowest
-# force; two states of the lowest level on either side of resonance tell it from friction.
+# force; two states of the lowest level on either side of resonance distinguish it from friction.
 
 # %% [markdown]
 # ## 2. Appendix B: amplitudes read as peaks
 #
-# Notebook 01 settles where the 47 1/s come from. Here somebody reads peaks off an oscilloscope and
-# asks what the curved beam's model lacks. States by harmonic balance, softening and stiffening
-# apart, 3° to 34° off resonance; the model has the true stiffness and the linear damping.
+# Notebook 01 shows where the 47 1/s come from. Here peaks are read off an oscilloscope, and the
+# question is what the curved beam's model lacks. States by harmonic balance, for softening and
+# stiffening separately, 3° to 34° off resonance; the model has the true stiffness and the linear
+# damping.
 
 # %%
 curved = sj.model.curved_beam()
@@ -537,13 +529,13 @@ headline["both: held-out and top level predicted to within their noise"] = all(
 show(soft.plot(), "peak_residuals")
 
 # %% [markdown]
-# No damping law is named. The true stiffness does not fit amplitudes that were misread, and that
-# gives the reading away: in softening it errs by 1 + sQ², which is what the program means by a mode
-# shape that changes; far into stiffening by a gain of −12 %, of which the cubic spring knows. (Not
-# under every noise: of six in stiffening, four name the gain alone, one adds two further effects,
-# one takes an added mass in its place and says `unknown`.) Where the stiffness is free to follow
-# whatever was read, as in an identification of backbone and damping by themselves, a damping law is
-# nearly as good:
+# No damping law is identified. The true stiffness does not fit amplitudes that were misread, which
+# reveals the error: in softening the reading is wrong by a factor 1 + sQ², as with a mode shape
+# that changes with amplitude; far into stiffening by a gain of −12 %, which the cubic spring
+# reveals. (Not for every draw of the noise: of six in stiffening, four give the gain alone, one
+# adds two further effects, one takes an added mass instead and answers `unknown`.) Where the
+# stiffness is free to follow the readings, as in an identification of backbone and damping without
+# a model, a damping law is nearly as good:
 
 # %%
 square, cube = (float(value) for value in curved.potential.coefficient)
@@ -564,13 +556,13 @@ headline["stiffness free: a damping law gains nine tenths of what the best expla
 headline["it is damping that falls with amplitude"] = min(law.parameters.values()) < 0
 
 # %% [markdown]
-# **What to learn.** An amplitude that is misread passes for a damping law of its own: here one that
+# **What to learn.** A misread amplitude looks like a damping law of its own: here one that
 # falls with the square of the amplitude in softening and rises to 1.1653 of the linear 40.70 1/s in
 # stiffening. With the fundamental there is nothing to find: what it lies above 40.70 1/s (1.0184 in
 # the limit of stiffening, a tenth next to the lowest frequency) is energy that harmonics really
-# take, of which the model knows. Two signs give a misread amplitude away: the stiffness disagrees
+# dissipate, which the model includes. Two signs reveal a misread amplitude: the stiffness disagrees
 # over the same amplitudes, which no damping law does, and peak and fundamental of the recorded
-# signal differ. Feed fundamentals; read no damping from peaks.
+# signal differ. Use fundamentals; do not compute damping from peaks.
 
 # %%
 print("\n".join(f"{'yes' if holds else 'NO '}  {claim}" for claim, holds in headline.items()))

@@ -1,4 +1,4 @@
-"""Whether the measurement that an ambiguous diagnosis asks for settles it.
+"""Does the measurement that an ambiguous diagnosis asks for decide it?
 
 Run, with the sets, keys and diagnoses of a half:
     python benchmarks/blind_sets/close_loops.py ask --keys DIR/keys --diagnoses OUT > asked.json
@@ -7,10 +7,10 @@ Run, with the sets, keys and diagnoses of a half:
     python benchmarks/blind_sets/close_loops.py score --keys DIR2/keys --diagnoses OUT2
 
 `ask` takes the ambiguous sets whose truth is in the library and whose classes have several effects,
-in the order of their names, and prints the requests of the first 20 that the generator can answer
-and that the program expects to be enough; on the standard error what became of all. `score` counts
-those that collapse: every class has one effect, and these are the true ones. One line a set, then
-the count.
+in the order of their names, and prints the requests of the first 20 that the generator can serve
+and that the diagnosis expects to be enough; the standard error lists what was done with all.
+`score` counts those that collapse: every class has one effect, and these are the true ones. One
+line a set, then the count.
 """
 
 import argparse

@@ -1,9 +1,9 @@
 """The measurement that a diagnosis asks for, of the same structure, beside the states it has.
 
-The states that a set has keep their errors. Harmonics are those that the same states had; further
-states are swept for after the test, as a level of its own with its own gain and phase error and new
-noise. A request that wants harmonics says how little noise they need: they get that, or the noise
-of the set's instruments if it is less.
+The states of a set keep their errors. Harmonics are those that the same states had; further states
+come from a new sweep after the test, as a level of its own with its own gain and phase error and
+new noise. A request of harmonics states the noise that they need: they get that, or the noise of
+the set's instruments if it is less.
 """
 
 from collections.abc import Mapping

@@ -1,10 +1,10 @@
-"""Blind data sets for `snrmjax diagnose`: truth by integration in time, errors of a test.
+"""Blind data sets for `snrmjax diagnose`: truth by time integration, with the errors of a test.
 
 Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
      [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1]
 
-Writes DIR/sets/NAME.csv and NAME.toml (the baseline, which lacks the effect) and, apart from
-them, DIR/keys/NAME.json (the truth). Nothing here shares code with the program that is judged.
+Writes DIR/sets/NAME.csv and NAME.toml (the baseline model, which lacks the effect) and, apart from
+them, DIR/keys/NAME.json (the truth). No code is shared with the package that is tested.
 `--requests` writes the sets named in a file of `close_loops.py`, each with the further measurement
 that the diagnosis of it asked for. One JSON line at the end: sets, sweeps, seconds.
 """

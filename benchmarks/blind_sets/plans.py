@@ -61,7 +61,7 @@ class Case:
 
 
 def all_plans() -> list[Plan]:
-    """The sets of one half, in an order that says nothing about their names."""
+    """The sets of one half, in an order unrelated to their names."""
     plans = [Plan("none", harmonics=k % 2 == 0) for k in range(30)]
     plans += [Plan("none", harmonics=k % 2 == 0, level_errors=True) for k in range(20)]
     for n, kind in enumerate(SHAPES):

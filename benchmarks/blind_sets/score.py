@@ -95,7 +95,7 @@ class Result:
 
     @property
     def honest_outside(self) -> bool:
-        """Unknown, or an imitation that is marked and foretells the held-out level."""
+        """Unknown, or an ambiguous answer that predicts the level left out."""
         if self.verdict == "ambiguous" and self.diagnosis is not None:
             gap = self.diagnosis["gap"]
             after = gap.get("held_out_after")

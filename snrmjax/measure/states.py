@@ -134,6 +134,10 @@ class SteadyStates(AbstractResult):
         """Where a velocity was measured whose amplitude alone is known."""
         return self.measured & (self.phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
 
+    def select(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SteadyStates":
+        """Some of the states: those where a mask is true, or of these rows in this order."""
+        return jax.tree.map(lambda column: column[np.asarray(rows)], self)
+
     def renumbered(self, offset: int) -> "SteadyStates":
         """The same states with `offset` added to their levels, before joining tests."""
         return eqx.tree_at(lambda data: data.level, self, self.level + offset)

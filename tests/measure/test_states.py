@@ -39,6 +39,15 @@ class TestJoining:
             sj.measure.join_steady_states(parts_of(1)[0], wrong)
 
 
+@pytest.mark.parametrize("rows", [np.array([True, False, True]), np.array([0, 2]), [0, 2]])
+def test_some_states_by_mask_and_by_rows(rows):
+    some = sj.measure.join_steady_states(parts_of(3)).select(rows)
+    assert some.n_states == 2
+    assert some.sensors == parts_of(1)[0].sensors
+    np.testing.assert_array_equal(some.frequency, [500.0, 502.0])
+    np.testing.assert_array_equal(some.velocity, [[0.6], [0.6 + 0.2j]])
+
+
 def test_records_joined_written_and_read_back(tmp_path):
     """What was recorded is what a file gives back: V = Ae^{iφ} at every level, known exactly."""
     time = np.linspace(0.0, 0.5, 2000)
