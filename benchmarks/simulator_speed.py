@@ -1,24 +1,25 @@
-"""Seconds a point of a forced response, against other programs and against the bare LU solves.
+"""Seconds a point of a forced response, against other programs and against the LU solves alone.
 
 Run: python benchmarks/simulator_speed.py [--without-peers] [--out DIR] [--environments DIR]
 
 Two curves with nine harmonics around all their folds: the flat beam (77 unknowns with the
-frequency) and the monostable curved beam (20). The peers get the equations as numbers, not the
-package, and run in environments of their own: pyHarm-os, jaxcont, and a plain NumPy/SciPy program
-(`peers/`). The limit is as many LU factorisations as snrmjax used, and nothing else. All methods
-take turns, medians of several warm runs; the first run is given apart as compile time. snrmjax's
-public verb also locates events and judges stability, which no peer does: "snrmjax, no stability"
-leaves out the latter. The factorisations that locate events are not counted in the limit.
+frequency) and the monostable curved beam (20). The peers are pyHarm-os, jaxcont, and a plain
+NumPy/SciPy program (`peers/`). They get the equations as numbers, not the package, and run in
+environments of their own. The limit is as many LU factorisations as snrmjax used, and nothing else.
+All methods take turns; times are medians of several warm runs, with the compile time of the first
+run apart. `forced_response` also locates events and computes stability, which no peer does:
+"snrmjax, no stability" leaves out the latter. The limit does not count the factorisations that
+locate events.
 
-Every curve is compared with snrmjax's of 31 harmonics (the truncation of nine shows there) and of
-nine in fine steps (errors of the method show there): the largest distance of a point to the
-reference, in the plane of frequency over the first natural frequency and velocity over its peak.
-`reference_not_covered` is the opposite distance, from the reference to the chords between the
+Every curve is compared with snrmjax's of 31 harmonics (which shows the truncation error of nine)
+and of nine in fine steps (which shows errors of the method): the largest distance of a point from
+the reference, in the plane of frequency over the first natural frequency and velocity over its
+peak. `reference_not_covered` is the opposite distance, from the reference to the chords between the
 points: about the square of a step, unless a method left out a part of the curve.
 
 Also: the first curve of a cold process, with and without a compilation cache; a second model of
-the same size; 64 forces one by one against the batch verb. One JSON line each, ratios last; the
-curves go to `--out` as .npz.
+the same size; 64 forces one by one and as one batch. One JSON line each, ratios last; the curves
+go to `--out` as .npz.
 """
 
 import argparse
@@ -84,7 +85,7 @@ def tell(**fields: object) -> None:
 def respond(
     case: Case, model: sj.model.Structure | None = None, **settings: object
 ) -> list[sj.simulate.ResponseCurve]:
-    """The public verb for one case; two parts where neither end is reached from the other."""
+    """The response of one case; two parts where neither end is reached from the other."""
     return sj.forced_response(
         model or case.model,
         [case.force],
@@ -95,7 +96,7 @@ def respond(
 
 
 def without_stability(case: Case) -> list[sj.simulate.ResponseCurve]:
-    """The same without stability, which the peers do not judge either."""
+    """The same without stability, which the peers do not compute either."""
     return respond(case, stability=False)
 
 
@@ -247,7 +248,7 @@ class Peer:
 @eqx.filter_jit
 def _factorise(matrix: jax.Array, repeats: int) -> jax.Array:
     def body(_: int, carry: jax.Array) -> jax.Array:
-        # The next matrix hangs on the last factors, so that none is left out.
+        # The next matrix depends on the last factors, so that none is left out.
         return matrix + 1e-30 * jax.lax.linalg.lu(carry)[0][0, 0]
 
     return jax.lax.fori_loop(0, repeats, body, matrix)
@@ -347,21 +348,21 @@ def compare(case: Case, out: Path, pythons: dict[str, Path]) -> dict[str, object
             n_solves=sum(int(c.n_solves) for c in curves[name]),
         )
     for peer in peers:
-        told = dict(peer.first)
+        answer = dict(peer.first)
         if not peer.seconds:
-            tell(measurement="forced_response", beam=case.beam, **told)
+            tell(measurement="forced_response", beam=case.beam, **answer)
             continue
         saved, warm = np.load(peer.curve), float(np.median(peer.seconds))
         curve = (saved["frequency_hz"], saved["velocity"])
         per = report(
-            told["method"],
+            answer["method"],
             curve,
-            max(told["prepare_seconds"] + told["first_seconds"] - warm, 0.0),
+            max(answer["prepare_seconds"] + answer["first_seconds"] - warm, 0.0),
             seconds=warm,
-            **{k: told[k] for k in ("version", "settings", "status", "reached_hz", "n_solves")},
+            **{k: answer[k] for k in ("version", "settings", "status", "reached_hz", "n_solves")},
         )
-        if told["status"] == "ok":
-            per_point[told["method"]] = per
+        if answer["status"] == "ok":
+            per_point[answer["method"]] = per
     one = {name: float(np.median(times)) for name, times in lu.items()}
     count = sum(int(c.n_solves) for c in curves["snrmjax"])
     for name, each in one.items():

@@ -117,19 +117,20 @@ for axes, (name, (volts, tenths, used)) in zip(grid[0], PRINTED.items(), strict=
     )
     axes.fill_between(
         *(1e3 * force, 1 - band, 1 + band),
-        **{"color": drawing.SERIES[2], "alpha": 0.35, "label": "the line's own error, 95 %"},
+        **{"color": drawing.SERIES[2], "alpha": 0.35, "label": "error of the line, 95 %"},
     )
     axes.plot(1e3 * force, 1 + missing / force, color=drawing.SERIES[0], label="intercept left out")
     axes.plot(
         *(1e3 * force, force / (force + missing)),
-        **{"color": drawing.SERIES[1], "label": "intercept taken off, though not there"},
+        **{"color": drawing.SERIES[1], "label": "intercept subtracted by mistake"},
     )
     axes.plot([1e3 * f for f in used], [1.0] * 3, "k|", ms=14, label="forces of the validation")
     axes.set(xscale="log", ylim=(0.55, 1.65))
     axes.set_xticks([0.2, 0.5, 1, 2, 5], ["0.2", "0.5", "1", "2", "5"], minor=False)
     axes.minorticks_off()
-    drawing.name_axes(axes, f"printed {name} beam", "force by the line (mN)", "damping over linear")
-grid[0, 1].legend(fontsize=drawing.SMALL, loc="upper right")
+    drawing.name_axes(axes, f"printed values, {name} beam", "Force by the line (mN)", "")
+    axes.set_ylabel("Damping over linear damping", fontsize=drawing.TEXT)
+drawing.legend(figure)
 show(figure, "force_lines")
 headline["printed intercepts are 6 % and 15 % of the lowest forces"] = (
     abs(shares["curved"] - 0.063) < 2e-3 and abs(shares["flat"] - 0.146) < 2e-3
@@ -139,7 +140,7 @@ headline["both beyond 95 % of their own error"] = all(c > half for c, half in in
 # %% [markdown]
 # Damping is force over velocity, so a relative error of the force is that of the damping. An
 # intercept that is *left out* makes the recorded force too large and damping rise towards low
-# amplitude; one that is *taken off though it is not there* makes it fall. Both go as 1/F.
+# amplitude; one that is *subtracted by mistake* makes it fall. Both go as 1/F.
 #
 # ### Virtual tests of a beam with the intercept left out of the force
 #
@@ -230,7 +231,7 @@ for share in (0.0, 0.06, 0.10, 0.15, -0.15):
     lowest = np.asarray(data.level) == 1
     rise[share] = float(np.mean(np.asarray(points.modal_damping)[lowest])) / linear
     label = f"{100 * share:.0f} % left out" if share > 0 else "force as it is"
-    series.append(plot.DampingSeries(label if share >= 0 else "15 % taken off", points=points))
+    series.append(plot.DampingSeries(label if share >= 0 else "15 % subtracted", points=points))
     print(f"{label if share >= 0 else '15 % taken off'}: lowest level {rise[share]:.3f} of linear")
 figure = plot.modal_damping_figure(series, linear=linear)
 (axes,) = figure.axes
@@ -337,8 +338,9 @@ axes.axhspan(-6, 6, color="0.88", zorder=0, label="not decided")
 axes.set_yscale("symlog", linthresh=10)
 axes.set_yticks([-100, -10, 0, 10, 100], ["−100", "−10", "0", "10", "100"])
 axes.set_xticks(range(len(BINS)), [f"{a}° to {b}°" for a, b in BINS])
-axes.legend(fontsize=drawing.SMALL)
-drawing.name_axes(axes, "", "states, degrees off resonance", "gain: offset less friction")
+axes.set_xlim(-0.4, len(BINS) - 0.6)
+drawing.name_axes(axes, "", "Phase of the states from resonance", "Gain: offset less friction")
+drawing.legend(figure)
 show(figure, "offset_or_friction")
 
 # %% [markdown]

@@ -28,7 +28,7 @@ def notes_on_families(
     unfinished = [one for one in candidates if not one.converged]
     told = [one for one in unfinished if one.chosen or one.weight > _COUNTS]
     if told:
-        listed = ", ".join(f"{one.family} of the {one.curve}" for one in told)
+        listed = ", ".join(f"{one.family}@{one.argument} of the {one.curve}" for one in told)
         notes.append(
             f"{len(told)} of {len(candidates)} families were compared by fits that had not "
             f"converged ({listed}): their scores in cross-validation are lower bounds."

@@ -105,7 +105,7 @@ def test_families_ranked_by_unfinished_fits_are_named():
     chosen = next(one for one in fit.families.candidates if one.curve == "damping" and one.chosen)
     assert notes_on_families(SelectionStatus.SETTLED, fit.families.candidates) == ()
     (note,) = notes_on_families(SelectionStatus.SETTLED, [chosen._replace(converged=False)])
-    assert "had not converged (viscous_quadratic of the damping)" in note
+    assert "had not converged (viscous_quadratic@velocity of the damping)" in note
 
 
 def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypatch):
