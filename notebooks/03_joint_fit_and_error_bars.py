@@ -171,11 +171,11 @@ for exact in sj.forced_response(flat, [2.669e-3, 1.334e-2], *ends):
 
 # %% [markdown]
 # So 32 states near resonance determine the curves as well as 85 along one response: the same mean
-# band of frequency, a narrower one of damping. But at other amplitudes. Each test is best where it
-# measured near resonance: the eight levels have a band four times narrower at small amplitudes, and
-# end at the largest amplitude that a test 33° off resonance reaches. The one response has a band
-# ten times narrower at its own tip, and knows small amplitudes only from states far from resonance,
-# where the phase hardly changes.
+# band of frequency, a narrower one of damping. They do so at different amplitudes. Each test is
+# best where it measured near resonance: the eight levels have a band four times narrower at small
+# amplitudes, and end at the largest amplitude that a test 33° off resonance reaches. The one
+# response has a band ten times narrower at its own tip, and knows small amplitudes only from states
+# far from resonance, where the phase hardly changes.
 #
 # Random noise is not the only error. Let the gain of every level be known to 1 % only:
 
