@@ -318,7 +318,7 @@ else:
 #
 # Note the bands of this fit. Six levels are too few to estimate the level-to-level variance of the
 # natural frequency: its notes name gain and phase only, and its bands are far too narrow. With all
-# eight levels it is 0.07 %, by which the predictions are judged below (in brackets). Where levels
+# eight levels it is 0.04 %, by which the predictions are judged below (in brackets). Where levels
 # are few, a band without level-to-level variance is too narrow.
 
 # %%
