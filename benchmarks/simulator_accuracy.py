@@ -2,7 +2,7 @@
 
 Run: python benchmarks/simulator_accuracy.py [--points N] [--stability N]
 
-The reference is that of the tests (tests/truth/periodic_motions.py): the equations of motion
+The reference is that of the tests (tests/truths/periodic_motions.py): the equations of motion
 written again in NumPy, integrated by SciPy's Dormand-Prince method of order 8 with rtol 1e-12, and
 a harmonic balance by sampling whose folds and peaks are found by brentq. Seven curves: the flat
 beam at four forces (60-120 Hz), the monostable curved beam at three (20-150 Hz).
@@ -27,7 +27,7 @@ import numpy as np
 import snrmjax as sj
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from truth.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
+from truths.periodic_motions import NumpyBalance, TimeDomain, initial_state, spectrum_distance
 
 HERTZ = 2 * np.pi
 KINDS = ("fold", "peak", "phase_resonance")

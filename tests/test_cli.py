@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import typer
 from matplotlib.figure import Figure
-from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
+from truths.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
 
 import snrmjax as sj
 from snrmjax.cli import app, main

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from truth.balanced_sets import OMEGA, ZETA, balanced, linear_model
+from truths.balanced_sets import OMEGA, ZETA, balanced, linear_model
 
 import snrmjax as sj
 from snrmjax.diagnose.completed_model import CompletedStatus, completed_model

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from jaxtyping import Array
-from truth.balanced_sets import (
+from truths.balanced_sets import (
     KEYS,
     NOISE,
     OMEGA,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from truth.balanced_sets import balanced, linear_model, quadratic
+from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence

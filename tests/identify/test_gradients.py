@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.derivatives import check_derivatives, numbers
+from truths.derivatives import check_derivatives, numbers
 
 import snrmjax as sj
 from snrmjax.identify.calibrate.inverse_force import inverse_force

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from truth.derivatives import check_derivatives, numbers
+from truths.derivatives import check_derivatives, numbers
 
 import snrmjax as sj
 

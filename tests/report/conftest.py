@@ -1,7 +1,7 @@
 """The curved beam tested near resonance, identified and predicted: once for all figures."""
 
 import pytest
-from truth.beam_forces import FORCES
+from truths.beam_forces import FORCES
 
 import snrmjax as sj
 from snrmjax.io.units import HERTZ

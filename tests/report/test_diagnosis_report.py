@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from truth.printed_page import unreadable
+from truths.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.diagnose.search.locating import Located

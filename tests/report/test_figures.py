@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
-from truth.beam_forces import FORCES
-from truth.printed_page import unreadable
+from truths.beam_forces import FORCES
+from truths.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.io.units import DEGREE, HERTZ

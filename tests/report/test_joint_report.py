@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from truth.exact_states import damping, modes, noisy, squared
-from truth.joint_fits import exact_fit, noisy_fit
-from truth.printed_page import unreadable
+from truths.exact_states import damping, modes, noisy, squared
+from truths.joint_fits import exact_fit, noisy_fit
+from truths.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.identify.inference.sensitivity import Contribution

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.beam_forces import FORCES
-from truth.printed_page import unreadable
+from truths.beam_forces import FORCES
+from truths.printed_page import unreadable
 
 from snrmjax.io.units import HERTZ
 from snrmjax.report import simulation_figures as plot

@@ -39,7 +39,7 @@ _SEEN = 0.1  # of the larger of two harmonics, above which the smaller one has a
 _CLOSER, _FINEST = 3.0, 1e-4  # factor between the noise floors tried, and the lowest one
 
 
-class TestedLevel(NamedTuple):
+class ProposedLevel(NamedTuple):
     """Where in the measured range a test is, by its resonance."""
 
     level: int  # that is measured again, or whose velocities are scaled
@@ -57,7 +57,7 @@ class DiscriminatingTest(NamedTuple):
     kind: str  # "harmonics", "off_resonance", "lower_level", "higher_level", "calibration"
     sentence: str
     quantity: str | None = None  # in which the models differ most: "harmonic 2", "velocity", …
-    place: TestedLevel | None = None
+    place: ProposedLevel | None = None
     states: int | None = None
     phase: tuple[float, float] | None = None  # degrees off resonance, on both sides
     harmonics: tuple[int, ...] = ()
@@ -266,7 +266,7 @@ class _Hypothesis:
         gain, needed, quantity, words = min(found, key=lambda one: one[0] / one[1])
         one = self.points[option.place]
         size = np.degrees(np.abs(one.phase))
-        place = TestedLevel(
+        place = ProposedLevel(
             level=int(self.misfit.level_numbers[one.level]),
             force=test.force[option.place],
             frequency=test.frequency[option.place] / (2 * np.pi),
@@ -285,7 +285,9 @@ class _Hypothesis:
         )
 
 
-def _what_to_measure(place: TestedLevel, scale: float, test: PredictedTest, option: _Option) -> str:
+def _what_to_measure(
+    place: ProposedLevel, scale: float, test: PredictedTest, option: _Option
+) -> str:
     """Where and what to measure, in words."""
     at = f"near {place.frequency:.4g} Hz"
     level = f"level {place.level} ({place.force:.3g} N)"

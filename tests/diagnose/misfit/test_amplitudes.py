@@ -8,7 +8,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.balanced_sets import HERE, KEYS, balanced, files, linear_model, quadratic
+from truths.balanced_sets import HERE, KEYS, balanced, files, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.cli import diagnose

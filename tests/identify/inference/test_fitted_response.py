@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth import joint_fits
-from truth.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
-from truth.joint_fits import noisy_fit
+from truths import joint_fits
+from truths.exact_states import CONSTANT, TRUE, damping, exact, modes, noisy, squared
+from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone

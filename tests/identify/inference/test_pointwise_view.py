@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from truth.exact_states import modes, noisy
+from truths.exact_states import modes, noisy
 
 import snrmjax as sj
 from snrmjax.identify.pointwise.identification import errors_from_scatter

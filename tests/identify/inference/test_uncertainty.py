@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
-from truth.joint_fits import noisy_fit
+from truths.exact_states import CONSTANT, NOISE, OMEGA, TRUE, modes, noisy, stated
+from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference import profiles

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from truth.exact_states import (
+from truths.exact_states import (
     CONSTANT,
     LEVELS,
     NOISE,
@@ -22,7 +22,7 @@ from truth.exact_states import (
     stated,
     truth_at,
 )
-from truth.joint_fits import exact_fit, noisy_fit
+from truths.joint_fits import exact_fit, noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from truth.exact_states import LEVELS, NOISE, TRUE, exact, modes, stated, truth_at
+from truths.exact_states import LEVELS, NOISE, TRUE, exact, modes, stated, truth_at
 
 import snrmjax as sj
 from snrmjax.identify.joint.joint_fit import fit_jointly

@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from scipy.optimize import least_squares
-from truth.exact_states import LEVELS, OMEGA, PARTICIPATION, SHAPE, noisy
+from truths.exact_states import LEVELS, OMEGA, PARTICIPATION, SHAPE, noisy
 
 import snrmjax as sj
 from snrmjax.identify.joint.fitting import SOLVER

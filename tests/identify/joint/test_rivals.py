@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.exact_states import modes, noisy
+from truths.exact_states import modes, noisy
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import ARGUMENTS

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.exact_states import CONSTANT, NOISE, OMEGA, modes, stated
+from truths.exact_states import CONSTANT, NOISE, OMEGA, modes, stated
 
 import snrmjax as sj
 from snrmjax.identify.curves.splines import SmoothingSpline

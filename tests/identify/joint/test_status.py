@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from truth.exact_states import TRUE, modes, noisy
-from truth.joint_fits import noisy_fit
+from truths.exact_states import TRUE, modes, noisy
+from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.curves.families import parse_family

@@ -2,7 +2,7 @@
 
 import functools
 
-from truth.exact_states import TRUE, modes, noisy
+from truths.exact_states import TRUE, modes, noisy
 
 import snrmjax as sj
 
