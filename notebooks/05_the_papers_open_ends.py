@@ -232,7 +232,7 @@ for share in (0.0, 0.06, 0.10, 0.15, -0.15):
     rise[share] = float(np.mean(np.asarray(points.modal_damping)[lowest])) / linear
     label = f"{100 * share:.0f} % left out" if share > 0 else "force as it is"
     series.append(plot.DampingSeries(label if share >= 0 else "15 % subtracted", points=points))
-    print(f"{label if share >= 0 else '15 % taken off'}: lowest level {rise[share]:.3f} of linear")
+    print(f"{label if share >= 0 else '15 % subtracted'}: lowest level {rise[share]:.3f} of linear")
 figure = plot.modal_damping_figure(series, linear=linear)
 (axes,) = figure.axes
 modal = float(first.mode_shape[0, 0] * first.participation[0])
