@@ -6,12 +6,15 @@ change what the instruments record.
 """
 
 import dataclasses
+import numbers
 from abc import abstractmethod
-from typing import ClassVar, Self
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.model.effect_metadata import (
@@ -297,3 +300,35 @@ class AbstractMeasurementEffect(AbstractEffect):
         1, … of the velocity in m/s, and the amplitude Q of the mode of interest's fundamental
         in kg^1/2 m. Returns the recorded force (N) and velocity (m/s).
         """
+
+
+def checked_effects(effects: AbstractEffect | Iterable[AbstractEffect]) -> tuple[Any, ...]:
+    """Effects as a structure holds them: a tuple, their parameters as arrays.
+
+    Parameters that are plain numbers become arrays of 64-bit floats; arrays stay as they are,
+    traced ones too. One effect counts as a tuple of one.
+    Raises `ValueError` for a class in place of an effect, and for what is no effect.
+    """
+    single = isinstance(effects, AbstractEffect | type) or not isinstance(effects, Iterable)
+    every: tuple[Any, ...] = (effects,) if single else tuple(effects)
+    return tuple(_with_arrays(effect) for effect in every)
+
+
+def _with_arrays(effect: Any) -> Any:
+    if isinstance(effect, type) and issubclass(effect, AbstractEffect):
+        values = ", ".join(f"{name}=…" for name in effect.parameters())
+        raise ValueError(
+            f"`effects` has {effect.__name__}, which is a class: give its parameters, "
+            f"`{effect.__name__}({values})`."
+        )
+    if not isinstance(effect, AbstractEffect):
+        raise ValueError(f"`effects` must be effects such as those of `EFFECTS`, not {effect!r}.")
+    plain = [
+        name
+        for name in effect.parameters()
+        if isinstance(getattr(effect, name), numbers.Real | np.ndarray)
+    ]
+    if not plain:
+        return effect
+    arrays = [jnp.asarray(getattr(effect, name), dtype=jnp.float64) for name in plain]
+    return eqx.tree_at(lambda one: [getattr(one, name) for name in plain], effect, arrays)

@@ -46,6 +46,20 @@ class Prior(NamedTuple):
         size = 1.0 if self.unit is None else self.unit(scales)
         return self.lower * size, self.upper * size
 
+    def __repr__(self) -> str:
+        """The range in words.
+
+        >>> Prior(lower=0.0), Prior(1e-5, 0.2), Prior()
+        (Prior(at least 0), Prior(from 1e-05 to 0.2), Prior(any))
+        """
+        at_least, at_most = self.lower > -np.inf, self.upper < np.inf
+        text = "any"
+        if at_least and at_most:
+            text = f"from {self.lower:g} to {self.upper:g}"
+        elif at_least or at_most:
+            text = f"at least {self.lower:g}" if at_least else f"at most {self.upper:g}"
+        return f"Prior({text}{'' if self.unit is None else ' times a measured size'})"
+
 
 ANY = Prior()
 NOT_BELOW_ZERO = Prior(lower=0.0)

@@ -1,6 +1,7 @@
 """A structure: linear modes, a polynomial potential and further effects."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from snrmjax.model.effect_base import (
     AbstractLinearChange,
     AbstractMeasurementEffect,
     AbstractMemoryless,
+    checked_effects,
 )
 from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
@@ -44,7 +46,7 @@ class Structure(eqx.Module):
 
     modes: LinearModes
     potential: PolynomialPotential
-    effects: tuple[AbstractEffect, ...] = ()
+    effects: tuple[AbstractEffect, ...] = eqx.field(default=(), converter=checked_effects)
     level_gain_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     level_phase_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     level_frequency_std: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
@@ -220,7 +222,7 @@ def structure(
     modes: LinearModes,
     potential: PolynomialPotential | None = None,
     *,
-    effects: tuple[AbstractEffect, ...] = (),
+    effects: AbstractEffect | Iterable[AbstractEffect] = (),
     level_gain_std: float = 0.0,
     level_phase_std: float = 0.0,
     level_frequency_std: float = 0.0,
@@ -229,9 +231,11 @@ def structure(
 ) -> Structure:
     """Build a `Structure`; without a potential it is linear but for its effects.
 
-    Arguments: `level_gain_std` relative, `level_phase_std` in rad, `level_frequency_std` in rad/s,
-    `level_damping_std` of the damping ratio.
-    Raises `ValueError` when potential and modes disagree about the number of modes.
+    Arguments: `effects` one or several, whose parameters may be plain numbers; `level_gain_std`
+    relative, `level_phase_std` in rad, `level_frequency_std` in rad/s, `level_damping_std` of the
+    damping ratio.
+    Raises `ValueError` when potential and modes disagree about the number of modes, and for what
+    is no effect, such as a class whose parameters are not given.
     """
     if potential is None:
         potential = polynomial_potential({}, modes.n_modes)
@@ -242,7 +246,7 @@ def structure(
     return Structure(
         modes=modes,
         potential=potential,
-        effects=tuple(effects),
+        effects=checked_effects(effects),
         level_gain_std=jnp.asarray(float(level_gain_std)),
         level_phase_std=jnp.asarray(float(level_phase_std)),
         level_frequency_std=jnp.asarray(float(level_frequency_std)),

@@ -10,6 +10,10 @@ class Rule(NamedTuple):
     expected: str
     good: Callable[[float], bool]
 
+    def __repr__(self) -> str:
+        """What is expected: Rule("positive")."""
+        return f'Rule("{self.expected}")'
+
 
 POSITIVE = Rule("positive", lambda value: value > 0)
 NOT_NEGATIVE = Rule("zero or positive", lambda value: value >= 0)

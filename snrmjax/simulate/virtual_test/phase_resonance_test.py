@@ -43,8 +43,10 @@ Means = Literal["harmonic_balance", "time_integration"]
 class SweepSimulation(NamedTuple):
     """How the motions of a phase-resonance test are computed.
 
-    By harmonic balance the frequency is stepped infinitely slowly; by time integration each sweep
-    has `steps_per_sweep` equal steps of at most `cycles_per_step` cycles.
+    `by` is "harmonic_balance", where the frequency is stepped infinitely slowly, or
+    "time_integration", where each sweep has `steps_per_sweep` equal steps of frequency, each held
+    for at most `cycles_per_step` cycles of the force. `harmonic_order` is the highest harmonic of
+    the motion, a multiple of the frequency of the force.
     """
 
     by: Means = "harmonic_balance"

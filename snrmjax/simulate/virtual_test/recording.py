@@ -19,7 +19,12 @@ _POINTS = 256  # of a curve, that instruments record at a time
 
 
 class MeasurementErrors(NamedTuple):
-    """Random errors of a test, 1σ; what a level shares is drawn once for each level."""
+    """Random errors of a test, 1σ; what a level shares is drawn once for each level.
+
+    `amplitude` of the velocity, relative (0.01 is 1 %); `phase` of the velocity, rad; `force`,
+    relative; `level_gain`, relative, and `level_phase`, rad, shared by a level; `harmonic`, m/s,
+    the rms of the complex error of every higher harmonic of the velocity.
+    """
 
     amplitude: float = 0.0  # relative, of the velocity
     phase: float = 0.0  # rad
@@ -33,7 +38,12 @@ NO_ERRORS = MeasurementErrors()
 
 
 class Recording(NamedTuple):
-    """What a test writes down of the states it visits: random errors, and further harmonics."""
+    """What a test writes down of the states it visits: random errors, and further harmonics.
+
+    `errors` of the instruments, none by default; `seed` of the random numbers behind them, a
+    whole number; `keep_harmonics` the orders (2, 3, … up to the test's `harmonic_order`) whose
+    velocity, m/s, is recorded beside the fundamental.
+    """
 
     errors: MeasurementErrors = NO_ERRORS
     seed: int = 0  # of the random errors

@@ -1,0 +1,79 @@
+"""Effects as users give them to a structure: with plain numbers, singly, or as a class."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import snrmjax as sj
+from snrmjax.model.effect_base import AbstractMemoryless, Scalar
+from snrmjax.model.effect_metadata import Parameter, Prior
+from snrmjax.model.effects import EFFECTS, make_effect
+
+
+class ThreeHalvesDamping(AbstractMemoryless):
+    """A user's effect, whose parameter is nothing but an annotation."""
+
+    kind: ClassVar[str] = "three_halves_damping_of_a_user"
+    coefficient: jax.Array
+
+    def force(self, displacement: Scalar, velocity: Scalar) -> Scalar:
+        """See `AbstractMemoryless.force`."""
+        return self.coefficient * velocity * (velocity**2 + 1e-12) ** 0.25
+
+
+def modes():
+    return sj.model.linear_modes([100.0], [0.01], [[1.0]], [1.0], sensors=("tip",))
+
+
+def peak(model):
+    curve, *_ = sj.forced_response(model, 1.0, 90.0, 110.0, harmonic_order=1)
+    return float(jnp.max(jnp.abs(curve.velocity[:, 1, 0])))
+
+
+@pytest.mark.parametrize("effect", [EFFECTS["quadratic_damping"], ThreeHalvesDamping])
+def test_parameters_may_be_plain_numbers(effect):
+    plain = sj.model.structure(modes(), effects=(effect(2.0),))
+    whole = sj.model.structure(modes(), effects=(effect(2),))
+    same = sj.model.structure(modes(), effects=(effect(jnp.asarray(2.0)),))
+    assert plain.effects[0].coefficient.dtype == whole.effects[0].coefficient.dtype == jnp.float64
+    assert jax.tree.structure(plain) == jax.tree.structure(same)
+    assert peak(plain) == peak(same)
+
+
+def test_traced_parameters_pass():
+    def strength(value):
+        model = sj.model.structure(modes(), effects=ThreeHalvesDamping(value))
+        return model.effects[0].force(jnp.zeros(()), jnp.asarray(4.0))
+
+    assert float(jax.jit(jax.grad(strength))(2.0)) == pytest.approx(8.0)
+
+
+def test_one_effect_is_a_tuple_of_one():
+    drag = make_effect("quadratic_damping", {"coefficient": 2.0})
+    assert sj.model.structure(modes(), effects=drag).effects == (drag,)
+
+
+def test_a_class_and_what_is_no_effect_are_refused_by_name():
+    for given in (EFFECTS["quadratic_damping"], [EFFECTS["quadratic_damping"]]):
+        with pytest.raises(ValueError, match=r"is a class.*`QuadraticDamping\(coefficient=…\)`"):
+            sj.model.structure(modes(), effects=given)
+    for given in (2.0, ["quadratic_damping"]):
+        with pytest.raises(ValueError, match="must be effects"):
+            sj.model.structure(modes(), effects=given)
+
+
+def test_rules_and_priors_print_in_words():
+    every = [one for kind in EFFECTS.values() for one in kind.parameters().values()]
+    assert not [repr(one) for one in every if "<function" in repr(one)]
+    assert 'Rule("positive")' in " ".join(map(repr, every))
+    prior = Prior(0.0, 1.2, lambda scales: scales.largest)
+    assert "from 0 to 1.2 times a measured size" in repr(Parameter("m", "gap", prior=prior))
+
+
+@pytest.mark.parametrize("name", ["MeasurementErrors", "Recording", "SweepSimulation"])
+def test_settings_of_a_virtual_test_state_every_field_and_its_unit(name):
+    settings = getattr(sj.simulate, name)
+    assert all(f"`{field}`" in settings.__doc__ for field in settings._fields)
+    assert any(unit in settings.__doc__ for unit in ("rad", "m/s", "cycles"))
