@@ -101,8 +101,9 @@ def diagnose_model(
     else:
         found, size = _with_noise_found(predictions, misfit, scales, kinds)
         noise_note = (
-            f"no noise is stated: {100 * size * ASSUMED_ERROR:.2g} % and as many hundredths of a "
-            "radian are taken, which is what the answer leaves; how well it fits is no proof then."
+            f"no noise is stated: the remaining misfit ({100 * size * ASSUMED_ERROR:.2g} % of "
+            f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, so a good fit "
+            "proves nothing."
         )
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
     free = locate_misfit(misfit, found.baseline)
@@ -133,7 +134,10 @@ def diagnose_model(
     without, refused = _completed_without_levels(misfit, model, fit)
     unconverged = _unconverged(found)
     if gain is not None and answer.effects:
-        notes.append(f"the answer puts that gain at {gain * answer.force_gain:.4g} N/V.")
+        notes.append(
+            f"with the effects found the gain becomes {gain * answer.force_gain:.3g} N/V (before: "
+            f"{gain:.3g})."
+        )
     notes += [*judgement.reasons, levels_note, noise_note]
     if levels is None:
         n = predictions.chosen.n_levels
@@ -320,11 +324,10 @@ def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     behind = [one for one in behind if np.isfinite(one)]
     near = sum(one < AS_GOOD for one in behind)
     if behind:
-        notes.append(
-            f"{len(behind)} of {len(rows)} fits that were compared had not converged when they "
-            f"ended; {near or 'none'} of them came within {AS_GOOD:g} of the best fit of their "
-            "step by Schwarz's criterion, which counts as equal."
-        )
+        effect = "all were clearly worse than the best, so the answer does not depend on them."
+        if near:
+            effect = f"{near} may be as good as the best, so the answer may depend on them."
+        notes.append(f"{len(behind)} of {len(rows)} trial fits stopped early; {effect}")
     if lost:
         notes.append(
             f"{', '.join(lost)} could not be fitted: with no starting point does the model have "

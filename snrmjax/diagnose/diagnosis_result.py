@@ -1,5 +1,6 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, NamedTuple
 
@@ -17,6 +18,8 @@ from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
+
+_WIDTH = 98  # of the notes, columns
 
 
 class Estimate(NamedTuple):
@@ -128,13 +131,22 @@ class Diagnosis(AbstractResult):
         ]
         if self.decide_by:
             lines.append(f"to decide: {self.decide_by}")
-        tried = sum(len(step) for step in self.table)
-        lines.append(
-            f"status: fit {_words(self.answer.status)}, completed model "
-            f"{_words(self.answer.completed_status)}; {self.checks.unconverged_fits} of {tried} "
-            "compared fits unconverged"
-        )
+        lines.append(f"status: {self._status()}")
+        if self.notes:
+            lines.append("notes:")
+            for note in self.notes:
+                lines += textwrap.wrap(note, _WIDTH, initial_indent="- ", subsequent_indent="  ")
         return tuple(lines)
+
+    def _status(self) -> str:
+        """How the fit and those it was compared with ended."""
+        status = f"fit {_words(self.answer.status)}"
+        if self.answer.completed_status is CompletedStatus.NOTHING_ADDED:
+            status = "nothing was added to the model"
+        elif self.answer.completed_status is CompletedStatus.NOT_PHYSICAL:
+            status += ", but no structure can have these parameters: there is no completed model"
+        tried, early = sum(len(step) for step in self.table), self.checks.unconverged_fits
+        return f"{status}; {early} of {tried} compared fits stopped early" if early else status
 
     def variables(self) -> Mapping[str, Variable]:
         """See `AbstractResult.variables`."""

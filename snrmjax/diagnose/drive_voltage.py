@@ -55,6 +55,6 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
     return FirstGain(
         found,
         gain,
-        f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. Its gain stays "
-        "free, so that damping and gain errors cannot be told apart.",
+        f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
+        "is fitted too: a 1 % error of the gain looks like 1 % of damping.",
     )

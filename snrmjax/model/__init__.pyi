@@ -21,7 +21,7 @@ from .effect_metadata import (
     parameter,
 )
 from .effect_shape import shape_of
-from .effects import EFFECTS, make_effect, register_effect
+from .effects import EFFECTS, describe_effects, make_effect, register_effect
 from .modes import (
     LinearModes,
     LinearModesStd,
@@ -62,6 +62,7 @@ __all__ = [
     "averaged_force",
     "averaged_response",
     "curved_beam",
+    "describe_effects",
     "equilibria",
     "flat_beam",
     "linear_modes",

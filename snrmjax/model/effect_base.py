@@ -309,8 +309,8 @@ def checked_effects(effects: AbstractEffect | Iterable[AbstractEffect]) -> tuple
     traced ones too. One effect counts as a tuple of one.
     Raises `ValueError` for a class in place of an effect, and for what is no effect.
     """
-    single = isinstance(effects, AbstractEffect | type) or not isinstance(effects, Iterable)
-    every: tuple[Any, ...] = (effects,) if single else tuple(effects)
+    several = isinstance(effects, Iterable) and not isinstance(effects, type)
+    every: Any = effects if several else (effects,)
     return tuple(_with_arrays(effect) for effect in every)
 
 

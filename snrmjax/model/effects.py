@@ -40,8 +40,42 @@ from snrmjax.model.library.stiffness import (
     StaticPreload,
 )
 
-EFFECTS: dict[str, type[AbstractEffect]] = {
-    effect.kind: effect
+
+class EffectTable(dict[str, type[AbstractEffect]]):
+    """Effects by their kind. It prints as a table: kind, parameters with units, description."""
+
+    def __repr__(self) -> str:
+        """One line for each effect."""
+        return describe_effects(self)
+
+
+def describe_effects(effects: Mapping[str, type[AbstractEffect]] | None = None) -> str:
+    """A table of effects, one line each: kind, parameters with their units, description.
+
+    Arguments: `effects` by kind, by default all of `EFFECTS`, with those that are registered.
+    """
+    every = EFFECTS if effects is None else effects
+    if not every:
+        return "no effects"
+    rows = [(kind, _parameters_with_units(one), _description(one)) for kind, one in every.items()]
+    width = max(len(kind) for kind, *_ in rows)
+    return "\n".join(f"{kind:{width}}  {own}: {text}".rstrip() for kind, own, text in rows)
+
+
+def _parameters_with_units(effect: type[AbstractEffect]) -> str:
+    return ", ".join(
+        f"{name} ({'no unit' if one.unit == '1' else one.unit})" if one.unit else name
+        for name, one in effect.parameters().items()
+    )
+
+
+def _description(effect: type[AbstractEffect]) -> str:
+    text = effect.description or effect.__doc__ or ""
+    return text.strip().split("\n")[0]
+
+
+EFFECTS: dict[str, type[AbstractEffect]] = EffectTable(
+    (effect.kind, effect)
     for effect in (
         LinearFrequencyShift,
         LinearDampingChange,
@@ -71,8 +105,11 @@ EFFECTS: dict[str, type[AbstractEffect]] = {
         ForceHarmonics,
         StaticPreload,
     )
-}
-"""The effects by the kind that files give them."""
+)
+"""The effects by the kind that files give them; `print(EFFECTS)` is a table of them."""
+
+# `help(EFFECTS)` shows the docstring of its class.
+EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{describe_effects()}"
 
 
 def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:

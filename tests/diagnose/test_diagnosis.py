@@ -365,7 +365,7 @@ def test_without_stated_noise_its_size_is_found_with_the_effect():
     found = sj.diagnose_model(linear_model(), silent)
     assert found.effects == ("quadratic_damping",)
     (note,) = (note for note in found.notes if note.startswith("no noise is stated: "))
-    size = float(note.split("is stated: ")[1].split(" %")[0])
+    size = float(note.split("misfit (")[1].split(" %")[0])
     # Velocity, phase and force together, as one relative error of all.
     assert size == pytest.approx(100 * NOISE["velocity"], rel=0.35)
 

@@ -1,5 +1,6 @@
 """What a diagnosis shows of itself: one screen of text, a labelled data set, a figure."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
+from snrmjax.diagnose.completed_model import CompletedStatus
 from snrmjax.diagnose.diagnosis import _notes_on_fits, _unconverged
 from snrmjax.diagnose.diagnosis_result import unit_of
 from snrmjax.diagnose.search.model_search import TriedEffect
@@ -21,7 +23,8 @@ def found():
 
 
 def test_a_diagnosis_says_itself_on_one_screen(found):
-    first, *lines = repr(found).splitlines()
+    text, _, _ = repr(found).partition("\n  notes:\n")
+    first, *lines = text.splitlines()
     assert first.startswith("Diagnosis: The model")
     assert "quadratic_damping" in first
     assert len(lines) < 20
@@ -30,7 +33,35 @@ def test_a_diagnosis_says_itself_on_one_screen(found):
     assert f"{value:.4g} ± {std:.2g}" in line
     assert line.endswith(unit_of("quadratic_damping.coefficient"))
     assert any("left out" in one for one in lines)
-    assert "fit converged, completed model completed" in lines[-1]
+    assert lines[-1].strip().startswith("status: fit converged")
+    assert "_" not in lines[-1]
+
+
+def test_a_diagnosis_prints_its_notes_in_lines_of_a_hundred_columns(found):
+    note = "a note of many words, " * 20 + "which ends here."
+    noted = dataclasses.replace(found, notes=("the first note.", note))
+    _, _, printed = repr(noted).partition("\n  notes:\n")
+    lines = printed.splitlines()
+    assert lines[0] == "  - the first note."
+    assert " ".join(line.strip() for line in lines[1:]) == f"- {note}"
+    assert max(map(len, lines)) <= 100
+    assert "notes:" not in repr(dataclasses.replace(found, notes=()))
+
+
+def test_the_last_line_says_how_the_fits_ended(found):
+    nothing = found.answer._replace(
+        status=MinimisationStatus.NOT_FITTED, completed_status=CompletedStatus.NOTHING_ADDED
+    )
+    early = found.checks._replace(unconverged_fits=3)
+    none = found.checks._replace(unconverged_fits=0)
+    tried = sum(len(step) for step in found.table)
+    for answer, checks, line in (
+        (nothing, none, "status: nothing was added to the model"),
+        (found.answer, none, "status: fit converged"),
+        (found.answer, early, f"status: fit converged; 3 of {tried} compared fits stopped early"),
+    ):
+        one = dataclasses.replace(found, answer=answer, checks=checks, notes=())
+        assert repr(one).splitlines()[-1].strip() == line
 
 
 def test_a_diagnosis_is_a_labelled_data_set(found):
@@ -58,10 +89,10 @@ def test_fits_that_did_not_converge_are_marked_and_counted(found):
     rows = [row for step in found.table for row in step]
     unconverged = [row for row in rows if not row.status.found_minimum]
     assert found.checks.unconverged_fits == len(unconverged)
-    notes = [note for note in found.notes if "had not converged" in note]
+    notes = [note for note in found.notes if "stopped early" in note]
     assert len(notes) == bool(unconverged)
     if notes:
-        assert notes[0].startswith(f"{len(unconverged)} of {len(rows)} fits")
+        assert notes[0].startswith(f"{len(unconverged)} of {len(rows)} trial fits")
 
 
 def test_effects_that_could_not_be_fitted_are_named():
@@ -76,8 +107,10 @@ def test_effects_that_could_not_be_fitted_are_named():
     )
     found = SimpleNamespace(table=(step,))
     unconverged, lost = _notes_on_fits(found, _unconverged(found))
-    assert unconverged.startswith("2 of 4 fits")
-    assert "1 of them came within 6" in unconverged
+    assert unconverged == (
+        "2 of 4 trial fits stopped early; 1 may be as good as the best, so the answer may depend "
+        "on them."
+    )
     assert lost.startswith("one_sided_stop could not be fitted")
 
 

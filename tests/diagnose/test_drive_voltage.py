@@ -40,7 +40,8 @@ def check(found):
     assert "quadratic_damping" in found.candidates[0]
     (first, last) = (note for note in found.notes if "N/V" in note)
     assert "drive voltage" in first
-    answered = float(last.split("gain at ")[1].split(" N/V")[0])
+    assert first.endswith("a 1 % error of the gain looks like 1 % of damping.")
+    answered = float(last.split("gain becomes ")[1].split(" N/V")[0])
     assert answered == pytest.approx(GAIN, rel=0.03)
     # The states are in newtons now.
     assert np.isfinite(np.asarray(found.data.force)).all()

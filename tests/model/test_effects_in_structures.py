@@ -64,6 +64,18 @@ def test_a_class_and_what_is_no_effect_are_refused_by_name():
             sj.model.structure(modes(), effects=given)
 
 
+def test_effects_and_families_print_as_tables():
+    lines = repr(EFFECTS).splitlines()
+    assert [line.split()[0] for line in lines] == list(EFFECTS)
+    (drag,) = (line for line in lines if line.startswith("quadratic_damping "))
+    assert "coefficient (1/(kg^1/2 m)): Drag of the surrounding air" in drag
+    assert sj.model.describe_effects() == repr(EFFECTS)
+    assert drag in type(EFFECTS).__doc__
+    families = repr(sj.identify.FAMILIES)
+    assert [line.split()[0] for line in families.splitlines()] == list(sj.identify.FAMILIES)
+    assert "class" not in families
+
+
 def test_rules_and_priors_print_in_words():
     every = [one for kind in EFFECTS.values() for one in kind.parameters().values()]
     assert not [repr(one) for one in every if "<function" in repr(one)]

@@ -65,7 +65,7 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
         return None
     return (
         f"{name} still explains a part of the misfit that is left (probability by chance "
-        f"{chance:.0e}): the true law is another one."
+        f"{chance:.0e}): the law is not the true one."
     )
 
 
@@ -81,10 +81,11 @@ def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | 
         ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
         if fdtrc(mine.sum(), (~mine).sum(), ratio) < UNLIKELY / len(groups):
             name = misfit.level_numbers[int(level[mine][0])]
-            what = "the force" if of_force[mine][0] else "the harmonics"
+            force = bool(of_force[mine][0])
+            what = f"level {name} is" if force else f"the harmonics of level {name} are"
             return (
-                f"the misfit of {what} that is left at level {name} is {np.sqrt(ratio):.2g} times "
-                "as large as elsewhere: it is not noise of one size."
+                f"{what} fitted {np.sqrt(ratio):.2g} times worse than the others: something is "
+                "missing there."
             )
     return None
 
@@ -113,8 +114,8 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
         return None
     return (
         f"the misfit that is left is {np.sqrt(ratio):.2g} times as large in the direction of a "
-        "change of the natural frequency as across it: it is not noise of one size. Were the "
-        "states of a level measured at different temperatures?"
+        "change of the natural frequency as across it, which noise is not: were the states of a "
+        "level measured at different temperatures?"
     )
 
 

@@ -189,9 +189,12 @@ def judge_fit(found: FoundEffects, neighbours: NeighbourNoise) -> Judgement:
         if structure is not None:
             reasons.append(structure)
         if noise > _LOUD**2:
+            taken, or_not = ("stated noise", ", or leave that column out,")
+            if not stated:
+                taken, or_not = ("misfit that is taken as noise", "")
             reasons.append(
-                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the noise "
-                "that counts here: state the scatter of a repeated test, or no noise at all, and "
+                f"from point to point the data scatter {np.sqrt(noise):.2g} times more than the "
+                f"{taken}: put the scatter of a repeated test into velocity_std_m_s{or_not} and "
                 "diagnose again."
             )
         return Judgement(Verdict.UNKNOWN, tuple(reasons))
@@ -278,9 +281,9 @@ def refuted_by_levels(
     for held in (inner, outer):
         if held.uncertain_p_value < UNLIKELY / 2:
             return (
-                f"level {held.level}, left out of the fit, is missed by {held.after:.2g} times the "
-                "noise, more than the uncertainty of the parameters allows: the true law is "
-                "another one."
+                f"fitted without level {held.level}, the model misses level {held.level} by "
+                f"{held.after:.2g} times the noise, more than the parameter errors explain: the "
+                "law is not the true one."
             )
     chance = inner.uncertain_p_value if parts_missing else inner.p_value
     if inner.after > inner.before and chance < UNLIKELY:

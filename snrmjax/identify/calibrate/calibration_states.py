@@ -88,8 +88,9 @@ def calibration_states(
     errors = np.asarray(relative_errors(told))[:, sensors]
     stated = bool(np.all(errors[measured][:, 1:] > 0))  # NaN is not
     if not stated:
+        stated_for = "not all are" if np.any(errors[measured][:, 1:] > 0) else "none is"
         errors = np.broadcast_to([0.0, ASSUMED_ERROR, ASSUMED_ERROR], errors.shape)
-        notes.append("some errors are not stated: equal relative errors are taken for all states.")
+        notes.append(f"every point is given the same relative error, as {stated_for} stated.")
     errors = np.where(measured[..., None], errors, 0.0)
     places = [k for k, h in enumerate(told.harmonic_order) if 1 < h <= harmonic_order]
     harmonics = told.harmonics[:, sensors][..., places]

@@ -214,14 +214,26 @@ class ViscousMicroslip(PowerLaw):
     tried: ClassVar[tuple[float, ...]] = (0.2, 0.5, 0.8)
 
 
-FAMILIES: dict[str, type[AbstractFamily]] = {
-    family.kind: family
+class FamilyTable(dict[str, type[AbstractFamily]]):
+    """Families of curves by name. It prints as a table: name and description."""
+
+    def __repr__(self) -> str:
+        """One line for each family."""
+        width = max((len(kind) for kind in self), default=0)
+        texts = {kind: (one.__doc__ or "").strip().split("\n")[0] for kind, one in self.items()}
+        return "\n".join(f"{kind:{width}}  {text}" for kind, text in texts.items())
+
+
+FAMILIES: dict[str, type[AbstractFamily]] = FamilyTable(
+    (family.kind, family)
     for family in (
         *(Polynomial, Spline, SmoothingSpline, PowerLaw),
         *(Constant, ViscousQuadratic, ViscousCoulomb, ViscousMicroslip),
     )
-}
-"""Families by name."""
+)
+"""Families by name; `print(FAMILIES)` is a table of them."""
+
+FamilyTable.__doc__ = f"{FamilyTable.__doc__}\n\n{FAMILIES!r}"
 
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 """Amplitudes that a curve may be a function of."""
