@@ -590,7 +590,9 @@ def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path
     np.testing.assert_allclose(advised["force_n"], GAIN * advised["drive_v"], rtol=1e-6)
     advice = [line for line in done.stderr.splitlines() if line.startswith("measure next, ")]
     assert len(advice) == 2
-    assert all(re.match(r"measure next, \d: \S+ V at \S+ Hz: ", line) for line in advice)
+    assert all(
+        re.match(r"measure next, \d: drive \S+ V, \S+ Hz \(expected ", line) for line in advice
+    )
     assert "0.4 N/V" in done.stderr
 
 

@@ -58,7 +58,7 @@ def write_next(path: FilePath, advice: Sequence[NextMeasurement] | NextMeasureme
         "force_n": [one.force for one in advice],
         "frequency_hz": [one.frequency / HERTZ for one in advice],
         "expected_band_ratio": [one.expected_band_ratio for one in advice],
-        "reason": [one.reason for one in advice],
+        "reason": [f"expected {one.expected}: {one.reason}" for one in advice],
     }
     drives = [one.drive for one in advice if one.drive is not None]
     if drives or (isinstance(advice, NextMeasurements) and advice.drive_known_only):
@@ -182,6 +182,7 @@ def _content(fit: JointFit) -> dict:
         "notes": fit.notes,
         "converged": fit.converged,
         "status": fit.status,
+        "level_numbers": fit.level_numbers,
     }
 
 
@@ -253,6 +254,7 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         free=tuple(content["free"]),
         notes=tuple(content["notes"]),
         status=FitStatus(content.get("status", known)),
+        level_numbers=tuple(content.get("level_numbers", range(data["n_levels"]))),
     )
 
 

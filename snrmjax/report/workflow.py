@@ -199,9 +199,9 @@ def identify_jointly(
         place = fit.names().index("force_gain")
         std = float(np.sqrt(fit.covariance[place, place]))
         notes.append(
-            "forces in newtons are those of the fitted gain, "
-            f"{float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} % (1σ), which "
-            "rests on the mode shapes and participations of the model; volts are measured."
+            "forces in N are drive voltage times the fitted gain "
+            f"({float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} %); if the "
+            "model's modal mass is wrong, so is the gain."
         )
     notes += [*notes_on_predictions(predictions, ratio)]
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
@@ -266,8 +266,8 @@ def headline(found: Findings) -> list[str]:
             lines.append(f"resonance at {one.load}: {place}, {damped}")
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
-        load = f"{force:.4g} N" if drive is None else f"{drive:.4g} V"
-        place = f"{load} at {advised.frequency / HERTZ:.6g} Hz"
+        load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
+        place = f"{load}, {advised.frequency / HERTZ:.6g} Hz (expected {advised.expected})"
         lines.append(f"measure next, {advised.rank}: {place}: {advised.reason}")
     return lines
 

@@ -5,6 +5,7 @@ terms contribute at the largest measured amplitude, so that all have the unit of
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,32 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Argument = Literal["displacement", "velocity"]
+
+
+_KIND_WORDS = {
+    "polynomial": "even polynomial",
+    "power_law": "power law",
+    "smoothing_spline": "smoothing spline",
+    "viscous_quadratic": "viscous and quadratic damping",
+    "viscous_coulomb": "viscous and Coulomb damping",
+    "viscous_microslip": "viscous and microslip damping",
+}
+
+
+def family_in_words(kind: str, size: int | None, arguments: Sequence[str]) -> str:
+    """A family of curves for readers: "smoothing spline of velocity, 9 knots".
+
+    Arguments: `arguments` the amplitudes that it is a function of, one or both.
+    """
+    name = _KIND_WORDS.get(kind, kind)
+    if kind == "constant" or (kind == "polynomial" and size == 0):
+        return "constant"
+    sized = ""
+    if size is not None and "spline" in kind:
+        sized = f", {size} knots"
+    elif size is not None and kind == "polynomial":
+        sized = f", {size} {'term' if size == 1 else 'terms'} beside the constant"
+    return f"{name} of {' and of '.join(arguments)}{sized}"
 
 
 class Coefficient(NamedTuple):
@@ -54,6 +81,11 @@ class AbstractFamily(AbstractCurve):
         """Family, size and amplitude as the joint fit takes them: "polynomial:2@velocity"."""
         size = "" if self.size is None else f":{self.size}"
         return f"{self.kind}{size}@{self.argument}"
+
+    @property
+    def words(self) -> str:
+        """Family, size and amplitude in words: "power law of velocity"."""
+        return family_in_words(self.kind, self.size, (self.argument,))
 
     @property
     def size(self) -> int | None:

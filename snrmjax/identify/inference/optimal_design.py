@@ -32,6 +32,9 @@ from snrmjax.numerics.result import Variable
 
 Target = Literal["curves", "frequency", "damping", "resonance", "fold"]
 
+_NOT_CONVERGED = (
+    "the fit that this advice rests on has not converged: another fit may advise other states"
+)
 _HERTZ = 2 * np.pi  # rad/s
 _SHOWN = 12  # advised states on one screen
 _PER_FORCE = 96  # candidate states of one force
@@ -70,6 +73,13 @@ class NextMeasurement(NamedTuple):
     reason: str
     drive: float | None = None  # V, where only the drive is known
 
+    @property
+    def expected(self) -> str:
+        """The expected velocity and its phase in words."""
+        degrees = round(float(np.degrees(self.phase)))
+        side = f"{abs(degrees)}° {'lead' if degrees > 0 else 'lag'}" if degrees else "resonance"
+        return f"{self.velocity:.3g} m/s, {side}"
+
 
 class NextMeasurements(AbstractTable[NextMeasurement]):
     """Advised steady states, the best first; a sequence of `NextMeasurement`."""
@@ -81,6 +91,7 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
     target: str = eqx.field(static=True)
     status: AdviceStatus = eqx.field(static=True)
     drive_known_only: bool = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def message(self) -> str:
@@ -91,13 +102,14 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
         """See `AbstractResult`."""
         lines = [f"NextMeasurements: {len(self)} states that narrow the band of {self.target} most"]
         for one in self.rows[:_SHOWN]:
-            load = f"{one.force:.4g} N" if one.drive is None else f"{one.drive:.4g} V"
-            lines.append(f"{one.rank}. {load} at {one.frequency / _HERTZ:.6g} Hz: {one.reason}")
+            load = f"force {one.force:.4g} N" if one.drive is None else f"drive {one.drive:.4g} V"
+            place = f"{load}, {one.frequency / _HERTZ:.6g} Hz (expected {one.expected})"
+            lines.append(f"{one.rank}: {place}: {one.reason}")
         if len(self) > _SHOWN:
             lines.append(f"and {len(self) - _SHOWN} more")
         if self.status != AdviceStatus.COMPLETE:
             lines.append(f"status: {self.message}")
-        return tuple(lines)
+        return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
@@ -121,7 +133,12 @@ class NextMeasurements(AbstractTable[NextMeasurement]):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"target": self.target, "sensor": self.sensor, "status": self.message}
+        return {
+            "target": self.target,
+            "sensor": self.sensor,
+            "status": self.message,
+            "notes": "\n".join(self.notes),
+        }
 
 
 def next_measurements(
@@ -146,7 +163,8 @@ def next_measurements(
     damping alone, or of the frequency of the resonance or upper fold under `target_force`.
     `forces`, by default twelve from the smallest to the largest measured. Both are in N, or in V
     where the fitted data know the drive only. Frequencies in rad/s.
-    Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so.
+    Returns at most `count` states: fewer, or none, when a test can reach no more; `status` says so,
+    and `notes` say that the fit has not converged.
     Raises `ValueError` when the target needs a force and has none, or does not exist there.
     Reference: the one-step rule of sequential design, Fedorov, Theory of Optimal Experiments
     (1972), for a mean of standard deviations.
@@ -170,6 +188,7 @@ def next_measurements(
         target=target,
         status=status if states is not None else AdviceStatus.NO_STATE,
         drive_known_only=fit.drive_known_only,
+        notes=() if fit.converged else (_NOT_CONVERGED,),
     )
 
 
@@ -208,7 +227,7 @@ def _ranked(
                 velocity=float(abs(states.velocity[best])),
                 phase=float(np.angle(states.velocity[best])),
                 expected_band_ratio=float(_mean_band(slopes, covariance) / before),
-                reason=_reason(target, states, best, old, variance),
+                reason=_reason(target, old, variance),
                 drive=drive if fit.drive_known_only else None,
             )
         )
@@ -346,13 +365,8 @@ def _best(
     return int(index[best]), left[best]
 
 
-def _reason(
-    target: Target, states: _States, best: int, before: np.ndarray, after: np.ndarray
-) -> str:
+def _reason(target: Target, before: np.ndarray, after: np.ndarray) -> str:
     """Why this state, in words."""
-    phase = np.degrees(np.angle(states.velocity[best]))
-    side = "below" if phase > 0 else "above"
-    place = "at resonance" if abs(phase) < 5 else f"{abs(phase):.0f}° {side} resonance"
     narrowed = 1 - np.sqrt(after / before)
     if target == "curves":
         half = len(before) // 2
@@ -361,9 +375,8 @@ def _reason(
         which = names[int(np.argmax(shares))]
         gain = max(shares)
     else:
-        which = {"frequency": "natural frequency"}.get(target, target)
+        which = {"frequency": "natural frequency", "damping": "damping"}.get(
+            target, f"{target} frequency"
+        )
         gain = float(np.mean(narrowed))
-    return (
-        f"{place}, near {abs(states.velocity[best]):.3g} m/s: narrows the band of {which} by "
-        f"{100 * gain:.2g} %"
-    )
+    return f"the {which} band becomes {100 * gain:.2g} % narrower"

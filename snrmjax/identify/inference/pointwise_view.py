@@ -22,6 +22,15 @@ from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import residual_velocity
 
+_FREE_PHASE = (
+    "let the fit estimate it (`--free instrument_phase`; in Python "
+    '`fit_jointly(…, free=["instrument_phase"])`)'
+)
+_PHASE_FREED = (
+    "since this fit has already estimated it, check the force calibration and trust points near "
+    "resonance"
+)
+
 
 def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
     """Each steady state's own point beside the curves of a joint fit.
@@ -50,11 +59,12 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
         points = errors_from_scatter(
             points, curves, level_gain=gain, level_phase=phase, frequency_std=wandering
         )
+    freed = "instrument_phase" in fit.free
     consequence = "have no point of their own (the joint fit uses them)"
     notes = (
         *fit.notes,
         *notes_on_points(points, fit.modes, consequence),
-        *notes_on_phases(points, curves),
+        *notes_on_phases(points, curves, _PHASE_FREED if freed else _FREE_PHASE),
     )
     return Identification(points, curves, notes)
 

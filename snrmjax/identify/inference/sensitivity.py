@@ -232,8 +232,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     for k, kind in enumerate(LEVEL_ERRORS):
         if fit.noise.level_std[k] > 0:
             rows += [
-                (f"{kind} of level {m + 1}", f"{kind} of levels", levels[:, m, k : k + 1])
-                for m in range(n_levels)
+                (f"{kind} of level {number}", f"{kind} of levels", levels[:, m, k : k + 1])
+                for m, number in enumerate(fit.level_numbers)
             ]
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]

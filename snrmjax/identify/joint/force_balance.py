@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
@@ -122,12 +122,9 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     """
     check_phases(data, "a joint fit")
     r = reference_sensor(modes)
-    stated = relative_errors(data)
-    combined, share, std, _ = modal_filter(data, modes, r, data.velocity, stated)
+    combined, share, std, _ = modal_filter(data, modes, r, data.velocity, relative_errors(data))
     velocity, errors = np.asarray(combined), np.asarray(std)
-    driven = not np.any(np.isfinite(np.asarray(data.force)))
-    force = np.asarray(data.drive if driven else data.force)
-    keep = np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
+    force, keep = _measured(data, velocity)
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
         far = off_resonance_error_factor(velocity)
@@ -150,6 +147,23 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
         ),
         known,
     )
+
+
+def level_numbers(data: SteadyStates, modes: LinearModes) -> tuple[int, ...]:
+    """The numbers that the data's own record gives the levels of `balance_data`, in its order."""
+    stated, r = relative_errors(data), reference_sensor(modes)
+    velocity, *_ = modal_filter(data, modes, r, data.velocity, stated)
+    keep = _measured(data, np.asarray(velocity))[1]
+    return tuple(int(one) for one in np.unique(np.asarray(data.level)[keep]))
+
+
+def _measured(
+    data: SteadyStates, velocity: Complex[np.ndarray, " state"]
+) -> tuple[Float[np.ndarray, " state"], Bool[np.ndarray, " state"]]:
+    """The force in N, or the drive in V where only that is known; the states that have all."""
+    driven = not np.any(np.isfinite(np.asarray(data.force)))
+    force = np.asarray(data.drive if driven else data.force)
+    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:

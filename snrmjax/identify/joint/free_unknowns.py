@@ -1,6 +1,7 @@
 """The unknowns that a fit may change as one vector, in the order that their names have."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -138,13 +139,20 @@ def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:
 
 
 def named_unknowns(
-    unknowns: Unknowns, data: BalanceData, free: tuple[str, ...]
+    unknowns: Unknowns,
+    data: BalanceData,
+    free: tuple[str, ...],
+    numbers: Sequence[int] | None = None,
 ) -> tuple[tuple[str, str], ...]:
-    """Names and units of the free unknowns in the order of their vector."""
+    """Names and units of the free unknowns in the order of their vector.
+
+    Arguments: `numbers` the levels' own, in place of counting them from 0.
+    """
     curves = (
         ("backbone", "rad^2/s^2", unknowns.squared_frequency),
         ("damping", "1/s", unknowns.modal_damping),
     )
+    levels = range(data.n_levels) if numbers is None else numbers
     measurement = {"force_gain": "log", "force_offset": "smallest force", "instrument_phase": "rad"}
     return (
         *(
@@ -153,7 +161,7 @@ def named_unknowns(
             for c in family.coefficients()
         ),
         *((name, unit) for name, unit in measurement.items() if name in free),
-        *((f"level_{k}.{e}", "std") for k in range(data.n_levels) for e in LEVEL_ERRORS),
+        *((f"level_{k}.{e}", "std") for k in levels for e in LEVEL_ERRORS),
         *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
     )
 

@@ -24,6 +24,7 @@ from snrmjax.identify.joint.force_balance import (
     PriorStd,
     Unknowns,
     balance_data,
+    level_numbers,
     stated_level_std,
 )
 from snrmjax.identify.joint.free_unknowns import (
@@ -39,6 +40,7 @@ from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.notes import (
     notes_on_autocorrelation,
     notes_on_families,
+    notes_on_level_errors,
     notes_on_noise,
     notes_on_reach,
 )
@@ -123,6 +125,7 @@ class JointFit(AbstractResult):
     free: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
     status: FitStatus = eqx.field(static=True)
+    level_numbers: tuple[int, ...] = eqx.field(static=True)  # of the file; `data` counts from 0
 
     @property
     def converged(self) -> bool:
@@ -188,6 +191,11 @@ class JointFit(AbstractResult):
         """What the free unknowns are called."""
         return tuple(name for name, _ in named_unknowns(self.unknowns, self.data, self.free))
 
+    def labels(self) -> tuple[str, ...]:
+        """`names` with the levels' own numbers, for readers."""
+        own = named_unknowns(self.unknowns, self.data, self.free, self.level_numbers)
+        return tuple(name for name, _ in own)
+
     def units(self) -> tuple[str, ...]:
         """Units of the free unknowns; a curve's terms count at the largest amplitude."""
         return tuple(unit for _, unit in named_unknowns(self.unknowns, self.data, self.free))
@@ -200,10 +208,12 @@ class JointFit(AbstractResult):
         ratio = np.asarray(damping(motion.amplitude(damping))) / (2 * omega)
         size = np.abs(np.asarray(motion.velocity))
         scale = f"{self.noise.scale:.3g} ± {self.noise.scale_std:.1g}"
-        noise = f"{scale} times the stated noise" if self.noise.stated else f"noise {scale}"
+        noise = f"{scale} times the stated noise"
+        if not self.noise.stated:
+            noise = f"noise {100 * self.noise.scale:.2g} % of the velocity (estimated)"
         rivals = len(self.families.rivals)
         return (
-            f"JointFit: backbone {squared.label}, damping {damping.label}",
+            f"JointFit: natural frequency: {squared.words}; damping: {damping.words}",
             f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
             f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
             f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
@@ -217,14 +227,14 @@ class JointFit(AbstractResult):
         """See `AbstractResult`."""
         std, data, per = np.sqrt(np.diag(self.covariance)), self.data, ("parameter",)
         state, force = ("state",), "V" if self.drive_known_only else "N"
-        measured = np.asarray(data.force)
+        measured, numbers = np.asarray(data.force), np.array(self.level_numbers)
         parts = Variable(("state", "part"), self.residuals, "1", "whitened residual")
         return {
-            "parameter": Variable(per, np.array(self.names()), "", "free unknown"),
+            "parameter": Variable(per, np.array(self.labels()), "", "free unknown"),
             "value": Variable(per, np.asarray(self.vector()[0]), "", "value, in `unit`"),
             "std": Variable(per, std, "", "1σ, in `unit`"),
             "unit": Variable(per, np.array(self.units()), "", "unit of the parameter"),
-            "level": Variable(state, np.asarray(data.level), "1", "level, counted from 0"),
+            "level": Variable(state, numbers[np.asarray(data.level)], "1", "level"),
             "frequency_hz": Variable(state, np.asarray(data.frequency) / _HERTZ, "Hz", "frequency"),
             "drive_v" if force == "V" else "force_n": Variable(state, measured, force, "force"),
             "velocity_m_s": Variable(
@@ -290,6 +300,7 @@ def fit_jointly(
             f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
         )
     measured, stated = balance_data(data, modes)
+    numbers = level_numbers(data, modes)
     n = len(measured.level)
     if n < 3:
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
@@ -343,11 +354,17 @@ def fit_jointly(
         notes += notes_on_families(families.status, families.candidates)
         if families.failed:
             notes += (_note_on_failed(families),)
-        noise = (components, chosen.jitter, np.asarray(prior.level), measured.n_levels)
+        wandering = 0.5 * float(last.data.std[0, 3])
+        noise = (components, wandering, np.asarray(prior.level), measured.n_levels)
         notes += notes_on_noise(*noise, stated=stated, alike=bool(found.autocorrelation.any()))
+        level = np.asarray(last.data.level)
+        if np.any((np.asarray(prior.level) == 0) & (np.asarray(last.prior.level) > 0)):
+            errors = np.asarray(found.unknowns.level * last.prior.level)
+            force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
+            notes += notes_on_level_errors(errors, numbers, np.array(force))
         notes += notes_on_autocorrelation(found.autocorrelation)
         motion = recorded_motion_of(found.unknowns, last)
-        notes += notes_on_reach(motion, np.asarray(last.data.level))
+        notes += notes_on_reach(motion, level)
         return JointFit(
             unknowns=found.unknowns,
             covariance=found.covariance,
@@ -365,6 +382,7 @@ def fit_jointly(
             free=released,
             notes=notes,
             status=found.status,
+            level_numbers=numbers,
         )
 
     rivals, failed = [], []

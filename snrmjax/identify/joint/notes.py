@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.identify.curves.family_base import family_in_words
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, Motion
 from snrmjax.identify.joint.ranking import FamilyCandidate
 from snrmjax.identify.joint.selection import SelectionStatus
@@ -12,6 +13,8 @@ from snrmjax.identify.joint.variance_components import VarianceComponents
 
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
+_LISTED = 8  # levels by name
+_TREND = 4  # levels: fewer are in order by chance too often
 _COUNTS = 0.03  # weight of a family that could widen a band
 
 
@@ -23,22 +26,50 @@ def notes_on_families(
     if status == SelectionStatus.NOT_SETTLED:
         notes.append(
             "the choice of families and the level-to-level variance still changed one another in "
-            "the last round: other families may fit as well; name one to be sure of the choice."
+            f"the last round: {_what_was_open(candidates)}."
         )
     unfinished = [one for one in candidates if not one.converged]
     told = [one for one in unfinished if one.chosen or one.weight > _COUNTS]
     if told:
-        listed = ", ".join(f"{one.family}@{one.argument} of the {one.curve}" for one in told)
+        arguments: dict[tuple[str, str, int], list[str]] = {}
+        for one in told:
+            arguments.setdefault((one.curve, one.family, one.size), []).append(one.argument)
+        listed = ", ".join(
+            f"{family_in_words(family, size, of)} for the {curve}"
+            for (curve, family, size), of in arguments.items()
+        )
+        better = ("was", "it", "its score says")
+        if len(told) > 1:
+            better = ("were", "they", "their scores say")
         notes.append(
-            f"{len(told)} of {len(candidates)} families were compared by fits that had not "
-            f"converged ({listed}): their scores in cross-validation are lower bounds."
+            f"{len(told)} of the {len(candidates)} trial curves ({listed}) {better[0]} not fitted "
+            f"to the end; {better[1]} may be better than {better[2]}."
         )
     return tuple(notes)
 
 
+def _what_was_open(candidates: Sequence[FamilyCandidate]) -> str:
+    """What else may fit as well, and what to name to be sure of the choice."""
+    curves = dict.fromkeys(one.curve for one in candidates)
+    own = [[one for one in candidates if one.curve == curve] for curve in curves]
+    if any(len({one.family for one in rows}) > 1 for rows in own):
+        return "other families may fit as well; name one to be sure of the choice"
+    wanted = []
+    if any(len({one.size for one in rows}) > 1 for rows in own):
+        wanted.append("a size (`spline:5`, for example)")
+    if any(len({one.argument for one in rows}) > 1 for rows in own):
+        wanted.append("@displacement or @velocity")
+    if not wanted:
+        return "the level-to-level variance, and with it the bands, are less certain than they say"
+    return (
+        "another size or amplitude of the same families may fit as well; add "
+        f"{' and '.join(wanted)} to their names to be sure of the choice"
+    )
+
+
 def notes_on_noise(
     components: VarianceComponents,
-    jitter: float,
+    wandering: float,
     given: Float[np.ndarray, " error"],
     n_levels: int,
     *,
@@ -47,32 +78,35 @@ def notes_on_noise(
 ) -> tuple[str, ...]:
     """Where the noise and the level-to-level variance are not as stated.
 
-    Arguments: `jitter` 1σ of relative stiffness from state to state, in units of the noise where
-    none is stated; `given` the stated 1σ of levels' errors; `alike` whether the residuals of
-    neighbouring states are correlated.
+    Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `given` the
+    stated 1σ of levels' errors; `alike` whether the residuals of neighbouring states are
+    correlated.
     """
     notes = []
     size = f"{components.noise:.2g} ± {components.noise_std:.1g}"
     if stated and components.contradicts_upward:
         notes.append(
-            f"residuals are {size} times the stated noise: the noise is understated or the "
-            "model is wrong; the bands are widened accordingly."
+            f"the fit misses the data by {size} times the stated noise: either that noise is too "
+            f"small or the model is wrong; the bands are {components.noise:.2g} times wider for it."
         )
     if stated and components.contradicts_downward:
         more = "" if alike else ", and the bands are wider than need be"
         notes.append(f"residuals are only {size} times the stated noise: it is overstated{more}.")
     found_only = np.where(given > 0, 0.0, components.level)
-    if jitter > 0:
-        jitter = 0.5 * jitter * (1.0 if stated else components.noise)
+    if wandering > 0:
+        more = "which the stated noise does not explain"
+        if not stated:
+            more = "more than random noise of force and velocity explains (no noise is stated)"
         notes.append(
-            f"the natural frequency varies by {100 * jitter:.2g} % from state to state (1σ), which "
-            "the stated noise does not explain; the bands include it."
+            f"the natural frequency varies by {100 * wandering:.2g} % from state to state (1σ), "
+            f"{more}; the bands include it."
         )
     shared = in_words(found_only)
     if shared:
         notes.append(
-            f"levels differ from one another by {shared} (1σ, estimated), which no stated error "
-            "explains; the bands include this level-to-level variance."
+            f"levels differ from one another by {shared} (1σ, estimated)"
+            + (", which no stated error explains" if stated or np.any(given > 0) else "")
+            + "; the bands include this level-to-level variance."
         )
     if components.unbounded:
         names = " and ".join(LEVEL_ERRORS[kind] for kind in components.unbounded)
@@ -110,14 +144,72 @@ def notes_on_autocorrelation(correlation: Float[np.ndarray, " part"]) -> tuple[s
     """That the residuals of neighbouring states are correlated."""
     if not np.any(correlation > 0):
         return ()
-    found = " and ".join(f"{value:.2g}" for value in correlation if value > 0)
+    parts = ("for the part in phase with the force", "for the part in quadrature with it")
+    found = ", ".join(
+        f"{value:.2g} {part}" for value, part in zip(correlation, parts, strict=True) if value > 0
+    )
     worth = float(np.max((1 + correlation) / (1 - correlation)))
     return (
-        f"residuals of neighbouring states along a resonance are correlated ({found}), which "
-        "random noise is not: the curves do not follow the data there, or the motion was not "
-        f"steady. About {worth:.0f} states carry the information of one, and the bands are widened "
-        "accordingly.",
+        f"neighbouring points miss the curve in the same direction (correlation {found}): a "
+        "systematic error, not noise; the curves do not follow the data there, or the motion was "
+        f"not steady. About {worth:.0f} points count as one in the bands.",
     )
+
+
+def notes_on_level_errors(
+    found: Float[np.ndarray, "level error"],
+    numbers: Sequence[int],
+    force: Float[np.ndarray, " level"],
+) -> tuple[str, ...]:
+    """By how much the fit scaled each level's velocities and turned their phases.
+
+    Arguments: `found` the errors of every level (`LEVEL_ERRORS`), zero where a kind of error is
+    none of the fit's unknowns; `numbers` the levels' own numbers; `force` of every level, or its
+    drive voltage.
+    """
+    notes = []
+    changes = (
+        ("scaled the velocities", 100 * np.expm1(-found[:, 0]), " %"),
+        ("turned the phases of the velocity", -np.degrees(found[:, 1]), "°"),
+    )
+    for done, change, unit in changes:
+        if len(numbers) < 2 or not np.any(change != 0):
+            continue
+        notes.append(
+            f"the fit {done} of {_by_level(change, numbers, unit)}, so that all levels lie on one "
+            f"pair of curves{_trend(change, np.argsort(force))}."
+        )
+    return tuple(notes)
+
+
+def _by_level(change: Float[np.ndarray, " level"], numbers: Sequence[int], unit: str) -> str:
+    """Every level's change, or of many levels the extremes."""
+    if len(numbers) > _LISTED:
+        low, high = int(np.argmin(change)), int(np.argmax(change))
+        return (
+            f"{len(numbers)} levels by {change[low]:+.2g}{unit} (level {numbers[low]}) to "
+            f"{change[high]:+.2g}{unit} (level {numbers[high]})"
+        )
+    run = list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
+    named = f"{numbers[0]} to {numbers[-1]}" if run and len(numbers) > 2 else _and(numbers)
+    return f"levels {named} by {_and([f'{one:+.2g}' for one in change])}{unit}"
+
+
+def _and(items: Sequence[object]) -> str:
+    texts = [str(one) for one in items]
+    return f"{', '.join(texts[:-1])} and {texts[-1]}"
+
+
+def _trend(change: Float[np.ndarray, " level"], order: np.ndarray) -> str:
+    """That four or more changes have one sign and grow or fall with the levels' force."""
+    size = np.abs(change)[order]
+    one_sign = np.all(change > 0) or np.all(change < 0)
+    if len(size) < _TREND or not one_sign:
+        return ""
+    for verb, steps in (("grow", np.diff(size)), ("fall", -np.diff(size))):
+        if np.all(steps > 0):
+            return f"; they {verb} with the force of the level, so they are probably not random"
+    return ""
 
 
 def notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:

@@ -176,11 +176,23 @@ def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str
     return notes
 
 
-def notes_on_phases(points: BackbonePoints, fit: BackboneFit) -> list[str]:
-    """A sentence when damping changes with the phase inside the levels, which it should not."""
+FREE_PHASE = (
+    "let a joint fit estimate it (`--fit auto --free instrument_phase`; in Python "
+    '`fit_jointly(…, free=["instrument_phase"])`)'
+)
+
+
+def notes_on_phases(
+    points: BackbonePoints, fit: BackboneFit, advice: str = FREE_PHASE
+) -> list[str]:
+    """A sentence when damping changes with the phase inside the levels, which it should not.
+
+    Arguments: `advice` what to do about it.
+    """
     use = np.asarray(points.usable)
     level = np.asarray(points.level)[use]
-    sine = np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
+    sign = np.sign(float(fit.backbone.modal_constant))  # negative: the mode moves against force
+    sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
     curve = np.asarray(fit.backbone.values(points.amplitude).modal_damping)[use]
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     members = level[:, None] == np.unique(level)
@@ -193,9 +205,11 @@ def notes_on_phases(points: BackbonePoints, fit: BackboneFit) -> list[str]:
     across = slope * 2 * np.sin(np.pi / 4)
     if explained < 0.3 or abs(across) < 0.1:
         return []
-    course = "rises" if across > 0 else "falls"
+    sides = ["45° below resonance (velocity leads)", "45° above it (velocity lags)"]
+    if across < 0:
+        sides = ["45° above resonance (velocity lags)", "45° below it (velocity leads)"]
     return [
-        f"inside the levels damping {course} by {100 * abs(across):.0f} % of itself "
-        "from 45° lag to 45° lead, which damping that depends on amplitude alone does "
-        "not: check the phase and the force calibration, and trust states near resonance."
+        f"damping comes out {100 * abs(across):.0f} % higher from points {sides[0]} than from "
+        f"points {sides[1]}, which a damping that depends on amplitude alone does not do; an error "
+        f"of the instrument's phase does: {advice}."
     ]

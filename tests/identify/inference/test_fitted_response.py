@@ -13,6 +13,7 @@ from truths.joint_fits import noisy_fit
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.inference.located_points import point_slopes
+from snrmjax.identify.joint.fitting import FitStatus
 from snrmjax.io.joint_results import write_next
 
 FORCE = 2.2  # N: folds are there
@@ -246,7 +247,7 @@ def test_where_only_the_drive_is_known_advice_is_in_volts(tmp_path):
     assert {round(one.drive, 9) for one in advice} <= {2.0, 4.0}
     for one in advice:
         assert one.force == pytest.approx(gain * one.drive, rel=1e-6)
-    assert " V at " in repr(advice)
+    assert " V, " in repr(advice)
     assert advice.to_xarray()["drive_v"].attrs["units"] == "V"
     assert "force_n" not in advice.to_pandas()
     write_next(tmp_path / "next.csv", advice)
@@ -264,3 +265,6 @@ def test_advice_is_a_table(fit):
     assert advice.to_xarray()["force_n"].attrs["units"] == "N"
     assert repr(advice).startswith("NextMeasurements: 3 states")
     assert advice.plot().axes
+    assert advice.notes == ()
+    ended = dataclasses.replace(fit, status=FitStatus.STEP_LIMIT)
+    assert "has not converged" in repr(sj.next_measurements(ended, 1))

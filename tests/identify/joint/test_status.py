@@ -105,7 +105,10 @@ def test_families_ranked_by_unfinished_fits_are_named():
     chosen = next(one for one in fit.families.candidates if one.curve == "damping" and one.chosen)
     assert notes_on_families(SelectionStatus.SETTLED, fit.families.candidates) == ()
     (note,) = notes_on_families(SelectionStatus.SETTLED, [chosen._replace(converged=False)])
-    assert "had not converged (viscous_quadratic@velocity of the damping)" in note
+    assert (
+        "(viscous and quadratic damping of velocity for the damping) was not fitted to the end"
+        in note
+    )
 
 
 def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypatch):

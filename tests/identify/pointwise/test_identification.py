@@ -117,7 +117,7 @@ class TestMeasuredBeam:
         assert any("no noise is stated" in note for note in found.notes)
         assert any("levels differ from one another by 0.0" in note for note in found.notes)
         # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
-        assert any("inside the levels damping rises by" in note for note in found.notes)
+        assert any("higher from points 45° below resonance" in note for note in found.notes)
 
 
 class TestLinearMode:
@@ -161,15 +161,15 @@ class TestLinearMode:
         notes = sj.identify_backbone(stated, MODES).notes
         assert any("times as much as the stated noise" in note for note in notes)
 
-    @pytest.mark.parametrize(("turn", "told"), [(0.0, None), (0.2, "falls"), (-0.2, "rises")])
+    @pytest.mark.parametrize(("turn", "told"), [(0.0, None), (0.2, "above"), (-0.2, "below")])
     def test_a_phase_that_is_off_shows_in_the_damping(self, turn, told):
         data = linear_test(0, 0.003)
         velocity = data.velocity[:, 0] * np.exp(1j * turn)
         turned = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
-        notes = [n for n in sj.identify_backbone(turned, MODES).notes if "inside the levels" in n]
+        notes = [n for n in sj.identify_backbone(turned, MODES).notes if "damping comes out" in n]
         # 2ζ̃ω̃ is |A|F cos φ/v: a phase that reads too high makes it fall towards the lead side.
         assert len(notes) == (told is not None)
-        assert all(f"damping {told} by" in note for note in notes)
+        assert all(f"higher from points 45° {told} resonance" in note for note in notes)
 
     def test_points_without_a_solution_are_counted(self):
         data = linear_test(0, 0.0)
