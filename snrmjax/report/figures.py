@@ -141,7 +141,9 @@ def backbone_figure(
     marks(dampings, own[~use], damping[~use], CROSS)
     bars = BAND * np.asarray(points.natural_frequency_std)[use] / HERTZ
     damping_bars = 100 * BAND * np.asarray(points.damping_ratio_std)[use]
-    stars(speeds, natural[use], own[use], "identified, 95 % bars", xerr=bars)
+    barred = np.any(bars > 0) or np.any(damping_bars > 0)
+    name = "identified, 95 % bars" if barred else "identified"
+    stars(speeds, natural[use], own[use], name, xerr=bars)
     stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
     stars(dampings, own[use], damping[use], yerr=damping_bars)
     above = {**CURVE, "zorder": 4}

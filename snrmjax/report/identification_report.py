@@ -22,10 +22,19 @@ from snrmjax.report.sampling import sample_backbone, velocity_of
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 
+LINE_THROUGH_STARS = "The line is the curve through the stars, the band its 95 % range."
+GAIN_NOT_IN_BANDS = (
+    " A wrong gain of force or velocity, which scales all damping ratios alike, is not in them."
+)
+POINTWISE_BANDS = (
+    "Error bars and bands are 95 %. They hold random errors only: stated noise, or the scatter of "
+    f"the points where none was stated, and what the points of one level share.{GAIN_NOT_IN_BANDS}"
+)
+NO_SCATTER = "none found beyond the noise"
 BACKBONE_CAPTION = (
     "Backbone. Blue dots are measured steady states. Each gives one star: (a) the natural "
-    "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. The line is "
-    "the curve through the stars, the band its 95 % range. Check that the stars lie on one line "
+    "frequency at its amplitude, (b) the phase resonance at 0°, (c) the damping ratio. "
+    f"{LINE_THROUGH_STARS} Check that the stars lie on one line "
     "whatever the phase of their dots: stars that spread with phase at one amplitude mean that the "
     "method's assumptions do not hold. Grey crosses are steady states left out of the curves."
 )
@@ -50,9 +59,7 @@ VALIDITY = (
     "the displacement amplitude, which is the velocity over the frequency of the force. A point "
     "measured at velocity v and angular frequency Ω therefore lies on the backbone at the velocity "
     "v·ω/Ω, with ω its natural frequency (unless the velocity was chosen as argument).",
-    "Error bars and bands are 95 %. They hold random errors only: stated noise, or the scatter of "
-    "the points where none was stated, and what the points of one level share. A wrong gain of "
-    "force or velocity, which scales all damping ratios alike, is not in them.",
+    POINTWISE_BANDS,
     "Reference: Kwarta & Allen, Nonlinear Normal Mode Backbone Estimation with Near-Resonant "
     "Steady State Inputs.",
 )
@@ -230,7 +237,7 @@ def _level_scatter(identification: Identification) -> str:
     fit = identification.fit
     hertz, damping = fit.level_frequency_std / HERTZ, 100 * fit.level_damping_std
     if not hertz > 0 and not damping > 0:
-        return "none found beyond the noise"
+        return NO_SCATTER
     return f"{hertz:.2g} Hz and {damping:.2g} % of critical damping (1σ)"
 
 

@@ -148,17 +148,21 @@ def _bands(
         axes.fill_between(x, y - error, y + error, **fill, label=name)
 
 
-def residuals_figure(fit: JointFit) -> Figure:
-    """Whitened residuals of a joint fit against amplitude and phase, and how they are spread.
+PARTS = ("in phase with the force", "in quadrature with it")
 
-    Each state leaves two, of unit variance and independent where noise and curves are right. A
+
+def residuals_figure(fit: JointFit) -> Figure:
+    """Misfit of each point in standard deviations, against amplitude and phase, and its spread.
+
+    The part of the force balance in phase with the force, which is the damping's at resonance, and
+    the part in quadrature, which is the stiffness's there, made independent of the first. A
     trend is what the curves do not follow; more outside ±1.96 than one in twenty is noise larger
     than stated, or outliers.
     """
     left = fit_residuals(fit)
     unit = unit_for(left.velocity, "m/s")
     figure, ((speeds, phases, spread),) = panels(PAGE, 2.9, 1, 3)
-    for part, (colour, name) in enumerate(((MEASURED, "first part"), (IDENTIFIED, "second part"))):
+    for part, (colour, name) in enumerate(((MEASURED, PARTS[0]), (IDENTIFIED, PARTS[1]))):
         style = {**DOT, "color": colour, "markersize": 2.8, "alpha": 0.7}
         marks(speeds, left.velocity / unit.size, left.parts[:, part], style, name)
         marks(phases, left.phase, left.parts[:, part], style)
@@ -174,7 +178,7 @@ def residuals_figure(fit: JointFit) -> Figure:
     normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     spread.plot(x, normal, color=SIMULATED, **CURVE, label="standard normal distribution")
     outside = 100 * float(np.mean(np.abs(left.parts) > BAND))
-    ylabel = "Whitened residual (σ)"
+    ylabel = "Misfit (σ)"
     name_axes(speeds, "(a) against amplitude", f"Velocity amplitude ({unit.name})", ylabel)
     name_axes(phases, "(b) against phase", "Velocity phase (°)", ylabel)
     title = f"(c) rms {left.rms:.2f} σ,\n{outside:.1f} % outside ±1.96 σ"

@@ -10,10 +10,17 @@ from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_re
 from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.inference.sensitivity import Contribution, contributions
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.joint_results import summarise_fit
 from snrmjax.io.units import DEGREE, HERTZ
-from snrmjax.report.html import ReportFigure, ReportTable, Section, minus, with_error
+from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, minus, with_error
+from snrmjax.report.identification_report import (
+    GAIN_NOT_IN_BANDS,
+    LINE_THROUGH_STARS,
+    NO_SCATTER,
+    POINTWISE_BANDS,
+)
 from snrmjax.report.joint_figures import (
     FitSeries,
     contributions_figure,
@@ -33,9 +40,10 @@ CURVES_CAPTION = (
     "errors, a line beside all dots is not."
 )
 RESIDUALS_CAPTION = (
-    "Whitened residuals: what the fit leaves of the force balance, two values a state, made "
-    "independent and in standard deviations of the noise. Where curves and noise are right they "
-    "are a cloud without shape, and one in twenty lies outside the dashed lines. A bend means that "
+    "Misfit of each point in standard deviations: what the fit leaves of the force balance in "
+    "phase with the force (at resonance that of the damping) and in quadrature with it (at "
+    "resonance that of the stiffness). Where curves and noise are right the dots are a cloud "
+    "without shape, and one in twenty lies outside the dashed lines. A bend means that "
     "the curves, the phase or the linear modes are wrong; a funnel, that the noise is."
 )
 SHARES_CAPTION = (
@@ -84,18 +92,19 @@ def joint_sections(
     """The sections of a report that tell a joint fit, with its figures."""
     fit = told.fit
     summary = summarise_fit(fit, ())
-    families = f"{summary['backbone']} for ω² and {summary['damping']} for 2ζω"
     intro = (
         f"Both curves were fitted together to {len(fit.data.level)} states of "
-        f"{fit.data.n_levels} levels: {families} (family, size and the amplitude it is a function "
-        "of). Errors that the states of a level share are unknowns of the fit."
+        f"{fit.data.n_levels} levels: {curves_in_words(fit)}. Errors that the states of a level "
+        "share are unknowns of the fit."
     )
     shown = [
         ReportFigure(figures["joint_fit"], CURVES_CAPTION),
         ReportFigure(figures["residuals"], RESIDUALS_CAPTION),
     ]
+    gain_unit = "N/V" if fit.drive_known_only else ""
+    tables = [parameter_table(summary, gain_unit), error_table(summary)]
     sections = [
-        Section("Joint fit", [intro], shown, [parameter_table(summary), error_table(summary)]),
+        Section("Joint fit", [intro], shown, tables),
         Section(
             "What the bands are made of",
             (),
@@ -112,15 +121,66 @@ def joint_sections(
     return sections
 
 
-def parameter_table(summary: dict) -> ReportTable:
-    """Parameters as `summarise_fit` has them, ± 1σ, and what they read as in other units."""
-    rows = [
-        (
-            *(name, minus(with_error(one["value"], one["std"])), _unit(one["unit"])),
-            minus(_reads_as(name, one["value"], one["std"])),
-        )
-        for name, one in summary["parameters"].items()
-    ]
+def curves_in_words(fit: JointFit) -> str:
+    """The families of both curves: "natural frequency: power law of displacement; damping: …"."""
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    return f"natural frequency: {squared.words}; damping: {damping.words}"
+
+
+def with_joint_fit(report: Report, fit: JointFit) -> Report:
+    """The report of an identification whose curves are a joint fit's, its words with them."""
+    noise, scale = fit.noise, with_error(fit.noise.scale, fit.noise.scale_std)
+    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    own = {
+        "noise": f"stated; the fit misses the data by {scale} times as much"
+        if noise.stated
+        else f"not stated; estimated as {percent} % of the velocity",
+        "scatter from level to level": (
+            f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER
+        ),
+        "argument of the curves": f"natural frequency: {squared.argument} amplitude; damping: "
+        f"{damping.argument} amplitude",
+    }
+    fitted = "force_gain" in fit.free
+    gain = ", and the error of the fitted force gain." if fitted else f".{GAIN_NOT_IN_BANDS}"
+    words = {
+        LINE_THROUGH_STARS: "The line is the joint fit to all steady states, not a curve drawn "
+        "through the stars; the band is its 95 % range.",
+        POINTWISE_BANDS: "Error bars and bands are 95 %. The bands of the joint fit hold the "
+        f"noise, stated or estimated, and what the points of one level share{gain}",
+    }
+
+    def said(text: str) -> str:
+        for old, new in words.items():
+            text = text.replace(old, new)
+        return text
+
+    return report._replace(
+        summary=[(name, own.get(name, text)) for name, text in report.summary],
+        sections=[
+            one._replace(
+                text=[said(text) for text in one.text],
+                figures=[f._replace(caption=said(f.caption)) for f in one.figures],
+            )
+            for one in report.sections
+        ],
+    )
+
+
+def parameter_table(summary: dict, gain_unit: str = "") -> ReportTable:
+    """Parameters as `summarise_fit` has them, ± 1σ, and what they read as in other units.
+
+    Arguments: `gain_unit` of the force gain: N/V where only the drive voltage is known.
+    """
+    rows = []
+    for name, one in summary["parameters"].items():
+        value, std = one["value"], one["std"]
+        row = (name, minus(with_error(value, std)), _unit(one["unit"]))
+        rows.append((*row, minus(_reads_as(name, value, std))))
+        if name == "force_gain":
+            # The fit's own unknown is the gain's logarithm.
+            rows[-1] = (name, f"{np.exp(value):.4g} ± {100 * std:.2g} %", gain_unit, "")
     caption = (
         "Parameters ± 1σ. Those of a curve are values of ω² or 2ζω, or what a term adds to them "
         "at the largest measured amplitude. Knots ascend in amplitude, the first at zero."
@@ -135,12 +195,10 @@ def _unit(name: str) -> str:
 
 
 def _reads_as(name: str, value: float, std: float) -> str:
-    """Values of a backbone as frequencies, a gain as a factor, a phase in degrees."""
+    """Values of a backbone as frequencies, a phase in degrees."""
     if name.startswith(("backbone.at_zero", "backbone.knot_")) and value > 0:
         omega = float(np.sqrt(value))
         return f"{with_error(omega / HERTZ, 0.5 * std / omega / HERTZ)} Hz"
-    if name == "force_gain":
-        return f"gain {with_error(float(np.exp(value)), float(np.exp(value)) * std)}"
     if name == "instrument_phase":
         return f"{with_error(value / DEGREE, std / DEGREE)}°"
     return ""
@@ -234,11 +292,10 @@ def family_table(summary: dict) -> ReportTable:
         "choice",
     )
     caption = (
-        "How well levels are predicted that were left out. Score: log predictive density relative "
-        "to the best, ± 1σ of the difference; a family within 2 of the best is as good. Error of "
-        "prediction: left-out residuals over their predicted size, 1 if the bands are right. "
-        "Weight: the stacking weight that the scores give a family; where families disagree, the "
-        "bands are wider by that. The curve taken may have one term more than the best score asks "
-        "for, so that its band does not rest on the shape of too small a family."
+        "Score: how well left-out levels were predicted (0 is best), ± 1σ; within 2 of the best is "
+        "as good. Error of prediction: how far the curve missed the left-out levels, over what "
+        "its band said, 1 if the band is right. Weight: share of this curve in the band. The "
+        "curve taken may have one term more than the best score asks for, so that its band does "
+        "not rest on the shape of too small a family."
     )
     return ReportTable(header, rows, caption, f"{len(rows)} families of curves compared")

@@ -37,7 +37,14 @@ from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
 from snrmjax.report.identification_report import ComparedResponses, identification_report
-from snrmjax.report.joint_report import ReportedFit, joint_figures, joint_sections, reported_fit
+from snrmjax.report.joint_report import (
+    ReportedFit,
+    curves_in_words,
+    joint_figures,
+    joint_sections,
+    reported_fit,
+    with_joint_fit,
+)
 from snrmjax.report.simulation_figures import normal_mode_figure
 from snrmjax.report.style import PrintedFigure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
@@ -203,7 +210,7 @@ def identify_jointly(
             f"({float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} %); if the "
             "model's modal mass is wrong, so is the gain."
         )
-    notes += [*notes_on_predictions(predictions, ratio)]
+    notes += [*notes_on_predictions(predictions, ratio), *(advice.notes if advice else ())]
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
         notes.append(
             f"{len(advice)} of {settings.further} further measurements are advised: "
@@ -366,7 +373,7 @@ def findings_report(
     if "nnm" in figures:
         shown = [ReportFigure(figures["nnm"], MODE_CAPTION)]
         further.append(Section("The nonlinear normal mode", (), shown))
-    return identification_report(
+    report = identification_report(
         found.identification,
         found.model.modes,
         figures,
@@ -376,6 +383,7 @@ def findings_report(
         responses=ComparedResponses(found.responses, found.resonances, found.simulated),
         further=further,
     )
+    return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
 
 
 def write_findings(folder: Path, found: Findings, title: str, done: dict[str, str]) -> None:
@@ -405,6 +413,8 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     summary["notes"] = list(found.notes)
     write_summary(folder / "summary.json", summary)
     figures = plot.save_figures(folder, identification_figures(found))
+    if found.fitted is not None:
+        done = done | {"curves": curves_in_words(found.fitted.fit)}
     write_report(folder / "report.html", findings_report(found, title, done, figures))
 
 

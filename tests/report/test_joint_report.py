@@ -1,5 +1,6 @@
 """Reports and figures of joint fits: the numbers of the fit, and bars of the whole variance."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -16,7 +17,8 @@ from snrmjax.report import joint_figures as joint_plot
 from snrmjax.report import joint_report
 from snrmjax.report import sampling as plot_data
 from snrmjax.report import style as drawing
-from snrmjax.report.html import Report, report_html
+from snrmjax.report.html import Report, ReportFigure, Section, report_html
+from snrmjax.report.identification_report import BACKBONE_CAPTION, NO_SCATTER, VALIDITY
 
 TRUE = {"backbone": "polynomial:1@displacement", "damping": "viscous_quadratic@velocity"}
 
@@ -68,6 +70,38 @@ def test_the_table_of_parameters_has_the_numbers_of_the_file(fit, sections, tmp_
     assert abs(float(hertz[0]) - 500 / HERTZ) < 4 * float(hertz[1])
     html = report_html(Report("Fit", sections=sections))
     assert all(row[1] in html for row in rows)
+
+
+def test_a_gain_is_a_number_with_a_unit_and_per_cent():
+    one = {"value": float(np.log(0.079)), "std": 0.058, "unit": "log"}
+    (row,) = joint_report.parameter_table({"parameters": {"force_gain": one}}, "N/V").rows
+    assert row == ("force_gain", "0.079 ± 5.8 %", "N/V", "")
+
+
+@pytest.mark.parametrize("free", [(), ("force_gain",)])
+def test_a_report_of_a_joint_fit_tells_the_joint_fit(fit, free):
+    fit = dataclasses.replace(fit, free=free)
+    summary = [
+        ("noise", "of points"),
+        ("scatter from level to level", NO_SCATTER),
+        ("argument of the curves", "displacement amplitude"),
+        ("left out", "none"),
+    ]
+    shown = ReportFigure(drawing.panels(1, 1, 1, 1)[0], BACKBONE_CAPTION)
+    sections = [Section("Backbone", (), [shown]), Section("How to read this", VALIDITY)]
+    whole = joint_report.with_joint_fit(Report("Fit", summary=summary, sections=sections), fit)
+    rows = dict(whole.summary)
+    # The exact states' level gain is 1 %, stated; the damping of the truth is the velocity's.
+    assert rows["scatter from level to level"] == "1 % in gain (1σ)"
+    argument = "natural frequency: displacement amplitude; damping: velocity amplitude"
+    assert rows["argument of the curves"] == argument
+    assert rows["noise"].startswith("stated; the fit misses the data by")
+    assert rows["left out"] == "none"
+    text = whole.sections[0].figures[0].caption + " ".join(whole.sections[1].text)
+    assert "curve through the stars" not in text
+    assert "joint fit to all steady states" in text
+    assert ("is not in them" in text) == (not free)
+    assert ("error of the fitted force gain" in text) == bool(free)
 
 
 def test_errors_found_are_those_of_the_fit(fit, sections):

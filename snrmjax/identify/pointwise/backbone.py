@@ -66,7 +66,7 @@ class BackboneValues(AbstractResult):
         return (
             f"BackboneValues: {np.size(self.velocity)} amplitudes, {spans(self.velocity)} m/s",
             f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
-            f"damping ratio {spans(self.damping_ratio)}",
+            f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
         )
 
     def variables(self) -> dict[str, Variable]:
@@ -189,14 +189,15 @@ class BackboneFit(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
         first, *others = self.backbone.summary()
-        scatter = " and ".join(f"{size:.3g}" for size in self.noise_scale)
-        kind = "times the stated noise" if self.noise_stated else "of the measured phasor (1σ)"
+        unit = 1 if self.noise_stated else 100
+        scatter = " and ".join(f"{unit * size:.3g}" for size in self.noise_scale)
+        kind = "times the stated noise" if self.noise_stated else "% of the measured phasor (1σ)"
         return (
             first.replace("Backbone", "BackboneFit", 1),
             *others,
             f"scatter of natural frequency and damping: {scatter} {kind}",
             f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
-            f"{self.level_damping_std:.2g} of the damping ratio (1σ)",
+            f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
         )
 
     def variables(self) -> dict[str, Variable]:

@@ -72,7 +72,7 @@ class SnrmPoints(AbstractResult):
         return (
             f"SnrmPoints: {np.size(self.status)} inversions ({statuses_in_words(self.status)})",
             f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
-            f"damping ratio {spans(self.damping_ratio)}",
+            f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
         )
 
     def variables(self) -> dict[str, Variable]:

@@ -76,7 +76,7 @@ class BackbonePoints(AbstractResult):
             f"BackbonePoints: {len(self.status)} steady states of {self._n_levels} levels at "
             f"{self.sensor!r} ({statuses_in_words(self.status)})",
             f"natural frequency {spans(np.asarray(self.natural_frequency) / _HERTZ)} Hz",
-            f"damping ratio {spans(self.damping_ratio)}",
+            f"damping ratio {spans(100 * np.asarray(self.damping_ratio))} %",
             f"velocity on the backbone {spans(self.backbone_velocity)} m/s",
             f"standard deviations of {int(stated.sum())} points",
         )

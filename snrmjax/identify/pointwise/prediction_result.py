@@ -26,7 +26,7 @@ class Resonance(AbstractResult):
         where = "beyond the measured amplitudes" if self.continued else "as far as was measured"
         return (
             f"Resonance under {self.force:.4g} N at {self.frequency / _HERTZ:.6g} Hz",
-            f"velocity {self.velocity:.4g} m/s, damping ratio {self.damping_ratio:.4g}",
+            f"velocity {self.velocity:.4g} m/s, damping ratio {100 * self.damping_ratio:.4g} %",
             where,
         )
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from truth.exact_states import modes, noisy
-from truth.joint_fits import noisy_fit
+from truths.exact_states import modes, noisy
+from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.sensitivity import contributions
