@@ -75,7 +75,9 @@ def diagnose(
         if not several:
             for note in found.notes:
                 warn(note)
-        effects = f" ({', '.join(found.effects)})" if found.effects else ""
+        effects = ", ".join(found.effects)
+        if effects:
+            effects = f" ({effects})" if found.verdict.is_answer else f"; best attempt: {effects}"
         say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
         say(f"  {readable_verdict(found)}")
         if found.decide_by:

@@ -28,7 +28,11 @@ class PhaseResonance(NamedTuple):
 
 
 class LevelResponse(NamedTuple):
-    """A level's measured resonance and those that two models predict."""
+    """A level's measured resonance and those that models predict.
+
+    `after` is that of the completed model or, of a level with `held_out`, of the model that was
+    completed without it; `completed` is that of the completed model in either case.
+    """
 
     level: int
     force: float  # N, at resonance
@@ -37,6 +41,7 @@ class LevelResponse(NamedTuple):
     after: PhaseResonance
     held_out: bool  # whether the model of `after` was not fitted to the level
     complete: bool = True  # whether both responses were traced to the end of the range
+    completed: PhaseResonance = PhaseResonance(np.nan, np.nan)  # of the model fitted to all levels
 
 
 class LevelPredictions(NamedTuple):
@@ -213,6 +218,7 @@ def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> li
                 simulated_resonance(own, sensor),
                 level in simulated.without_level,
                 _complete(old) and _complete(own),
+                simulated_resonance(new, sensor),
             )
         )
     return rows

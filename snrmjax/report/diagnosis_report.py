@@ -2,16 +2,18 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
+from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.io.diagnosis_results import summarise_diagnosis
@@ -40,9 +42,10 @@ from snrmjax.report.html import (
     with_error,
     write_report,
 )
-from snrmjax.report.style import PrintedFigure, unit_for, with_unit
+from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 
 _SHOWN = 10  # candidates
+_AS_NOISE = 1.3  # times the noise, up to which a misfit counts as noise
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
 _RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
 
@@ -187,7 +190,9 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
             " ".join((_words(name), *_value_and_unit(kind, name, pair))).strip()
             for name, pair in _own(kind, diagnosis.parameters).items()
         ]
-        rows.append((effect_name(kind), ", ".join(values)))
+        name = effect_name(kind)
+        unsure = diagnosis.verdict == Verdict.UNKNOWN
+        rows.append((f"unknown; best attempt: {name}" if unsure else name, ", ".join(values)))
     rows.append(
         ("misfit of the force (rms)", f"{_times(gap.before)} → {_times(gap.after)} × noise")
     )
@@ -201,9 +206,12 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
             rows.append((name, text))
     if predicted:
         top = max(predicted, key=lambda one: one.force)
-        each = ("measured", top.measured), ("model as given", top.before)
-        pairs = (*each, ("completed model", top.after))
-        text = "; ".join(f"{name}: {_resonance(one)}" for name, one in pairs)
+        pairs = [("measured", top.measured), ("model as given", top.before)]
+        pairs.append(("completed model", top.completed))
+        if top.held_out:
+            pairs.append((f"predicted without having seen level {top.level}", top.after))
+        unit = _velocity_unit(one for _, one in pairs)
+        text = "; ".join(f"{name}: {_resonance(one, unit)}" for name, one in pairs)
         rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
     if diagnosis.decide_by:
         rows.append(("what to measure next", _readable(diagnosis.decide_by)))
@@ -225,9 +233,16 @@ def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) ->
         for name, pair in _own(kind, diagnosis.parameters).items()
     ]
     caption = "Parameters of the effects ± 1σ, as model.toml has them."
+    if diagnosis.gap.after > _AS_NOISE:
+        caption += (
+            " The ± holds only if the noise is as stated, but the misfit that is left is "
+            f"{_times(diagnosis.gap.after)} times that noise."
+        )
     table = ReportTable(("effect", "parameter", "value ± 1σ", "unit"), rows, caption)
     figures = [shown["laws"]] if "laws" in shown else []
-    return Section("What is missing", text, figures, [table])
+    unsure = diagnosis.verdict == Verdict.UNKNOWN
+    heading = "The best attempt, which does not explain the data" if unsure else "What is missing"
+    return Section(heading, text, figures, [table])
 
 
 def _comparison_section(
@@ -236,15 +251,18 @@ def _comparison_section(
     """Responses and misfit before and after, what disagrees, and the resonances."""
     tables = []
     if predicted:
-        header = ("level", "force", "measured", "model as given", "completed model")
+        header = ["level", "force", "measured", "model as given", "completed model"]
         caption = (
             "Phase resonances of the levels: frequency, velocity amplitude and, of models, the "
             "fold where the branch ends. Where no phase was measured: the state with the largest "
-            "velocity over force. Levels with * are predicted by a model fitted without them."
+            "velocity over force."
         )
-        tables.append(ReportTable(header, [_resonances(row) for row in predicted], caption))
+        if any(row.held_out for row in predicted):
+            header.append("predicted without having seen the level")
+            caption += " The last column is of models that were fitted without that level."
+        tables.append(ReportTable(header, _resonances(predicted), caption))
     figures = [shown[name] for name in ("responses", "residuals") if name in shown]
-    text = [_located(part) for part in diagnosis.located]
+    text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
     if not text:
         text = ["No part of the force balance differs from the model by more than the noise."]
     return Section("Model and data, before and after", text, figures, tables)
@@ -265,10 +283,15 @@ def _step(number_of: int, count: int) -> str:
 
 
 def _limits_section(diagnosis: Diagnosis) -> Section:
-    rows = []
+    rows, misfit, scales = [], diagnosis.force_misfit, None
+    if diagnosis.completed is not None:
+        modes = diagnosis.completed.modes
+        scales = scales_of_motions(modes, diagnosis.data, misfit.rows, misfit.sensor)
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
         size = (number(limit, 2), _unit(kind, parameter))
+        if beyond_data(EFFECTS[kind], limit, scales):
+            size = ("not detectable in these data", "")
         rows.append((effect_name(kind), _meaning(kind, parameter), *size))
     table = ReportTable(
         ("effect", "parameter", "detected from", "unit"),
@@ -327,9 +350,13 @@ def _tried(row: TriedEffect) -> tuple[str, str, str]:
     ]
     return (
         effect_name(row.kind),
-        f"{row.gain:.0f}" if np.isfinite(row.gain) else "not fitted",
+        _gain(row.gain) if np.isfinite(row.gain) else "not fitted",
         ", ".join(values),
     )
+
+
+def _gain(gain: float) -> str:
+    return f"{gain:.0f}" if abs(gain) < 1e4 else number(gain, 2)
 
 
 _PARTS = {
@@ -344,30 +371,47 @@ _PARTS = {
 }
 
 
-def _located(part: Located) -> str:
-    """One part of the disagreement as a sentence."""
+def _located(part: Located, misfit: float = 1.0) -> str:
+    """One part of the disagreement as a sentence.
+
+    The 1σ of its power of amplitude is widened by the misfit that is left, in units of noise.
+    """
     unit = unit_for(part.velocity_range, "m/s")
     low, high = (f"{one / unit.size:.3g}" for one in part.velocity_range)
     small = part.p_value < _LEAST_P_VALUE
     chance = "below 10⁻¹²" if small else number(part.p_value, 1)
     text = f"{_PARTS[part.part]}, at velocity amplitudes from {low} to {high} {unit.name}"
     if part.exponent is not None:
-        power = with_error(part.exponent, part.exponent_std or 0.0)
-        text += f"; the change goes with the power {power} of the amplitude"
-    return f"{text} (probability by chance: {chance})."
+        power = with_error(part.exponent, (part.exponent_std or 0.0) * max(1.0, misfit))
+        how = "grows" if part.exponent > 0 else "falls"
+        text += f"; the change {how} as amplitude^({power})"
+    return f"{text} (by chance: {chance})."
 
 
-def _resonances(row: LevelResponse) -> tuple[str, ...]:
-    mark = "*" if row.held_out else ""
-    each = (_resonance(one) for one in (row.measured, row.before, row.after))
-    return (f"{row.level}{mark}", _unbroken(with_unit(row.force, "N")), *each)
+def _resonances(rows: Sequence[LevelResponse]) -> list[tuple[str, ...]]:
+    """The rows of the table of resonances, all velocities in one unit."""
+    each = [(row.measured, row.before, row.completed, row.after) for row in rows]
+    unit = _velocity_unit(one for four in each for one in four)
+    some_unseen = any(row.held_out for row in rows)
+    table = []
+    for row, (*seen, unseen) in zip(rows, each, strict=True):
+        texts = [_resonance(one, unit) for one in seen]
+        if some_unseen:
+            texts.append(_resonance(unseen, unit) if row.held_out else "–")
+        table.append((str(row.level), _unbroken(with_unit(row.force, "N")), *texts))
+    return table
 
 
-def _resonance(one: PhaseResonance) -> str:
+def _velocity_unit(resonances: Iterable[PhaseResonance]) -> Unit:
+    velocities = [one.velocity for one in resonances if np.isfinite(one.velocity)]
+    return unit_for(velocities, "m/s")
+
+
+def _resonance(one: PhaseResonance, unit: Unit) -> str:
     if not np.isfinite(one.frequency):
         return "no resonance"
     fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""
-    speed = _unbroken(with_unit(one.velocity, "m/s", 3))
+    speed = _unbroken(f"{one.velocity / unit.size:.3g} {unit.name}")
     return f"{_unbroken(f'{one.frequency:.5g} Hz')}, {speed}{fold}"
 
 

@@ -84,6 +84,7 @@ def test_one_program_simulates_before_after_and_what_has_not_seen_a_level():
         tip = SHAPE**2 * row.force / (2 * ZETA * OMEGA)
         assert row.before.velocity == pytest.approx(tip, rel=1e-9)
         assert row.after.velocity == pytest.approx(tip / factor, rel=1e-9)
+        assert row.completed.velocity == pytest.approx(tip / 2.0, rel=1e-9)  # seen or not
     louder = level_responses(level_simulations(LevelModels(model, doubled), data, 0, 1.5), data, 0)
     for row, same in zip(louder, rows, strict=True):
         assert row.before.velocity == pytest.approx(same.before.velocity, rel=1e-9)

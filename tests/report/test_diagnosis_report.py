@@ -213,12 +213,53 @@ def test_disagreement_is_located_in_words():
     part = Located("damping", (0.0401, 0.161), 0.0, 1.86, 0.11)
     assert told._located(part) == (
         "The damping differs from the model's, at velocity amplitudes from 0.0401 to 0.161 m/s; "
-        "the change goes with the power 1.86 ± 0.11 of the amplitude (probability by chance: below "
-        "10⁻¹²)."
+        "the change grows as amplitude^(1.86 ± 0.11) (by chance: below 10⁻¹²)."
     )
+    # Noise that is stated ten times too small makes the 1σ ten times too small.
+    assert "amplitude^(1.9 ± 1.1)" in told._located(part, 10.0)
     part = Located("not_a_function_of_amplitude", (0.001, 0.02), 2e-7)
     assert "no function of the amplitude" in told._located(part)
-    assert "from 1 to 20 mm/s (probability by chance: 2 × 10⁻⁷)" in told._located(part)
+    assert "from 1 to 20 mm/s (by chance: 2 × 10⁻⁷)" in told._located(part)
+
+
+def test_predictions_of_unseen_levels_are_told_from_those_of_the_completed_model(drag, pictures):
+    levels, figures = pictures
+    unseen = max(levels, key=lambda one: one.force)
+    assert unseen.held_out
+    assert unseen.completed.velocity != unseen.after.velocity
+    html = html_of(drag[2], (levels, figures)).replace("\u00a0", " ")
+    own, out = f"{unseen.completed.frequency:.5g} Hz", f"{unseen.after.frequency:.5g} Hz"
+    assert f"completed model: {own}" in html
+    assert f"predicted without having seen level {unseen.level}: {out}" in html
+    assert "predicted without having seen the level" in html
+    table = html[html.index("predicted without having seen the level") :]
+    table = table[: table.index("</table>")]
+    assert len(set(re.findall(r"\d ([mµ]?m/s)", table))) == 1
+
+
+def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
+    found = drag[2]
+    assert "holds only if the noise is as stated" not in html_of(found, pictures)
+    poor = dataclasses.replace(found, verdict="unknown", gap=found.gap._replace(after=169.0))
+    html = html_of(poor, pictures)
+    assert "unknown; best attempt: quadratic damping" in html
+    assert "The best attempt, which does not explain the data" in html
+    assert "the misfit that is left is 170 times that noise" in html
+
+
+def test_what_these_data_cannot_show_is_said_to_be_so(drag, pictures):
+    found = drag[2]
+    assert "not detectable in these data" not in html_of(found, pictures)
+    name = next(one for one in found.detection_limits if one.startswith("cubic_stiffness."))
+    far = {name: 1e6 * found.detection_limits[name]}
+    for limits in (far, {"force_gain_error.gain": 25.0}):
+        html = html_of(dataclasses.replace(found, detection_limits=limits), pictures)
+        assert "not detectable in these data" in html
+
+
+def test_gains_of_candidates_have_sensible_digits():
+    assert told._gain(8881703213.0) == "8.9 × 10⁹"
+    assert told._gain(431.6) == "432"
 
 
 def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pictures):

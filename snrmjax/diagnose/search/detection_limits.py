@@ -3,15 +3,21 @@
 from collections.abc import Collection
 
 import numpy as np
+from jaxtyping import Int
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, unfitted
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import DETECTED
-from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
+from snrmjax.model.effect_shape import shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
+from snrmjax.model.modes import LinearModes
 
 _TRIALS = 4  # of a limit
+_BEYOND = 10.0  # times all that was measured: effects that must be larger cannot be detected
 
 
 def detection_limits(
@@ -53,3 +59,39 @@ def _corrected(misfit: WeightedMisfit, one: EffectCandidate, limit: float, need:
         # χ² grows with a power between the second and the fourth.
         limit *= float(np.clip(need / square, 0.01, 100.0)) ** (1 / 3)
     return limit
+
+
+def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales | None) -> bool:
+    """Whether an effect at its detection limit would exceed all that was measured ten times.
+
+    Arguments: `limit` of its strength, in its own unit; `scales` of the measured motions, without
+    which relative strengths alone are judged.
+    """
+    unit = next(iter(effect.parameters().values())).unit
+    if not np.isfinite(limit) or (unit == "1" and limit > _BEYOND):
+        return True
+    starts = [] if scales is None else starts_of(effect, scales)
+    if not starts or not starts[0][0]:
+        return False
+    shape = shape_of(effect)
+    order = 1 if shape is None else shape.strength_order
+    return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > _BEYOND)
+
+
+def scales_of_motions(
+    modes: LinearModes, data: SteadyStates, rows: Int[np.ndarray, " state"], sensor: int
+) -> MotionScales:
+    """Typical sizes of measured motions: of some rows, at one sensor."""
+    j = modes.mode_of_interest
+    speed = np.abs(np.asarray(data.velocity)[rows, sensor])
+    omega, force = np.asarray(data.frequency)[rows], np.asarray(data.force)[rows]
+    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
+    return MotionScales(
+        amplitude=float(np.median(amplitude)),
+        largest=float(np.max(amplitude)),
+        frequency=float(modes.natural_frequency[j]),
+        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        receptance=float(np.median(speed / omega / force)),
+        smallest_force=float(np.min(force)),
+        damping_ratio=float(modes.damping_ratio[j]),
+    )
