@@ -19,6 +19,9 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 
+AS_NOISE = 1.3
+"""Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
+
 _WIDTH = 98  # of the notes, columns
 
 
@@ -124,6 +127,8 @@ class Diagnosis(AbstractResult):
             unit = "" if stated == "1" else stated
             lines.append(f"{name} = {value:.4g} ± {std:.2g} {unit}".rstrip())
         lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
+        if self.parameters and gap.after > AS_NOISE:
+            lines[-1] += "; the ± above holds only if the noise is as stated"
         lines += [
             f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"
             for out in (inner, outer)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
@@ -38,6 +38,7 @@ from snrmjax.report.html import (
     ReportFigure,
     ReportTable,
     Section,
+    minus,
     number,
     with_error,
     write_report,
@@ -45,7 +46,6 @@ from snrmjax.report.html import (
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 
 _SHOWN = 10  # candidates
-_AS_NOISE = 1.3  # times the noise, up to which a misfit counts as noise
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
 _RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
 
@@ -192,10 +192,11 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
         ]
         name = effect_name(kind)
         unsure = diagnosis.verdict == Verdict.UNKNOWN
-        rows.append((f"unknown; best attempt: {name}" if unsure else name, ", ".join(values)))
-    rows.append(
-        ("misfit of the force (rms)", f"{_times(gap.before)} → {_times(gap.after)} × noise")
-    )
+        rows.append((f"best attempt: {name}" if unsure else name, ", ".join(values)))
+    misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
+    if diagnosis.effects and gap.after > AS_NOISE:
+        misfit += "; the ± above holds only if the noise is as stated"
+    rows.append(("misfit of the force (rms)", misfit))
     for place, out in (
         ("misfit of a level between others", gap.interpolated),
         ("misfit of the largest level", gap.extrapolated),
@@ -233,7 +234,7 @@ def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) ->
         for name, pair in _own(kind, diagnosis.parameters).items()
     ]
     caption = "Parameters of the effects ± 1σ, as model.toml has them."
-    if diagnosis.gap.after > _AS_NOISE:
+    if diagnosis.gap.after > AS_NOISE:
         caption += (
             " The ± holds only if the noise is as stated, but the misfit that is left is "
             f"{_times(diagnosis.gap.after)} times that noise."
@@ -356,7 +357,7 @@ def _tried(row: TriedEffect) -> tuple[str, str, str]:
 
 
 def _gain(gain: float) -> str:
-    return f"{gain:.0f}" if abs(gain) < 1e4 else number(gain, 2)
+    return minus(f"{gain:.0f}") if abs(gain) < 1e4 else number(gain, 2)
 
 
 _PARTS = {

@@ -121,6 +121,8 @@ def test_every_verdict_has_a_sentence_of_its_own():
     assert all(one[0].isupper() and one.endswith(".") for one in sentences)
     told = verdict_sentence(Verdict.AMBIGUOUS, classes, 4.0, 1.0)
     assert "cubic_damping or quadratic_damping" in told
+    three = verdict_sentence(Verdict.UNKNOWN, (("a",), ("b",), ("c",)), 4.0, 1.0)
+    assert "the best attempt is a, b and c:" in three
     assert "4.0 to 1.0" in told
     alone = verdict_sentence(Verdict.AMBIGUOUS, (("cubic_damping",),), 4.0, 1.0)
     assert "probably" in alone

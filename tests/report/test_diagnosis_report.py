@@ -242,8 +242,10 @@ def test_a_best_attempt_and_its_errors_are_called_so(drag, pictures):
     assert "holds only if the noise is as stated" not in html_of(found, pictures)
     poor = dataclasses.replace(found, verdict="unknown", gap=found.gap._replace(after=169.0))
     html = html_of(poor, pictures)
-    assert "unknown; best attempt: quadratic damping" in html
+    assert "best attempt: quadratic damping" in html
     assert "The best attempt, which does not explain the data" in html
+    assert "× noise; the ± above holds only if the noise is as stated" in html
+    assert "holds only if the noise is as stated" in repr(poor)
     assert "the misfit that is left is 170 times that noise" in html
 
 
@@ -260,6 +262,7 @@ def test_what_these_data_cannot_show_is_said_to_be_so(drag, pictures):
 def test_gains_of_candidates_have_sensible_digits():
     assert told._gain(8881703213.0) == "8.9 × 10⁹"
     assert told._gain(431.6) == "432"
+    assert told._gain(-6.1) == "−6"
 
 
 def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pictures):

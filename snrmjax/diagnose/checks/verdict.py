@@ -54,7 +54,7 @@ def verdict_sentence(
     Arguments: `classes` has every effect of the answer with those that fit as well; misfits
     before and after it in units of noise.
     """
-    found = " and ".join(group[0] for group in classes)
+    found = _listed([group[0] for group in classes], "and")
     falls = f"the misfit falls from {_times(before)} to {_times(after)} times the noise"
     with_it = "with them" if len(classes) > 1 else "with it"
     if verdict is Verdict.NOTHING_MISSING:
@@ -73,7 +73,7 @@ def verdict_sentence(
     if verdict is Verdict.NAMED:
         return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
     if any(len(group) > 1 for group in classes):
-        rivals = " and ".join(_alternatives(group) for group in classes)
+        rivals = " and ".join(_listed(group, "or") for group in classes)
         return f"The model lacks {rivals}, and these data cannot tell which: {with_it} {falls}."
     return (
         f"The model probably lacks {found}: {with_it} {falls}, but something else could have the "
@@ -85,9 +85,10 @@ def _times(misfit: float) -> str:
     return f"{misfit:.1f}" if misfit < 10 else f"{misfit:.0f}"
 
 
-def _alternatives(group: Sequence[str]) -> str:
-    *others, last = group
-    return f"{', '.join(others)} or {last}" if others else last
+def _listed(names: Sequence[str], word: str) -> str:
+    """Names as in a sentence: "a, b and c"."""
+    *others, last = names or [""]
+    return f"{', '.join(others)} {word} {last}" if others else last
 
 
 class NeighbourNoise(NamedTuple):

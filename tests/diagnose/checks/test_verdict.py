@@ -77,7 +77,8 @@ def test_scatter_that_grows_with_the_level_is_no_noise():
     rows = noise() * np.repeat(1.0 + LEVEL, 2)
     verdict, reasons, _ = verdict_on(misfit_of(), rows)
     assert verdict == "unknown"
-    assert "level 4" in reasons[1]
+    assert reasons[1].startswith("level 4 is fitted ")
+    assert reasons[1].endswith(" times worse than the others: something is missing there.")
 
 
 def test_what_neighbours_along_the_resonance_share_is_no_noise():
@@ -160,7 +161,7 @@ FINE = HeldOut(3, 5.0, 1.0, 0.5, 0.5)
     [
         (FINE, FINE, True, None),
         (FINE, FINE._replace(after=9.0, p_value=0.0, uncertain_p_value=0.1), True, None),
-        (FINE, FINE._replace(level=5, uncertain_p_value=1e-6), False, "level 5"),
+        (FINE, FINE._replace(level=5, uncertain_p_value=1e-6), False, "misses level 5"),
         (FINE._replace(after=1.5, p_value=0.01), FINE, False, None),
         (FINE._replace(after=1.5, p_value=0.01), FINE, True, "another law may act alike"),
         # Few states: it may be by chance, but the level is not predicted to within the noise.
