@@ -73,6 +73,8 @@ from snrmjax.report.style import (
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 
+_VISIBLE = 0.01  # of an axis: shorter bars are inside the stars
+
 
 class DampingSeries(NamedTuple):
     """The modal damping of one structure, or by one method: points, a curve, or both."""
@@ -98,6 +100,21 @@ def save_figures(folder: Path, figures: Mapping[str, Figure]) -> dict[str, Print
     for name, one in drawn.items():
         write_atomically(folder / f"{name}.png", one.png)
     return drawn
+
+
+def _named_with_bars(*axes: tuple[np.ndarray, np.ndarray]) -> str:
+    """What identified points are called: of their bars only what can be seen.
+
+    Arguments: of every axis the bars and the values that it spans.
+    """
+    widths = [
+        (np.nanmax(bars, initial=0.0), np.ptp(values) if len(values) else 0.0)
+        for bars, values in axes
+    ]
+    if not any(bar > 0 for bar, _ in widths):
+        return "identified"
+    seen = any(bar > _VISIBLE * span for bar, span in widths)
+    return "identified, 95 % bars" if seen else "identified, 95 % bars smaller than the stars"
 
 
 def backbone_figure(
@@ -141,8 +158,7 @@ def backbone_figure(
     marks(dampings, own[~use], damping[~use], CROSS)
     bars = BAND * np.asarray(points.natural_frequency_std)[use] / HERTZ
     damping_bars = 100 * BAND * np.asarray(points.damping_ratio_std)[use]
-    barred = np.any(bars > 0) or np.any(damping_bars > 0)
-    name = "identified, 95 % bars" if barred else "identified"
+    name = _named_with_bars((bars, omega[use]), (damping_bars, damping[use]))
     stars(speeds, natural[use], own[use], name, xerr=bars)
     stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
     stars(dampings, own[use], damping[use], yerr=damping_bars)

@@ -173,7 +173,7 @@ def residuals_figure(fit: JointFit) -> Figure:
         axes.set_ylim(-reach, reach)
     speeds.set_xlim(left=0.0)
     edges = np.linspace(-reach, reach, 2 * int(np.clip(np.sqrt(left.parts.size), 8, 20)) + 1)
-    spread.hist(left.parts.reshape(-1), edges, density=True, color="0.75", label="residuals")
+    spread.hist(left.parts.reshape(-1), edges, density=True, color="0.75", label="misfits")
     x = np.linspace(-reach, reach, 201)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     spread.plot(x, normal, color=SIMULATED, **CURVE, label="standard normal distribution")

@@ -427,3 +427,13 @@ def test_figures_can_be_read_on_a_printed_page(
         normal_mode_figure(mode),
     ):
         assert unreadable(figure) == []
+
+
+def test_bars_that_cannot_be_seen_are_not_promised():
+    span = np.array([42.0, 43.0])
+    names = [plot._named_with_bars((np.full(2, size), span)) for size in (0.1, 1e-4, 0.0, np.nan)]
+    assert names == [
+        "identified, 95 % bars",
+        "identified, 95 % bars smaller than the stars",
+        *["identified"] * 2,
+    ]

@@ -54,6 +54,9 @@ def test_the_curves(found):
     values = backbone.values(np.linspace(0.5, 1.0, 7) * float(backbone.largest))
     for result in (backbone, found.fit, values):
         assert repr(result).splitlines()[1].strip() == "natural frequency 79.58 to 79.58 Hz"
+        ratio = repr(result).splitlines()[2].split()
+        assert float(ratio[2]) == pytest.approx(100 * float(MODES.damping_ratio[0]), rel=1e-3)
+        assert ratio[-1] == "%"
         assert result.to_xarray().natural_frequency_hz.attrs["units"] == "Hz"
         assert isinstance(result.plot(), Figure)
     assert len(values.to_pandas()) == 7
