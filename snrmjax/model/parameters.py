@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.model.effects import effect_parameters
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
 
@@ -131,7 +130,7 @@ def _places(model: Structure) -> dict[str, _Place]:
         kinds.append(effect.kind)
         number = kinds.count(effect.kind)
         head = effect.kind if number == 1 else f"{effect.kind}_{number}"
-        for field in effect_parameters(effect.kind):
+        for field in effect.parameters():
             if jnp.ndim(getattr(effect, field)) == 0:
                 places[f"{head}.{field}"] = _Place("effects", k, field)
     return places

@@ -40,6 +40,16 @@ def test_parameters_may_be_plain_numbers(effect):
     assert plain.effects[0].coefficient.dtype == whole.effects[0].coefficient.dtype == jnp.float64
     assert jax.tree.structure(plain) == jax.tree.structure(same)
     assert peak(plain) == peak(same)
+    assert sj.model.parameter_values(plain)[f"{effect.kind}.coefficient"] == 2.0
+
+
+def test_a_virtual_test_takes_an_effect_with_plain_numbers():
+    model = sj.model.structure(modes(), effects=ThreeHalvesDamping(2.0))
+    settings = sj.simulate.SweepSimulation(harmonic_order=1)
+    found = sj.phase_resonance_test(
+        model, [1.0], 95.0, 105.0, points_per_level=2, simulation=settings
+    )
+    assert found.steady_states.velocity.shape[0] > 0
 
 
 def test_traced_parameters_pass():

@@ -81,6 +81,19 @@ def test_scatter_that_grows_with_the_level_is_no_noise():
     assert reasons[1].endswith(" times worse than the others: something is missing there.")
 
 
+def test_scatter_from_point_to_point_is_told_with_the_column_that_states_it():
+    rows = 20 * noise() * np.repeat(1.0 + LEVEL, 2)
+    misfit = misfit_of()
+    *_, stated = verdict_on(misfit, rows).reasons
+    assert stated.startswith("from point to point the data scatter ")
+    assert "times more than the stated noise: put the scatter of a repeated test into" in stated
+    assert "velocity_std_m_s, or leave that column out, and diagnose again." in stated
+    misfit.predictions.chosen.noise_stated = False  # then there is no column to leave out
+    *_, unstated = verdict_on(misfit, rows).reasons
+    assert "than the misfit that is taken as noise" in unstated
+    assert "leave that column out" not in unstated
+
+
 def test_what_neighbours_along_the_resonance_share_is_no_noise():
     # A wave of one period along a level, in both parts of the force.
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
