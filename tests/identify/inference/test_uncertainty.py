@@ -83,7 +83,8 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     rows = contributions(fit)
     assert sum(row.frequency_share for row in rows) == pytest.approx(1, abs=1e-6)
     assert sum(row.damping_share for row in rows) == pytest.approx(1, abs=1e-6)
-    assert {row.source for row in rows} >= {"random error of phase", "gain of level 5"}
+    # Levels are named as the data name them: here from 0 to 4.
+    assert {row.source for row in rows} >= {"random error of phase", "gain of level 4"}
     # At resonance a level's gain counts as the velocities of its nine states do together; states
     # off resonance tell it, since stiffness against frequency has the same factor.
     near = contributions(sj.fit_jointly(noisy(1, widest=4), modes(), level_gain_std=0.01, **TRUE))
