@@ -160,10 +160,12 @@ def _courses(identification: Identification) -> tuple[_Course, _Course]:
 def identification_sentence(identification: Identification, modes: LinearModes) -> str:
     """What an identification found, in one plain sentence."""
     frequency, damping = _courses(identification)
-    low, high = (with_unit(one, "m/s", 3) for one in frequency.velocity[[0, -1]])
+    unit = unit_for(frequency.velocity, "m/s")
+    low, high = (f"{one / unit.size:.3g}" for one in frequency.velocity[[0, -1]])
     return (
-        f"From {low} to {high} at {identification.points.sensor}, the natural frequency of mode "
-        f"{modes.mode_of_interest + 1} {frequency.words()} and its damping ratio {damping.words()}."
+        f"From {low} to {high} {unit.name} at {identification.points.sensor}, the natural "
+        f"frequency of mode {modes.mode_of_interest + 1} {frequency.words()} and its "
+        f"damping ratio {damping.words()}."
     )
 
 
