@@ -419,7 +419,7 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
 
 
 def test_data_of_another_mode_and_of_one_level_are_said():
-    far = sj.diagnose_model(linear_model(frequency=3 * OMEGA), balanced(quadratic))
+    far = sj.diagnose_model(linear_model(frequency=2 * OMEGA), balanced(quadratic))
     assert "linear_frequency_shift" in far.effects
     assert any("another mode" in note for note in far.notes)
     one = sj.diagnose_model(linear_model(), balanced(quadratic, levels=1, per_level=20))

@@ -28,6 +28,7 @@ def fit():
     return noisy_fit()
 
 
+@pytest.mark.long
 def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 

@@ -152,6 +152,7 @@ def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
     assert np.mean(inside) > 0.9
 
 
+@pytest.mark.long
 def test_implicit_derivatives_know_how_smooth_a_curve_is_expected_to_be(fits):
     std = np.sqrt(np.diag(sensitivity(fits[0]).covariance))
     # The residuals' curvature moves them by some per cent; without bends a knot would be unknown.
