@@ -84,8 +84,24 @@ def pytest_collection_modifyitems(items):
             if item.get_closest_marker("long"):
                 item.add_marker(skip)
     # What runs longest starts first: no worker then waits at the end for the other's last file.
-    long = ("test_notebooks.py", "test_cli.py", "test_calibration.py")
-    items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(long))
+    items.sort(key=lambda item: _file(item) != "test_notebooks.py" and not _of_joint_fits(item))
+    for item in items:
+        own = "joint fits" if _of_joint_fits(item) else _file(item)
+        item.add_marker(pytest.mark.xdist_group(own))
+
+
+def _file(item: pytest.Item) -> str:
+    return item.nodeid.split("::")[0].removeprefix("tests/")
+
+
+def _of_joint_fits(item: pytest.Item) -> bool:
+    """Whether a test compiles the programs of joint fits, which one worker does for all."""
+    return _file(item).startswith(
+        (
+            *("identify/joint", "identify/inference", "identify/curves", "report/test_joint"),
+            *("report/test_html", "report/test_figures", "test_cli.py", "test_readme.py"),
+        )
+    )
 
 
 @pytest.fixture

@@ -244,52 +244,6 @@ def test_a_wrong_number_ends_with_two_in_the_units_of_the_option(files, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_joint_fit_writes_what_the_contract_says(files, tmp_path):
-    model, data = files
-    out = tmp_path / "out"
-    done = run(
-        *("identify", str(data), "--model", str(model), "--out", str(out)),
-        *("--fit", "polynomial:1,constant", "--next", "2", "--predict-force", "1.5e-5"),
-    )
-    assert done.code == 0, done.stderr
-    assert columns(out / "next.csv") == [
-        "rank",
-        "force_n",
-        "frequency_hz",
-        "expected_band_ratio",
-        "reason",
-    ]
-    with (out / "backbone.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 200
-    assert float(rows[0]["velocity_m_s"]) == 0
-    # The states are exact and linear; what is left is the end of the solver.
-    assert float(rows[-1]["natural_frequency_hz"]) == pytest.approx(64.78, rel=1e-6)
-    assert float(rows[-1]["damping_ratio"]) == pytest.approx(0.05, rel=1e-6)
-    fit = json.loads((out / "summary.json").read_text())["joint_fit"]
-    assert set(fit["parameters"]) == {"backbone.at_zero", "backbone.power_2", "damping.constant"}
-    assert fit["parameters"]["damping.constant"]["value"] == pytest.approx(40.706, rel=1e-4)
-    assert len(fit["covariance"]) == 3
-    (resonance,) = fit["resonances"]
-    assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-6)
-    assert (out / "fit.json").exists()
-    for name in ("joint_fit", "residuals", "contributions", "next"):
-        assert (out / f"{name}.png").exists()
-    for share in ("frequency_share", "damping_share"):
-        assert sum(row[share] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
-    html = (out / "report.html").read_text()
-    for heading in ("Joint fit", "What the bands are made of", "What to measure next"):
-        assert f"<h2>{heading}</h2>" in html
-    with (out / "next.csv").open() as file:
-        reasons = [row["reason"] for row in csv.DictReader(file)]
-    for reason in reasons:
-        # The report has the expected velocity and phase in columns of their own.
-        expected, _, gain = reason.partition(": ")
-        assert re.fullmatch(r"expected \S+ m/s, (\d+° (lead|lag)|resonance)", expected)
-        assert re.fullmatch(r"the (natural frequency|damping) band becomes \S+ % narrower", gain)
-        assert gain in html
-
-
 @pytest.mark.parametrize(
     ("option", "named"),
     [
@@ -479,7 +433,7 @@ def fitted(beam, tmp_path_factory):
         patch.setattr(tables, "write_atomically", counted)
         module = "snrmjax.identify.pointwise.identification"
         patch.setattr(f"{module}.fit_backbone", lambda *_, **__: beside.append(_))
-        options = ("--fit", FAMILIES, "--predict-force", "1", "--predict-force", "4")
+        options = ("--fit", FAMILIES, "--predict-force", "1", "--predict-force", "4", "--next", "2")
         done = run("identify", data, "--model", model, "--out", out, *options)
     assert done.code == 0, done.stderr
     return out, written, beside
@@ -493,9 +447,52 @@ def rows(path: Path) -> dict[str, np.ndarray]:
     return {name: np.array([float(row[name]) for row in table]) for name in names}
 
 
+def test_a_joint_fit_writes_what_the_contract_says(fitted):
+    out, _, _ = fitted
+    assert columns(out / "next.csv") == [
+        "rank",
+        "force_n",
+        "frequency_hz",
+        "expected_band_ratio",
+        "reason",
+    ]
+    table = rows(out / "backbone.csv")
+    speed, omega = table["velocity_m_s"], HERTZ * table["natural_frequency_hz"]
+    assert len(speed) == 200
+    assert speed[0] == 0
+    # The states are exact; what is left is the end of the solver.
+    np.testing.assert_allclose(omega**2, squared(speed / omega), rtol=1e-6)
+    np.testing.assert_allclose(
+        2 * table["damping_ratio"][1:] * omega[1:], damping(speed[1:]), rtol=1e-6
+    )
+    fit = json.loads((out / "summary.json").read_text())["joint_fit"]
+    assert set(fit["parameters"]) == {
+        *("backbone.at_zero", "backbone.power_2"),
+        *("damping.at_zero", "damping.quadratic"),
+    }
+    assert fit["parameters"]["damping.at_zero"]["value"] == pytest.approx(damping(0.0), rel=1e-6)
+    assert len(fit["covariance"]) == 4
+    assert (out / "fit.json").exists()
+    for name in ("joint_fit", "residuals", "contributions", "next"):
+        assert (out / f"{name}.png").exists()
+    for share in ("frequency_share", "damping_share"):
+        assert sum(row[share] for row in fit["contributions"]) == pytest.approx(1, rel=1e-9)
+    html = (out / "report.html").read_text()
+    for heading in ("Joint fit", "What the bands are made of", "What to measure next"):
+        assert f"<h2>{heading}</h2>" in html
+    with (out / "next.csv").open() as file:
+        reasons = [row["reason"] for row in csv.DictReader(file)]
+    for reason in reasons:
+        # The report has the expected velocity and phase in columns of their own.
+        expected, _, gain = reason.partition(": ")
+        assert re.fullmatch(r"expected \S+ m/s, (\d+° (lead|lag)|resonance)", expected)
+        assert re.fullmatch(r"the (natural frequency|damping) band becomes \S+ % narrower", gain)
+        assert gain in html
+
+
 def test_each_table_of_a_joint_fit_is_written_once(fitted):
     _, written, _ = fitted
-    assert sorted(written) == ["backbone.csv", "points.csv", "prediction.csv"]
+    assert sorted(written) == ["backbone.csv", "next.csv", "points.csv", "prediction.csv"]
 
 
 def test_predictions_of_a_joint_fit_lie_on_its_own_curves(fitted):

@@ -128,6 +128,7 @@ def test_an_effect_that_no_one_knows_is_not_named():
     assert found.checks.p_value < 1e-3
 
 
+@pytest.mark.long
 def test_two_simple_effects_are_not_read_as_a_further_mode():
     # A 1:2 resonance with free frequency and damping fits as well, with one parameter more.
     found, key = blind("blind_13")
@@ -249,6 +250,7 @@ def test_a_mode_close_by_is_found_beside_a_nonlinearity():
     assert abs(value - wanted) < 3 * std
 
 
+@pytest.mark.long
 def test_what_is_kept_beside_a_mode_close_by_is_chosen_anew():
     data = beside(0.96 * OMEGA, 0.01, 0.3, stiffening=-0.01, seed=5)
     found = sj.diagnose_model(linear_model(), data)
@@ -339,6 +341,7 @@ def test_errors_of_the_baseline_are_passed_on_as_the_effect_passes_them():
     np.testing.assert_allclose(after, turn * before, rtol=0, atol=2e-5 * np.abs(before).max())
 
 
+@pytest.mark.long
 def test_levels_whose_mode_differs_are_no_effect_once_that_is_stated():
     data = balanced(lambda v: 0.0 * v, shift=1e-3)
     unaware = sj.diagnose_model(linear_model(), data)

@@ -265,8 +265,15 @@ class TestInversion:
         )
 
 
-@pytest.mark.parametrize("argument", ["displacement", "velocity"])
-@pytest.mark.parametrize("curve", [PchipCurve, PiecewiseLinear])
+@pytest.mark.parametrize(
+    ("curve", "argument"),
+    [
+        (PiecewiseLinear, "displacement"),
+        (PchipCurve, "velocity"),
+        pytest.param(PchipCurve, "displacement", marks=pytest.mark.long),
+        pytest.param(PiecewiseLinear, "velocity", marks=pytest.mark.long),
+    ],
+)
 def test_backbone_curves(curve, argument):
     knots = np.linspace(0.1, 1.0, 5)
     # Knots and beyond: with a kink there, straight lines have no derivative at a knot.

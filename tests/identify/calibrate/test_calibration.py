@@ -113,6 +113,7 @@ def test_the_measured_force_is_needed_whatever_the_instruments_write_down():
     np.testing.assert_allclose(found.velocity[:, 2:4, 0], data.harmonics[:, 0], rtol=1e-6)
 
 
+@pytest.mark.long
 def test_derivatives_of_the_inverse_force_are_those_of_central_differences(exact):
     model, names = curved(make_effect("quadratic_damping", {"coefficient": 0.5})), ("111", "1111")
     names = (*(f"potential.{key}" for key in names), "mode_1.damping_ratio", DRAG)
@@ -206,6 +207,7 @@ def test_errors_are_as_large_as_stated(exact):
     assert low < freedom * sum(f.reduced_chi_square for f in found) < high
 
 
+@pytest.mark.long
 def test_the_order_of_rows_does_not_matter(exact):
     start, _ = scaled(curved(), NAMES, np.array([1.1, 0.9]))
     data = noisy(exact, 3)

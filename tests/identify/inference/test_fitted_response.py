@@ -233,6 +233,7 @@ def test_no_state_that_a_test_can_reach_is_an_answer(fit):
     assert few.status == sj.identify.AdviceStatus.FEWER_STATES
 
 
+@pytest.mark.long
 def test_where_only_the_drive_is_known_advice_is_in_volts(tmp_path):
     level, omega, force, velocity = exact()
     gain = 0.4  # N/V

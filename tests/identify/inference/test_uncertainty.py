@@ -73,6 +73,7 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
         assert np.max(error) < 2e-3 * np.max(np.abs(difference) / unit)
 
 
+@pytest.mark.long
 def test_the_implicit_covariance_is_gauss_newtons_where_residuals_are_small():
     exact = sj.fit_jointly(noisy(), modes(), level_gain_std=0.01, **TRUE)
     found = sensitivity(exact).covariance[:4, :4]

@@ -159,6 +159,7 @@ def compiled_programs(caplog, call):
     return [text.split()[4] for text in said if text.startswith("Finished XLA compilation")]
 
 
+@pytest.mark.long
 def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):
     """32 states in place of 31, or another family, compile no program of the package anew."""
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from truths.sizes import repeats
 
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
 from snrmjax.identify.joint.initial_guess import levels_apart
@@ -63,7 +64,9 @@ def test_stated_scatter_is_kept_and_one_level_says_nothing():
     assert estimated_components(problem, index[:1]).level == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("n_levels", [2, 3, 4, 8])
+@pytest.mark.parametrize(
+    "n_levels", [2, 4, *(pytest.param(n, marks=pytest.mark.long) for n in (3, 8))]
+)
 def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
     level = np.repeat(np.arange(n_levels), PER_LEVEL)
     n = len(level)
@@ -72,7 +75,8 @@ def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
     std = np.concatenate([[np.inf], np.zeros(n_levels)])
     index = 1 + np.arange(n_levels)[:, None]
     inside, sizes = [], []
-    for seed in range(300):
+    tests = repeats(150, 300)
+    for seed in range(tests):
         rng = np.random.default_rng(seed)
         residuals = rng.normal(size=n) + 50.0 * 0.1 * rng.normal(size=n_levels)[level]
         problem = Linearised(residuals, slopes, std, np.zeros(len(std)))
@@ -85,7 +89,7 @@ def test_few_levels_widen_the_band_of_their_mean_as_students_t_does(n_levels):
     assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(0.1, rel=0.2)
     # With two degrees of freedom a band ends at t = 4.303; with one it holds what Cauchy says.
     wanted = 2 / np.pi * np.arctan(4.303) if n_levels == 2 else 0.95
-    assert np.mean(inside) == pytest.approx(wanted, abs=3 * np.sqrt(0.05 / 300))
+    assert np.mean(inside) == pytest.approx(wanted, abs=3 * np.sqrt(0.05 / tests))
 
 
 def test_a_scatter_that_no_test_has_is_none_and_is_said():

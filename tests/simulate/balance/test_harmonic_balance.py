@@ -53,15 +53,6 @@ OTHERS = {
 residual_of = eqx.filter_jit(HarmonicBalance.residual)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Nothing here runs long: compile as quickly as the tests of other rooms do."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 def one_mode(potential=None, effects=(), omega=2.0, ratio=0.05, participation=1.5):
     modes = linear_modes([omega], [ratio], [[1.0]], [participation])
     return structure(modes, polynomial_potential(potential or {}, 1), effects=effects)

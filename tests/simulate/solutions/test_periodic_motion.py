@@ -26,15 +26,6 @@ def one_mode(potential=None, effects=(), ratio=0.02):
     return structure(modes, polynomial_potential(potential or {}, 1), effects=effects)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation():
-    """Derivatives take long to compile and nothing here runs long."""
-    before = jax.config.values["jax_disable_most_optimizations"]
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 def oscillator(*more):
     """Hardening, softening and drag."""
     drag = make_effect("quadratic_damping", {"coefficient": 0.002})
