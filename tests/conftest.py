@@ -84,24 +84,29 @@ def pytest_collection_modifyitems(items):
             if item.get_closest_marker("long"):
                 item.add_marker(skip)
     # What runs longest starts first: no worker then waits at the end for the other's last file.
-    items.sort(key=lambda item: _file(item) != "test_notebooks.py" and not _of_joint_fits(item))
-    for item in items:
-        own = "joint fits" if _of_joint_fits(item) else _file(item)
-        item.add_marker(pytest.mark.xdist_group(own))
+    items.sort(key=lambda item: _unit(item.nodeid) not in ("joint fits", "test_notebooks.py"))
 
 
-def _file(item: pytest.Item) -> str:
-    return item.nodeid.split("::")[0].removeprefix("tests/")
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Files go to workers whole; those of joint fits, which share programs, all to one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByPrograms(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return _unit(nodeid)
+
+    return ByPrograms(config, log)
 
 
-def _of_joint_fits(item: pytest.Item) -> bool:
-    """Whether a test compiles the programs of joint fits, which one worker does for all."""
-    return _file(item).startswith(
-        (
-            *("identify/joint", "identify/inference", "identify/curves", "report/test_joint"),
-            *("report/test_html", "report/test_figures", "test_cli.py", "test_readme.py"),
-        )
+def _unit(nodeid: str) -> str:
+    """What a worker takes at once: a file, or all that compile the programs of joint fits."""
+    file = nodeid.split("::")[0].removeprefix("tests/")
+    joint = (
+        *("identify/joint", "identify/inference", "identify/curves", "report/test_joint"),
+        *("report/test_html", "report/test_figures", "test_cli.py", "test_readme.py"),
     )
+    return "joint fits" if file.startswith(joint) else file
 
 
 @pytest.fixture

@@ -468,9 +468,9 @@ def test_a_joint_fit_writes_what_the_contract_says(fitted):
     fit = json.loads((out / "summary.json").read_text())["joint_fit"]
     assert set(fit["parameters"]) == {
         *("backbone.at_zero", "backbone.power_2"),
-        *("damping.at_zero", "damping.quadratic"),
+        *("damping.viscous", "damping.quadratic"),
     }
-    assert fit["parameters"]["damping.at_zero"]["value"] == pytest.approx(damping(0.0), rel=1e-6)
+    assert fit["parameters"]["damping.viscous"]["value"] == pytest.approx(damping(0.0), rel=1e-6)
     assert len(fit["covariance"]) == 4
     assert (out / "fit.json").exists()
     for name in ("joint_fit", "residuals", "contributions", "next"):
