@@ -243,9 +243,18 @@ def steady_states(
     return jax.device_put(states, may_alias=False)
 
 
+def _on_host(data: SteadyStates, *names: str) -> SteadyStates:
+    """Some columns as NumPy's, for which nothing compiles, unless one of them is traced."""
+    columns = [getattr(data, name) for name in names]
+    if any(isinstance(column, jax.core.Tracer) for column in columns):
+        return data
+    own: dict[str, Any] = dict(zip(names, map(np.asarray, columns), strict=True))
+    return dataclasses.replace(data, **own)
+
+
 def check_phases(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where phases are unknown; `purpose` is what needs them."""
-    phases: Any = data.phase_unknown
+    phases: Any = _on_host(data, "phase_std", "measured").phase_unknown
     if isinstance(phases, jax.core.Tracer):  # within `jax.jit` nothing has a value yet
         return
     unknown = np.any(np.asarray(phases), axis=1)
@@ -261,7 +270,8 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
 
 def check_force(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
-    known: Any = jnp.isfinite(data.force)
+    known: Any = jnp.isfinite if isinstance(data.force, jax.core.Tracer) else np.isfinite
+    known = known(_on_host(data, "force").force)
     # Within `jax.jit` nothing has a value yet; within a derivative this still has one.
     if isinstance(known, jax.core.Tracer) or np.any(known):
         return

@@ -48,6 +48,7 @@ def blind(name):
     return sj.diagnose_model(*files(name)), KEYS[name]
 
 
+@pytest.mark.long
 def test_a_pair_that_its_own_weighing_refutes_is_no_better_than_one_effect():
     """The curved beam, stiffening, whose peaks were read for its fundamental: 13 % too large.
 
@@ -239,6 +240,7 @@ def test_a_mode_close_by_is_found_and_doubted():
     assert found.table[0][0].kind in ("residual_mode", "sensor_phase_error")
 
 
+@pytest.mark.long
 def test_a_mode_close_by_is_found_beside_a_nonlinearity():
     data = beside(1.03 * OMEGA, 0.01, 0.3, stiffening=0.03, seed=1)
     found = sj.diagnose_model(linear_model(), data)

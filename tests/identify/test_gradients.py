@@ -269,7 +269,7 @@ class TestInversion:
     ("curve", "argument"),
     [
         (PiecewiseLinear, "displacement"),
-        (PchipCurve, "velocity"),
+        pytest.param(PchipCurve, "velocity", marks=pytest.mark.long),
         pytest.param(PchipCurve, "displacement", marks=pytest.mark.long),
         pytest.param(PiecewiseLinear, "velocity", marks=pytest.mark.long),
     ],

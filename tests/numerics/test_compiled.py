@@ -66,6 +66,7 @@ def test_methods_take_floats_as_arguments(compilations):
     assert len(compilations) == 0
 
 
+@pytest.mark.long
 def test_a_backbone_at_other_amplitudes_compiles_nothing(compilations):
     beam, hertz = sj.model.flat_beam(), 2 * np.pi
     test = sj.phase_resonance_test(

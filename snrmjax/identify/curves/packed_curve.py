@@ -97,6 +97,13 @@ def _value_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return _value(x, parameters, shape), slope
 
 
+def _filled(parameters: Array, missing: int) -> Array:
+    """With zeros behind: on the host, where nothing compiles for one more size, if it can be."""
+    if isinstance(parameters, jax.core.Tracer):
+        return jnp.pad(parameters, (0, missing))
+    return jnp.asarray(np.pad(np.asarray(parameters), (0, missing)))
+
+
 def packed(family: AbstractFamily) -> AbstractCurve:
     """The same curve as an `PackedCurve`; a family that users wrote stays what it is."""
     n = family.parameters.shape[0]
@@ -120,7 +127,7 @@ def packed(family: AbstractFamily) -> AbstractCurve:
     else:
         return family
     return PackedCurve(
-        parameters=jnp.pad(family.parameters, (0, size - n)),
+        parameters=_filled(family.parameters, size - n),
         scale=family.scale,
         exponents=jnp.asarray(exponents),
         is_free=jnp.asarray(free),

@@ -158,22 +158,21 @@ def as_backbone(
     if sound < _KNOTS:
         displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
         sampled = values_at_displacement(fit, displacement)
-    values, slopes = (jnp.asarray(part) for part in sampled[:2])
-    shifts = jnp.asarray(open_choice(fit, displacement=displacement))
+    values, slopes = (np.asarray(part) for part in sampled[:2])
+    shifts = np.asarray(open_choice(fit, displacement=displacement))
     covariance = [
         slopes[:, k] @ fit.covariance @ slopes[:, k].T + shifts[:, :, k].T @ shifts[:, :, k]
         for k in range(2)
     ]
     measured = np.asarray(fit.motion().displacement)
     # Dry friction has no finite damping at rest: there the next knot's value stands.
-    damping = (
-        values[:, 1].at[0].set(jnp.where(jnp.isfinite(values[0, 1]), values[0, 1], values[1, 1]))
-    )
+    damping = values[:, 1].copy()
+    damping[0] = damping[0] if np.isfinite(damping[0]) else damping[1]
     return Backbone(
-        squared_frequency=PchipCurve(jnp.asarray(displacement), values[:, 0]),
-        modal_damping=PchipCurve(jnp.asarray(displacement), damping),
-        squared_frequency_covariance=covariance[0],
-        modal_damping_covariance=jnp.nan_to_num(covariance[1]),
+        squared_frequency=PchipCurve(jnp.asarray(displacement), jnp.asarray(values[:, 0])),
+        modal_damping=PchipCurve(jnp.asarray(displacement), jnp.asarray(damping)),
+        squared_frequency_covariance=jnp.asarray(covariance[0]),
+        modal_damping_covariance=jnp.asarray(np.nan_to_num(covariance[1])),
         modal_constant=fit.problem.modal_constant,
         smallest=jnp.asarray(measured.min()),
         largest=jnp.asarray(measured.max()),

@@ -185,15 +185,20 @@ def _second_order(
     return hessian, mixed
 
 
+@compiled
+def _slopes_of_prior(curve: AbstractFamily) -> Float[Array, "row parameter"]:
+    def of(parameters: Array) -> Array:
+        return eqx.tree_at(lambda f: f.parameters, curve, parameters).prior_residuals()
+
+    return jax.jacfwd(of)(curve.parameters)
+
+
 def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
     """Derivatives, by the unknowns, of what is expected near zero of both curves."""
 
-    def of(curve: AbstractFamily, parameters: Array) -> Array:
-        return eqx.tree_at(lambda f: f.parameters, curve, parameters).prior_residuals()
-
     begin, blocks = 0, []
     for curve in (fit.unknowns.squared_frequency, fit.unknowns.modal_damping):
-        slopes = np.asarray(jax.jacfwd(of, argnums=1)(curve, curve.parameters))
+        slopes = np.asarray(_slopes_of_prior(curve))
         end = begin + slopes.shape[1]
         blocks.append(np.pad(slopes, ((0, 0), (begin, len(fit.covariance) - end))))
         begin = end

@@ -120,7 +120,9 @@ def fitted(
             unknown, none_known = len(program.own), np.full(2, np.nan)
             covariance = np.full((unknown, unknown), np.nan)
             ended = (problem, components, residuals, none_known, FitStatus.NOT_FINITE)
-            return Fitted(Unravel(start, free)(program.vector[program.own]), covariance, *ended)
+            return Fitted(
+                Unravel(start, free)(np.asarray(program.vector)[program.own]), covariance, *ended
+            )
         jacobian = np.asarray(answer.jacobian)[:, program.own]
         if robust:
             weight = np.sqrt(np.asarray(problem.data.weight))
@@ -139,7 +141,7 @@ def fitted(
     size = components.noise**2 if stated and components.contradicts_downward else 1.0
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
-        unknowns=Unravel(start, free)(program.vector[program.own]),
+        unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
         covariance=root @ root.T + size * added_covariance(root, rows, alike, levels),
         problem=problem,
         components=components,

@@ -122,8 +122,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     """
     check_phases(data, "a joint fit")
     r = reference_sensor(modes)
-    combined, share, std, _ = modal_filter(data, modes, r, data.velocity, relative_errors(data))
-    velocity, errors = np.asarray(combined), np.asarray(std)
+    velocity, share, errors = _filtered(data, modes)
     force, keep = _measured(data, velocity)
     known = bool(np.all(np.isfinite(errors[keep]))) and bool(np.all(errors[keep][:, 1:3] > 0))
     if not known:
@@ -135,12 +134,12 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     return (
         BalanceData(
             level=jnp.asarray(index),
-            frequency=jnp.asarray(data.frequency)[keep],
+            frequency=jnp.asarray(np.asarray(data.frequency)[keep]),
             force=jnp.asarray(force[keep]),
             velocity=jnp.asarray(velocity[keep]),
-            share=jnp.asarray(share)[keep],
+            share=jnp.asarray(share[keep]),
             std=jnp.asarray(errors[keep]),
-            weight=jnp.ones(int(keep.sum())),
+            weight=jnp.asarray(np.ones(int(keep.sum()))),
             correction=no_errors(int(keep.sum())),
             n_levels=len(levels),
             sensor=r,
@@ -151,10 +150,20 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
 
 def level_numbers(data: SteadyStates, modes: LinearModes) -> tuple[int, ...]:
     """The numbers that the data's own record gives the levels of `balance_data`, in its order."""
-    stated, r = relative_errors(data), reference_sensor(modes)
-    velocity, *_ = modal_filter(data, modes, r, data.velocity, stated)
-    keep = _measured(data, np.asarray(velocity))[1]
+    velocity, *_ = _filtered(data, modes)
+    keep = _measured(data, velocity)[1]
     return tuple(int(one) for one in np.unique(np.asarray(data.level)[keep]))
+
+
+def _filtered(data: SteadyStates, modes: LinearModes) -> tuple[np.ndarray, ...]:
+    """What the sensors together say of one of them: velocity, shares, relative errors."""
+    errors = relative_errors(jax.tree.map(np.asarray, data))
+    given = (reference_sensor(modes), data.velocity, errors)
+    velocity, share, std, _ = _one_sensor(data, modes, *given)
+    return np.asarray(velocity), np.asarray(share), np.asarray(std)
+
+
+_one_sensor = compiled(modal_filter)
 
 
 def _measured(
@@ -243,7 +252,7 @@ def force_balance(
 
 def no_errors(n_states: int) -> Float[Array, "state input"]:
     """States as they were recorded."""
-    return jnp.zeros((n_states, len(STATE_ERRORS)))
+    return jnp.asarray(np.zeros((n_states, len(STATE_ERRORS))))
 
 
 def error_slopes(

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
@@ -34,12 +35,25 @@ class Unravel(eqx.Module):
 
     def vector(self) -> Float[Array, " unknown"]:
         """The free unknowns."""
-        return ravel_pytree(eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free)))[0]
+        moving = eqx.filter(self.unknowns, free_unknowns(self.unknowns, self.free))
+        leaves = jax.tree.leaves(moving)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return ravel_pytree(moving)[0]
+        # On the host nothing compiles for one more size.
+        return jnp.asarray(np.concatenate([np.ravel(np.asarray(leaf)) for leaf in leaves]))
 
     def __call__(self, vector: Float[Array, " unknown"]) -> Unknowns:
         """All unknowns, the free ones from the vector."""
         moving, fixed = eqx.partition(self.unknowns, free_unknowns(self.unknowns, self.free))
-        return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
+        if isinstance(vector, jax.core.Tracer):
+            return eqx.combine(ravel_pytree(moving)[1](vector), fixed)
+        leaves, structure = jax.tree.flatten(moving)
+        ends = np.cumsum([leaf.size for leaf in leaves])
+        own = np.split(np.asarray(vector), ends[:-1])
+        parts = [
+            jnp.asarray(part.reshape(leaf.shape)) for part, leaf in zip(own, leaves, strict=True)
+        ]
+        return eqx.combine(jax.tree.unflatten(structure, parts), fixed)
 
     @property
     def level_places(self) -> Int[np.ndarray, "level error"]:

@@ -48,6 +48,7 @@ def test_resonance_of_known_curves(exact_fit):
     assert not found.continued
 
 
+@pytest.mark.long
 def test_a_larger_ratio_looks_further(exact_fit):
     largest = exact_fit.largest[0]
     x = 2.5 * largest
