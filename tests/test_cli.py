@@ -318,7 +318,7 @@ def test_identify_sends_amplitudes_alone_to_diagnose(files, tmp_path, load, opti
     [
         (("simulate", "--force", "1e-4", "--from-hz", "60", "--to-hz", "70"), "response.csv"),
         (("nnm", "--help"), None),
-        (("identify",), "backbone.csv"),
+        (("identify", "--help"), None),
         (("diagnose",), None),
         (("demo", "--help"), None),
     ],

@@ -140,6 +140,7 @@ def test_the_inverse_force_says_itself(exact):
     assert isinstance(found.plot(), Figure)
 
 
+@pytest.mark.long
 def test_the_inverse_force_has_slopes_by_the_mode_shape():
     modes = sj.model.linear_modes([300.0], [0.01], [[2.0]], [3.0])
     data = sj.measure.steady_states([1, 1], [295.0, 305.0], [1.0, 1.0], [0.1 + 0.05j, 0.1 - 0.05j])
@@ -245,6 +246,7 @@ def test_what_a_level_shares_is_found(exact):
     assert "understated" in without.notes[-1]
 
 
+@pytest.mark.long
 def test_a_prior_weighs_as_much_as_its_std_says(exact):
     start, _ = scaled(curved(), NAMES[1:], 0.998)
     data = noisy(exact, 1)

@@ -130,6 +130,7 @@ def test_slopes_of_points_are_central_differences(fit, kind):
     np.testing.assert_allclose([best.frequency_std, best.velocity_std], std, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_band_of_a_curve_is_the_spread_of_drawn_curves(fit):
     rng = np.random.default_rng(0)
     vector = np.asarray(fit.vector()[0])

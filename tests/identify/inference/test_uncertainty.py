@@ -167,6 +167,7 @@ def test_bootstrap_and_posterior_agree_with_the_covariance_for_independent_noise
         assert row.posterior == pytest.approx(row.gauss_newton, rel=0.25)
 
 
+@pytest.mark.long
 def test_a_bootstrap_of_levels_sees_their_scatter():
     # Gains of 5 % outweigh 1 % of nine states near resonance, where the states do not tell them.
     scattered = sj.fit_jointly(noisy(1, gain=0.05, widest=4), modes(), level_gain_std=0.05, **TRUE)

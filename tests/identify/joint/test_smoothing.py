@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.exact_states import CONSTANT, NOISE, OMEGA, modes, stated
+from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.curves.splines import SmoothingSpline
@@ -134,8 +135,11 @@ def near_resonance(seed, n_levels=14):
 
 @pytest.fixture(scope="module")
 def fits():
-    """Three noisy tests of a curve that few knots cannot follow, families chosen by the data."""
-    return [fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01) for seed in range(3)]
+    """Noisy tests of a curve that few knots cannot follow, families chosen by the data."""
+    return [
+        fit_jointly(near_resonance(seed), modes(), level_gain_std=0.01)
+        for seed in range(repeats(1, 3))
+    ]
 
 
 def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):

@@ -131,6 +131,7 @@ def test_conditions_are_met_and_differentiated(condition, curve):
     assert np.linalg.matrix_rank(forward) >= (2 if value is not None else 1)
 
 
+@pytest.mark.long
 def test_gradients_of_the_flat_beam(flat_curve):
     """Peak amplitude and both folds by all 55 coefficients, 4 frequencies and 4 dampings."""
     model, curve = flat_curve
