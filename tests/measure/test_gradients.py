@@ -90,8 +90,14 @@ def of_refined_fits(relative, records):
     return numbers(fit.amplitude, fit.frequency, fit.frequency_std)
 
 
-@pytest.mark.parametrize("broken", [False, True])
-@pytest.mark.parametrize("function", [of_fits, of_refined_fits])
+@pytest.mark.parametrize(
+    ("function", "broken"),
+    [
+        *((of_fits, broken) for broken in (False, True)),
+        (of_refined_fits, True),
+        pytest.param(of_refined_fits, False, marks=pytest.mark.long),
+    ],
+)
 def test_harmonic_fits(function, broken):
     records = RECORDS.copy()
     if broken:

@@ -51,7 +51,7 @@ def drawn(free, *, room=False):
     return residuals, near, unravel, problem.data
 
 
-@pytest.mark.parametrize("room", [False, True])
+@pytest.mark.parametrize("room", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_slopes_are_those_of_every_unknown_alone(room):
     residuals, near, unravel, data = drawn(FREE, room=room)
     rng = np.random.default_rng(0)
