@@ -629,3 +629,45 @@ def test_every_writer_takes_the_path_first():
         assert first.name == "path", writer
         assert second.default is inspect.Parameter.empty
         assert all(other.kind is inspect.Parameter.KEYWORD_ONLY for other in others), writer
+
+
+def phases_changed(data: Path, change) -> Path:
+    """Writes the rows again with real and imaginary part of the velocity changed."""
+    rows = [line.split(",") for line in data.read_text().splitlines()[1:]]
+    lines = [[*row[:3], *map(repr, change(float(row[3]), float(row[4])))] for row in rows]
+    data.write_text(HEADER + "".join(",".join(line) + "\n" for line in lines))
+    return data
+
+
+CONJUGATED = (
+    "seem to be conjugated (time dependence e^(-iΩt)); change the sign of `velocity_im_m_s`"
+)
+
+
+@pytest.mark.parametrize("command", ["identify", "diagnose"])
+def test_conjugated_phases_are_named_in_a_note(files, tmp_path, command):
+    model, data = files
+    phases_changed(data, lambda re, im: (re, -im))
+    settings = ["--no-responses"] if command == "diagnose" else []
+    done = run(command, data, "--model", model, "--out", tmp_path / "out", *settings)
+    assert done.code == 0, done.stderr
+    name = "summary.json" if command == "identify" else "diagnosis.json"
+    assert CONJUGATED in json.loads((tmp_path / "out" / name).read_text())["notes"][0]
+    assert CONJUGATED in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda re, im: (-re, -im), "turn the phases by 180°"),
+        (lambda re, im: (im / 402, -re / 402), "displacements seem to be given as velocities"),
+    ],
+)
+def test_phases_with_which_nothing_can_be_solved_are_named_in_the_error(
+    files, tmp_path, change, named
+):
+    model, data = files
+    done = run("identify", phases_changed(data, change), "--model", model, "--out", tmp_path / "o")
+    assert done.code == 2
+    assert named in " ".join(done.stderr.split())
+    assert not (tmp_path / "o").exists()

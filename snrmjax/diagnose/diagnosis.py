@@ -31,6 +31,7 @@ from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
 from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects, find_effects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
+from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractLinearChange
 from snrmjax.model.effect_metadata import MotionScales
@@ -47,6 +48,7 @@ _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is mo
 
 
 @on_one_core
+@naming_wrong_phases
 def diagnose_model(
     model: Structure, data: SteadyStates, *, force_gain_std: float = 0.0
 ) -> Diagnosis:

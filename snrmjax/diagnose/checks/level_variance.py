@@ -22,7 +22,7 @@ def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure
     Smooth curves of amplitude follow any law: what differs from level to level beside them is no
     function of amplitude. Its variance is estimated by restricted maximum likelihood. Returns the
     model unchanged and no note where that is zero, where levels differ by more than those of one
-    structure can, or where the joint fit fails.
+    structure can, or where the joint fit fails or has curves that no structure can have.
     """
     # Few diagnoses need it, and it takes long to import.
     from snrmjax.identify.inference.fitted_curves import values_at_displacement
@@ -35,6 +35,8 @@ def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure
         return model, ""
     values = values_at_displacement(fit, np.asarray(fit.motion().displacement))[0]
     squared, modal_damping = np.median(values, axis=0)
+    if not (squared > 0 and modal_damping > 0):
+        return model, ""
     omega = np.sqrt(squared)
     widened = dataclasses.replace(
         model,

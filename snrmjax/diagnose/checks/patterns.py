@@ -102,11 +102,11 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
     mine = noise.column < 2
     force[noise.state[mine], noise.column[mine]] = left[mine]
     unit[noise.state[mine], noise.column[mine]] = misfit.by_linear[mine, 0]
-    whole = np.isfinite(force).all(axis=1)
+    size = np.linalg.norm(unit, axis=1)
+    whole = np.isfinite(force).all(axis=1) & (size > 0)
     if not whole.any() or misfit.predictions.chosen.phase_unknown.any():
         return None
-    force, unit = force[whole], unit[whole]
-    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    force, unit = force[whole], unit[whole] / size[whole, None]
     with_it = np.sum(force * unit, axis=1)
     across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
     ratio = float(np.sum(with_it**2) / np.sum(across**2))

@@ -324,8 +324,14 @@ def _simplest(misfit: WeightedMisfit, fits: list[EffectFit]) -> EffectFit:
     A further mode or a threshold can be placed where the data deviate by chance; a criterion that
     counts parameters does not account for the choice of the place.
     """
+    fits = [fit for fit in fits if np.isfinite(fit.criterion(misfit.n_rows))]
+    if not fits:
+        raise ValueError(
+            "no trial fit of an effect has a finite misfit: the model is too far from the data to "
+            "be compared."
+        )
     least = min(fit.criterion(misfit.n_rows) for fit in fits)
-    near = [fit for fit in fits if fit.criterion(misfit.n_rows) < least + AS_GOOD]
+    near = [fit for fit in fits if fit.criterion(misfit.n_rows) <= least + AS_GOOD]
     return min(near, key=lambda fit: (len(fit.values), fit.criterion(misfit.n_rows)))
 
 

@@ -15,6 +15,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     off_resonance_error_factor,
 )
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
+from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
@@ -54,6 +55,7 @@ class Identification(AbstractResult):
         return {**self.fit.attributes(), "notes": "\n".join(self.notes)}
 
 
+@naming_wrong_phases
 def identify_backbone(
     data: SteadyStates,
     modes: LinearModes | Structure,
