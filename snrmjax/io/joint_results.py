@@ -39,7 +39,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 
 BAND_POINTS = 200
-_FORMAT = 2
+_FORMAT = 3
 
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:
@@ -100,6 +100,7 @@ def summarise_fit(
             "natural_frequency_std_relative": 0.5 * level["stiffness"],
             "damping_std_relative": level["damping"],
         },
+        "modal_mass": _modal_mass(fit),
         "tried": [candidate._asdict() for candidate in fit.families.candidates],
         "rivals": [
             {
@@ -122,6 +123,18 @@ def summarise_fit(
             for p in r.not_located
         ],
         "notes": list(fit.notes),
+    }
+
+
+def _modal_mass(fit: JointFit) -> dict:
+    """The modal mass that damping is relative to, in kg, and whether it is the model's."""
+    mass = float(fit.problem.modal_mass_of(fit.unknowns))
+    prior = float(fit.prior.linear[-1])
+    return {
+        "value_kg": mass,
+        "std_kg": mass * prior * float(np.sqrt(fit.covariance[-1, -1])),
+        "model_kg": 1 / abs(float(fit.problem.modal_constant)),
+        "found": prior > 0,
     }
 
 
@@ -164,7 +177,7 @@ def _content(fit: JointFit) -> dict:
             name: getattr(unknowns, name)
             for name in ("log_force_gain", "force_offset", "instrument_phase", "level", "linear")
         },
-        "spread": {"level": fit.prior.level, "linear": fit.prior.linear},
+        "spread": vars(fit.prior),
         "data": vars(fit.data),
         "modes": vars(fit.modes),
         "residuals": fit.residuals,
@@ -215,7 +228,7 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         sensors=tuple(modes["sensors"]),
         mode_of_interest=modes["mode_of_interest"],
         rigid_body=RigidBodyModes(modes["rigid_body_shape"], modes["rigid_body_participation"]),
-        std=LinearModesStd(modes["natural_frequency_std"], modes["damping_ratio_std"]),
+        std=LinearModesStd(*(modes.get(f"{name}_std") for name in LinearModesStd._fields)),
     )
     squared, damping = (
         _family(content["squared_frequency"]),
@@ -223,7 +236,7 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
     )
     arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
     shared = {key: content[key] for key in _SHARED}
-    prior = PriorStd(*(jnp.asarray(content["spread"][k]) for k in ("level", "linear")))
+    prior = PriorStd(**{name: jnp.asarray(std) for name, std in content["spread"].items()})
     # Files written before a fit had a status know only whether it converged.
     known = FitStatus.CONVERGED if content["converged"] else FitStatus.NOT_SETTLED
     return JointFit(

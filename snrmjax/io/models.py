@@ -1,7 +1,7 @@
 """Models: a structure in and out, as TOML."""
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,13 @@ from snrmjax.io.files import (
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
-from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
+from snrmjax.model.modes import (
+    UNSTATED_MODAL_MASS_STD,
+    LinearModes,
+    LinearModesStd,
+    RigidBodyModes,
+    linear_modes,
+)
 from snrmjax.model.potential import (
     Monomial,
     PolynomialPotential,
@@ -33,7 +39,7 @@ from snrmjax.model.structures import Structure, structure
 from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
 
 _MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
-_MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std")
+_MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std", "modal_mass_std")
 _RIGID_BODY_KEYS = ("shape", "participation")
 _MEASUREMENT_KEYS = (
     *("level_gain_std", "level_phase_std_deg"),
@@ -199,6 +205,7 @@ def _modes(top: _Table, file: str) -> LinearModes:
                 for table in flexible
             ],
             [table.number("damping_ratio_std", NOT_NEGATIVE, default=0.0) for table in flexible],
+            _modal_mass_std(flexible),
         ),
     )
 
@@ -272,6 +279,14 @@ def write_model(path: FilePath, model: Structure) -> None:
     write_atomically(path, text)
 
 
+def _modal_mass_std(flexible: Sequence[_Table]) -> list[float] | None:
+    """As stated, for a mode without it as where nobody stated any; None if no mode has one."""
+    if not any("modal_mass_std" in table.entries for table in flexible):
+        return None
+    default = UNSTATED_MODAL_MASS_STD
+    return [table.number("modal_mass_std", NOT_NEGATIVE, default=default) for table in flexible]
+
+
 def _entries(model: Structure) -> dict[str, object]:
     modes = model.modes
     flexible = []
@@ -285,6 +300,8 @@ def _entries(model: Structure) -> dict[str, object]:
             entry["frequency_std_hz"] = in_unit(float(modes.natural_frequency_std[k]), HERTZ)
         if modes.damping_ratio_std[k] != 0:
             entry["damping_ratio_std"] = float(modes.damping_ratio_std[k])
+        if modes.modal_mass_std is not None:
+            entry["modal_mass_std"] = float(modes.modal_mass_std[k])
         entry["shape"] = _shape_entry(modes, modes.mode_shape[:, k])
         flexible.append(entry)
     rigid = [

@@ -10,6 +10,12 @@ from jaxtyping import Array, Complex, Float, Shaped
 
 _SHOWN = 12  # modes, in a text
 
+UNSTATED_MODAL_MASS_STD = 0.05
+"""1σ, relative, of a modal mass of which nobody stated one.
+
+Repeated modal tests find modal masses to some per cent; the drive point's reading counts twice.
+"""
+
 
 class LinearModes(eqx.Module):
     """Mass-normalised linear modes, seen at some sensors and driven by one force pattern.
@@ -27,6 +33,8 @@ class LinearModes(eqx.Module):
     damping_ratio_std: Float[Array, " mode"]
     sensors: tuple[str, ...] = eqx.field(static=True)
     mode_of_interest: int = eqx.field(static=True, default=0)
+    # 1σ, relative, of the modal masses 1/(Φ_r Φᵀb); None where nobody stated any.
+    modal_mass_std: Float[Array, " mode"] | None = None
 
     def __repr__(self) -> str:
         """A line for every mode; within `jax.jit` and for a batch, the fields' shapes."""
@@ -75,6 +83,8 @@ class LinearModesStd(NamedTuple):
 
     natural_frequency: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None  # rad/s
     damping_ratio: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
+    # Relative; None where nobody stated it (`UNSTATED_MODAL_MASS_STD`).
+    modal_mass: Shaped[np.ndarray | Array, " mode"] | list[float] | None = None
 
 
 def linear_modes(
@@ -92,7 +102,8 @@ def linear_modes(
 
     Arguments: natural frequencies in rad/s, damping as a fraction of critical, shapes at the
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
-    frequencies and damping ratios, without which they are known exactly.
+    frequencies and damping ratios, without which they are known exactly, and of modal masses
+    (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says.
     Raises `ValueError` that names the argument whose shape or value is wrong.
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])
@@ -140,8 +151,10 @@ def linear_modes(
         ),
     }
     for name, own in zip(LinearModesStd._fields, std or LinearModesStd(), strict=True):
-        own = np.zeros(n_modes) if own is None else _vector(f"std.{name}", own, n_modes)
-        numbers[f"{name}_std"] = own
+        if own is not None:
+            numbers[f"{name}_std"] = _vector(f"std.{name}", own, n_modes)
+        elif name != "modal_mass":
+            numbers[f"{name}_std"] = np.zeros(n_modes)
     modes = LinearModes(**numbers, sensors=tuple(names), mode_of_interest=mode_of_interest)
     # All at once: one by one they compile, a copy of every shape.
     return jax.device_put(modes, may_alias=False)

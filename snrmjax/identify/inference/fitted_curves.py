@@ -173,7 +173,7 @@ def as_backbone(
         modal_damping=PchipCurve(jnp.asarray(displacement), jnp.asarray(damping)),
         squared_frequency_covariance=jnp.asarray(covariance[0]),
         modal_damping_covariance=jnp.asarray(np.nan_to_num(covariance[1])),
-        modal_constant=fit.problem.modal_constant,
+        modal_constant=fit.problem.constant_of(fit.unknowns),
         smallest=jnp.asarray(measured.min()),
         largest=jnp.asarray(measured.max()),
         argument="displacement",

@@ -31,7 +31,7 @@ class ForcedMotion(eqx.Module):
     linear_std: Float[Array, " deviation"]
     constant: Float[Array, ""]  # A, 1/kg
     force: Float[Array, ""]  # N
-    load: Float[Array, ""]  # |A|F, m/s²
+    load: Float[Array, ""]  # |A|F, m/s², with the model's modal mass
     sensor: int = eqx.field(static=True)
 
     @classmethod
@@ -52,13 +52,22 @@ class ForcedMotion(eqx.Module):
         """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
         squared, damping = curves_at(self.unravel(vector), x, omega)
         size = (squared - omega**2) ** 2 + (omega * damping) ** 2
-        return size * (x / self.load) ** 2 - 1.0
+        return size * (x / self.load_of(vector)) ** 2 - 1.0
+
+    def load_of(self, vector: Array) -> Float[Array, ""]:
+        """|A|F in m/s², with the fit's modal mass."""
+        return self.load * self._mass_ratio(self.unravel(vector))
+
+    def _mass_ratio(self, unknowns: Unknowns) -> Float[Array, ""]:
+        """The model's modal mass over the fit's."""
+        return jnp.exp(-unknowns.linear[-1] * self.linear_std[-1])
 
     def velocity(self, vector: Array, x: Array, omega: Array) -> Complex[Array, "*batch"]:
         """Velocity at the fit's sensor, residual modes included."""
         unknowns, force = self.unravel(vector), self.force
         squared, damping = curves_at(unknowns, x, omega)
-        own = 1j * omega * self.constant * force / (squared - omega**2 + 1j * omega * damping)
+        constant = self.constant * self._mass_ratio(unknowns)
+        own = 1j * omega * constant * force / (squared - omega**2 + 1j * omega * damping)
         linear = with_deviations(self.modes, unknowns.linear, self.linear_std)
         rest = residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))
         return own + rest[..., self.sensor]

@@ -188,7 +188,7 @@ def _point_with_slopes(
             lambda x: motion.excess(vector, x, omega), (x,), (jnp.ones_like(x),)
         )
         squared, damping = curves_at(motion.unravel(vector), x, omega)
-        resonance = [squared / omega**2 - 1, omega * damping * x / motion.load - 1]
+        resonance = [squared / omega**2 - 1, omega * damping * x / motion.load_of(vector) - 1]
         return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
 
     def step(_: int, point: Array) -> Array:

@@ -42,7 +42,7 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
     Arguments: `data` are the steady states of the fit, with forces in newtons.
     Returns an `Identification` whose `notes` are those of the fit and of the points.
     """
-    points = identify_points(data, fit.modes)
+    points = identify_points(data, fit.modes_found)
     j = fit.modes.mode_of_interest
     own, ratio = (float(v[j]) for v in (fit.modes.natural_frequency, fit.modes.damping_ratio))
     curves = BackboneFit(
@@ -86,8 +86,7 @@ def without_bands(fit: JointFit, curves: Sequence[FittedResponse]) -> FitPredict
     Returns the resonances in order of amplitude, and the curves in their order.
     """
     modes, sensor = fit.modes, fit.data.sensor
-    j = modes.mode_of_interest
-    constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
+    constant = float(fit.problem.constant_of(fit.unknowns))
     linear = with_deviations(modes, fit.unknowns.linear, fit.prior.linear)
 
     def of_other_modes(frequency: np.ndarray, force: float) -> np.ndarray:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.family_base import AbstractCurve
+from snrmjax.identify.curves.packed_curve import packed
 from snrmjax.identify.inference.fitted_curves import (
     open_choice,
     values_at_displacement,
@@ -186,7 +187,7 @@ def _second_order(
 
 
 @compiled
-def _slopes_of_prior(curve: AbstractFamily) -> Float[Array, "row parameter"]:
+def _slopes_of_prior(curve: AbstractCurve) -> Float[Array, "row parameter"]:
     def of(parameters: Array) -> Array:
         return eqx.tree_at(lambda f: f.parameters, curve, parameters).prior_residuals()
 
@@ -198,7 +199,8 @@ def _bend_slopes(fit: JointFit) -> Float[np.ndarray, "row unknown"]:
 
     begin, blocks = 0, []
     for curve in (fit.unknowns.squared_frequency, fit.unknowns.modal_damping):
-        slopes = np.asarray(_slopes_of_prior(curve))
+        # One form of all families: one program. Its further rows and columns are zero.
+        slopes = np.asarray(_slopes_of_prior(packed(curve)))[:, : curve.parameters.shape[0]]
         end = begin + slopes.shape[1]
         blocks.append(np.pad(slopes, ((0, 0), (begin, len(fit.covariance) - end))))
         begin = end
@@ -243,7 +245,9 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     for k in range(n_linear):
         column = inverse[:, p - n_linear + k]
         if fit.prior.linear[k] > 0:
-            rows.append((f"linear parameter {k + 1}", "linear parameters", column[:, None]))
+            name = "modal mass" if k == n_linear - 1 else f"linear parameter {k + 1}"
+            kind = "modal mass" if k == n_linear - 1 else "linear parameters"
+            rows.append((name, kind, column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
     if np.any(fit.noise.autocorrelation > 0):

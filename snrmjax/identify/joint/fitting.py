@@ -3,6 +3,7 @@
 from enum import IntEnum
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -215,3 +216,19 @@ def _solve(
         throw=False,
     )
     return solution.value * unit, jnp.asarray(solution.result == optx.RESULTS.successful)
+
+
+def finite_fit(found: Fitted) -> Fitted:
+    """The fit; raises `ValueError` where its residuals are not finite."""
+    if found.status == FitStatus.NOT_FINITE:
+        raise ValueError(
+            "the residuals of the fit became infinite or undefined: try other families."
+        )
+    return found
+
+
+def as_guess(found: Fitted, problem: BalanceProblem) -> tuple[Unknowns, BalanceProblem]:
+    """A fit as another one starts from it: levels in their own units, its states' errors."""
+    raw = found.unknowns.level * found.problem.prior.level
+    guess = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
+    return guess, problem.with_data(correction=found.problem.data.correction)

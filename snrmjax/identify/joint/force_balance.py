@@ -6,7 +6,7 @@ curve, however the response folds.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
-from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import mapped
 from snrmjax.numerics.compiled import compiled
@@ -62,14 +62,16 @@ class Unknowns(eqx.Module):
     force_offset: Float[Array, ""]  # N, relative to the smallest force
     instrument_phase: Float[Array, ""]  # rad
     level: Float[Array, "level error"]
-    linear: Float[Array, " deviation"]
+    linear: Float[Array, " deviation"]  # as `PriorStd.linear`
 
 
 class PriorStd(eqx.Module):
     """Prior standard deviations (1σ) of the unknowns that have one."""
 
     level: Float[Array, " error"]  # of `LEVEL_ERRORS`, stated or estimated
-    linear: Float[Array, " deviation"]  # natural frequencies (rad/s), then damping ratios
+    # Of the residual modes' natural frequencies (rad/s) and damping ratios, then, relative, of the
+    # modal mass of the mode of interest.
+    linear: Float[Array, " deviation"]
 
 
 class BalanceProblem(eqx.Module):
@@ -85,9 +87,21 @@ class BalanceProblem(eqx.Module):
 
     @property
     def modal_constant(self) -> Float[Array, ""]:
-        """A = Φ_r Φᵀb in 1/kg: the acceleration at the sensor per newton of modal force."""
+        """A = Φ_r Φᵀb in 1/kg of the model: 1/|A| is its modal mass, seen from force and sensor."""
         r, j = self.data.sensor, self.modes.mode_of_interest
         return self.modes.mode_shape[r, j] * self.modes.participation[j]
+
+    def log_modal_mass(self, unknowns: Unknowns) -> Float[Array, ""]:
+        """By how much the fit's modal mass exceeds the model's: the logarithm of their ratio."""
+        return unknowns.linear[-1] * self.prior.linear[-1]
+
+    def modal_mass_of(self, unknowns: Unknowns) -> Float[Array, ""]:
+        """The modal mass in kg, seen from force and sensor, that the fit found."""
+        return 1 / jnp.abs(self.constant_of(unknowns))
+
+    def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
+        """`modal_constant` with the modal mass that the fit found."""
+        return self.modal_constant * jnp.exp(-self.log_modal_mass(unknowns))
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
@@ -108,6 +122,27 @@ def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " erro
             "is 0: state a damping ratio."
         )
     return np.array([gain, phase, 2 * frequency / own, damping / ratio if damping > 0 else 0.0])
+
+
+def stated_prior(
+    modes: LinearModes, level_std: Float[np.ndarray, " error"], free: Sequence[str]
+) -> PriorStd:
+    """Priors as they are stated, and for a modal mass of which nobody stated a 1σ.
+
+    A force gain that is `free` is one with the modal mass: the mass is then the model's.
+    """
+    keep = np.asarray(modes.residual_modes, dtype=int)
+    stated = modes.modal_mass_std
+    mass = UNSTATED_MODAL_MASS_STD if stated is None else float(stated[modes.mode_of_interest])
+    each = (modes.natural_frequency_std, modes.damping_ratio_std)
+    linear = [*(np.asarray(std)[keep] for std in each), [0.0 if "force_gain" in free else mass]]
+    return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)))
+
+
+def with_known_mass(problem: BalanceProblem) -> BalanceProblem:
+    """The problem with the model's modal mass for certain."""
+    linear = problem.prior.linear.at[-1].set(0.0)
+    return dataclasses.replace(problem, prior=dataclasses.replace(problem.prior, linear=linear))
 
 
 def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
@@ -184,7 +219,7 @@ def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> Line
         modes,
         (
             modes.natural_frequency.at[keep].add(change[: keep.size]),
-            modes.damping_ratio.at[keep].add(change[keep.size :]),
+            modes.damping_ratio.at[keep].add(change[keep.size : 2 * keep.size]),
         ),
     )
 
@@ -243,7 +278,7 @@ def force_balance(
     damping = damping * (1 + level[:, 3])
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
-    needed = stiffness * motion.velocity / (1j * omega * problem.modal_constant)
+    needed = stiffness * motion.velocity / (1j * omega * problem.constant_of(unknowns))
     # Relative to the recorded force, but with no advantage from a larger gain.
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit

@@ -176,7 +176,8 @@ def named_unknowns(
         ),
         *((name, unit) for name, unit in measurement.items() if name in free),
         *((f"level_{k}.{e}", "std") for k in levels for e in LEVEL_ERRORS),
-        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0])),
+        *((f"linear_{k}", "std") for k in range(unknowns.linear.shape[0] - 1)),
+        ("modal_mass", "std"),
     )
 
 

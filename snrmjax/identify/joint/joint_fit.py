@@ -15,6 +15,8 @@ from snrmjax.identify.joint.fitting import (
     FitSettings,
     FitStatus,
     Fitted,
+    as_guess,
+    finite_fit,
     fitted,
 )
 from snrmjax.identify.joint.force_balance import (
@@ -26,6 +28,8 @@ from snrmjax.identify.joint.force_balance import (
     balance_data,
     level_numbers,
     stated_level_std,
+    stated_prior,
+    with_known_mass,
 )
 from snrmjax.identify.joint.free_unknowns import (
     FREE,
@@ -41,6 +45,7 @@ from snrmjax.identify.joint.notes import (
     notes_on_autocorrelation,
     notes_on_families,
     notes_on_level_errors,
+    notes_on_modal_mass,
     notes_on_noise,
     notes_on_reach,
 )
@@ -52,6 +57,7 @@ from snrmjax.identify.joint.selection import (
     select_families,
 )
 from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
+from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
@@ -61,6 +67,7 @@ from snrmjax.numerics.result import AbstractResult, Variable
 _HERTZ = 2 * np.pi  # rad/s
 _ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
 _ROUGHLY = 2, 6  # the same, of a fit that another one starts from, and of rivals
+_ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
 _CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
 
 
@@ -159,6 +166,13 @@ class JointFit(AbstractResult):
         """Whether states are corrected for their most likely errors, their noise believed."""
         return bool(np.any(np.asarray(self.data.correction) != 0))
 
+    @property
+    def modes_found(self) -> LinearModes:
+        """The linear modes with the modal mass that the fit found for the mode of interest."""
+        share = jnp.exp(-self.problem.log_modal_mass(self.unknowns))
+        found = self.modes.participation.at[self.modes.mode_of_interest].multiply(share)
+        return eqx.tree_at(lambda m: m.participation, self.modes, found)
+
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
         return recorded_motion_of(self.unknowns, self.problem)
@@ -255,6 +269,7 @@ class JointFit(AbstractResult):
 
 
 @on_one_core
+@naming_wrong_phases
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -275,6 +290,9 @@ def fit_jointly(
     without any, or at the initial guess where that leads to clearly less noise. Where the stated
     noise is believed, every step corrects the states for their most likely errors (orthogonal
     distance regression). The other modes' frequencies and dampings stay inside their stated errors.
+    The modal mass is an unknown with its stated 1σ (`LinearModesStd.modal_mass`); where none is
+    stated it is the model's, unless states away from resonance ask for another. A free force gain
+    is one with it.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
@@ -306,12 +324,7 @@ def fit_jointly(
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
-    keep = np.asarray(modes.residual_modes, dtype=int)
-    linear_std = np.concatenate(
-        [np.asarray(modes.natural_frequency_std)[keep], np.asarray(modes.damping_ratio_std)[keep]]
-    )
-    prior = PriorStd(jnp.asarray(level_std), jnp.asarray(linear_std))
-    problem = BalanceProblem(measured, modes, prior)
+    problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
     request = FamilyRequest(parse_family(backbone), parse_family(damping), released)
 
     def select(guess: Unknowns, problem: BalanceProblem, *, components_too: bool) -> Selection:
@@ -323,7 +336,7 @@ def fit_jointly(
     def fit_from(
         chosen: Selection, guess: Unknowns, problem: BalanceProblem, rounds: tuple[int, int]
     ) -> Fitted:
-        level = _with_components(prior, chosen.components, measured.n_levels)
+        level = _with_components(problem.prior, chosen.components, measured.n_levels)
         std = problem.data.std.at[:, 3].set(chosen.jitter)
         noisy = BalanceProblem(problem.with_data(std=std).data, modes, level)
         start = _started(guess, chosen, level)
@@ -335,14 +348,22 @@ def fit_jointly(
     # variance comes first.
     first_guess = initial_guess(problem, released)
     chosen = select(first_guess, problem, components_too=False)
-    first = _finite(fit_from(chosen, first_guess, problem, _ROUGHLY))
-    guess, corrected = _as_guess(first, problem)
+    first = finite_fit(fit_from(chosen, first_guess, problem, _ROUGHLY))
+    if (
+        modes.modal_mass_std is None
+        and abs(first.unknowns.linear[-1]) < _ASKED * first.covariance[-1, -1] ** 0.5
+    ):
+        problem = with_known_mass(problem)
+        chosen = select(first_guess, problem, components_too=False)
+        first = finite_fit(fit_from(chosen, first_guess, problem, _ROUGHLY))
+    prior = problem.prior
+    guess, corrected = as_guess(first, problem)
     chosen = select(guess, corrected, components_too=True)
-    best = _finite(fit_from(chosen, guess, corrected, _ROUNDS))
+    best = finite_fit(fit_from(chosen, guess, corrected, _ROUNDS))
     if best.status != FitStatus.CONVERGED or (stated and best.components.contradicts_upward):
         # Where levels differ so much that no fit without that comes near, the guess is better.
         other = select(first_guess, problem, components_too=True)
-        again = _finite(fit_from(other, first_guess, problem, _ROUNDS))
+        again = finite_fit(fit_from(other, first_guess, problem, _ROUNDS))
         if again.components.noise < _CLEARLY_LESS * best.components.noise:
             chosen, best = other, again
 
@@ -362,6 +383,7 @@ def fit_jointly(
             errors = np.asarray(found.unknowns.level * last.prior.level)
             force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
             notes += notes_on_level_errors(errors, numbers, np.array(force))
+        notes += notes_on_modal_mass(found.unknowns, last, found.covariance)
         notes += notes_on_autocorrelation(found.autocorrelation)
         motion = recorded_motion_of(found.unknowns, last)
         notes += notes_on_reach(motion, level)
@@ -386,7 +408,7 @@ def fit_jointly(
         )
 
     rivals, failed = [], []
-    guess, corrected = _as_guess(best, problem)
+    guess, corrected = as_guess(best, problem)
     for one in chosen.rivals:
         pair: list[AbstractFamily] = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
         pair[one.curve == "damping"] = one.family
@@ -400,14 +422,6 @@ def fit_jointly(
     return told(best, FamilyChoice(chosen.table, tuple(rivals), tuple(failed), chosen.status))
 
 
-def _finite(found: Fitted) -> Fitted:
-    if found.status == FitStatus.NOT_FINITE:
-        raise ValueError(
-            "the residuals of the fit became infinite or undefined: try other families."
-        )
-    return found
-
-
 def _note_on_failed(families: FamilyChoice) -> str:
     every = len(families.failed) + len(families.rivals)
     listed = ", ".join(
@@ -418,13 +432,6 @@ def _note_on_failed(families: FamilyChoice) -> str:
         f"{len(families.failed)} of {every} competing families could not be fitted ({listed}): the "
         "bands do not include them."
     )
-
-
-def _as_guess(found: Fitted, problem: BalanceProblem) -> tuple[Unknowns, BalanceProblem]:
-    """A fit as another one starts from it: levels in their own units, its states' errors."""
-    raw = found.unknowns.level * found.problem.prior.level
-    guess = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
-    return guess, problem.with_data(correction=found.problem.data.correction)
 
 
 def _started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:

@@ -6,7 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.curves.family_base import family_in_words
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, Motion
+from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
+    BalanceProblem,
+    Motion,
+    Unknowns,
+)
 from snrmjax.identify.joint.ranking import FamilyCandidate
 from snrmjax.identify.joint.selection import SelectionStatus
 from snrmjax.identify.joint.variance_components import VarianceComponents
@@ -15,6 +20,7 @@ _BESIDE = 5.0  # degrees from resonance, with every state farther on the same si
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
 _LISTED = 8  # levels by name
 _TREND = 4  # levels: fewer are in order by chance too often
+_BREACH = 2.0  # standard deviations that are worth a word
 _COUNTS = 0.03  # weight of a family that could widen a band
 
 
@@ -138,6 +144,37 @@ def in_words(level_std: Float[np.ndarray, " error"]) -> str:
     }
     pairs = [(units[k], one) for k, one in zip(LEVEL_ERRORS, level_std, strict=True) if one > 0]
     return ", ".join(f"{factor * one:.2g}{name}" for (factor, name), one in pairs)
+
+
+def notes_on_modal_mass(
+    unknowns: Unknowns,
+    problem: BalanceProblem,
+    covariance: Float[np.ndarray, "unknown unknown"],
+) -> tuple[str, ...]:
+    """Which modal mass the damping is relative to: the model's, or one that the data ask for."""
+    prior = float(problem.prior.linear[-1])
+    model = 1 / abs(float(problem.modal_constant))
+    if prior == 0:
+        return ()
+    found = float(problem.modal_mass_of(unknowns))
+    std = found * prior * float(np.sqrt(covariance[-1, -1]))
+    away = abs(found / model - 1)
+    source = "assumed" if problem.modes.modal_mass_std is None else "stated"
+    if away > _BREACH * prior:
+        return (
+            f"the states away from resonance ask for a modal mass of {found:.4g} ± {std:.2g} kg, "
+            f"{100 * (found / model - 1):+.2g} % from the model's {model:.4g} kg and beyond its "
+            f"{source} 1σ of {100 * prior:.2g} %: check the linear test, the force calibration and "
+            "the mode shape at the sensor.",
+        )
+    if away > _BREACH * std / model:
+        return (
+            f"the states away from resonance ask for a modal mass of {found:.4g} ± {std:.2g} kg; "
+            f"the model has {model:.4g} kg (1σ {source}: {100 * prior:.2g} %). Damping ratios are "
+            f"relative to {found:.4g} kg: relative to the model's they are {100 * away:.2g} % "
+            f"{'larger' if found > model else 'smaller'}.",
+        )
+    return ()
 
 
 def notes_on_autocorrelation(correlation: Float[np.ndarray, " part"]) -> tuple[str, ...]:

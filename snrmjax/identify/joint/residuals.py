@@ -20,7 +20,6 @@ from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
-    PriorStd,
     Unknowns,
     Weighting,
     force_balance,
@@ -226,7 +225,7 @@ def balance_slopes(unknowns: Unknowns, problem: BalanceProblem) -> BalanceSlopes
 @compiled
 def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
     data = problem.data
-    unit = PriorStd(jnp.ones(len(LEVEL_ERRORS)), problem.prior.linear)
+    unit = dataclasses.replace(problem.prior, level=jnp.ones(len(LEVEL_ERRORS)))
     problem = dataclasses.replace(problem, prior=unit)
     weighting = weighting_at(unknowns, problem)
 
@@ -253,7 +252,7 @@ def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
     columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
     motion = motion_of(unknowns, problem, data.correction)
     # The balance is linear in the values of both curves.
-    by_damping = motion.velocity / (problem.modal_constant * motion.force)
+    by_damping = motion.velocity / (problem.constant_of(unknowns) * motion.force)
     by_squared = by_damping / (1j * data.frequency)
     level = unknowns.level[data.level]
 

@@ -89,6 +89,9 @@ class AbstractInternalResonance(AbstractAddedMode):
             participation=jnp.append(modes.participation, 0.0),
             natural_frequency_std=jnp.append(modes.natural_frequency_std, 0.0),
             damping_ratio_std=jnp.append(modes.damping_ratio_std, 0.0),
+            modal_mass_std=None
+            if modes.modal_mass_std is None
+            else jnp.append(modes.modal_mass_std, 0.0),
         )
         monomial = (*(modes.mode_of_interest,) * self.order, n_modes)
         return expanded_modes, _with_monomial(potential, monomial, self.coefficient, n_modes + 1)

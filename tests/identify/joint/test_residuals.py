@@ -33,7 +33,7 @@ def drawn(free, *, room=False):
         *([OMEGA, 3 * OMEGA], [0.012, 0.01], [[SHAPE, 1.5]], [PARTICIPATION, 2.0]),
         std=sj.model.LinearModesStd([1.0, 5.0], [1e-3, 2e-3]),
     )
-    prior = PriorStd(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3]))
+    prior = PriorStd(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3, 0.02]))
     data = balance_data(noisy(1, gain=0.01), modes)[0]
     problem = BalanceProblem(data, modes, prior)
     unknowns = initial_guess(problem, ())

@@ -89,7 +89,7 @@ def test_a_choice_of_families_that_did_not_settle_says_so(monkeypatch):
 
     one = modes()
     data, _ = balance_data(noisy(1), one)
-    problem = BalanceProblem(data, one, PriorStd(jnp.zeros(4), jnp.zeros(0)))
+    problem = BalanceProblem(data, one, PriorStd(jnp.zeros(4), jnp.zeros(1)))
     request = FamilyRequest(*(parse_family(TRUE[name]) for name in ("backbone", "damping")), ())
     settings = (problem, initial_guess(problem, ()), request)
     assert select_families(*settings, components_too=True).status == SelectionStatus.SETTLED

@@ -1,0 +1,111 @@
+"""A modal mass that the model has wrong, on states whose mass is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from truths.exact_states import (
+    CONSTANT,
+    OMEGA,
+    PARTICIPATION,
+    SHAPE,
+    TRUE,
+    noisy,
+    squared,
+    truth_at,
+)
+
+import snrmjax as sj
+from snrmjax.identify.inference.pointwise_view import identification_of_fit
+from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
+
+WRONG = 1.06  # the model's modal mass over the true one
+SPEEDS = np.linspace(0.2, 0.9, 5)
+
+
+def wrong_modes(std=None):
+    """The true mode but for its participation: a modal mass of 1.06 times the true one."""
+    return sj.model.linear_modes(
+        *([OMEGA], [0.012], [[SHAPE]], [PARTICIPATION / WRONG]),
+        std=sj.model.LinearModesStd(modal_mass=None if std is None else [std]),
+    )
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return sj.fit_jointly(noisy(3, gain=0.003), wrong_modes(), level_gain_std=0.003, **TRUE)
+
+
+def test_states_away_from_resonance_tell_it(fit):
+    told = summarise_fit(fit, ())["modal_mass"]
+    assert told["found"]
+    assert told["model_kg"] == pytest.approx(WRONG / CONSTANT, rel=1e-12)
+    assert abs(told["value_kg"] - 1 / CONSTANT) < 2.5 * told["std_kg"]
+    assert told["std_kg"] < 0.02 / CONSTANT
+    (note,) = (note for note in fit.notes if "modal mass" in note)
+    assert "5 %" in note
+
+
+def test_curves_are_relative_to_it(fit):
+    values, want = sj.identify.fitted_values(fit, SPEEDS), truth_at(SPEEDS)
+    z = [
+        (values.natural_frequency - np.sqrt(want[0])) / values.natural_frequency_std,
+        (values.modal_damping - want[1]) / values.modal_damping_std,
+    ]
+    assert np.max(np.abs(z)) < 3
+    # With the model's mass damping is wrong by 6 %, the mass's whole error.
+    assert np.max(np.abs(values.modal_damping / want[1] - 1)) < 0.03
+
+
+def test_predictions_and_points_have_it_too(fit):
+    (resonance,) = sj.identify.fitted_response(fit, 2.0)[0].resonances
+    # At phase resonance the damping's force is the whole: A F = 2ζ̃ω̃ v.
+    damping = truth_at(np.array([resonance.velocity]))[1]
+    assert damping[0] * resonance.velocity == pytest.approx(2.0 * CONSTANT, rel=0.03)
+    points = identification_of_fit(noisy(3, gain=0.003), fit).points
+    x = np.abs(np.asarray(points.mode_velocity)) / np.asarray(noisy(3, gain=0.003).frequency)
+    ratio = np.asarray(points.natural_frequency) / np.sqrt(squared(x))
+    # States below and above resonance miss in opposite directions where the mass is wrong.
+    phase = np.angle(np.asarray(points.mode_velocity))
+    assert abs(np.mean(ratio[phase > 0.5]) - np.mean(ratio[phase < -0.5])) < 3e-4
+
+
+def test_it_comes_back_from_its_file(fit, tmp_path):
+    write_joint_fit(tmp_path / "fit.json", fit)
+    again = read_joint_fit(tmp_path / "fit.json")
+    assert summarise_fit(again, ())["modal_mass"] == summarise_fit(fit, ())["modal_mass"]
+
+
+@pytest.mark.parametrize("case", ["stated to be exact", "near resonance", "gain free"])
+def test_where_nothing_tells_it_the_models_is_taken(case):
+    data = noisy(3, gain=0.003)
+    std = 0.0 if case == "stated to be exact" else None
+    free = ["force_gain"] if case == "gain free" else []
+    if case == "near resonance":
+        near = np.abs(np.angle(np.asarray(data.velocity)[:, 0])) < np.radians(3)
+        data = data.select(near)
+    found = sj.fit_jointly(data, wrong_modes(std), free=free, level_gain_std=0.003, **TRUE)
+    told = summarise_fit(found, ())["modal_mass"]
+    assert not told["found"]
+    assert told["value_kg"] == told["model_kg"]
+    assert not any("modal mass" in note for note in found.notes)
+
+
+def test_a_stated_error_is_kept_and_its_breach_said():
+    data = noisy(3, gain=0.003)
+    wide = sj.fit_jointly(data, wrong_modes(0.04), level_gain_std=0.003, **TRUE)
+    assert summarise_fit(wide, ())["modal_mass"]["found"]
+    tight = sj.fit_jointly(data, wrong_modes(0.01), level_gain_std=0.003, **TRUE)
+    (note,) = (note for note in tight.notes if "modal mass" in note)
+    assert "beyond its stated 1σ of 1 %" in note
+
+
+def test_a_model_file_states_it(tmp_path):
+    model = sj.model.structure(wrong_modes(0.03))
+    sj.io.write_model(tmp_path / "model.toml", model)
+    assert "modal_mass_std = 0.03" in (tmp_path / "model.toml").read_text()
+    again = sj.read_model(tmp_path / "model.toml").modes
+    assert again.modal_mass_std.tolist() == [0.03]
+    silent = dataclasses.replace(model, modes=wrong_modes())
+    sj.io.write_model(tmp_path / "model.toml", silent)
+    assert sj.read_model(tmp_path / "model.toml").modes.modal_mass_std is None
