@@ -43,11 +43,13 @@ from snrmjax.identify.joint.free_unknowns import (
 from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.notes import (
     notes_on_autocorrelation,
+    notes_on_failed_rivals,
     notes_on_families,
     notes_on_level_errors,
     notes_on_modal_mass,
     notes_on_noise,
     notes_on_reach,
+    notes_on_stated_errors,
 )
 from snrmjax.identify.joint.ranking import FamilyCandidate
 from snrmjax.identify.joint.selection import (
@@ -373,8 +375,8 @@ def fit_jointly(
         if found.status != FitStatus.CONVERGED:
             notes = (f"the fit has {FIT_MESSAGE[found.status]}; try a simpler family.",)
         notes += notes_on_families(families.status, families.candidates)
-        if families.failed:
-            notes += (_note_on_failed(families),)
+        lost = [(one.family, one.curve, one.weight) for one in families.failed]
+        notes += notes_on_failed_rivals(lost, len(families.rivals))
         wandering = 0.5 * float(last.data.std[0, 3])
         noise = (components, wandering, np.asarray(prior.level), measured.n_levels)
         notes += notes_on_noise(*noise, stated=stated, alike=bool(found.autocorrelation.any()))
@@ -383,6 +385,7 @@ def fit_jointly(
             errors = np.asarray(found.unknowns.level * last.prior.level)
             force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
             notes += notes_on_level_errors(errors, numbers, np.array(force))
+        notes += notes_on_stated_errors(np.asarray(found.unknowns.level), level_std)
         notes += notes_on_modal_mass(found.unknowns, last, found.covariance)
         notes += notes_on_autocorrelation(found.autocorrelation)
         motion = recorded_motion_of(found.unknowns, last)
@@ -420,18 +423,6 @@ def fit_jointly(
         else:
             failed.append(FailedRival(one.curve, one.family.label, one.weight, found.status))
     return told(best, FamilyChoice(chosen.table, tuple(rivals), tuple(failed), chosen.status))
-
-
-def _note_on_failed(families: FamilyChoice) -> str:
-    every = len(families.failed) + len(families.rivals)
-    listed = ", ".join(
-        f"{one.family} of the {one.curve}, weight {100 * one.weight:.0f} %"
-        for one in families.failed
-    )
-    return (
-        f"{len(families.failed)} of {every} competing families could not be fitted ({listed}): the "
-        "bands do not include them."
-    )
 
 
 def _started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:

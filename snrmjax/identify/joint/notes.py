@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2, norm
 
 from snrmjax.identify.curves.family_base import family_in_words
 from snrmjax.identify.joint.force_balance import (
@@ -21,7 +22,16 @@ _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
 _LISTED = 8  # levels by name
 _TREND = 4  # levels: fewer are in order by chance too often
 _BREACH = 2.0  # standard deviations that are worth a word
+_CHANCE = 1e-3  # of stated errors that are right to be called too small
 _COUNTS = 0.03  # weight of a family that could widen a band
+
+_COMMON = {
+    "gain": "all velocities share an error, or the force or the modal mass has one",
+    "phase": "the instruments turn all phases alike (free `instrument_phase`)",
+    "stiffness": "the natural frequency differs between this test and the others",
+    "damping": "the force or the modal mass has an error",
+}
+"""What an error that all levels share may be."""
 
 
 def notes_on_families(
@@ -52,6 +62,24 @@ def notes_on_families(
             f"to the end; {better[1]} may be better than {better[2]}."
         )
     return tuple(notes)
+
+
+def notes_on_failed_rivals(
+    failed: Sequence[tuple[str, str, float]], fitted: int
+) -> tuple[str, ...]:
+    """Competing families that the bands do not include.
+
+    Arguments: family, curve and weight of each; `fitted` is how many others the bands include.
+    """
+    if not failed:
+        return ()
+    listed = ", ".join(
+        f"{family} of the {curve}, weight {100 * weight:.0f} %" for family, curve, weight in failed
+    )
+    return (
+        f"{len(failed)} of {len(failed) + fitted} competing families could not be fitted "
+        f"({listed}): the bands do not include them.",
+    )
 
 
 def _what_was_open(candidates: Sequence[FamilyCandidate]) -> str:
@@ -144,6 +172,34 @@ def in_words(level_std: Float[np.ndarray, " error"]) -> str:
     }
     pairs = [(units[k], one) for k, one in zip(LEVEL_ERRORS, level_std, strict=True) if one > 0]
     return ", ".join(f"{factor * one:.2g}{name}" for (factor, name), one in pairs)
+
+
+def notes_on_stated_errors(
+    deviation: Float[np.ndarray, "level error"], stated: Float[np.ndarray, " error"]
+) -> tuple[str, ...]:
+    """Where levels deviate by more than their stated errors allow, or all in one direction.
+
+    Arguments: `deviation` of every level in units of its 1σ (`LEVEL_ERRORS`); `stated` 1σ, zero
+    where none is.
+    """
+    notes, n_levels = [], len(deviation)
+    for kind, name in enumerate(LEVEL_ERRORS):
+        own = deviation[:, kind]
+        if stated[kind] == 0 or float(own @ own) <= chi2.isf(_CHANCE, n_levels):
+            continue
+        size = in_words(np.where(np.arange(len(stated)) == kind, stated, 0.0))
+        needed = float(np.sqrt(np.mean(own**2)))
+        wanted = in_words(np.where(np.arange(len(stated)) == kind, needed * stated, 0.0))
+        shift = float(np.mean(own)) * np.sqrt(n_levels)
+        alike = ""
+        if abs(shift) > norm.isf(_CHANCE / 2) and n_levels > 1 and name in _COMMON:
+            alike = f"; their mean is {float(np.mean(own)):+.2g} of it: {_COMMON[name]}"
+        notes.append(
+            f"levels deviate by {needed:.2g} times the stated 1σ of {size} (root mean square; "
+            f"largest {np.max(np.abs(own)):.2g} times): the data ask for at least {wanted}, "
+            f"and the bands are too narrow if that is what levels vary by{alike}."
+        )
+    return tuple(notes)
 
 
 def notes_on_modal_mass(

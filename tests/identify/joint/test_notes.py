@@ -1,8 +1,12 @@
 """What a joint fit says in words of its data."""
 
+import dataclasses
+import re
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from truths.exact_states import modes, noisy
+from truths.exact_states import TRUE, modes, noisy
 from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
@@ -12,6 +16,7 @@ from snrmjax.identify.joint.notes import (
     notes_on_families,
     notes_on_level_errors,
     notes_on_noise,
+    notes_on_stated_errors,
 )
 from snrmjax.identify.joint.ranking import FamilyCandidate
 from snrmjax.identify.joint.selection import SelectionStatus
@@ -124,3 +129,35 @@ def test_one_screen_speaks_in_words_and_per_cent():
     text = repr(noisy_fit())
     assert "damping: viscous and quadratic damping of velocity" in text
     assert "@" not in text.splitlines()[0]
+
+
+class TestStatedErrorsOfLevels:
+    def test_a_breach_and_a_common_shift_are_said(self):
+        """Velocities 4 % too large in every level, of which 0.5 % is stated; the mass is known."""
+        data = noisy(5, per_level=25)
+        large = dataclasses.replace(data, velocity=1.04 * data.velocity)
+        known = dataclasses.replace(modes(), modal_mass_std=jnp.zeros(1))
+        fit = sj.fit_jointly(large, known, level_gain_std=0.005, **TRUE)
+        (note,) = (one for one in fit.notes if "levels deviate by" in one)
+        # The stated error holds them back: they tell less than the whole.
+        told = float(re.search(r"ask for at least ([\d.]+) % in gain", note)[1])
+        assert 1.0 < told < 4.0
+        assert "their mean is +" in note
+        assert "0.5 % in gain" in note
+
+    def test_opposite_deviations_have_no_common_part(self):
+        found = notes_on_stated_errors(
+            np.array([[4.0, 0, 0, 0], [-4.0, 0, 0, 0]]), np.array([0.01, 0, 0, 0])
+        )
+        assert "ask for at least 4 % in gain" in found[0]
+        assert "their mean" not in found[0]
+
+    def test_errors_as_stated_are_no_matter(self):
+        rng = np.random.default_rng(0)
+        stated = np.array([0.01, 0.01, 0, 0])
+        said = sum(
+            bool(notes_on_stated_errors(rng.normal(size=(5, 4)), stated)) for _ in range(500)
+        )
+        assert said <= 5  # one expected of 500 draws with two stated kinds; six are one in 1700
+        fit = sj.fit_jointly(noisy(5, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
+        assert not any("levels deviate by" in one for one in fit.notes)
