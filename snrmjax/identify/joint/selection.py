@@ -174,6 +174,7 @@ class _Scoring(NamedTuple):
     stated_std: Float[np.ndarray, " error"]  # of the levels' errors
     folds: list[np.ndarray]  # rows of every left-out part
     components: VarianceComponents
+    apart: tuple[int, ...] = ()  # of the levels' errors: those whose common part is an unknown
 
     @classmethod
     def of(cls, problem: BalanceProblem, known: BalanceSlopes, free: tuple[str, ...]) -> "_Scoring":
@@ -197,6 +198,12 @@ class _Scoring(NamedTuple):
             stated_std=stated,
             folds=[np.repeat(left_out == k, 2) for k in np.unique(left_out)],
             components=VarianceComponents(1.0, 0.0, tuple(stated.tolist())),
+            apart=tuple(
+                kind
+                for kind, name in enumerate(LEVEL_ERRORS)
+                if (name == "gain" and ("force_gain" in free or prior.linear[-1] > 0))
+                or (name == "phase" and "instrument_phase" in free)
+            ),
         )
 
     def with_components(self, components: VarianceComponents) -> "_Scoring":
@@ -249,6 +256,10 @@ class _Scoring(NamedTuple):
             problem.residuals * self.noise, problem.slopes * self.noise, std, problem.deviation
         )
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
+        for kind in self.apart:
+            # Levels vary about their common part: that is the gain's, the mass's or the phase's.
+            own = raw.slopes[:, index[:, kind]]
+            raw.slopes[:, index[:, kind]] = own - own.mean(axis=1, keepdims=True)
         pair = (squared, damping)
         bends = [self.bends(problem, pair, k) for k in range(2) if _is_smooth(pair[k])]
         return estimated_components(raw, index, look=look, bends=bends)
