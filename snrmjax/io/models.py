@@ -113,7 +113,8 @@ def read_model(path: FilePath) -> Structure:
 
     Files are in Hz and degrees and count modes from one; the result is in rad/s and rad and
     counts from zero. The sensors are those of the modes' shapes, in the first mode's order; a
-    model without a name takes the file's.
+    model without a name takes the file's. A mode may state the 1σ of its linear test:
+    `frequency_std_hz`, `damping_ratio_std` and, relative, `modal_mass_std`.
 
     Returns the structure. Raises `ValueError` that names file, table, key, value and what was
     expected; a near miss is suggested for an unknown name.
