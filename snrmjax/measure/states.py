@@ -270,8 +270,8 @@ def check_phases(data: SteadyStates, purpose: str) -> None:
 
 def check_force(data: SteadyStates, purpose: str) -> None:
     """Raise `ValueError` where no state has a force; `purpose` is what needs it."""
-    known: Any = jnp.isfinite if isinstance(data.force, jax.core.Tracer) else np.isfinite
-    known = known(_on_host(data, "force").force)
+    force: Any = _on_host(data, "force").force
+    known = force.__array_namespace__().isfinite(force)
     # Within `jax.jit` nothing has a value yet; within a derivative this still has one.
     if isinstance(known, jax.core.Tracer) or np.any(known):
         return

@@ -13,7 +13,7 @@ _SHOWN = 12  # modes, in a text
 UNSTATED_MODAL_MASS_STD = 0.05
 """1σ, relative, of a modal mass of which nobody stated one.
 
-Repeated modal tests find modal masses to some per cent; the drive point's reading counts twice.
+An assumption: careful modal tests of one structure agree to some per cent in their modal masses.
 """
 
 

@@ -26,6 +26,7 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
+from snrmjax.model.modes import LinearModes
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
@@ -343,12 +344,23 @@ def scales_of(predictions: Predictions) -> MotionScales:
 
 
 def _scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
-    modes, j, states = model.modes, model.modes.mode_of_interest, chosen.states
-    speed, omega, force = (
+    states = chosen.states
+    columns = (
         np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
     )
-    shape = abs(float(modes.mode_shape[chosen.sensors[0], j]))
-    amplitude = speed / omega / shape
+    return motion_scales(model.modes, chosen.sensors[0], *columns)
+
+
+def motion_scales(
+    modes: LinearModes,
+    sensor: int,
+    speed: Float[np.ndarray, " state"],
+    omega: Float[np.ndarray, " state"],
+    force: Float[np.ndarray, " state"],
+) -> MotionScales:
+    """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
+    j = modes.mode_of_interest
+    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
     return MotionScales(
         amplitude=float(np.median(amplitude)),
         largest=float(np.max(amplitude)),

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, unfitted
+from snrmjax.diagnose.misfit.predictions import motion_scales
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import DETECTED
 from snrmjax.measure.states import SteadyStates
@@ -82,16 +83,6 @@ def scales_of_motions(
     modes: LinearModes, data: SteadyStates, rows: Int[np.ndarray, " state"], sensor: int
 ) -> MotionScales:
     """Typical sizes of measured motions: of some rows, at one sensor."""
-    j = modes.mode_of_interest
     speed = np.abs(np.asarray(data.velocity)[rows, sensor])
     omega, force = np.asarray(data.frequency)[rows], np.asarray(data.force)[rows]
-    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
-    return MotionScales(
-        amplitude=float(np.median(amplitude)),
-        largest=float(np.max(amplitude)),
-        frequency=float(modes.natural_frequency[j]),
-        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
-        receptance=float(np.median(speed / omega / force)),
-        smallest_force=float(np.min(force)),
-        damping_ratio=float(modes.damping_ratio[j]),
-    )
+    return motion_scales(modes, sensor, speed, omega, force)

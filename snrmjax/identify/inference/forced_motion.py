@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.identify.inference.fitted_curves import beyond_estimation
-from snrmjax.identify.joint.force_balance import Unknowns, with_deviations
+from snrmjax.identify.joint.force_balance import Unknowns, log_modal_mass, with_deviations
 from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.model.modes import LinearModes, residual_velocity
@@ -29,22 +29,19 @@ class ForcedMotion(eqx.Module):
     unravel: Unravel
     modes: LinearModes
     linear_std: Float[Array, " deviation"]
-    constant: Float[Array, ""]  # A, 1/kg
+    constant: Float[Array, ""]  # A, 1/kg, with the model's modal mass
     force: Float[Array, ""]  # N
-    load: Float[Array, ""]  # |A|F, m/s², with the model's modal mass
     sensor: int = eqx.field(static=True)
 
     @classmethod
     def of(cls, fit: JointFit, force: float) -> "ForcedMotion":
         """A fit under a force in N."""
-        constant = fit.problem.modal_constant
         return cls(
             unravel=fit.packed().unravel,
             modes=fit.modes,
             linear_std=fit.prior.linear,
-            constant=constant,
+            constant=fit.problem.modal_constant,
             force=jnp.asarray(float(force)),
-            load=jnp.asarray(abs(float(constant)) * force),
             sensor=fit.data.sensor,
         )
 
@@ -56,17 +53,17 @@ class ForcedMotion(eqx.Module):
 
     def load_of(self, vector: Array) -> Float[Array, ""]:
         """|A|F in m/s², with the fit's modal mass."""
-        return self.load * self._mass_ratio(self.unravel(vector))
+        return jnp.abs(self._constant_of(self.unravel(vector))) * self.force
 
-    def _mass_ratio(self, unknowns: Unknowns) -> Float[Array, ""]:
-        """The model's modal mass over the fit's."""
-        return jnp.exp(-unknowns.linear[-1] * self.linear_std[-1])
+    def _constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
+        """A in 1/kg with the fit's modal mass."""
+        return self.constant * jnp.exp(-log_modal_mass(unknowns, self.linear_std))
 
     def velocity(self, vector: Array, x: Array, omega: Array) -> Complex[Array, "*batch"]:
         """Velocity at the fit's sensor, residual modes included."""
         unknowns, force = self.unravel(vector), self.force
         squared, damping = curves_at(unknowns, x, omega)
-        constant = self.constant * self._mass_ratio(unknowns)
+        constant = self._constant_of(unknowns)
         own = 1j * omega * constant * force / (squared - omega**2 + 1j * omega * damping)
         linear = with_deviations(self.modes, unknowns.linear, self.linear_std)
         rest = residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))

@@ -93,7 +93,7 @@ class BalanceProblem(eqx.Module):
 
     def log_modal_mass(self, unknowns: Unknowns) -> Float[Array, ""]:
         """By how much the fit's modal mass exceeds the model's: the logarithm of their ratio."""
-        return unknowns.linear[-1] * self.prior.linear[-1]
+        return log_modal_mass(unknowns, self.prior.linear)
 
     def modal_mass_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """The modal mass in kg, seen from force and sensor, that the fit found."""
@@ -102,6 +102,11 @@ class BalanceProblem(eqx.Module):
     def constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """`modal_constant` with the modal mass that the fit found."""
         return self.modal_constant * jnp.exp(-self.log_modal_mass(unknowns))
+
+
+def log_modal_mass(unknowns: Unknowns, linear_std: Float[Array, " deviation"]) -> Float[Array, ""]:
+    """The logarithm of the fit's modal mass over the model's: the last of the deviations."""
+    return unknowns.linear[-1] * linear_std[-1]
 
 
 def stated_level_std(model: Structure | LinearModes) -> Float[np.ndarray, " error"]:
