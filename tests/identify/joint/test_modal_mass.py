@@ -17,7 +17,8 @@ from truths.exact_states import (
 )
 
 import snrmjax as sj
-from snrmjax.identify.inference.pointwise_view import identification_of_fit
+from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
 
 MEASURED = Path(__file__).resolve().parents[4] / "shared" / "data" / "brake_reuss_beam"
@@ -64,6 +65,10 @@ def test_predictions_and_points_have_it_too(fit):
     # At phase resonance the damping's force is the whole: A F = 2ζ̃ω̃ v.
     damping = truth_at(np.array([resonance.velocity]))[1]
     assert damping[0] * resonance.velocity == pytest.approx(2.0 * CONSTANT, rel=0.03)
+    assert as_backbone(fit).modal_constant == pytest.approx(CONSTANT, rel=0.02)
+    (plain,) = without_bands(fit, sj.identify.fitted_response(fit, 2.0)).resonances
+    ratio = damping[0] / (2 * resonance.frequency)
+    assert plain.damping_ratio == pytest.approx(ratio, rel=0.03)
     points = identification_of_fit(noisy(3, gain=0.003), fit).points
     x = np.abs(np.asarray(points.mode_velocity)) / np.asarray(noisy(3, gain=0.003).frequency)
     ratio = np.asarray(points.natural_frequency) / np.sqrt(squared(x))
