@@ -261,9 +261,9 @@ BROKEN = {
 
 
 def test_the_kinds_are_those_of_the_library():
-    from snrmjax.model.effects import EFFECTS
+    from snrmjax.model.effects import EFFECTS, LAWS
 
-    assert set(EFFECTS) == KINDS
+    assert {*EFFECTS, *LAWS} == KINDS
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Responses that models predict under the forces of a test, and their resonances."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -7,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
@@ -135,7 +135,10 @@ def level_simulations(
     every, seen = list(forces.values()), [level for level in forces if level in without_level]
     after = [completed] * len(every) + [without_level[level] for level in seen]
     loads = [force_gain * force for force in (*every, *(forces[level] for level in seen))]
-    same = with_idle_effects(model, [e.kind for e in completed.effects[len(model.effects) :]])
+    modes, j = model.modes, model.modes.mode_of_interest
+    own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    idle = tuple(e.idle(*own) for e in completed.effects[len(model.effects) :])
+    same = dataclasses.replace(model, effects=(*model.effects, *idle))
     found = responses([*[same] * len(every), *after], data, [*every, *loads])
     old, new = found[: len(every)], found[len(every) :]
     return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))

@@ -20,7 +20,8 @@ from snrmjax.io.files import (
 )
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
-from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.effect_metadata import Entries
+from snrmjax.model.effects import EFFECTS, LAWS, effect_class, make_effect
 from snrmjax.model.modes import (
     UNSTATED_MODAL_MASS_STD,
     LinearModes,
@@ -91,6 +92,16 @@ class _Table(NamedTuple):
             if not rule.good(value):
                 raise self.refusal(key, rule.expected, value)
         return float(value)
+
+    def numbers(self, key: str, *rules: Rule) -> list[float]:
+        """A list of finite numbers that keep their rules."""
+        value = self.entries[key]
+        if not isinstance(value, list):
+            raise self.refusal(key, "a list of numbers", value)
+        return [
+            _Table({key: one}, f"{self.place}, knot {k + 1},").number(key, *rules)
+            for k, one in enumerate(value)
+        ]
 
     def table(self, key: str, place: str) -> "_Table":
         """A table inside this one."""
@@ -253,14 +264,23 @@ def _effect(table: _Table) -> AbstractEffect:
     kind = table.entries["kind"]
     if not isinstance(kind, str):
         raise table.refusal("kind", "a text", kind)
-    if kind in EFFECTS:
-        wanted = EFFECTS[kind].parameters()
+    every = (*EFFECTS, *LAWS)
+    if kind in every:
+        wanted = effect_class(kind).parameters()
         table = _Table(table.entries, f"{table.place} ({kind})")
         table.check_keys(("kind", *wanted))
-        values = {name: table.number(name, *one.rules) for name, one in wanted.items()}
-        return make_effect(kind, values)
-    near = suggestion(kind, EFFECTS)
-    known = "" if near else f" (known are {', '.join(sorted(EFFECTS))})"
+        values: dict[str, float | np.ndarray] = {
+            name: table.number(name, *one.rules)
+            if one.entries is Entries.ONE
+            else np.array(table.numbers(name, *one.rules))
+            for name, one in wanted.items()
+        }
+        try:
+            return make_effect(kind, values)
+        except ValueError as error:
+            raise ValueError(f"{table.place} cannot be read: {error}") from error
+    near = suggestion(kind, every)
+    known = "" if near else f" (known are {', '.join(sorted(every))})"
     raise ValueError(f"{table.place} has the unknown kind {shown(kind)}{near}{known}.")
 
 
@@ -345,10 +365,13 @@ def _shape_entry(modes: LinearModes, shape: object) -> dict[str, float]:
 
 
 def _effect_entry(effect: AbstractEffect) -> dict[str, object]:
-    if effect.kind not in EFFECTS:
+    if effect.kind not in (*EFFECTS, *LAWS):
         raise ValueError(f"an effect to be written must be of a known kind, not {effect.kind!r}.")
-    names = effect_parameters(effect.kind)
-    return {"kind": effect.kind} | {name: _one(name, getattr(effect, name)) for name in names}
+    entry: dict[str, object] = {"kind": effect.kind}
+    for name, one in effect_class(effect.kind).parameters().items():
+        value = getattr(effect, name)
+        entry[name] = _one(name, value) if one.entries is Entries.ONE else np.ravel(value).tolist()
+    return entry
 
 
 def _one(name: str, value: object) -> float:

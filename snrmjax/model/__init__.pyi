@@ -21,7 +21,7 @@ from .effect_metadata import (
     parameter,
 )
 from .effect_shape import shape_of
-from .effects import EFFECTS, describe_effects, make_effect, register_effect
+from .effects import EFFECTS, LAWS, describe_effects, make_effect, register_effect
 from .modes import (
     LinearModes,
     LinearModesStd,
@@ -38,6 +38,7 @@ __all__ = [
     "CURVED_BEAM_FORCES",
     "EFFECTS",
     "FLAT_BEAM_FORCES",
+    "LAWS",
     "AbstractForce",
     "AbstractHysteresis",
     "AbstractKinked",

@@ -117,6 +117,13 @@ class AbstractEffect(eqx.Module):
         _, *others = cls.parameters().values()
         return cls(*(jnp.asarray(value) for value in (0.0, *(one.typical for one in others))))
 
+    def idle(self, natural_frequency: float, damping_ratio: float) -> Self:
+        """An effect like this one, of the same structure, that does nothing.
+
+        Arguments: see `without_strength`.
+        """
+        return type(self).without_strength(natural_frequency, damping_ratio)
+
 
 class AbstractForce(AbstractEffect):
     """A force on the mode of interest, known over one cycle of a steady motion."""

@@ -69,6 +69,14 @@ FURTHER_DAMPING = Prior(1e-5, 0.2)
 """Damping ratios that a further mode may have."""
 
 
+class Entries(StrEnum):
+    """Whether a parameter is one number, or one for every knot of a law."""
+
+    ONE = "one"
+    KNOTS = "knots"  # where the knots are, rising: chosen, not fitted
+    VALUES = "values"  # at the knots
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """One parameter of an effect: its unit, what it is, and which values it may have.
@@ -77,6 +85,7 @@ class Parameter:
     value from which a fit begins and which the parameter has while the effect has no strength.
     `exponent` names, for the coefficient c of a law c x^p, the parameter p: the coefficient is
     that at unit amplitude, and a fit steps in c R^(p − 1), at a typical amplitude R, instead.
+    `entries` says of a law's parameters that they are a number for every knot.
     """
 
     unit: str = ""
@@ -85,6 +94,7 @@ class Parameter:
     prior: Prior = ANY
     typical: float = 1.0
     exponent: str | None = None
+    entries: Entries = Entries.ONE
 
 
 def parameter(
@@ -95,12 +105,13 @@ def parameter(
     prior: Prior = ANY,
     typical: float = 1.0,
     exponent: str | None = None,
+    entries: Entries = Entries.ONE,
 ) -> Any:
     """A field of an effect that is one of its parameters; the arguments are `Parameter`'s.
 
     The first parameter is the effect's strength: at zero the effect does nothing.
     """
-    stated = Parameter(unit, meaning, rules, prior, typical, exponent)
+    stated = Parameter(unit, meaning, rules, prior, typical, exponent, entries)
     return eqx.field(metadata={"parameter": stated})
 
 

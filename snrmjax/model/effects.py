@@ -8,7 +8,17 @@ import numpy as np
 from jaxtyping import Array
 
 from snrmjax.model.effect_base import AbstractEffect
+from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.library.damping import CubicDamping, QuadraticDamping, VanDerPolDamping
+from snrmjax.model.library.free_laws import (
+    AbstractLaw,
+    DampingLaw,
+    DisplacementDampingLaw,
+    SlipLaw,
+    StiffnessLaw,
+    UnevenDampingLaw,
+    UnevenStiffnessLaw,
+)
 from snrmjax.model.library.friction import CoulombFriction, IwanMicroslip, JenkinsSlider
 from snrmjax.model.library.internal_resonances import (
     InternalResonanceOneToThree,
@@ -108,6 +118,19 @@ EFFECTS: dict[str, type[AbstractEffect]] = EffectTable(
 )
 """The effects by the kind that files give them; `print(EFFECTS)` is a table of them."""
 
+LAWS: dict[str, type[AbstractLaw]] = {
+    law.kind: law
+    for law in (
+        StiffnessLaw,
+        UnevenStiffnessLaw,
+        DampingLaw,
+        UnevenDampingLaw,
+        DisplacementDampingLaw,
+        SlipLaw,
+    )
+}
+"""The laws given by a table of knots, by their kind: drawn where no effect of the library holds."""
+
 # `help(EFFECTS)` shows the docstring of its class.
 EffectTable.__doc__ = f"{EffectTable.__doc__}\n\n{describe_effects()}"
 
@@ -132,7 +155,7 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     Returns the class. Raises `ValueError` for a kind that exists already and for a class without
     parameters.
     """
-    if effect.kind in EFFECTS:
+    if effect.kind in (*EFFECTS, *LAWS):
         raise ValueError(f"there is an effect of the kind {effect.kind!r} already.")
     if not effect.parameters():
         raise ValueError(f"{effect.kind!r} must have a parameter: a field without a default.")
@@ -140,24 +163,33 @@ def register_effect(effect: type[AbstractEffect]) -> type[AbstractEffect]:
     return effect
 
 
+def effect_class(kind: str) -> type[AbstractEffect]:
+    """The class of a kind of effect, of the library, of a user or a drawn law.
+
+    Raises `KeyError` for an unknown kind.
+    """
+    return EFFECTS[kind] if kind in EFFECTS else LAWS[kind]
+
+
 def effect_parameters(kind: str) -> tuple[str, ...]:
     """Names of the parameters of one kind of effect, in the order of its constructor."""
-    return tuple(EFFECTS[kind].parameters())
+    return tuple(effect_class(kind).parameters())
 
 
-def make_effect(kind: str, parameters: Mapping[str, float | Array]) -> AbstractEffect:
+def make_effect(kind: str, parameters: Mapping[str, float | Array | np.ndarray]) -> AbstractEffect:
     """Build an effect from its kind and its parameters by name.
 
     Raises `ValueError` for an unknown kind, for an unknown, a missing and a non-finite parameter,
-    and for one out of its range (traced parameters are not looked at).
+    for one out of its range (traced parameters are not looked at), and for a law whose tables
+    have not two knots or more, or different numbers of them, or knots that do not rise.
 
     >>> drag = make_effect("quadratic_damping", {"coefficient": 2.0})
     >>> drag.cycle_force(jnp.array([1.0, 0.0]), jnp.array([0.0, -3.0]))
     Array([  0., -18.], dtype=float64)
     """
-    if kind not in EFFECTS:
-        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted(EFFECTS)}.")
-    wanted = EFFECTS[kind].parameters()
+    if kind not in (*EFFECTS, *LAWS):
+        raise ValueError(f"unknown effect kind {kind!r}; known are {sorted((*EFFECTS, *LAWS))}.")
+    wanted = effect_class(kind).parameters()
     if set(parameters) != set(wanted):
         raise ValueError(f"{kind} takes the parameters {list(wanted)}, not {sorted(parameters)}.")
     for name, value in parameters.items():
@@ -171,4 +203,34 @@ def make_effect(kind: str, parameters: Mapping[str, float | Array]) -> AbstractE
                     raise ValueError(
                         f"`{name}` of {kind} must be {rule.expected}, but is {entry:g}."
                     )
-    return EFFECTS[kind](**{k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()})
+    arrays = {k: jnp.asarray(v, dtype=jnp.float64) for k, v in parameters.items()}
+    _check_tables(kind, arrays)
+    return effect_class(kind)(**arrays)
+
+
+def _check_tables(kind: str, arrays: Mapping[str, Array]) -> None:
+    """Refuse tables of a law that are no table, and one number where a table belongs."""
+    shape: tuple[int, ...] = ()
+    for name, one in effect_class(kind).parameters().items():
+        value = arrays[name]
+        if one.entries is Entries.ONE:
+            continue
+        if value.ndim != 1 or value.shape[0] < 2:
+            raise ValueError(
+                f"`{name}` of {kind} must be two numbers or more, one for every knot, but has the "
+                f"shape {value.shape}."
+            )
+        if shape and value.shape != shape:
+            raise ValueError(
+                f"`{name}` of {kind} must have {shape[0]} numbers, one for every knot, but has "
+                f"{value.shape[0]}."
+            )
+        shape = value.shape
+        if one.entries is Entries.KNOTS and not isinstance(value, jax.core.Tracer):
+            steps = np.diff(np.asarray(value))
+            if np.any(steps <= 0):
+                place = int(np.argmax(steps <= 0))
+                raise ValueError(
+                    f"`{name}` of {kind} must rise from knot to knot, but has "
+                    f"{float(value[place + 1]):g} after {float(value[place]):g}."
+                )

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
 
@@ -20,7 +21,9 @@ def parameter_names(model: Structure) -> tuple[str, ...]:
 
     Names such as "potential.1111", "mode_1.natural_frequency" (rad/s), "mode_1.damping_ratio",
     "mode_1.participation" (kg^-1/2) and "quadratic_damping.coefficient"; of several effects of a
-    kind the second is "quadratic_damping_2". Parameters that are arrays have no name.
+    kind the second is "quadratic_damping_2". The values of a law at its knots are
+    "stiffness_law.restoring_force_1" and so on; the knots themselves are no parameters, nor are
+    other arrays.
 
     >>> from snrmjax.model import curved_beam
     >>> parameter_names(curved_beam())[:3]
@@ -51,9 +54,9 @@ def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
 
 def parameter_value(model: Structure, name: str) -> Float[Array, ""]:
     """The number that a name of `parameter_names` stands for."""
-    part, entry, field = _places(model)[name]
+    part, entry, field, knot = _places(model)[name]
     if part == "effects":
-        return jnp.asarray(getattr(model.effects[entry], field))
+        return jnp.asarray(getattr(model.effects[entry], field))[knot]
     return getattr(getattr(model, part), field)[entry]
 
 
@@ -66,18 +69,18 @@ def parameter_values(model: Structure) -> dict[str, float]:
     }
     return {
         name: float(
-            getattr(model.effects[entry], field)
+            np.asarray(getattr(model.effects[entry], field))[knot]
             if part == "effects"
             else arrays[part, field][entry]
         )
-        for name, (part, entry, field) in places.items()
+        for name, (part, entry, field, knot) in places.items()
     }
 
 
 def stated_stds(model: Structure) -> dict[str, float]:
     """1σ of the numbers for which the model states one."""
     found = {}
-    for name, (part, entry, field) in _places(model).items():
+    for name, (part, entry, field, _) in _places(model).items():
         std = getattr(getattr(model, part), f"{field}_std", None)
         if std is not None and (own := float(np.asarray(std)[entry])) > 0:
             found[name] = own
@@ -86,7 +89,7 @@ def stated_stds(model: Structure) -> dict[str, float]:
 
 def stated_std(model: Structure, name: str) -> float:
     """1σ that the model states for a number, 0 where it states none."""
-    part, entry, field = _places(model)[name]
+    part, entry, field, _ = _places(model)[name]
     std = getattr(getattr(model, part), f"{field}_std", None)
     return 0.0 if std is None else float(std[entry])
 
@@ -116,6 +119,7 @@ class _Place(NamedTuple):
     part: str
     entry: int
     field: str
+    knot: tuple[int, ...] = ()  # of a law's field the place in it
 
 
 def _places(model: Structure) -> dict[str, _Place]:
@@ -130,9 +134,14 @@ def _places(model: Structure) -> dict[str, _Place]:
         kinds.append(effect.kind)
         number = kinds.count(effect.kind)
         head = effect.kind if number == 1 else f"{effect.kind}_{number}"
-        for field in effect.parameters():
-            if jnp.ndim(getattr(effect, field)) == 0:
+        for field, one in effect.parameters().items():
+            value = getattr(effect, field)
+            if jnp.ndim(value) == 0:
                 places[f"{head}.{field}"] = _Place("effects", k, field)
+            elif one.entries is Entries.VALUES and jnp.ndim(value) == 1:
+                for knot in range(value.shape[0]):
+                    name = f"{head}.{field}_{knot + 1}"
+                    places[name] = _Place("effects", k, field, (knot,))
     return places
 
 
@@ -141,10 +150,12 @@ def _replaced(
 ) -> Structure:
     effects = list(model.effects)
     entries: dict[tuple[str, str], dict[int, int]] = {}
-    for k, (part, entry, field) in enumerate(places):
+    for k, (part, entry, field, knot) in enumerate(places):
         if part == "effects":
-            number = {field: jnp.asarray(values[k])}
-            effects[entry] = dataclasses.replace(effects[entry], **number)
+            number = jnp.asarray(values[k])
+            if knot:
+                number = jnp.asarray(getattr(effects[entry], field)).at[knot].set(number)
+            effects[entry] = dataclasses.replace(effects[entry], **{field: number})
         else:
             entries.setdefault((part, field), {})[entry] = k
     changed = {part: getattr(model, part) for part, _ in entries}

@@ -81,6 +81,17 @@ def settled_positions(
     return jnp.where(sources == untouched, 0.0, position)
 
 
+def slipped_position(
+    displacement: Float[Array, " time"], slip_displacement: Float[Array, " slider"]
+) -> Float[Array, "time slider"]:
+    """`settled_positions` of a cycle between two turning points; NaN where there are more."""
+    slip, q = slip_displacement, displacement[:, None]
+    high, low, falling = _turning_points(displacement)
+    down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
+    stuck = jnp.clip(0.0, high - slip, low + slip)
+    return jnp.where(2 * slip < high - low, jnp.where(falling[:, None], down, up), stuck)
+
+
 class AbstractSliders(AbstractHysteresis):
     """Friction by sliders side by side; the states are their positions in kg^1/2 m."""
 
@@ -166,11 +177,7 @@ class JenkinsSlider(AbstractSliders):
         self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
     ) -> Float[Array, " time"]:
         """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
-        q, slip = displacement, self.slip_displacement
-        high, low, falling = _turning_points(q)
-        down, up = jnp.minimum(high - slip, q + slip), jnp.maximum(low + slip, q - slip)
-        stuck = jnp.clip(0.0, high - slip, low + slip)
-        position = jnp.where(2 * slip < high - low, jnp.where(falling, down, up), stuck)
+        position = slipped_position(displacement, jnp.asarray(self.slip_displacement)[None])[:, 0]
         return -self.stiffness * position
 
 
