@@ -2,12 +2,14 @@
 
 import textwrap
 from collections.abc import Iterable, Mapping
+from itertools import product
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut
+from snrmjax.diagnose.checks.probabilities import answer_name
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
 from snrmjax.diagnose.completed_model import CompletedStatus
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
@@ -23,6 +25,7 @@ AS_NOISE = 1.3
 """Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
 
 _WIDTH = 98  # of the notes, columns
+_LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
 
 
 class Estimate(NamedTuple):
@@ -42,6 +45,7 @@ class Answer(NamedTuple):
     completed: Structure | None  # None where no structure can have these parameters
     completed_status: CompletedStatus
     force_gain: float  # acting force over recorded one, where a gain was free; else 1
+    probabilities: dict[str, float]  # of all answers considered; effects are joined by `+`
 
 
 class Gap(NamedTuple):
@@ -108,6 +112,23 @@ class Diagnosis(AbstractResult):
         return self.answer.parameters
 
     @property
+    def probabilities(self) -> dict[str, float]:
+        """Of every answer considered, the most probable first; effects are joined by `+`.
+
+        `none`, `unknown` and, where noise is stated, `noise_rejected` are among them.
+        """
+        return self.answer.probabilities
+
+    @property
+    def probability(self) -> float:
+        """That the answer given is right: its verdict, or one effect of every class."""
+        verdict = Verdict(self.verdict)
+        if not verdict.is_answer:
+            return self.probabilities.get(verdict.value, 0.0)
+        given = {answer_name(kinds) for kinds in product(*self.candidates)}
+        return float(sum(self.probabilities.get(name, 0.0) for name in given))
+
+    @property
     def completed(self) -> Structure | None:
         """The model with the effects; None where `answer.completed_status` is `NOT_PHYSICAL`."""
         return self.answer.completed
@@ -122,6 +143,7 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult.summary`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         lines = [f"Diagnosis: {self.verdict_sentence}"]
+        lines += textwrap.wrap(f"probabilities: {self.most_probable()}", _WIDTH)
         for name, (value, std) in self.parameters.items():
             stated = unit_of(name)
             unit = "" if stated == "1" else stated
@@ -142,6 +164,16 @@ class Diagnosis(AbstractResult):
             for note in self.notes:
                 lines += textwrap.wrap(note, _WIDTH, initial_indent="- ", subsequent_indent="  ")
         return tuple(lines)
+
+    def most_probable(self) -> str:
+        """The answers with the largest probabilities, in words; the one given first."""
+        given = f"{probability_in_words(self.probability)} for the answer given"
+        others = [
+            f"{probability_in_words(value)} {name.replace('+', ' with ')}"
+            for name, value in list(self.probabilities.items())[:_LISTED]
+            if value >= _LEAST_LISTED
+        ]
+        return f"{given}; {', '.join(others)}"
 
     def _status(self) -> str:
         """How the fit and those it was compared with ended."""
@@ -200,6 +232,7 @@ class Diagnosis(AbstractResult):
             "verdict_sentence": self.verdict_sentence,
             "effects": ", ".join(self.effects),
             "decide_by": self.decide_by or "",
+            "probability": self.probability,
             "gap_before": self.gap.before,
             "gap_after": self.gap.after,
             "p_value_of_fit": self.checks.p_value,
@@ -211,6 +244,17 @@ def unit_of(parameter: str) -> str:
     """The unit of a parameter, named by its effect and itself; "" where none is stated."""
     kind, _, name = parameter.partition(".")
     return EFFECTS[kind].parameters()[name].unit if kind in EFFECTS else ""
+
+
+def probability_in_words(probability: float) -> str:
+    """A probability in per cent, never rounded to certainty.
+
+    >>> probability_in_words(0.937), probability_in_words(0.9999)
+    ('94 %', 'above 99 %')
+    """
+    if 0.005 <= probability <= 0.995:
+        return f"{100 * probability:.0f} %"
+    return "below 1 %" if probability < 0.5 else "above 99 %"
 
 
 def _texts(texts: Iterable[str]) -> np.ndarray:

@@ -18,7 +18,9 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     `states` and how far off resonance in phase, the `harmonics` with the noise that they need, the
     `quantity` in which the models differ most, the expected gain of χ² over the rival that is
     separated least well and the gain that is needed; `calibration_too` if effects stay open that
-    only a calibration separates. `tried` has every fit that was compared with its `status`.
+    only a calibration separates. `probability` is that of the answer given: of its verdict, or of
+    the members of its classes; `probabilities` are those of all answers considered. `tried` has
+    every fit that was compared with its `status`.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
@@ -26,6 +28,8 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
         "verdict": diagnosis.verdict.value,
         "effects": list(diagnosis.effects),
         "candidates": [list(group) for group in diagnosis.candidates],
+        "probabilities": diagnosis.probabilities,
+        "probability": diagnosis.probability,
         "decide_by": diagnosis.decide_by,
         "request": _test(diagnosis.discriminating_test),
         "located": [_part(part) for part in diagnosis.located],

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.diagnose.checks.probabilities import NOISE_REJECTED, NONE, UNKNOWN
 from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
+from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, probability_in_words
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
@@ -68,6 +69,15 @@ _CAPTIONS = {
         "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
         "are about as good as the best."
     ),
+}
+_PROBABILITIES = (
+    "The most probable answers, by how well each explains these data with all its parameters "
+    "uncertain. All answers considered add up to 100 %."
+)
+_OTHER_ANSWERS = {
+    NONE: "nothing is missing",
+    UNKNOWN: "something that no effect of the library explains",
+    NOISE_REJECTED: "the noise is not as stated",
 }
 _HELD_RESPONSE = (
     " These levels hold the response, not the force: lines of constant force meet a level at its "
@@ -197,6 +207,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
     rows.append(("misfit of the force (rms)", misfit))
+    rows.append(("probability of this answer", probability_in_words(diagnosis.probability)))
     for place, out in (
         ("misfit of a level between others", gap.interpolated),
         ("misfit of the largest level", gap.extrapolated),
@@ -276,7 +287,16 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
         for k, step in enumerate(diagnosis.table)
         if step
     ]
+    rows = [
+        (_answer_in_words(name), probability_in_words(value))
+        for name, value in list(diagnosis.probabilities.items())[:_SHOWN]
+    ]
+    tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
     return Section("What else was considered", (), [shown["candidates"]], tables)
+
+
+def _answer_in_words(name: str) -> str:
+    return _OTHER_ANSWERS.get(name) or _readable(name.replace("+", " with "))
 
 
 def _step(number_of: int, count: int) -> str:

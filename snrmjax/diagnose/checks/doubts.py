@@ -24,6 +24,7 @@ class Doubt(NamedTuple):
     decide_by: str
     refutes: bool = False
     identical: bool = False  # the other law changes all that was measured alike
+    beyond: bool = False  # the levels that determine the parameters
 
 
 _WIDER = "widen the range of levels at both ends and record the second and third harmonics"

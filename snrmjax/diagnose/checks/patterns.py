@@ -39,9 +39,9 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     if chosen.phase_unknown.any():
         return None  # sizes are not linear in a curve
     speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
-    amplitude = _hats(np.log(speed), _OF_AMPLITUDE)
+    amplitude = hat_functions(np.log(speed), _OF_AMPLITUDE)
     order = np.argsort(np.argsort(chosen.rows)).astype(float)
-    of_test = _hats(order, _OF_TEST)
+    of_test = hat_functions(order, _OF_TEST)
     curves = (
         ("the stiffness as a free function of the amplitude", 0, amplitude),
         ("the damping as a free function of the amplitude", 1, amplitude),
@@ -157,7 +157,9 @@ def along(
             yield values[some[np.argsort(keys, kind="stable")]]
 
 
-def _hats(where: Float[np.ndarray, " state"], knots: int) -> Float[np.ndarray, "state knot"]:
+def hat_functions(
+    where: Float[np.ndarray, " state"], knots: int
+) -> Float[np.ndarray, "state knot"]:
     """Piecewise linear curves with equally many states between any two knots."""
     at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
     return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)

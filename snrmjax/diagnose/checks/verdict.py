@@ -320,4 +320,5 @@ def unproved_beyond(outer: HeldOut) -> Doubt | None:
         "proves the law there.",
         f"measure levels between level {outer.level} and the one below it, or above it",
         identical=True,
+        beyond=True,
     )

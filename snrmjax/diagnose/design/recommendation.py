@@ -48,13 +48,21 @@ def recommendation(
     else:
         static = [only_by_calibration(group) for group in groups]
         sentences += [decide_by(group, harmonics=True) for group in static if group]
-        if test.kind == "harmonics" and test.settles:
-            rest = set().union(*groups) - set().union(*static)
-            sentences.append(decide_by(rest, harmonics=harmonics))
         if not test.settles:
             sentences.append(
                 "No single test that was compared is expected to decide; the most informative one:"
             )
         sentences.append(test.sentence)
     sentences += [f"{text[0].upper()}{text[1:]}." for text in open_questions]
-    return " ".join(dict.fromkeys(sentences)) or None
+    return " ".join(_once(sentences)) or None
+
+
+def _once(sentences: Sequence[str]) -> list[str]:
+    """Every measurement once: the most specific sentence of those that begin alike."""
+    every = list(dict.fromkeys(sentences))
+    asked = [one.rstrip(".").lower() for one in every]
+    return [
+        one
+        for k, one in enumerate(every)
+        if not any(asked[k] in other for j, other in enumerate(asked) if j != k)
+    ]

@@ -60,6 +60,7 @@ class FoundEffects(NamedTuple):
         tuple[str, ...], ...
     ]  # of every effect: itself, then those that fit equally well
     table: tuple[tuple[TriedEffect, ...], ...]  # of every step
+    considered: tuple[EffectFit, ...] = ()  # all fits under the errors of `misfit`
 
     @property
     def p_value(self) -> float:
@@ -110,9 +111,9 @@ def _compared_with(
         return found
     best = _simplest(misfit, fits)
     gain, table = _gain(misfit, fit, best), (*found.table, _table(misfit, found.baseline, [best]))
+    found = found._replace(table=table, considered=(*found.considered, *fits))
     if gain > AS_GOOD:
-        return _replaced(found._replace(table=table), close, every, best)
-    found = found._replace(table=table)
+        return _replaced(found, close, every, best)
     if gain < -AS_GOOD or set(fit.kinds) <= set(best.kinds):
         return found
     place = fit.kinds.index(alike[0]) if alike else 0
@@ -133,17 +134,20 @@ def _replaced(
     mine = fit_effect(misfit, _where(pool, best, close.kind), beside)
     if _is_below(misfit, mine, _REFUTED) and found.p_value > _REFUTED:
         return found
-    classes, table = [], list(found.table)
+    classes, table, considered = [], list(found.table), [baseline_fit(misfit), mine]
     for kind in best.kinds[:-1]:
         rivals = found.classes[found.fit.kinds.index(kind)][1:]
         rest = _only(misfit, pool, mine, [other for other in mine.kinds if other != kind])
         jobs = [(_where(pool, mine, kind), rest)]
         jobs += [(every[name], rest) for name in rivals if name not in rest.kinds]
         fits = fit_effects(misfit, jobs) if rivals else []
+        considered += fits
         classes.append(_class(misfit, fits, kind, at=-1) if rivals else (kind,))
         if rivals:
             table.append(_table(misfit, rest, fits))
-    return FoundEffects(misfit, mine, baseline_fit(misfit), (*classes, (close.kind,)), tuple(table))
+    classes.append((close.kind,))
+    nothing = considered[0]
+    return FoundEffects(misfit, mine, nothing, tuple(classes), tuple(table), tuple(considered))
 
 
 def _only(
@@ -163,7 +167,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     table = [rows]
     best = _simplest(misfit, singles) if singles else nothing
     if _gain(misfit, nothing, best) <= DETECTED:
-        return FoundEffects(misfit, nothing, nothing, (), tuple(table))
+        return FoundEffects(misfit, nothing, nothing, (), tuple(table), (nothing, *singles))
     pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
     simple_pairs: list[EffectFit] = []
     if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
@@ -173,9 +177,9 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     lowest = min(singles, key=lambda fit: fit.criterion(misfit.n_rows))
     pair = min(pairs, key=lambda fit: fit.criterion(misfit.n_rows), default=lowest)
     single = _gain(misfit, lowest, pair) <= DETECTED
-    of_one = FoundEffects(
-        misfit, best, nothing, (_class(misfit, singles, best.kinds[0]),), tuple(table)
-    )
+    own_class = _class(misfit, singles, best.kinds[0])
+    considered = [nothing, *singles, *pairs, *simple_pairs]
+    of_one = FoundEffects(misfit, best, nothing, (own_class,), tuple(table), tuple(considered))
     if single:
         as_simple = _simplest(misfit, [best, *simple_pairs])
         if as_simple is best:
@@ -184,6 +188,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     misfit = with_errors_passed_on(misfit, pair)
     nothing = baseline_fit(misfit)
     alone = [_alone(misfit, every, kind, pair) for kind in pair.kinds]
+    considered = [nothing, *alone]
     simple = min(alone, key=lambda fit: fit.criterion(misfit.n_rows))
     if _gain(misfit, simple, fit_effect(misfit, *_rest(every, simple, pair))) <= DETECTED:
         # One effect explains what two seemed to: no start had come near it.
@@ -191,7 +196,8 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         fits = fit_effects(misfit, [(_from(every, f), nothing) for f in others])
         one = _simplest(misfit, [simple, *fits])
         answers = (_class(misfit, [simple, *fits], one.kinds[0]),)
-        return FoundEffects(misfit, one, nothing, answers, tuple(table))
+        considered += fits
+        return FoundEffects(misfit, one, nothing, answers, tuple(table), tuple(considered))
     # Each is chosen again beside the other: the first beside the second, then the reverse.
     classes: list[tuple[str, ...]] = []
     kind, other = pair.kinds[0], alone[1]
@@ -203,6 +209,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         own = fit_effects(misfit, [(_where(every, pair, kind), start) for start in (begun, other)])
         fits.append(min(own, key=lambda fit: fit.criterion(misfit.n_rows)))
         table.append(_table(misfit, other, fits))
+        considered += fits
         pair = _simplest(misfit, fits)
         classes.append(_class(misfit, fits, pair.kinds[1], at=1))
         if place == 0:
@@ -210,18 +217,20 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
             other = alone[0] if chosen == alone[0].kinds[0] else _alone(misfit, every, chosen, pair)
     if single:  # one effect with more parameters fits equally well as both
         best = fit_effect(misfit, _from(every, best))
+        considered.append(best)
         if _gain(misfit, best, pair) < AS_GOOD and best.kinds[0] not in classes[0]:
             classes[0] = (*classes[0], *best.kinds)
     if _is_below(misfit, pair, _REFUTED) and of_one.p_value > _REFUTED:
         return of_one  # with errors passed on by itself the pair no longer fits
     if _is_below(misfit, pair, _REFUTED):
         thirds = fit_effects(misfit, [(c, pair) for c in _promising(misfit, every, pair)])
+        considered += thirds
         third = min(thirds, key=lambda fit: fit.criterion(misfit.n_rows), default=pair)
         if _gain(misfit, pair, third) > DETECTED:
             table.append(_table(misfit, pair, thirds))
             pair = _simplest(misfit, thirds)
             classes.append(_class(misfit, thirds, pair.kinds[2], at=2))
-    return FoundEffects(misfit, pair, nothing, tuple(classes), tuple(table))
+    return FoundEffects(misfit, pair, nothing, tuple(classes), tuple(table), tuple(considered))
 
 
 def _pairs(

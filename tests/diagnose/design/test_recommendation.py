@@ -35,5 +35,20 @@ def test_two_classes_with_the_same_calibration_ask_for_it_once():
     assert said.endswith("Measure off resonance.")
 
 
+def test_a_measurement_that_says_more_stands_for_one_that_says_less():
+    """A gap or a stop and a damping of one side: both are told by harmonic 2."""
+    contacts = ("gap_stiffness", "one_sided_stop")
+    asked = ["record harmonic 2 at the largest level"]
+    said = recommendation(found_with(contacts, orders=(3,)), None, asked, phases=True)
+    assert said == "Record harmonic 2 at the largest level: only a one-sided contact makes it."
+
+
+def test_a_test_of_harmonics_is_asked_for_in_one_sentence():
+    test = DiscriminatingTest("harmonics", "Measure harmonic 2.", expected_gain=9.0)
+    test = test._replace(needed_gain=5.0)
+    contacts = ("gap_stiffness", "one_sided_stop")
+    assert recommendation(found_with(contacts), test, [], phases=True) == "Measure harmonic 2."
+
+
 def test_nothing_open_needs_no_measurement():
     assert recommendation(found_with(("cubic_stiffness",)), None, [], phases=True) is None
