@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.identify.checks.instruments import saying_what_is_undetermined
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.joint.fitting import (
@@ -20,6 +21,7 @@ from snrmjax.identify.joint.fitting import (
     fitted,
 )
 from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,
@@ -158,10 +160,15 @@ class JointFit(AbstractResult):
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Largest displacement (m) and velocity (m/s) that the fit has seen."""
-        motion = self.motion()
-        speed = np.abs(np.asarray(motion.velocity))
-        return float(np.max(np.asarray(motion.displacement))), float(np.max(speed))
+        """Largest displacement (m) and velocity (m/s) of the mode, as measured.
+
+        No gain of a level moves them.
+        """
+        motion, level = self.motion(), np.asarray(self.unknowns.level * self.prior.level)
+        recorded = np.exp(level[np.asarray(self.data.level), 0])
+        pair = (np.asarray(motion.displacement), np.abs(np.asarray(motion.velocity)))
+        displacement, velocity = (float(np.max(recorded * size)) for size in pair)
+        return displacement, velocity
 
     @property
     def corrected(self) -> bool:
@@ -272,6 +279,7 @@ class JointFit(AbstractResult):
 
 @on_one_core
 @naming_wrong_phases
+@saying_what_is_undetermined(LEVEL_ERRORS)
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -305,7 +313,8 @@ def fit_jointly(
     `level_phase_std` (rad), where given, stand in place of the first two.
     Returns a `JointFit`, whose `status` says whether it converged.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
-    than there are data, and a fit whose residuals become infinite or undefined.
+    than there are data, a gain, an offset or a phase that the data do not determine, and a fit
+    whose residuals become infinite or undefined.
     Validity: one nonlinear mode whose ω̃ and 2ζ̃ω̃ are functions of amplitude alone.
     """
     level_std = stated_level_std(modes)

@@ -1,0 +1,107 @@
+"""Whether a joint fit says which errors of the instruments its data do not determine."""
+
+import numpy as np
+import pytest
+from truths.exact_states import exact, modes
+
+import snrmjax as sj
+from snrmjax.identify.checks.instruments import notes_on_instruments
+from snrmjax.identify.inference.fitted_curves import values_to_the_largest
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
+
+GAIN = 2.5  # N/V
+
+
+def driven(widest, per_level=7, *, drift=0.0, noise=0.003, keep=slice(None)):
+    """A test whose force is known in volts; `drift` scales the velocities level by level."""
+    level, omega, force, velocity = (a[keep] for a in exact(per_level, widest))
+    rng = np.random.default_rng(4)
+    wrong = 1 + drift * (level / 4 - 0.5)
+    noisy = velocity * wrong * np.exp(noise * (rng.normal(size=(2, len(level))).T @ [1, 1j]))
+    unknown = np.full(len(level), np.nan)
+    stds = {"velocity_std": noise * np.abs(noisy), "phase_std": np.full((len(level), 1), noise)}
+    return sj.measure.steady_states(level, omega, unknown, noisy, drive=force / GAIN, **stds)
+
+
+def on_the_gain(fit):
+    return [note for note in fit.notes if "determine the force gain" in note]
+
+
+def test_a_gain_that_the_inertia_determines_is_taken_without_a_word():
+    fit = sj.fit_jointly(driven(60), modes(), backbone="polynomial:1", damping="polynomial:1")
+    assert float(np.exp(fit.unknowns.log_force_gain)) == pytest.approx(GAIN, rel=0.01)
+    assert on_the_gain(fit) == []
+
+
+@pytest.mark.parametrize(
+    ("widest", "said"), [(6, "within 6° of resonance"), (0.5, "its 1σ is"), (1e-3, None)]
+)
+def test_states_near_resonance_hardly_determine_the_gain(widest, said):
+    """At resonance the force is the damping's, and half of both does the same."""
+    data = driven(widest, 2, noise=0.01) if widest < 1 else driven(widest)
+    curves = {"backbone": "polynomial:1", "damping": "polynomial:1"}
+    if said is None:
+        with pytest.raises(
+            ValueError, match=r"force gain cannot be determined .* known added mass"
+        ):
+            sj.fit_jointly(data, modes(), **curves)
+        return
+    (note,) = on_the_gain(sj.fit_jointly(data, modes(), **curves))
+    assert said in note
+    assert "added mass" in note
+
+
+def test_the_velocity_axis_ends_where_it_was_measured():
+    """Levels whose gains drift are brought onto one curve, but the axis is that of the record."""
+    data = driven(60, drift=0.1)
+    fit = sj.fit_jointly(data, modes(), backbone="polynomial:1", damping="polynomial:1")
+    assert fit.noise.level_std[0] > 0.02
+    measured = float(np.max(np.abs(np.asarray(data.velocity))))
+    speed = np.asarray(values_to_the_largest(fit, 5).velocity)
+    assert speed[-1] == pytest.approx(measured, rel=0.002)  # the level's noise is 0.1 %
+
+
+class _Fit:
+    """What a fit says of its instruments."""
+
+    free = ("instrument_phase", "force_offset")
+    notes = ()
+
+    def __init__(self, *std, level=(0.0, 0.0, 0.0, 0.0)):
+        self.covariance = np.diag(np.square(std))
+        self.noise = type("", (), {"level_std": np.array(level)})
+
+    def names(self):
+        return self.free
+
+    def motion(self):
+        raise AssertionError  # only a gain asks for phases
+
+
+@pytest.mark.parametrize(
+    ("std", "said"),
+    [
+        ((0.01, 0.05), ""),
+        ((np.radians(8), 0.05), "hardly determine `instrument_phase` (1σ 8°)"),
+        ((0.01, 0.3), "hardly determine `force_offset` (1σ 30 % of the smallest force)"),
+    ],
+)
+def test_offset_and_phase_have_bounds_too(std, said):
+    notes = notes_on_instruments(_Fit(*std), LEVEL_ERRORS)
+    assert (said in notes[0]) if said else notes == ()
+
+
+def test_an_offset_of_any_size_is_refused():
+    with pytest.raises(ValueError, match="cannot determine `force_offset`"):
+        notes_on_instruments(_Fit(0.01, 1.5), LEVEL_ERRORS)
+
+
+def test_levels_at_the_cap_are_said_and_refused_beside_a_free_gain():
+    capped = _Fit(0.01, 0.01, level=(0.3, 0.0, 0.0, 0.0))
+    (note,) = notes_on_instruments(capped, LEVEL_ERRORS)
+    assert "error in gain" in note
+    assert "not to be believed" in note
+    capped.free = ("force_gain", "force_offset")
+    capped.motion = lambda: type("", (), {"velocity": np.exp(1j * np.array([-1.0, 1.0]))})
+    with pytest.raises(ValueError, match="cannot be determined beside it: measure the force"):
+        notes_on_instruments(capped, LEVEL_ERRORS)
