@@ -1,7 +1,7 @@
 """The command `diagnose`: what a model lacks."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,6 +9,9 @@ from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.options import FILES, Out
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
+
+if TYPE_CHECKING:
+    from snrmjax.diagnose.diagnosis_result import Diagnosis
 
 
 def diagnose(
@@ -40,6 +43,37 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the measurement that would decide an open answer: a CSV of steady states "
+            "to be filled in.",
+            metavar="FILE",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ] = None,
+    add: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Further steady states of the same structure, such as a plan that was filled in: "
+            "one diagnosis of all states (repeatable).",
+            metavar="FILE",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ] = None,
+    former: Annotated[
+        Path | None,
+        typer.Option(
+            "--continue",
+            help="diagnosis.json of the states without those of `--add`: fits begin at its "
+            "answers too, and the notes say what the further states changed.",
+            metavar="FILE",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Find the physics that a model lacks: where it disagrees with the data, and what that is.
 
@@ -49,9 +83,18 @@ def diagnose(
     Without phases (`velocity_m_s`, or a `phase_std_deg` of 60 or more) the notes say what
     these data cannot decide.
     """
+    from snrmjax.io.measurement_plans import read_former_answer, read_further_states
     from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
 
     several = len(data) > 1
+    for option, given in (("--plan", plan), ("--add", add), ("--continue", former)):
+        if several and given:
+            raise ValueError(f"`{option}` is for one data file, but {len(data)} are given.")
+    if former is not None and not add:
+        raise ValueError("`--continue` needs further states: name their file with `--add`.")
+    if plan is not None and not plan.parent.is_dir():
+        raise ValueError(f"--plan {plan} cannot be written: its folder does not exist.")
+    before = None if former is None else read_former_answer(former)
     if len({path.stem for path in data}) < len(data):
         raise ValueError("two of the data files have the same name: they would share a folder.")
     refused = []
@@ -62,10 +105,16 @@ def diagnose(
             with staged(out / path.stem if several else out) as folder:
                 structure = read_model(own)
                 measured = read_steady_states(path, structure)
+                for file in add or ():
+                    measured = read_further_states(file, structure, measured)
                 for note in measured.notes:
                     warn(note)
                 simulate = not several if responses is None else responses
-                found = write_diagnosis(folder, path.stem, structure, measured, simulate=simulate)
+                found = write_diagnosis(
+                    folder, path.stem, structure, measured, simulate=simulate, former=before
+                )
+                if plan is not None:
+                    _write_plan(plan, found)
         except ValueError as error:
             if not several:
                 raise
@@ -80,9 +129,26 @@ def diagnose(
             effects = f" ({effects})" if found.verdict.is_answer else f"; best attempt: {effects}"
         say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
         say(f"  {readable_verdict(found)}")
+        say(f"  probabilities: {found.most_probable()}")
         if found.decide_by:
             say(f"  what would decide: {found.decide_by}")
     if not several:
         say(f"written to {out}: open {out / 'report.html'}")
     if refused:
         raise ValueError(f"no diagnosis for {len(refused)} of {len(data)}: {', '.join(refused)}.")
+
+
+def _write_plan(file: Path, found: "Diagnosis") -> None:
+    """Write what to measure next, or say why there is nothing to measure."""
+    from snrmjax.diagnose.measurement_plan import measurement_plan
+    from snrmjax.io.measurement_plans import write_plan
+
+    asked = measurement_plan(found)
+    if asked is None:
+        why = "what would decide is no measurement of steady states."
+        if found.decide_by is None:
+            why = "nothing is open that a measurement would decide."
+        warn(f"no plan is written to {file}: {why}")
+        return
+    write_plan(file, asked)
+    say(f"  {asked.states.n_states} steady states to be measured are written to {file}")

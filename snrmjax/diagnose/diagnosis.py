@@ -1,6 +1,8 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +26,7 @@ from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, co
 from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
 from snrmjax.diagnose.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
+from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
@@ -35,7 +38,6 @@ from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractLinearChange
-from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
@@ -51,7 +53,11 @@ _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is mo
 @on_one_core
 @naming_wrong_phases
 def diagnose_model(
-    model: Structure, data: SteadyStates, *, force_gain_std: float = 0.0
+    model: Structure,
+    data: SteadyStates,
+    *,
+    force_gain_std: float = 0.0,
+    former: FormerAnswer | None = None,
 ) -> Diagnosis:
     """Find the physics that a model lacks to explain measured steady states.
 
@@ -62,6 +68,8 @@ def diagnose_model(
     nearby could have caused are compared with one.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
+    `former` is the answer by fewer of these states: fits begin where its fits ended too, and the
+    notes say what the further states changed.
     Where the force is known as a drive voltage only, a first value of its gain is found and the
     gain is free. Where neither noise nor errors of levels are stated, both are estimated: the
     noise is what the answer leaves, and the level-to-level variance what no smooth curves of
@@ -99,10 +107,13 @@ def diagnose_model(
     excluded = _excluded(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
     noise_note = ""
+    search = partial(
+        find_effects, scales=scales, kinds=kinds, further_starts=former.starts if former else {}
+    )
     if predictions.chosen.noise_stated:
-        found = find_effects(misfit, scales, kinds)
+        found = search(misfit)
     else:
-        found, size = _with_noise_found(predictions, misfit, scales, kinds)
+        found, size = _with_noise_found(predictions, misfit, search)
         noise_note = (
             f"no noise is stated: the remaining misfit ({100 * size * ASSUMED_ERROR:.2g} % of "
             f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, so a good fit "
@@ -139,6 +150,8 @@ def diagnose_model(
     )
     without, refused = _completed_without_levels(misfit, model, fit)
     unconverged = _unconverged(found)
+    if former is not None:
+        notes.append(what_changed(former, answer.probabilities))
     if gain is not None and answer.effects:
         notes.append(
             f"with the effects found the gain becomes {gain * answer.force_gain:.3g} N/V (before: "
@@ -203,7 +216,9 @@ def _excluded(model: Structure, force_gain_std: float, *, phases: bool) -> set[s
 
 
 def _with_noise_found(
-    predictions: Predictions, misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]
+    predictions: Predictions,
+    misfit: WeightedMisfit,
+    search: Callable[[WeightedMisfit], FoundEffects],
 ) -> tuple[FoundEffects, float]:
     """What is missing, with noise as large as what is left; its size over the assumed one.
 
@@ -221,7 +236,7 @@ def _with_noise_found(
     for _ in range(_ROUNDS):
         predictions = predictions.with_errors_scaled(factor)
         size *= factor
-        found = find_effects(weighted_misfit(predictions), scales, kinds)
+        found = search(weighted_misfit(predictions))
         factor = max(rms_misfit(found.misfit, found.fit), least / size)
         if factor > _NEAR:
             break

@@ -291,9 +291,10 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
 
     Arguments: the tests, as separate arguments or as one list. Levels are kept as they are: states
     of one level are taken to share their errors of gain and phase, so give different tests
-    different levels beforehand (`SteadyStates.renumbered`).
+    different levels beforehand (`SteadyStates.renumbered`). Harmonics that a test did not record
+    are not measured in its states.
     Returns `SteadyStates`. Raises `ValueError` when there is nothing to join, when something is
-    not `SteadyStates`, or when sensors or recorded harmonics differ.
+    not `SteadyStates`, or when sensors differ.
 
     >>> one = steady_states([1], [500.0], [1.0], [0.6 + 0.0j])
     >>> join_steady_states([one, one.renumbered(1)]).level
@@ -309,15 +310,25 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
             raise ValueError(
                 f"`join_steady_states` joins `SteadyStates`, but got a `{type(test).__name__}`."
             )
-        if test.sensors != tests[0].sensors or test.harmonic_order != tests[0].harmonic_order:
+        if test.sensors != tests[0].sensors:
             raise ValueError(
-                "tests can be joined when they have the same sensors and harmonics, but one has "
-                f"{list(test.sensors)} and {list(test.harmonic_order)}, the first "
-                f"{list(tests[0].sensors)} and {list(tests[0].harmonic_order)}."
+                "tests can be joined when they have the same sensors, but one has "
+                f"{list(test.sensors)}, the first {list(tests[0].sensors)}."
             )
     notes = tuple(dict.fromkeys(note for test in tests for note in test.notes))
-    alike = [dataclasses.replace(test, notes=notes) for test in tests]
+    orders = tuple(sorted({order for test in tests for order in test.harmonic_order}))
+    alike = [dataclasses.replace(_with_harmonics(test, orders), notes=notes) for test in tests]
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
+
+
+def _with_harmonics(data: SteadyStates, orders: tuple[int, ...]) -> SteadyStates:
+    """The states with room for these harmonics, NaN where they were not recorded."""
+    if data.harmonic_order == orders:
+        return data
+    room = jnp.full((*data.velocity.shape, len(orders)), jnp.nan, dtype=data.velocity.dtype)
+    places = np.array([orders.index(order) for order in data.harmonic_order], dtype=int)
+    filled = room.at[:, :, places].set(data.harmonics)
+    return dataclasses.replace(data, harmonics=filled, harmonic_order=orders)
 
 
 def _listed(part: Any) -> list[Any]:

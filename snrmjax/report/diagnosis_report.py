@@ -13,6 +13,7 @@ from snrmjax.diagnose.checks.probabilities import NOISE_REJECTED, NONE, UNKNOWN
 from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, probability_in_words
+from snrmjax.diagnose.former_answer import FormerAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
@@ -86,14 +87,20 @@ _HELD_RESPONSE = (
 
 
 def write_diagnosis(
-    folder: Path, title: str, model: Structure, data: SteadyStates, *, simulate: bool
+    folder: Path,
+    title: str,
+    model: Structure,
+    data: SteadyStates,
+    *,
+    simulate: bool,
+    former: FormerAnswer | None = None,
 ) -> Diagnosis:
     """Diagnose, and write everything that the command writes into a folder.
 
     Where no structure can have the parameters found, there is no `model.toml` and nothing is
     simulated; the notes say so.
     """
-    found = diagnose_model(model, data)
+    found = diagnose_model(model, data, former=former)
     predicted: list[LevelResponse] = []
     figures = diagnosis_figures(found)
     if simulate and found.effects and found.completed is not None:

@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from snrmjax.diagnose.design.design_points import (
     HARMONICS,
@@ -47,6 +47,14 @@ class ProposedLevel(NamedTuple):
     frequency: float  # Hz
 
 
+class PlannedStates(NamedTuple):
+    """The steady states of a test as the answer predicts them."""
+
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N
+    velocity: Float[np.ndarray, " state"]  # m/s, at the reference sensor
+
+
 class DiscriminatingTest(NamedTuple):
     """A test that is expected to separate the models that a diagnosis could not.
 
@@ -65,6 +73,7 @@ class DiscriminatingTest(NamedTuple):
     expected_gain: float | None = None  # of χ² over the rival that is separated least well
     needed_gain: float | None = None
     calibration_too: bool = False  # whether effects stay open that only a calibration separates
+    planned: PlannedStates | None = None
 
     @property
     def settles(self) -> bool:
@@ -282,7 +291,14 @@ class _Hypothesis:
             harmonic_std=option.floor,
             expected_gain=float(gain),
             needed_gain=needed,
+            planned=_planned(test, option),
         )
+
+
+def _planned(test: PredictedTest, option: _Option) -> PlannedStates:
+    states, mine = test.misfit.predictions.chosen.states, test.members[option.place]
+    columns = (states.frequency, states.force, np.abs(states.velocity[:, 0]))
+    return PlannedStates(*(np.asarray(column)[mine] for column in columns))
 
 
 def _what_to_measure(

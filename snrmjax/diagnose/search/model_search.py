@@ -1,6 +1,6 @@
 """Stepwise search for the effects that explain a misfit, and for those that fit equally well."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -70,14 +70,21 @@ class FoundEffects(NamedTuple):
 
 
 def find_effects(
-    misfit: WeightedMisfit, scales: MotionScales, kinds: tuple[str, ...]
+    misfit: WeightedMisfit,
+    scales: MotionScales,
+    kinds: tuple[str, ...],
+    further_starts: Mapping[str, tuple[float, ...]] | None = None,
 ) -> FoundEffects:
     """Add effects one by one while Schwarz's criterion falls by `DETECTED`, at most three.
 
     A close linear mode has three parameters of its own and could follow a part of most laws: it
     is not searched for, but an answer that it could have caused is compared with it.
+    `further_starts` are parameters, by kind, from which fits begin too.
     """
     every = {kind: candidate(kind, scales) for kind in kinds}
+    for kind, start in (further_starts or {}).items():
+        if kind in every and len(start) == len(every[kind].unit):
+            every[kind] = every[kind]._replace(starts=(*every[kind].starts, start))
     alternatives = [every.pop(kind) for kind in kinds if not EFFECTS[kind].searched]
     found = _searched(misfit, every)
     for one in alternatives:

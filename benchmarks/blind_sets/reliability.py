@@ -1,0 +1,185 @@
+"""Are diagnoses right as often as they say? The reliability diagram of stated probabilities.
+
+Run, with keys and diagnoses of sets (`generate.py`, `snrmjax diagnose`; both may be repeated):
+    python benchmarks/blind_sets/reliability.py --keys DIR/keys --diagnoses OUT
+        [--keys DIR2/keys --diagnoses OUT2] [--figure reliability.png]
+
+Every diagnosis states a `probability` of the answer that it gives. An answer is right where it has
+as many classes as there are true effects and each of these stands in a class of its own; `none`
+where nothing is missing, or nothing that the columns show; `unknown` where the law is outside the
+library; `noise_rejected` where the noise is stated wrong. In five bins of the stated probability
+the number of right answers is compared with what the stated probabilities themselves allow by
+chance (95 %). Prints one JSON line, and the sets of a bin outside its limits to the standard error.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from score import Result
+
+EDGES = (0.0, 0.4, 0.6, 0.8, 0.95, 1.0)
+CHANCE = 0.95
+
+
+class Stated(NamedTuple):
+    """A diagnosis: what it said, how probable it said that is, and whether it is right."""
+
+    name: str
+    probability: float
+    right: bool
+
+
+class Bin(NamedTuple):
+    """Diagnoses of similar stated probability."""
+
+    members: tuple[Stated, ...]
+    fewest: int  # right answers that chance allows
+    most: int
+
+    @property
+    def right(self) -> int:
+        """How many are right."""
+        return sum(one.right for one in self.members)
+
+    @property
+    def holds(self) -> bool:
+        """Whether chance allows so many right answers."""
+        return self.fewest <= self.right <= self.most
+
+
+def is_right(result: Result) -> bool:
+    """Whether the answer given is the truth."""
+    key, verdict = result.key, result.verdict
+    if key["group"] == "noise_wrong":
+        return verdict == "noise_rejected"
+    if key["outside"]:
+        named = key["outside"] in {kind for group in result.classes for kind in group}
+        return verdict == "unknown" or (named and len(result.classes) == 1)
+    if not key["effects"] or verdict == "none":
+        return verdict == "none" and not (key["effects"] and result.seen)
+    return result.in_class and len(result.classes) == len(key["effects"])
+
+
+def read_stated(keys: Path, diagnoses: Path) -> list[Stated]:
+    """All sets with a key and a diagnosis."""
+    found = []
+    for path in sorted(keys.glob("*.json")):
+        file = diagnoses / path.stem / "diagnosis.json"
+        if not file.exists():
+            continue
+        result = Result(
+            json.loads(path.read_text(encoding="utf-8")),
+            json.loads(file.read_text(encoding="utf-8")),
+        )
+        said = result.diagnosis["probability"] if result.diagnosis else 0.0
+        found.append(Stated(f"{keys.parent.name}/{path.stem}", said, is_right(result)))
+    return found
+
+
+def limits(probabilities: Sequence[float]) -> tuple[int, int]:
+    """Numbers of right answers between which chance leaves 95 %, if the probabilities hold.
+
+    Of independent events with these probabilities (Poisson's binomial distribution).
+    """
+    distribution = np.ones(1)
+    for p in probabilities:
+        distribution = np.convolve(distribution, [1 - p, p])
+    below = np.cumsum(distribution)
+    tail = 0.5 * (1 - CHANCE)
+    most = min(int(np.searchsorted(below, 1 - tail)), len(probabilities))
+    return int(np.searchsorted(below, tail)), most
+
+
+def binned(stated: Sequence[Stated]) -> list[Bin]:
+    """The diagnoses in five bins of their stated probability."""
+    found = []
+    for low, high in pairwise(EDGES):
+        last = high == EDGES[-1]
+        mine = tuple(one for one in stated if low <= one.probability and (last or one[1] < high))
+        found.append(Bin(mine, *limits([one.probability for one in mine])))
+    return found
+
+
+def draw(bins: Sequence[Bin], file: Path) -> None:
+    """Frequency of being right against stated probability, with the limits of chance."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(4.6, 4.4))
+    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, zorder=1)
+    for number, one in enumerate(b for b in bins if b.members):
+        n = len(one.members)
+        said = float(np.mean([each.probability for each in one.members]))
+        label = "95 % by chance, if the stated holds" if number == 0 else None
+        axes.plot(
+            [said, said], [one.fewest / n, one.most / n],
+            color="#0072b2", linewidth=7, alpha=0.3, solid_capstyle="butt", label=label,
+        )  # fmt: skip
+        axes.plot(
+            said, one.right / n, "o",
+            color="#0072b2" if one.holds else "#d55e00", label="found" if number == 0 else None,
+        )  # fmt: skip
+        left = said > 0.85
+        axes.annotate(
+            f"{one.right} of {n}", (said, one.right / n), fontsize=8,
+            xytext=(-9 if left else 9, -3), textcoords="offset points",
+            ha="right" if left else "left",
+        )  # fmt: skip
+    axes.set(xlim=(0, 1.02), ylim=(0, 1.04), aspect="equal")
+    axes.set_xlabel("stated probability of the answer given")
+    axes.set_ylabel("share of right answers")
+    axes.legend(loc="upper left", frameon=False, fontsize=8)
+    figure.tight_layout()
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Print the line, and draw the figure."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--keys", type=Path, action="append", required=True)
+    parser.add_argument("--diagnoses", type=Path, action="append", required=True)
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    stated = []
+    for keys, diagnoses in zip(options.keys, options.diagnoses, strict=True):
+        stated += read_stated(keys, diagnoses)
+    if not stated:
+        sys.exit("no set has both a key and a diagnosis.")
+    bins = binned(stated)
+    said, right = (np.array([one[k] for one in stated], dtype=float) for k in (1, 2))
+    line = {
+        "sets": len(stated),
+        "right": int(right.sum()),
+        "mean_stated": round(float(said.mean()), 3),
+        "brier": round(float(np.mean((said - right) ** 2)), 4),
+        "brier_of_one_number": round(float(right.mean() * (1 - right.mean())), 4),
+        "bins": [
+            {
+                "from": low,
+                "sets": len(one.members),
+                "right": one.right,
+                "by_chance": [one.fewest, one.most],
+            }
+            for low, one in zip(EDGES[:-1], bins, strict=True)
+        ],
+        "bins_within_chance": sum(one.holds for one in bins),
+    }
+    print(json.dumps(line))
+    for one in bins:
+        for each in one.members if not one.holds else ():
+            print(f"{each.name} {each.probability:.3f} {each.right}", file=sys.stderr)
+    if options.figure is not None:
+        draw(bins, options.figure)
+
+
+if __name__ == "__main__":
+    main()

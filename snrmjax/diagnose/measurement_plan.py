@@ -1,0 +1,103 @@
+"""The measurement that a diagnosis asks for, as steady states to be measured."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.checks.verdict import Verdict
+from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates, relative_errors, steady_states
+
+_MOST = 24  # states of a level that is measured again
+_WIDER = (0.5, 1.5)  # times the smallest and the largest level, where levels are too few
+_ORDERS = (2, 3)  # harmonics that are asked for where none were recorded
+
+
+class MeasurementPlan(NamedTuple):
+    """Steady states to be measured: frequencies and forces are set, velocities are expected ones.
+
+    `states` have levels of their own, since errors of gain and phase are those of a session, and
+    the errors of the former test as far as these were stated.
+    """
+
+    states: SteadyStates
+    harmonics: tuple[int, ...]  # that are to be recorded
+    harmonic_std: float | None  # m/s, noise of harmonics that the plan relies on
+
+
+def measurement_plan(diagnosis: Diagnosis) -> MeasurementPlan | None:
+    """What to measure so that an open diagnosis is decided; None where no steady state can do so.
+
+    The test of `decide_by`, where one was compared. Otherwise, where something is open, the
+    largest level again with the harmonics that were not recorded; where they were, a smaller and a
+    larger level. None for an answer that nothing contradicts, and where a calibration decides.
+    """
+    test, data = diagnosis.discriminating_test, diagnosis.data
+    known = tuple(order for order in data.harmonic_order if order in _ORDERS)
+    if test is not None and test.planned is not None:
+        asked = test.harmonics or known
+        parts = [(test.planned.frequency, test.planned.force, test.planned.velocity)]
+        return MeasurementPlan(_states(diagnosis, parts), asked, test.harmonic_std)
+    is_open = diagnosis.verdict in (Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+    if not is_open or diagnosis.decide_by is None or test is not None:
+        return None
+    levels = _levels_by_size(diagnosis)
+    if set(known) != set(_ORDERS):
+        return MeasurementPlan(
+            _states(diagnosis, [_of_level(diagnosis, levels[-1])]), _ORDERS, None
+        )
+    parts = [
+        _of_level(diagnosis, level, scale)
+        for level, scale in zip((levels[0], levels[-1]), _WIDER, strict=True)
+    ]
+    return MeasurementPlan(_states(diagnosis, parts), known, None)
+
+
+_Part = tuple[np.ndarray, np.ndarray, np.ndarray]  # frequency, force, velocity
+
+
+def _levels_by_size(diagnosis: Diagnosis) -> list[int]:
+    """Numbers of the levels, that with the smallest velocities first."""
+    level = np.asarray(diagnosis.data.level)
+    speed = np.abs(np.asarray(diagnosis.data.velocity)[:, diagnosis.force_misfit.sensor])
+    return sorted(set(level.tolist()), key=lambda number: speed[level == number].max())
+
+
+def _of_level(diagnosis: Diagnosis, number: int, scale: float = 1.0) -> _Part:
+    """Some states of a level, from low to high frequency, at forces so many times larger."""
+    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
+    mine = np.flatnonzero(np.asarray(data.level) == number)
+    mine = mine[np.argsort(np.asarray(data.frequency)[mine], kind="stable")]
+    mine = mine[:: -(-len(mine) // _MOST)]
+    speed = np.abs(np.asarray(data.velocity)[mine, sensor])
+    return np.asarray(data.frequency)[mine], scale * np.asarray(data.force)[mine], scale * speed
+
+
+def _states(diagnosis: Diagnosis, parts: list[_Part]) -> SteadyStates:
+    """Planned states, each part as a level of its own, with errors as large as before."""
+    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
+    frequency, force, speed = (np.concatenate(column) for column in zip(*parts, strict=True))
+    first = int(np.asarray(data.level).max()) + 1
+    level = np.concatenate([np.full(len(part[0]), first + k) for k, part in enumerate(parts)])
+    seen = np.asarray(data.measured)
+    force_std, velocity_std, phase_std = np.nanmedian(
+        np.where(seen[:, :, None], np.asarray(relative_errors(data)), np.nan)[:, sensor], axis=0
+    )
+    n, wide = len(frequency), (len(frequency), len(data.sensors))
+    alone = np.broadcast_to(seen.any(axis=0), wide)
+    velocity = np.where(np.arange(wide[1]) == sensor, speed[:, None], 0.0)
+    stated = np.isfinite(np.asarray(data.order)).any()
+    volts = np.asarray(data.drive) / np.asarray(data.force)
+    return steady_states(
+        level,
+        frequency,
+        force,
+        velocity,
+        sensors=data.sensors,
+        measured=alone,
+        velocity_std=np.where(velocity > 0, velocity_std * velocity, np.nan),
+        phase_std=np.where(alone & (phase_std < PHASE_UNKNOWN), phase_std, np.nan),
+        force_std=force_std * force,
+        drive=np.median(volts) * force if np.isfinite(volts).all() else None,
+        order=np.ones(n) if stated else None,
+    )

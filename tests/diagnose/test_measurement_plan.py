@@ -1,0 +1,189 @@
+"""The loop closes: an open answer asks for a measurement, and the filled plan decides it.
+
+The truth is the closed form of `truths.growing_damping`: a mode whose damping grows as Q², by
+cubic damping or by van der Pol's, which differ in their third harmonics only.
+"""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from truths.growing_damping import (
+    GROWTH,
+    NOISE,
+    OMEGA,
+    PARTICIPATION,
+    SHAPE,
+    THIRD,
+    ZETA,
+    linear_model,
+    measured,
+)
+from typer.testing import CliRunner
+
+import snrmjax as sj
+from snrmjax.cli import app
+from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
+from snrmjax.io.measurement_plans import read_further_states
+
+
+def answer(omega, force, kind, rng):
+    """Velocity and its third harmonic as the true structure answers a force, with noise."""
+
+    def dynamic(x):
+        return OMEGA**2 - omega**2 + 1j * omega * (2 * ZETA * OMEGA + GROWTH * x**2)
+
+    x = brentq(lambda q: abs(dynamic(q)) * q - force * PARTICIPATION, 0.0, 1.0)
+    exact = 1j * omega * x * np.exp(-1j * np.angle(dynamic(x))) * SHAPE
+    third = THIRD[kind] * GROWTH * x**2 / omega * abs(exact) * np.exp(3j * np.angle(exact))
+    own = np.exp(NOISE["velocity"] * rng.normal() + 1j * NOISE["phase"] * rng.normal())
+    return exact * own, third
+
+
+def fill(path, kind):
+    """What an engineer does with a plan: every empty field gets what was measured."""
+    rng = np.random.default_rng(3)
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        omega = 2 * np.pi * float(row["frequency_hz"])
+        velocity, third = answer(omega, float(row["force_n"]), kind, rng)
+        floor = float(row["harmonic_std_m_s"])
+        parts = {"": velocity}
+        for order, size in ((2, 0.0), (3, third)):
+            parts[f"h{order}_"] = size + floor / np.sqrt(2) * complex(*rng.normal(size=2))
+        for name, value in parts.items():
+            for part, number in (("re", value.real), ("im", value.imag)):
+                if f"velocity_{name}{part}_m_s" in row:
+                    row[f"velocity_{name}{part}_m_s"] = repr(float(number))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
+    """A folder with an ambiguous diagnosis and its plan, as the command writes them."""
+    folder = tmp_path_factory.mktemp("loop")
+    sj.io.write_model(folder / "model.toml", linear_model())
+    sj.io.write_steady_states(folder / "first.csv", measured())
+    run(folder, "--plan", str(folder / "plan.csv"), "--out", str(folder / "one"))
+    return folder
+
+
+def run(folder, *options):
+    table, model = str(folder / "first.csv"), str(folder / "model.toml")
+    done = CliRunner().invoke(
+        app, ["diagnose", table, "--model", model, "--no-responses", *options]
+    )
+    return done
+
+
+def refusal(done):
+    """What a command that was refused says."""
+    assert isinstance(done.exception, ValueError)
+    return str(done.exception)
+
+
+@pytest.mark.parametrize(
+    "truth", ["van_der_pol_damping", pytest.param("cubic_damping", marks=pytest.mark.long)]
+)
+def test_the_filled_plan_names_the_truth(asked, truth, tmp_path):
+    before = json.loads((asked / "one" / "diagnosis.json").read_text())
+    assert before["verdict"] == "ambiguous"
+    assert max(before["probabilities"].values()) < 0.7
+    plan = tmp_path / "filled.csv"
+    plan.write_text((asked / "plan.csv").read_text())
+    fill(plan, truth)
+    former = str(asked / "one" / "diagnosis.json")
+    done = run(asked, "--add", str(plan), "--continue", former, "--out", str(tmp_path / "two"))
+    assert done.exit_code == 0
+    after = json.loads((tmp_path / "two" / "diagnosis.json").read_text())
+    assert after["effects"] == [truth]
+    assert after["candidates"] == [[truth]]
+    (other,) = set(THIRD) - {truth}
+    assert after["probabilities"].get(other, 0.0) < 0.01
+    (said,) = (note for note in after["notes"] if note.startswith("before the further states"))
+    assert "ambiguous" in said
+    assert truth in said
+
+
+def test_an_unfilled_plan_is_refused_by_row_and_column(asked, tmp_path):
+    out = tmp_path / "out"
+    done = run(asked, "--add", str(asked / "plan.csv"), "--out", str(out))
+    said = refusal(done)
+    assert "`velocity_re_m_s` must be filled in with what was measured" in said
+    assert "row 2 of plan.csv has an empty field" in said
+    assert not out.exists()
+
+
+def test_a_forgotten_harmonic_is_refused_too(asked, tmp_path):
+    """An empty harmonic of a data file is not stated; of a plan it was forgotten."""
+    plan = tmp_path / "filled.csv"
+    plan.write_text((asked / "plan.csv").read_text())
+    fill(plan, "cubic_damping")
+    with plan.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    rows[3]["velocity_h3_im_m_s"] = ""
+    with plan.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    with pytest.raises(ValueError, match=r"`velocity_h3_im_m_s` must be .* row 5 of filled\.csv"):
+        read_further_states(plan, linear_model(), measured())
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--continue", "one/diagnosis.json"), "`--continue` needs further states"),
+        (("--add", "plan.csv", "--continue", "model.toml"), "must be a diagnosis.json"),
+        (("--plan", "nowhere/plan.csv"), "its folder does not exist"),
+        (("first.csv", "--add", "plan.csv"), "`--add` is for one data file, but 2 are given"),
+    ],
+)
+def test_what_cannot_be_continued_is_said(asked, tmp_path, options, said):
+    paths = [one if one.startswith("--") else str(asked / one) for one in options]
+    done = run(asked, *paths, "--out", str(tmp_path / "out"))
+    assert said in refusal(done)
+
+
+def test_a_plan_has_what_was_asked_for_at_levels_of_its_own(asked):
+    """Three phasor parts to be filled in; levels of the first test are 0 to 4."""
+    with (asked / "plan.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    told = json.loads((asked / "one" / "diagnosis.json").read_text())["request"]
+    assert len(rows) == told["states"]
+    assert {row["level"] for row in rows} == {"5"}
+    assert {f"velocity_h{order}_re_m_s" for order in told["harmonics"]} < set(rows[0])
+    for row in rows:
+        assert row["velocity_re_m_s"] == row["velocity_im_m_s"] == ""
+        assert float(row["harmonic_std_m_s"]) == pytest.approx(told["harmonic_std_m_s"], rel=0.01)
+        # The noise is that of the first test.
+        assert float(row["phase_std_deg"]) == pytest.approx(np.degrees(NOISE["phase"]), rel=0.01)
+        ratio = float(row["force_std_n"]) / float(row["force_n"])
+        assert ratio == pytest.approx(NOISE["force"], rel=0.02)
+
+
+def test_planned_states_resonate_where_the_structure_does(asked):
+    """Frequencies and forces of the plan hold velocities that the true structure has there."""
+    with (asked / "plan.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    rng = np.random.default_rng(0)
+    for row in rows:
+        omega, force = 2 * np.pi * float(row["frequency_hz"]), float(row["force_n"])
+        velocity, _ = answer(omega, force, "cubic_damping", rng)
+        expected = float(row["velocity_std_m_s"]) / NOISE["velocity"]
+        assert abs(velocity) == pytest.approx(expected, rel=0.06)  # 1 % noise, 2 % of the law
+
+
+def test_what_changed_names_old_and_new_answers():
+    former = FormerAnswer("ambiguous", ("a",), {"a": 0.5, "b": 0.4, "c": 0.1, "d": 0.0}, {})
+    said = what_changed(former, {"b": 0.9, "e": 0.1})
+    assert "ambiguous (a)" in said
+    for word in ("a 50 % → 0 %", "b 40 % → 90 %", "c 10 % → 0 %", "e now 10 %"):
+        assert word in said
+    assert "d " not in said.partition("Probabilities:")[2]
