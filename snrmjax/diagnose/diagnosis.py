@@ -8,6 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose.checks.answer_checks import (
+    gain_found,
+    notes_on_stated_parameters,
+    with_answer_checked,
+)
 from snrmjax.diagnose.checks.cross_validation import (
     held_out_levels,
     held_out_places,
@@ -83,9 +88,9 @@ def diagnose_model(
     notes: list[str] = []
     gain = None
     if driven_by_voltage(data):
-        data, gain, note = with_first_gain(model, data)
+        data, gain, of_gain = with_first_gain(model, data)
         force_gain_std = force_gain_std or FREE_GAIN_STD
-        notes.append(note)
+        notes += of_gain
     predictions = predictions_of(model, data, force_gain_std)
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)
@@ -104,7 +109,7 @@ def diagnose_model(
             "from the data to be compared."
         )
     scales = scales_of(predictions)
-    excluded = _excluded(model, force_gain_std, phases=not unknown.all())
+    excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
     noise_note = ""
     search = partial(
@@ -123,18 +128,21 @@ def diagnose_model(
     free = locate_misfit(misfit, found.baseline)
     neighbours = neighbour_noise(misfit, fit)
     levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
+    parameters = _estimates(misfit, fit)
     judgement = judge(found, neighbours, free.parts, levels)
+    errors = {name: one.std for name, one in parameters.items()}
+    judgement = with_answer_checked(judgement, misfit, fit, errors)
     test = None
     # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
         test = recommended_test(found)
-    parameters = _estimates(misfit, fit)
     completed = completed_model(
         model if fit.kinds else given,
         misfit.baseline_parameters(fit.rows),
         fit.kinds,
         {name: one.value for name, one in parameters.items()},
     )
+    force = gain_found(misfit, fit)
     something = judgement.verdict is not Verdict.NOTHING_MISSING
     answer = Answer(
         effects=fit.kinds if something else (),
@@ -143,7 +151,7 @@ def diagnose_model(
         status=fit.status,
         completed=completed.model,
         completed_status=completed.status,
-        force_gain=_force_gain(misfit, fit),
+        force_gain=1.0 if force is None else force.value,
         probabilities=probabilities_of(
             considered_answers(found, sum(not one.beyond for one in judgement.open_questions))
         ),
@@ -167,6 +175,7 @@ def diagnose_model(
     chosen = misfit.predictions.chosen
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
+    notes += [*notes_on_stated_parameters(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
     notes += _notes_on_fits(found, unconverged)
     return Diagnosis(
@@ -203,13 +212,13 @@ def _check_number_of_states(phase_unknown: np.ndarray) -> None:
         )
 
 
-def _excluded(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
+def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
     """Kinds of effects that are not looked for."""
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
     if force_gain_std > _LOOSE:  # beside a force that may be nothing a mode could be all one sees
-        excluded |= {kind for kind, effect in EFFECTS.items() if not effect.searched}
+        excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
     if not phases:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
     return excluded
@@ -256,12 +265,6 @@ def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
         label: Estimate(float(value), float(error))
         for label, value, error in zip(fit.labels, fit.values, std, strict=True)
     }
-
-
-def _force_gain(misfit: WeightedMisfit, fit: EffectFit) -> float:
-    """Acting force over recorded one, as the data determine it where it is unknown."""
-    std, place = misfit.predictions.force_gain_std, len(misfit.predictions.stated)
-    return 1 + std * float(misfit.noise.shared_errors(fit.rows)[place]) if std > 0 else 1.0
 
 
 def _completed_without_levels(

@@ -19,7 +19,7 @@ class FirstGain(NamedTuple):
 
     data: SteadyStates
     gain: float  # N/V
-    note: str
+    notes: tuple[str, ...]
 
 
 def driven_by_voltage(data: SteadyStates) -> bool:
@@ -35,8 +35,10 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
     the gain is the median, over the states, of the force that the model needs for the measured
     motion over the drive voltage.
 
-    Raises `ValueError` where the model has no such motions, and what `fit_jointly` raises.
+    Raises `ValueError` where the model has no such motions, and what `fit_jointly` raises, as for
+    a gain that the states do not determine.
     """
+    doubts: tuple[str, ...] = ()
     if np.any(np.asarray(data.phase_unknown)):
         in_volts = eqx.tree_at(lambda d: d.force, data, data.drive)
         needed = weighted_misfit(predictions_of(model, in_volts, FREE_GAIN_STD)).baseline.force
@@ -46,15 +48,17 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
         found, by = eqx.tree_at(lambda d: d.force, data, gain * data.drive), "the model as given"
     else:
         # Few need it, and it takes as long to import as half the others.
+        from snrmjax.identify.checks.instruments import notes_on_instruments
         from snrmjax.identify.inference.corrected_states import corrected_states
+        from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
         from snrmjax.identify.joint.joint_fit import fit_jointly
 
         fit = fit_jointly(data, model.modes, free=("force_gain",))
         gain = float(np.exp(fit.unknowns.log_force_gain))
         found, by = corrected_states(data, fit), "a joint fit of smooth curves"
-    return FirstGain(
-        found,
-        gain,
+        doubts = notes_on_instruments(fit, LEVEL_ERRORS)
+    note = (
         f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
-        "is fitted too: a 1 % error of the gain looks like 1 % of damping.",
+        "is fitted too: a 1 % error of the gain looks like 1 % of damping."
     )
+    return FirstGain(found, gain, (note, *doubts))

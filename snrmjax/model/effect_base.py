@@ -58,6 +58,8 @@ class AbstractEffect(eqx.Module):
       lacks; forces without an entry act like others that change the same part;
     - `is_linear`: a linear structure remains linear with it;
     - `like_force_gain`: a gain of all forces does the same;
+    - `follows_force`: it adds a linear motion that the force drives, which beside a force of any
+      size could be all that one sees;
     - `only_phase`: amplitudes do not show it;
     - `searched`: whether a diagnosis looks for it by itself, or only as an alternative to an
       answer.
@@ -71,6 +73,7 @@ class AbstractEffect(eqx.Module):
     acts_like: ClassVar[str | None] = None
     is_linear: ClassVar[bool] = False
     like_force_gain: ClassVar[bool] = False
+    follows_force: ClassVar[bool] = False
     only_phase: ClassVar[bool] = False
     searched: ClassVar[bool] = True
 

@@ -84,3 +84,17 @@ def stated(level, omega, force, velocity, **others):
         force_std=NOISE["force"] * force if force is not None else None,
         **others,
     )
+
+
+GAIN = 2.5  # N/V
+
+
+def driven(widest, per_level=7, *, drift=0.0, noise=0.003):
+    """A test whose force is known in volts; `drift` scales the velocities level by level."""
+    level, omega, force, velocity = exact(per_level, widest)
+    rng = np.random.default_rng(4)
+    wrong = 1 + drift * (level / (LEVELS - 1) - 0.5)
+    noisy = velocity * wrong * np.exp(noise * (rng.normal(size=(2, len(level))).T @ [1, 1j]))
+    unknown = np.full(len(level), np.nan)
+    stds = {"velocity_std": noise * np.abs(noisy), "phase_std": np.full((len(level), 1), noise)}
+    return sj.measure.steady_states(level, omega, unknown, noisy, drive=force / GAIN, **stds)

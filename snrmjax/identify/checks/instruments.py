@@ -12,11 +12,12 @@ _CAP = 0.99  # of the largest level-to-level variance that a fit allows: where i
 LARGEST_LEVEL_STD = 0.3
 """1σ of what levels share beyond which they are not levels of one structure's test."""
 
-_BY_MEASUREMENT = (
+REMEDY_OF_GAIN = (
     "Measure the force, or calibrate the drive (a force transducer at one state, or a known added "
     "mass); or add states 30° to 70° from resonance on both sides, where the inertia of the modal "
     "mass is known"
 )
+"""What determines the gain of a force that is known in volts."""
 
 
 class _Bounds(NamedTuple):
@@ -28,7 +29,7 @@ class _Bounds(NamedTuple):
 
 
 _BOUNDS: dict[str, _Bounds] = {
-    "force_gain": _Bounds(0.1, 0.5, _BY_MEASUREMENT),
+    "force_gain": _Bounds(0.1, 0.5, REMEDY_OF_GAIN),
     "force_offset": _Bounds(
         0.2, 1.0, "Add levels of smaller force, and states 30° to 70° from resonance"
     ),
@@ -114,7 +115,7 @@ def notes_on_instruments(fit: _InstrumentFit, level_errors: Sequence[str]) -> tu
         )
         if "force_gain" in fit.free:
             raise ValueError(
-                f"{said} The force gain cannot be determined beside it: {_BY_MEASUREMENT.lower()}."
+                f"{said} The force gain cannot be determined beside it. {REMEDY_OF_GAIN}."
             )
         notes.append(said)
     return tuple(notes)

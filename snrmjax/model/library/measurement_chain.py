@@ -185,6 +185,7 @@ class ResidualMode(AbstractMeasurementEffect):
     acts_like: ClassVar[str | None] = _SIZE
     confusions: ClassVar[tuple[Confusion, ...]] = (FAR_MODE_OR_PHASE_ERROR,)
     is_linear: ClassVar[bool] = True
+    follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     receptance: Scalar = parameter("m/N", "displacement of the far modes over the force")
 
@@ -226,6 +227,7 @@ class CloseMode(AbstractMeasurementEffect):
     )
     is_linear: ClassVar[bool] = True
     searched: ClassVar[bool] = False
+    follows_force: ClassVar[bool] = True
     stage: ClassVar[int] = 1
     modal_constant: Scalar = parameter("1/kg", "product of its shapes at sensor and force")
     frequency_hz: Scalar = parameter(

@@ -2,25 +2,12 @@
 
 import numpy as np
 import pytest
-from truths.exact_states import exact, modes
+from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
 from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
-
-GAIN = 2.5  # N/V
-
-
-def driven(widest, per_level=7, *, drift=0.0, noise=0.003, keep=slice(None)):
-    """A test whose force is known in volts; `drift` scales the velocities level by level."""
-    level, omega, force, velocity = (a[keep] for a in exact(per_level, widest))
-    rng = np.random.default_rng(4)
-    wrong = 1 + drift * (level / 4 - 0.5)
-    noisy = velocity * wrong * np.exp(noise * (rng.normal(size=(2, len(level))).T @ [1, 1j]))
-    unknown = np.full(len(level), np.nan)
-    stds = {"velocity_std": noise * np.abs(noisy), "phase_std": np.full((len(level), 1), noise)}
-    return sj.measure.steady_states(level, omega, unknown, noisy, drive=force / GAIN, **stds)
 
 
 def on_the_gain(fit):
@@ -103,5 +90,5 @@ def test_levels_at_the_cap_are_said_and_refused_beside_a_free_gain():
     assert "not to be believed" in note
     capped.free = ("force_gain", "force_offset")
     capped.motion = lambda: type("", (), {"velocity": np.exp(1j * np.array([-1.0, 1.0]))})
-    with pytest.raises(ValueError, match="cannot be determined beside it: measure the force"):
+    with pytest.raises(ValueError, match=r"cannot be determined beside it\. Measure the force"):
         notes_on_instruments(capped, LEVEL_ERRORS)

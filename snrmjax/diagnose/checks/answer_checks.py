@@ -1,0 +1,164 @@
+"""Whether an answer means anything: known parameters, a known gain, and the measured forces."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.checks.doubts import Doubt
+from snrmjax.diagnose.checks.verdict import Judgement, Verdict
+from snrmjax.diagnose.misfit.candidates import parameter_labels
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undetermined
+
+_MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
+_NOISES = 3.0  # 1σ of a stated error of the levels, that may be missed too
+_PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
+_FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
+
+
+class GainFound(NamedTuple):
+    """The acting force over the recorded one, where a gain is free."""
+
+    value: float
+    std: float  # relative 1σ, beside all parameters of the answer
+    farthest: float  # rad, the largest phase of a state from resonance
+
+
+def gain_found(misfit: WeightedMisfit, fit: EffectFit) -> GainFound | None:
+    """The gain as an answer has it; None where the forces are known."""
+    prior, place = misfit.predictions.force_gain_std, len(misfit.predictions.stated)
+    if prior == 0:
+        return None
+    value = 1 + prior * float(misfit.noise.shared_errors(fit.rows)[place])
+    columns = np.concatenate([fit.slopes, misfit.noise.shared], axis=1)
+    known = np.append(np.zeros(fit.slopes.shape[1]), np.ones(misfit.noise.shared.shape[1]))
+    size = np.linalg.norm(np.vstack([columns, np.diag(known)]), axis=0)
+    size = np.where(size > 0, size, 1.0)
+    scaled = columns / size
+    covariance = np.linalg.pinv(scaled.T @ scaled + np.diag(known / size**2), hermitian=True)
+    at = fit.slopes.shape[1] + place
+    std = prior * float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
+    phase = np.angle(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
+    known_phase = ~misfit.predictions.chosen.phase_unknown[:, 0]
+    farthest = float(np.max(np.abs(phase[known_phase]), initial=0.0))
+    return GainFound(value, std / max(abs(value), 1e-12), farthest)
+
+
+def with_answer_checked(
+    judgement: Judgement, misfit: WeightedMisfit, fit: EffectFit, std: Mapping[str, float]
+) -> Judgement:
+    """The verdict after a look at what the answer says of the structure.
+
+    `unknown` where the gain of the force is not determined or has moved far from its first value,
+    or where the completed model needs other forces than acted for the motions that were measured;
+    `ambiguous` where an effect's strength is smaller than its own 1σ.
+
+    Arguments: `std` of the effects' parameters by name. Verdicts that give no answer stay.
+    """
+    if not judgement.verdict.is_answer:
+        return judgement
+    every = [_on_gain(misfit, fit), _on_forces(misfit, fit), *_on_strengths(fit, std)]
+    found = [one for one in every if one is not None]
+    refuted = [one for one in found if one.refutes]
+    if refuted:
+        reasons = tuple(one.reason for one in refuted)
+        open_questions = (*refuted, *judgement.open_questions)
+        return Judgement(Verdict.UNKNOWN, (*reasons, *judgement.reasons), open_questions)
+    if not found:
+        return judgement
+    reasons = (*judgement.reasons, *(one.reason for one in found))
+    return Judgement(Verdict.AMBIGUOUS, reasons, (*judgement.open_questions, *found))
+
+
+def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
+    """Why the gain of an answer is none."""
+    gain = gain_found(misfit, fit)
+    if gain is None:
+        return None
+    if not 1 / _FAR_GAIN < gain.value < _FAR_GAIN:
+        reason = (
+            f"the answer needs {gain.value:.2g} times the force that smooth curves need: with a "
+            "force of any size almost any law fits, so the force gain cannot be determined beside "
+            "it."
+        )
+        return Doubt(reason, _remedy(), refutes=True)
+    said = force_gain_undetermined(gain.std, gain.farthest)
+    if not said:
+        return None
+    if "cannot" in said:
+        return Doubt(said, _remedy(), refutes=True)
+    reason = "the force gain, which these data hardly determine, may be a part of the answer."
+    return Doubt(reason, _remedy())
+
+
+def _remedy() -> str:
+    return f"{REMEDY_OF_GAIN[0].lower()}{REMEDY_OF_GAIN[1:]}"
+
+
+def _on_forces(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
+    """That the completed model does not reproduce the forces of the test."""
+    missed = missed_forces(misfit, fit)
+    level_gain = float(misfit.model.level_stds[0])
+    worst = max(missed, key=lambda level: missed[level])
+    if missed[worst] < max(_MISSED, _NOISES * level_gain):
+        return None
+    reason = (
+        "the completed model does not reproduce the measured responses: for the motions of level "
+        f"{worst} it needs forces that differ from those that acted by {100 * missed[worst]:.0f} % "
+        "(root mean square)."
+    )
+    return Doubt(reason, "state the noise of a repeated test and check the model", refutes=True)
+
+
+def missed_forces(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, float]:
+    """By level: relative misfit (rms) of the force that the completed model needs.
+
+    With the baseline's own parameters and the gain of the force at their most likely values;
+    errors of a level stay in. Infinite where the model has no such motion.
+    """
+    group, predictions = misfit.predictions.group, misfit.predictions
+    values = group.values.copy()
+    values[[group.place(label) for label in fit.labels]] = fit.values
+    for name, value in misfit.baseline_parameters(fit.rows).items():
+        values[group.place(name)] = value
+    gain = gain_found(misfit, fit)
+    column = predictions.of(group, values[None]).columns[0, :, :2]
+    needed = (1 + column[:, 0] + 1j * column[:, 1]) / (1.0 if gain is None else gain.value)
+    left = np.where(np.isfinite(needed), np.abs(needed - 1), np.inf)
+    level = np.asarray(predictions.level_numbers)
+    return {int(k): float(np.sqrt(np.mean(left[level == k] ** 2))) for k in np.unique(level)}
+
+
+def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
+    """Parameters of the model as given that an answer moves beyond their stated errors."""
+    moved = misfit.noise.shared_errors(fit.rows)
+    pulled = [
+        f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}"
+        for (name, (_, std)), step in zip(misfit.predictions.stated.items(), moved, strict=False)
+        if abs(step) > _PULLED
+    ]
+    if not pulled:
+        return ()
+    return (
+        f"the answer moves {', '.join(pulled)}, as the model states it: check the linear test, or "
+        "whether it was of another assembly.",
+    )
+
+
+def _on_strengths(fit: EffectFit, std: Mapping[str, float]) -> list[Doubt]:
+    """Effects whose strength is smaller than its own 1σ."""
+    values, found = dict(zip(fit.labels, fit.values.tolist(), strict=True)), []
+    for kind in fit.kinds:
+        strength = parameter_labels(kind)[0]
+        size, own = abs(values[strength]), std[strength]
+        if own > size:
+            found.append(
+                Doubt(
+                    f"these data do not determine {kind}: its strength is {size:.2g} with a 1σ of "
+                    f"{own:.2g}, larger than itself.",
+                    "measure at more amplitudes and frequencies",
+                )
+            )
+    return found
