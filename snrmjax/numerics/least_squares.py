@@ -18,7 +18,7 @@ def penalised_least_squares(
     design: Float[np.ndarray, "point parameter"],
     target: Float[np.ndarray, " point"],
     std: Float[np.ndarray, " point"],
-    members: Bool[np.ndarray, "point level"],
+    members: Bool[np.ndarray, "point level"] | Float[np.ndarray, "point level"],
     penalty: Float[np.ndarray, "row parameter"],
     penalty_target: Float[np.ndarray, " row"],
 ) -> LeastSquares:
@@ -30,6 +30,7 @@ def penalised_least_squares(
     covariance is the sandwich for cov(error) = s²·diag(std²) + τ²·(same level), returned as its
     two parts for s = 1 and τ = 1.
 
+    Arguments: `members` says which points a level has, or how far an error 1 of it moves them.
     Reference: Liang & Zeger, Biometrika 73 (1986) 13, doi:10.1093/biomet/73.1.13 (working
     independence and sandwich covariance).
     """

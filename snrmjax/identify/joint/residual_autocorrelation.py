@@ -80,8 +80,23 @@ def added_covariance(
             continue
         for some in levels:
             arms = jacobian[some, part] @ root
-            apart = np.abs(np.subtract.outer(np.arange(len(some)), np.arange(len(some))))
-            excess += arms.T @ (rho**apart - np.eye(len(some))) @ arms
+            excess += arms.T @ _of_neighbours(arms, rho)
     values, directions = np.linalg.eigh(excess)
     arms = root @ directions * np.sqrt(np.maximum(values, 0.0))
     return arms @ arms.T
+
+
+def _of_neighbours(
+    arms: Float[np.ndarray, "place unknown"], rho: float
+) -> Float[np.ndarray, "place unknown"]:
+    """(R − 1)·arms, with R's entries ρ^|i − j|: by its inverse, which has three diagonals."""
+    n = len(arms)
+    if n < 2:
+        return np.zeros_like(arms)
+    from scipy.linalg import solveh_banded  # keeps the package quick to import
+
+    bands = np.zeros((2, n))
+    bands[0, 1:] = -rho
+    bands[1] = 1 + rho**2
+    bands[1, [0, -1]] = 1.0
+    return (1 - rho**2) * solveh_banded(bands, arms) - arms

@@ -294,16 +294,18 @@ def left_out_scores(problem: Linearised, folds: list[np.ndarray]) -> tuple[np.nd
     x = problem.slopes[:, keep] / size
     change = -np.linalg.solve(matrix, x.T @ problem.residuals)
     left = problem.residuals + x @ change
+    # As many unknowns as there are, not states: with W what the other parts know, the prediction's
+    # covariance is C = 1 + own·W⁻¹·ownᵀ, its determinant that of all parts over W's, and its error
+    # C times what the fit to all parts leaves.
+    floor = 1e-10 * np.eye(len(matrix))
+    sign_of_all, of_all = np.linalg.slogdet(matrix + floor)
     scores, squares, count = [], 0.0, 0
     for rows in folds:
-        own = x[rows]
-        without = matrix - own.T @ own + 1e-10 * np.eye(len(matrix))
-        arms = np.linalg.solve(without, own.T)
-        error = left[rows] + own @ (arms @ left[rows])
-        covariance = np.eye(rows.sum()) + own @ arms
-        covariance = 0.5 * (covariance + covariance.T)
-        sign, logarithm = np.linalg.slogdet(covariance)
-        square = float(error @ np.linalg.solve(covariance, error))
-        scores.append(-0.5 * (square + logarithm) if sign > 0 else -np.inf)
-        squares, count = squares + square, count + len(error)
+        own, rest = x[rows], left[rows]
+        without, pull = matrix - own.T @ own + floor, own.T @ rest
+        sign, logarithm = np.linalg.slogdet(without)
+        square = float(rest @ rest + pull @ np.linalg.solve(without, pull))
+        known = sign * sign_of_all > 0
+        scores.append(-0.5 * (square + of_all - logarithm) if known else -np.inf)
+        squares, count = squares + square, count + len(rest)
     return np.array(scores), float(np.sqrt(squares / count))

@@ -4,6 +4,7 @@ A curve is a family (piecewise linear as in the paper, or a shape-preserving cub
 and values at the knots. Families differ only in how they pass through the knots.
 """
 
+import itertools
 from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
@@ -12,9 +13,10 @@ import interpax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy.linalg import lstsq
 
+from snrmjax.identify.pointwise.knot_terms import CondensedPoints, KnotTerms, slopes_at_knots
 from snrmjax.numerics.least_squares import ErrorSizes, error_sizes, penalised_least_squares
 
 
@@ -172,15 +174,16 @@ def fit_curve(
     covariance.
     Returns `CurveFit`.
     """
-    amplitude, level = points.amplitude, points.level
     problem = _problem(kind, knots, smoothing, points, fixed_first)
-    at_knots, _, slopes = _settle(problem)
+    at_knots, _, by_values = _settle(problem)
     free, n = problem.free, len(knots)
+    design = problem.condensed.terms.curve(np.eye(n), by_values)
+    _, level = np.unique(points.level, return_inverse=True)
     result = penalised_least_squares(
-        slopes[:, free],
-        np.zeros(len(amplitude)),
-        problem.spread,
-        np.asarray(level)[:, None] == np.unique(level),
+        design[:, free],
+        np.zeros(len(design)),
+        np.ones(len(design)),
+        problem.condensed.of_groups(1 / problem.spread, level),
         problem.rough[:, free],
         np.zeros(len(problem.rough)),
     )
@@ -198,9 +201,10 @@ def fit_curve(
 class _Problem(NamedTuple):
     """A fit in values of order one."""
 
-    kind: str
-    knots: np.ndarray
-    amplitude: np.ndarray
+    abscissa: np.ndarray  # of the knots
+    cubic: bool
+    terms: KnotTerms  # of the points
+    condensed: CondensedPoints  # that say as much as the points
     target: np.ndarray
     spread: np.ndarray
     rough: np.ndarray  # rows of the roughness penalty
@@ -220,14 +224,18 @@ def _problem(
     unit = float(np.max(np.abs(values)))
     target, spread = np.asarray(values) / unit, np.asarray(std) / unit
     information = np.sum(1.0 / spread**2) / len(knots)
-    bending = _bending(np.asarray(CURVES[kind].abscissa(jnp.asarray(knots))))
+    squared = kind == PchipCurve.kind
+    abscissa, at = (knots**2, amplitude**2) if squared else (knots, amplitude)
+    cubic = squared and len(knots) > 2
+    terms = KnotTerms.of(np.asarray(at), abscissa, cubic=cubic)
     return _Problem(
-        kind=kind,
-        knots=knots,
-        amplitude=amplitude,
+        abscissa=abscissa,
+        cubic=cubic,
+        terms=terms,
+        condensed=CondensedPoints.of(terms, spread),
         target=target,
         spread=spread,
-        rough=np.sqrt(smoothing * information) * bending,
+        rough=np.sqrt(smoothing * information) * _bending(abscissa),
         first=float(np.mean(target)) if fixed_first is None else fixed_first / unit,
         free=slice(0 if fixed_first is None else 1, len(knots)),
         unit=unit,
@@ -235,37 +243,34 @@ def _problem(
 
 
 def _settle(problem: _Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values at the knots, the curve at the points and its derivatives there.
+    """Values at the knots, the curve's slopes there and the derivatives of these by the values.
 
     The slopes of the spline depend on its values: Gauss-Newton steps until they settle.
     """
-    at_knots = np.full(len(problem.knots), float(np.mean(problem.target)))
+    n, rows = len(problem.abscissa), problem.condensed.terms
+    at_knots = np.full(n, float(np.mean(problem.target)))
     at_knots[0] = problem.first
-    everything = np.ones(len(problem.target), dtype=bool)
+    target = problem.condensed.of_rows(problem.target / problem.spread)
     for _ in range(12):
-        current, slopes = _linearised(problem.kind, problem.knots, at_knots, problem.amplitude)
-        step = _step(problem, at_knots, current, slopes, everything)
+        slopes, by_values = slopes_at_knots(problem.abscissa, at_knots, cubic=problem.cubic)
+        design = rows.curve(np.eye(n), by_values)
+        step = _step(problem, at_knots, design, target - rows.curve(at_knots, slopes))
         at_knots = at_knots + step
         if np.max(np.abs(step)) < 1e-9:
             break
-    return at_knots, current + slopes @ step, slopes
+    return at_knots, slopes + by_values @ step, by_values
 
 
 def _step(
-    problem: _Problem,
-    at_knots: np.ndarray,
-    current: np.ndarray,
-    slopes: np.ndarray,
-    used: Bool[np.ndarray, " point"],
+    problem: _Problem, at_knots: np.ndarray, design: np.ndarray, right: np.ndarray
 ) -> np.ndarray:
-    """Change of the values at the knots that fits some of the points best."""
+    """Change of the values at the knots that fits weighted rows best."""
     free = problem.free
-    spread = problem.spread[used]
-    design = np.concatenate([slopes[used, free] / spread[:, None], problem.rough[:, free]])
-    right = np.concatenate([(problem.target - current)[used] / spread, -problem.rough @ at_knots])
+    stacked = np.concatenate([design[:, free], problem.rough[:, free]])
+    both = np.concatenate([right, -problem.rough @ at_knots])
     step = np.zeros(len(at_knots))
     # Not by normal equations: a strong penalty would drown what the points say.
-    step[free] = lstsq(design, right, cond=1e-15, lapack_driver="gelsy", check_finite=False)[0]
+    step[free] = lstsq(stacked, both, cond=1e-15, lapack_driver="gelsy", check_finite=False)[0]
     return step
 
 
@@ -293,15 +298,23 @@ def predict_left_out(
     """
     amplitude, values, std, level = points
     problem = _problem(kind, knots, smoothing, points, fixed_first)
-    at_knots, current, slopes = _settle(problem)
+    at_knots, slopes, by_values = _settle(problem)
+    n = len(knots)
+    design = problem.terms.curve(np.eye(n), by_values)
+    current = problem.terms.curve(at_knots, slopes)
+    rows = np.column_stack([design, problem.target - current]) / problem.spread[:, None]
+    order = np.argsort(level, kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(level[order])) + 1)
+    others = _all_but_one([np.asarray(np.linalg.qr(rows[own], mode="r")) for own in members])
+    lowest = _lowest_of_others(np.array([amplitude[own].min() for own in members]))
+    highest = -_lowest_of_others(np.array([-amplitude[own].max() for own in members]))
     errors, spreads = [], []
-    for one in np.unique(level):
-        kept, left = level != one, level == one
-        left &= (amplitude >= amplitude[kept].min()) & (amplitude <= amplitude[kept].max())
-        if not left.any():
+    for own, kept, low, high in zip(members, others, lowest, highest, strict=True):
+        left = own[(amplitude[own] >= low) & (amplitude[own] <= high)]
+        if not left.size:
             continue
-        step = _step(problem, at_knots, current, slopes, kept)
-        predicted = (current + slopes @ step)[left] * problem.unit
+        step = _step(problem, at_knots, kept[:, :-1], kept[:, -1])
+        predicted = (current[left] + design[left] @ step) * problem.unit
         errors.append(values[left] - predicted)
         spreads.append(std[left])
     if not errors:
@@ -313,12 +326,36 @@ def predict_left_out(
     return LeftOut(score, error_sizes(errors, spreads), squares)
 
 
+def _all_but_one(parts: list[np.ndarray]) -> list[np.ndarray]:
+    """Triangular factors of all parts but one, for each in turn, in a few steps a part."""
+
+    def joined(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.qr(np.concatenate([a, b]), mode="r"))
+
+    none = np.zeros((0, parts[0].shape[1]))
+    before = itertools.accumulate(parts[:-1], joined, initial=none)
+    after = list(itertools.accumulate(parts[:0:-1], joined, initial=none))[::-1]
+    return [np.concatenate(both) for both in zip(before, after, strict=True)]
+
+
+def _lowest_of_others(numbers: Float[np.ndarray, " level"]) -> Float[np.ndarray, " level"]:
+    """The lowest number of all levels but one, for each in turn; infinity where it is alone."""
+    first, second = np.sort([*numbers, np.inf])[:2]
+    return np.where(numbers == first, second, first)
+
+
 def log_slope(curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
     """dg/d log a of a curve at amplitudes between its knots, to the accuracy weights need."""
     knots, values = np.asarray(curve.knots), np.asarray(curve.values)
     low = np.clip(amplitude * (1 - 1e-4), knots[0], knots[-1])
     high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
-    change = [_linearised(curve.kind, knots, values, a)[0] for a in (low, high)]
+    squared = curve.kind == PchipCurve.kind
+    abscissa, cubic = knots**2 if squared else knots, squared and len(knots) > 2
+    slopes, _ = slopes_at_knots(abscissa, values, cubic=cubic)
+    change = [
+        KnotTerms.of(a**2 if squared else a, abscissa, cubic=cubic).curve(values, slopes)
+        for a in (low, high)
+    ]
     return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
 
 
@@ -332,28 +369,3 @@ def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row kno
         mean = 0.5 * (left + right)
         rows[k, k : k + 3] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) / np.sqrt(mean)
     return rows
-
-
-def _linearised(
-    kind: str, knots: np.ndarray, values: np.ndarray, amplitude: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A curve at some amplitudes and its derivatives with respect to its values, in NumPy.
-
-    The fit tries many knots and would compile for each; the curves themselves are JAX.
-    The spline's derivatives are central differences: they steer Gauss-Newton steps whose fixed
-    point does not depend on them.
-    """
-    n = len(knots)
-    if n == 1:
-        return np.full(len(amplitude), values[0]), np.ones((len(amplitude), 1))
-    if kind == PiecewiseLinear.kind or n == 2:
-        x, u = (amplitude, knots) if kind == PiecewiseLinear.kind else (amplitude**2, knots**2)
-        slopes = np.stack([np.interp(x, u, column) for column in np.eye(n)], axis=1)
-        return slopes @ values, slopes
-    # A quarter of the time that importing the package would take, and not needed to simulate.
-    from scipy.interpolate import PchipInterpolator
-
-    step = 1e-7 * max(float(np.max(np.abs(values))), 1e-300)
-    columns = values[:, None] + step * np.concatenate([np.eye(n), -np.eye(n)], axis=1)
-    both = PchipInterpolator(knots**2, np.column_stack([values, columns]))(amplitude**2)
-    return both[:, 0], (both[:, 1 : n + 1] - both[:, n + 1 :]) / (2 * step)

@@ -19,6 +19,7 @@ from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
+from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.result import AbstractResult, Variable
 
 
@@ -55,6 +56,7 @@ class Identification(AbstractResult):
         return {**self.fit.attributes(), "notes": "\n".join(self.notes)}
 
 
+@on_one_core
 @naming_wrong_phases
 def identify_backbone(
     data: SteadyStates,
@@ -197,9 +199,11 @@ def notes_on_phases(
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
     curve = np.asarray(fit.backbone.values(points.amplitude).modal_damping)[use]
     excess = np.asarray(points.modal_damping)[use] / curve - 1
-    members = level[:, None] == np.unique(level)
-    share = members / members.sum(axis=0)
-    x, y = (values - members @ (share.T @ values) for values in (sine, excess))
+    _, member = np.unique(level, return_inverse=True)
+    count = np.bincount(member)
+    x, y = (
+        values - (np.bincount(member, weights=values) / count)[member] for values in (sine, excess)
+    )
     if not np.any(x != 0) or not np.any(y != 0):
         return []
     slope = float(x @ y / (x @ x))

@@ -16,8 +16,6 @@ from snrmjax.identify.pointwise.curve_fit import (
     PchipCurve,
     PiecewiseLinear,
     PointSample,
-    _linearised,
-    _slopes,
     fit_curve,
     log_slope,
     place_knots,
@@ -149,18 +147,6 @@ class TestCurveFit:
         np.testing.assert_allclose(
             fit.std(jnp.asarray(amplitude)), np.std(drawn, axis=0, ddof=1), rtol=0.05
         )
-
-    @pytest.mark.parametrize(
-        ("kind", "n"), [("piecewise_linear", 6), ("spline", 1), ("spline", 2), ("spline", 6)]
-    )
-    def test_the_fits_own_slopes_are_those_of_the_curve(self, kind, n):
-        knots, values = KNOTS[:n], np.array([3.0, 4.0, 4.6, 6.5, 8.0, 8.5])[:n]
-        amplitude = np.linspace(knots[0], knots[-1], 101)
-        curve = curve_of(kind, knots, values)
-        found, slopes = _linearised(kind, knots, values, amplitude)
-        np.testing.assert_allclose(found, evaluate(curve, jnp.asarray(amplitude)), rtol=1e-13)
-        # Central differences with a step of 1e-7: rounding 1e-16/1e-7 of values up to 8.5.
-        np.testing.assert_allclose(slopes, _slopes(curve, jnp.asarray(amplitude)), atol=2e-8)
 
     def test_log_slope(self):
         curve = curve_of("spline")
