@@ -107,8 +107,9 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[st
 
 
 def _near_resonance(data: SteadyStates, r: int, constant: float) -> _NearResonance | None:
-    velocity = np.sign(constant) * np.asarray(data.velocity)[:, r]
-    force, omega, level = (np.asarray(x) for x in (data.force, data.frequency, data.level))
+    data = jax.tree.map(np.asarray, data)
+    velocity = np.sign(constant) * data.velocity[:, r]
+    force, omega, level = map(np.asarray, (data.force, data.frequency, data.level))
     if not np.any(np.isfinite(force)):
         force = np.asarray(data.drive)
     use = np.asarray(data.measured & ~data.phase_unknown)[:, r]

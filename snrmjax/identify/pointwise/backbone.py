@@ -3,6 +3,7 @@
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -26,7 +27,7 @@ from snrmjax.identify.pointwise.curve_fit import (
 from snrmjax.identify.pointwise.inversion_result import spans
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
-from snrmjax.numerics.compiled import jitted
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import ErrorSizes
 from snrmjax.numerics.result import AbstractResult, Variable
 
@@ -132,25 +133,25 @@ class Backbone(AbstractResult):
         ends = float(self.smallest), float(self.largest)
         return self.values(jnp.asarray(np.linspace(*ends, _SAMPLES)))
 
-    @jitted
+    @compiled
     def natural_frequency(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ω̃ in rad/s."""
         squared = self.squared_frequency(amplitude)
         return jnp.sqrt(jnp.where(squared > 0, squared, jnp.nan))
 
-    @jitted
+    @compiled
     def damping_ratio(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """ζ̃ as a fraction of critical."""
         return self.modal_damping(amplitude) / (2 * self.natural_frequency(amplitude))
 
-    @jitted
+    @compiled
     def velocity(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Velocity amplitude in m/s on the backbone, where Ω = ω̃."""
         if self.argument == "velocity":
             return jnp.asarray(amplitude)
         return jnp.asarray(amplitude) * self.natural_frequency(amplitude)
 
-    @jitted
+    @compiled
     def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
         """All that the backbone says at some amplitudes, with standard deviations (1σ).
 
@@ -239,7 +240,8 @@ def fit_backbone(
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
     Not differentiable: knots and smoothing are chosen on the host.
     """
-    use = np.asarray(points.usable & jnp.isfinite(points.amplitude))
+    points = jax.tree.map(np.asarray, points)
+    use = np.asarray(points.usable & np.isfinite(points.amplitude))
     if use.sum() < 2:
         raise ValueError(
             f"a backbone needs at least 2 solved points, but only {int(use.sum())} of "

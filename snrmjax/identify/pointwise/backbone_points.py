@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from snrmjax.identify.pointwise.inversion import invert_one, invert_phasor
+from snrmjax.identify.pointwise.inversion import closed_form, invert_phasor
 from snrmjax.identify.pointwise.inversion_result import PointStatus, SnrmPoints
 from snrmjax.identify.pointwise.points_result import (
     AmplitudeArgument,
@@ -23,6 +23,7 @@ from snrmjax.measure.indicators import appropriation_of
 from snrmjax.measure.signals import peak_amplitude
 from snrmjax.measure.states import SteadyStates, check_force, check_phases, relative_errors
 from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.finite_slopes import safe_root
 
 AmplitudeMeasure = Literal["fundamental", "peak"]
@@ -81,7 +82,7 @@ def identify_points(
     return _identify(data, modes, reference_sensor(modes), amplitude, measure)
 
 
-@eqx.filter_jit
+@compiled
 def _identify(
     data: SteadyStates,
     modes: LinearModes,
@@ -291,15 +292,17 @@ def _solve(
         inputs: Array, parameters: Array, frequency: Array, share: Array, solved: Array
     ) -> Array:
         constant, velocity, residual = measured(inputs, parameters, frequency, share)
-        # A singular system would stop the whole batch: unsolved states get a harmless one.
+        # What is not finite would pass to the whole batch: unsolved states get a harmless one.
         constant, frequency, velocity, residual = (
             jnp.where(solved, value, stand_in)
             for value, stand_in in zip(
                 (constant, frequency, velocity, residual), (1.0, 1.0, 1.0, 0.0), strict=True
             )
         )
-        natural, damping = invert_one(constant, frequency, velocity, residual)
-        argument = argument_of(velocity - residual, frequency)
+        # The roots that `invert_phasor` finds are those of the closed form, and so their slopes.
+        own = velocity - residual
+        natural, damping = closed_form(constant, frequency, own)
+        argument = argument_of(own, frequency)
         return jnp.stack([natural**2, 2 * damping * natural, jnp.log(argument)])
 
     constant, velocity, residual = measured(inputs, parameters, frequency, share)

@@ -346,17 +346,27 @@ def _lowest_of_others(numbers: Float[np.ndarray, " level"]) -> Float[np.ndarray,
 
 def log_slope(curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]) -> np.ndarray:
     """dg/d log a of a curve at amplitudes between its knots, to the accuracy weights need."""
-    knots, values = np.asarray(curve.knots), np.asarray(curve.values)
+    knots = np.asarray(curve.knots)
     low = np.clip(amplitude * (1 - 1e-4), knots[0], knots[-1])
     high = np.clip(amplitude * (1 + 1e-4), knots[0], knots[-1])
+    change = values_on_host(curve, high) - values_on_host(curve, low)
+    return change / np.maximum(np.log(high / low), 1e-12)
+
+
+def values_on_host(
+    curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]
+) -> Float[np.ndarray, " point"]:
+    """A curve at some amplitudes in NumPy: nothing compiles for one more number of them."""
+    knots, values = np.asarray(curve.knots), np.asarray(curve.values)
     squared = curve.kind == PchipCurve.kind
-    abscissa, cubic = knots**2 if squared else knots, squared and len(knots) > 2
-    slopes, _ = slopes_at_knots(abscissa, values, cubic=cubic)
-    change = [
-        KnotTerms.of(a**2 if squared else a, abscissa, cubic=cubic).curve(values, slopes)
-        for a in (low, high)
-    ]
-    return (change[1] - change[0]) / np.maximum(np.log(high / low), 1e-12)
+    x, at = (knots**2, amplitude**2) if squared else (knots, amplitude)
+    cubic = squared and len(knots) > 2
+    slopes, _ = slopes_at_knots(x, values, cubic=cubic)
+    inside = KnotTerms.of(np.clip(at, x[0], x[-1]), x, cubic=cubic).curve(values, slopes)
+    if len(knots) < 2:
+        return inside
+    ends = slopes if cubic else np.diff(values) / np.diff(x)
+    return inside + ends[0] * np.minimum(at - x[0], 0) + ends[-1] * np.maximum(at - x[-1], 0)
 
 
 def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:

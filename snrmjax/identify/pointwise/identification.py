@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +15,7 @@ from snrmjax.identify.pointwise.backbone_points import (
     identify_points,
     off_resonance_error_factor,
 )
+from snrmjax.identify.pointwise.curve_fit import values_on_host
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -193,11 +195,12 @@ def notes_on_phases(
 
     Arguments: `advice` what to do about it.
     """
-    use = np.asarray(points.usable)
-    level = np.asarray(points.level)[use]
+    points = jax.tree.map(np.asarray, points)
+    use = points.usable
+    level = points.level[use]
     sign = np.sign(float(fit.backbone.modal_constant))  # negative: the mode moves against force
     sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
-    curve = np.asarray(fit.backbone.values(points.amplitude).modal_damping)[use]
+    curve = values_on_host(fit.backbone.modal_damping, np.asarray(points.amplitude)[use])
     excess = np.asarray(points.modal_damping)[use] / curve - 1
     _, member = np.unique(level, return_inverse=True)
     count = np.bincount(member)

@@ -8,7 +8,8 @@ import pytest
 
 from snrmjax.identify.pointwise.backbone import Backbone, fit_backbone
 from snrmjax.identify.pointwise.backbone_points import identify_points
-from snrmjax.identify.pointwise.curve_fit import PchipCurve, _linearised
+from snrmjax.identify.pointwise.curve_fit import PchipCurve
+from snrmjax.identify.pointwise.knot_terms import KnotTerms, slopes_at_knots
 from snrmjax.measure.states import steady_states
 from snrmjax.model.modes import linear_modes
 
@@ -62,11 +63,19 @@ def fitted(data, modes=MODES, **settings):
     return fit_backbone(identify_points(data, modes, amplitude=argument), modes, **settings)
 
 
+def linearised(curve, amplitude):
+    """Values of a curve between its knots, and their derivatives by those at the knots."""
+    power = 2 if curve.kind == "spline" else 1
+    knots, values = np.asarray(curve.knots) ** power, np.asarray(curve.values)
+    cubic = power == 2 and len(knots) > 2
+    terms = KnotTerms.of(amplitude**power, knots, cubic=cubic)
+    slopes, by_values = slopes_at_knots(knots, values, cubic=cubic)
+    return terms.curve(values, slopes), terms.curve(np.eye(len(knots)), by_values)
+
+
 def curve_and_std(curve, covariance, amplitude):
     """Value and 1σ in NumPy: `Backbone` itself compiles for every number of knots."""
-    values, slopes = _linearised(
-        curve.kind, np.asarray(curve.knots), np.asarray(curve.values), amplitude
-    )
+    values, slopes = linearised(curve, amplitude)
     variance = np.einsum("pk,kl,pl->p", slopes, np.asarray(covariance), slopes)
     return values, np.sqrt(variance)
 
@@ -81,9 +90,7 @@ class TestExactPoints:
             (fit.backbone.squared_frequency, squared(at)),
             (fit.backbone.modal_damping, RATE),
         ):
-            found, _ = _linearised(
-                curve.kind, np.asarray(curve.knots), np.asarray(curve.values), at
-            )
+            found, _ = linearised(curve, at)
             # Lines in the squared amplitude are free of the roughness penalty; steps end at 1e-9.
             np.testing.assert_allclose(found, truth, rtol=1e-8)
         assert fit.noise_stated is False
@@ -108,7 +115,7 @@ class TestExactPoints:
         curve = fit.backbone.squared_frequency
         assert curve.kind == "piecewise_linear"
         at = np.clip(GRID, float(fit.backbone.smallest), float(fit.backbone.largest))
-        found, _ = _linearised(curve.kind, np.asarray(curve.knots), np.asarray(curve.values), at)
+        found, _ = linearised(curve, at)
         # A chord misses a parabola by its curvature times the square of the widest gap, over 8;
         # the fit shares that between its ends.
         widest = np.diff(curve.knots).max()

@@ -20,6 +20,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     log_slope,
     place_knots,
     predict_left_out,
+    values_on_host,
 )
 from snrmjax.numerics.least_squares import ErrorSizes
 
@@ -88,6 +89,14 @@ class TestCurves:
         slope = 0.0 if n == 1 else 1.0 / (KNOTS[1] ** power - KNOTS[0] ** power)
         truth = 3.0 + slope * (amplitude**power - KNOTS[0] ** power)
         np.testing.assert_allclose(found, truth, rtol=1e-14)
+
+    @pytest.mark.parametrize("n", [1, 2, 6])
+    @both_kinds
+    def test_the_host_has_the_same_values(self, kind, n):
+        curve, at = curve_of(kind, KNOTS[:n], VALUES[:n]), np.concatenate([INSIDE, BEYOND])
+        np.testing.assert_allclose(
+            values_on_host(curve, at), evaluate(curve, jnp.asarray(at)), rtol=1e-12
+        )
 
     @both_kinds
     def test_shapes_and_transformations(self, kind):
