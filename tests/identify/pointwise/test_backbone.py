@@ -227,7 +227,7 @@ class TestStd:
         omega, zeta = [], []
         for _ in range(2000):
             drawn = [
-                _linearised("spline", knots, v + root @ rng.normal(size=3), at)[0]
+                linearised(PchipCurve(knots, v + root @ rng.normal(size=3)), at)[0]
                 for v, root in zip(values, roots, strict=True)
             ]
             omega.append(np.sqrt(drawn[0]))
