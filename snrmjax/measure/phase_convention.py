@@ -20,6 +20,7 @@ _PER_TERM = 5  # states for each of them
 _WRONG, _RIGHT = 0.25, 0.15  # relative misfit of the phasors: as given above, otherwise read below
 _DAMPED = 0.25  # mean cosine of the phase near resonance, at least, of another reading
 _BETTER, _AS_GOOD = 3.0, 1.5  # ratios of misfits: of another reading at least; of equal ones
+_WRONG_SIZE = 10.0  # ratio of modal constants, that no law of amplitude passes for
 
 
 class _Reading(NamedTuple):
@@ -89,7 +90,8 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[st
     misfit = np.array([fits[0].misfit, *(_of_a_damped_mode(one) for one in fits[1:])])
     best = float(misfit.min())
     if best > _RIGHT or misfit[0] < max(_WRONG, _BETTER * best):
-        return ()
+        known = np.any(np.isfinite(np.asarray(data.force)))
+        return _wrong_size(near, fits[0], abs(constant)) if known else ()
     chosen = np.flatnonzero(misfit <= _AS_GOOD * best)
     known = np.any(np.isfinite(np.asarray(data.force)))
     size = fits[chosen[0]].constant / abs(constant) if known else np.nan
@@ -103,6 +105,27 @@ def wrong_phases(data: SteadyStates, modes: LinearModes | Structure) -> tuple[st
     return (
         f"{said} (A single mode misses the phasors by {100 * misfit[0]:.0f} % as they are, by "
         f"{100 * best:.2g} % read so.)",
+    )
+
+
+def _wrong_size(near: _NearResonance, fit: _Fit, constant: float) -> tuple[str, ...]:
+    """A sentence where velocity over force is not that of the model's modal mass by far.
+
+    Only where states away from resonance refute that mass: at resonance any will do.
+    """
+    ratio = fit.constant / constant
+    if fit.misfit > _RIGHT or not np.isfinite(ratio) or 1 / _WRONG_SIZE < ratio < _WRONG_SIZE:
+        return ()
+    held = _fitted(near, _READINGS[0], mass=near.frequency.mean() * near.mobility.max() / constant)
+    if held.misfit < max(_WRONG, _BETTER * fit.misfit):
+        return ()
+    return (
+        f"velocity over force is {ratio:.3g} times that of a mode with the model's `shape` times "
+        "`participation`: the force seems not to be in newtons (a drive voltage belongs into "
+        "`drive_v`), the velocity not in m/s, or the modal mass is another one; damping and "
+        "what is found off resonance mean nothing until that is mended, or the gain of the force "
+        f"is free. (A single mode with the model's modal mass misses the phasors by "
+        f"{100 * held.misfit:.0f} %, with its own by {100 * fit.misfit:.2g} %.)",
     )
 
 
@@ -130,7 +153,7 @@ def _of_a_damped_mode(fit: _Fit) -> float:
     return fit.misfit if fit.cosine > _DAMPED else np.inf
 
 
-def _fitted(near: _NearResonance, reading: _Reading) -> _Fit:
+def _fitted(near: _NearResonance, reading: _Reading, mass: float | None = None) -> _Fit:
     phasor = np.exp(1j * near.phase)
     phasor = reading.turn * (phasor.conj() if reading.conjugated else phasor)
     mean, most = near.frequency.mean(), near.mobility.max()
@@ -138,7 +161,11 @@ def _fitted(near: _NearResonance, reading: _Reading) -> _Fit:
     terms = np.clip(len(ratio) // _PER_TERM, 1, len(_POWERS))
     curve = np.stack([near.amplitude**p for p in _POWERS[:terms]], axis=1) * relative[:, None]
     stiffness = curve / ratio[:, None]
-    mass, sine = _least_squares(np.column_stack([stiffness, -relative * ratio]), phasor.imag)
+    inertia = relative * ratio
+    if mass is None:
+        mass, sine = _least_squares(np.column_stack([stiffness, -inertia]), phasor.imag)
+    else:
+        sine = _least_squares(stiffness, phasor.imag + mass * inertia)[1] - mass * inertia
     if mass <= 0:  # none that a mode can have
         mass, sine = 0.0, _least_squares(stiffness, phasor.imag)[1]
     cosine = np.maximum(_least_squares(curve, phasor.real)[1], 0.0)

@@ -19,9 +19,10 @@ from snrmjax.identify.inference.optimal_design import (
 )
 from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
 from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.pointwise.backbone import BackboneValues, CurveFamily
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, CurveFamily
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
+from snrmjax.identify.pointwise.missing_resonance import why_no_resonance
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
     PredictedResponse,
@@ -154,7 +155,7 @@ def identify_by_points(
         )
         for force in dict.fromkeys(loads.forces)
     )
-    notes = (*found.notes, *notes_on_predictions(predictions, ratio))
+    notes = (*found.notes, *notes_on_predictions(predictions, ratio, backbone, data))
     words = {
         "amplitude": f"{settings.amplitude}, {settings.measure}",
         "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
@@ -210,7 +211,8 @@ def identify_jointly(
             f"({float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} %); if the "
             "model's modal mass is wrong, so is the gain."
         )
-    notes += [*notes_on_predictions(predictions, ratio), *(advice.notes if advice else ())]
+    notes += notes_on_predictions(predictions, ratio, found.fit.backbone, data)
+    notes += advice.notes if advice else ()
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
         notes.append(
             f"{len(advice)} of {settings.further} further measurements are advised: "
@@ -236,14 +238,17 @@ def _require_drive(data: SteadyStates) -> None:
         )
 
 
-def notes_on_predictions(predictions: Sequence[Prediction], ratio: float) -> list[str]:
+def notes_on_predictions(
+    predictions: Sequence[Prediction], ratio: float, backbone: Backbone, data: SteadyStates
+) -> list[str]:
     """Sentences on forces without a resonance, with several, or with one beyond the data."""
     notes = []
     for one in predictions:
         if not one.resonances:
             notes.append(
                 f"no resonance at {one.load} up to {ratio:g} times the largest measured amplitude: "
-                "`--extrapolate` looks farther, on curves that no measurement supports there."
+                f"{why_no_resonance(backbone, data, one.force, ratio)}. `--extrapolate` looks "
+                "farther, on curves that no measurement supports there."
             )
         elif any(each.continued for each in one.resonances):
             notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")

@@ -175,3 +175,21 @@ def test_the_diagnosis_says_it():
         found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
         assert found.verdict == "unknown"
         check_named(found.notes, how)
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1000.0, True), (0.001, True), (1.1, False)])
+def test_a_force_in_another_unit_is_named(factor, said):
+    """Volts called newtons, or kilonewtons: no modal mass that a linear test finds does that."""
+    data = noisy(1)
+    data = dataclasses.replace(data, force=data.force * factor)
+    found = wrong_phases(data, modes())
+    assert bool(found) is said
+    if said:
+        assert f"is {1 / factor:.1g}"[:4] in found[0]
+        assert "not to be in newtons" in found[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_states_near_resonance_are_not_taken_for_another_unit(seed):
+    """There inertia hardly counts, and the mass that fits best may be any."""
+    assert wrong_phases(noisy(seed, widest=2), modes()) == ()

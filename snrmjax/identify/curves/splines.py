@@ -208,7 +208,8 @@ def _bends(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
         mean = 0.5 * (below + above)
         matrix[k, k : k + 3] = mean * np.array([1 / below, -1 / below - 1 / above, 1 / above])
     reach = np.log(amplitude[2:] / np.maximum(amplitude[:-2], 0.5 * amplitude[1:-1]))
-    return matrix / np.sqrt(reach / np.mean(reach))[:, None]
+    mean = np.mean(reach) if reach.size else 1.0  # two knots have no bend between them
+    return matrix / np.sqrt(reach / mean)[:, None]
 
 
 def hats(u: Array | np.ndarray, knots: Float[Array | np.ndarray, " knot"]) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -150,8 +150,9 @@ def _with_curves(unknowns: Unknowns, pair: Sequence[AbstractFamily]) -> Unknowns
     return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, tuple(pair))
 
 
-def _is_smooth(curve: AbstractFamily) -> bool:
-    return isinstance(curve, SmoothingSpline)
+def _is_smooth(curve: AbstractFamily) -> TypeGuard[SmoothingSpline]:
+    """Whether a curve has bends of a size to be found: through two knots it has none."""
+    return isinstance(curve, SmoothingSpline) and bool(np.size(curve.bends))
 
 
 def _bent(curve: AbstractFamily, size: float | np.ndarray) -> AbstractFamily:
@@ -319,14 +320,14 @@ class _Scoring(NamedTuple):
         doi:10.1214/aos/1176348651.
         """
         curves = _with_bends(pair, sizes)
-        smooth = {k: c for k, c in enumerate(pair) if isinstance(c, SmoothingSpline)}
+        smooth = {k: c for k, c in enumerate(pair) if _is_smooth(c)}
         if alike or not smooth:
             return curves
         problem, seen = self.linearised(*curves), (self.known.displacement, self.known.speed)
         bends = [self.bends(problem, pair, k) for k in smooth]
         places = [places_of_bends(curve, *seen) for curve in smooth.values()]
         found = (_UNDERSMOOTHED * size for size in sizes_along(problem, bends, places))
-        return [with_sizes(c, next(found)) if isinstance(c, SmoothingSpline) else c for c in pair]
+        return [with_sizes(c, next(found)) if _is_smooth(c) else c for c in pair]
 
     def bends(self, problem: Linearised, pair: _Pair, which: int) -> Bends:
         """The bends of one of the curves among the unknowns."""

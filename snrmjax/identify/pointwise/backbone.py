@@ -24,7 +24,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     place_knots,
     predict_left_out,
 )
-from snrmjax.identify.pointwise.inversion_result import spans
+from snrmjax.identify.pointwise.inversion_result import reasons_in_words, spans
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import compiled
@@ -245,7 +245,7 @@ def fit_backbone(
     if use.sum() < 2:
         raise ValueError(
             f"a backbone needs at least 2 solved points, but only {int(use.sum())} of "
-            f"{use.size} are."
+            f"{use.size} are: {reasons_in_words(points.status)}."
         )
     if family not in ("spline", "piecewise_linear"):
         raise ValueError(f'`family` must be "spline" or "piecewise_linear", not {family!r}.')

@@ -36,11 +36,36 @@ STATUS_MESSAGE: dict[PointStatus, str] = {
 }
 
 
+_TOO_LARGE = (
+    "Where all states have it, the force or the other modes' participations are too large for the "
+    "motion: is the force in newtons, and the velocity in m/s?"
+)
+_USUAL_CAUSE: dict[PointStatus, str] = {
+    PointStatus.NEGATIVE_DAMPING: (
+        "Where all states have it, `participation`, the shape at the sensor, the sensor or the "
+        "force has the wrong sign, or the phases are not those of a velocity relative to the force"
+    ),
+    PointStatus.TWO_ROOTS: _TOO_LARGE,
+    PointStatus.NO_ROOT: _TOO_LARGE,
+    PointStatus.NO_REAL_FREQUENCY: _TOO_LARGE,
+}
+
+
 def statuses_in_words(status: Int[np.ndarray | Array, "*batch"]) -> str:
     """How many members have which status: "12 ok, 1 two_roots"."""
     kinds, counts = np.unique(np.asarray(status), return_counts=True)
     pairs = zip(kinds, counts, strict=True)
     return ", ".join(f"{n} {PointStatus(int(kind)).name.lower()}" for kind, n in pairs)
+
+
+def reasons_in_words(status: Int[np.ndarray | Array, " state"]) -> str:
+    """Why states have no point, the most frequent reason first, and what most often causes it."""
+    kinds, counts = np.unique(np.asarray(status), return_counts=True)
+    order = [k for k in np.argsort(-counts, kind="stable") if kinds[k] != PointStatus.OK]
+    found = [(PointStatus(int(kinds[k])), int(counts[k])) for k in order]
+    listed = "; ".join(f"{count} have {STATUS_MESSAGE[kind]}" for kind, count in found)
+    causes = [_USUAL_CAUSE[kind] for kind, _ in found[:1] if kind in _USUAL_CAUSE]
+    return ". ".join([listed, *causes])
 
 
 def status_names(status: Int[np.ndarray | Array, " state"]) -> np.ndarray:

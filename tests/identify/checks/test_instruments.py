@@ -38,6 +38,14 @@ def test_states_near_resonance_hardly_determine_the_gain(widest, said):
     assert "added mass" in note
 
 
+def test_few_states_of_one_level_are_fitted_too():
+    """Smoothing splines through two knots have no bends whose size could be found."""
+    data = driven(8)
+    data = data.select(np.asarray(data.level) == 4)
+    fit = sj.fit_jointly(data, modes())
+    assert "within 8° of resonance" in on_the_gain(fit)[0]
+
+
 def test_the_velocity_axis_ends_where_it_was_measured():
     """Levels whose gains drift are brought onto one curve, but the axis is that of the record."""
     data = driven(60, drift=0.1)

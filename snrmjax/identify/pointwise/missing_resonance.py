@@ -1,0 +1,82 @@
+"""Why identified curves have no resonance under a force, and what was measured near it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.measure.states import SteadyStates
+
+_AMPLITUDES = 200
+_SAME_FORCE = 0.05  # relative difference of a level's force from the one that was asked for
+_HERTZ = 2 * np.pi
+
+
+class MeasuredResonance(NamedTuple):
+    """Where a level was measured in phase with its force, between two states."""
+
+    level: int
+    force: float  # N
+    frequency: float  # Hz
+    velocity: float  # m/s
+
+
+def measured_resonances(data: SteadyStates, sensor: int, sign: float) -> list[MeasuredResonance]:
+    """Phase resonances that states enclose, level by level; `sign` is that of the mode's constant.
+
+    By interpolation in the tangent of the phase.
+    """
+    velocity = sign * np.asarray(data.velocity)[:, sensor]
+    force, frequency = np.asarray(data.force), np.asarray(data.frequency)
+    level = np.asarray(data.level)
+    good = np.isfinite(force) & np.isfinite(np.abs(velocity)) & (velocity.real > 0)
+    found = []
+    for number in np.unique(level[good]):
+        mine = np.flatnonzero(good & (level == number))
+        tangent = velocity[mine].imag / velocity[mine].real
+        if not tangent.min() <= 0 <= tangent.max():
+            continue
+        order = mine[np.argsort(tangent)]
+        rows = np.sort(tangent)
+        columns = (force, frequency / _HERTZ, np.abs(velocity))
+        at = (float(np.interp(0.0, rows, column[order])) for column in columns)
+        found.append(MeasuredResonance(int(number), *at))
+    return found
+
+
+def why_no_resonance(
+    backbone: Backbone, data: SteadyStates, force: float, largest_amplitude_ratio: float
+) -> str:
+    """What force resonances need on identified curves, and whether one was measured at this force.
+
+    Arguments: `data` with forces in newtons; `force` in N; curves are looked at up to
+    `largest_amplitude_ratio` times the largest measured amplitude.
+    """
+    reach = largest_amplitude_ratio * float(backbone.largest)
+    needed = _forces(backbone, reach * np.linspace(0.0, 1.0, _AMPLITUDES))
+    known = needed[np.isfinite(needed)]
+    said = ""
+    if known.size:
+        said = f"there these curves need {known.min():.4g} to {known.max():.4g} N"
+    sensor, sign = data.sensors.index(backbone.sensor), np.sign(float(backbone.modal_constant))
+    every = measured_resonances(data, sensor, sign)
+    near = min(every, key=lambda one: abs(one.force / force - 1), default=None)
+    if near is None or abs(near.force / force - 1) > _SAME_FORCE:
+        return said
+    amplitude = near.velocity
+    if backbone.argument == "displacement":
+        amplitude /= _HERTZ * near.frequency
+    own = float(_forces(backbone, np.array([amplitude]))[0])
+    return (
+        f"{said}. One was measured: level {near.level} has it at {near.frequency:.5g} Hz, "
+        f"{near.velocity:.3g} m/s and {near.force:.4g} N, and for that amplitude the curves need "
+        f"{own:.4g} N: they miss this level, and what they predict under a force is as uncertain"
+    )
+
+
+def _forces(backbone: Backbone, amplitude: np.ndarray) -> np.ndarray:
+    """Forces of phase resonances of these amplitudes, N."""
+    at = jnp.asarray(amplitude)
+    speed, damping = np.asarray(backbone.velocity(at)), np.asarray(backbone.modal_damping(at))
+    return speed * damping / abs(float(backbone.modal_constant))

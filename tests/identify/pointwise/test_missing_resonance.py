@@ -1,0 +1,75 @@
+"""What is said where identified curves have no resonance, or states no points."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from truths.exact_states import CONSTANT, OMEGA, SHAPE, damping, exact, modes, squared, stated
+
+import snrmjax as sj
+from snrmjax.identify.pointwise.missing_resonance import measured_resonances, why_no_resonance
+from snrmjax.identify.pointwise.prediction import resonances
+
+TIP = 2e-3  # m, the largest displacement at resonance
+
+
+@pytest.fixture(scope="module")
+def identified():
+    """States whose top level says to have had four times the force, and their true curves."""
+    level, omega, force, velocity = exact(per_level=9)
+    found = sj.identify_backbone(stated(level, omega, force, velocity), modes())
+    return found.fit.backbone, stated(level, omega, np.where(level == 4, 4, 1) * force, velocity)
+
+
+def needed(displacement):
+    """Force of a phase resonance, N."""
+    omega = np.sqrt(squared(displacement))
+    return displacement * omega * damping(displacement * omega) / CONSTANT
+
+
+def test_a_measured_resonance_that_the_curves_lack_is_shown(identified):
+    backbone, data = identified
+    recorded = 4 * needed(TIP)
+    assert resonances(backbone, modes(), recorded) == []
+    said = why_no_resonance(backbone, data, recorded, 1.5)
+    # Beyond the data the curves go on straight.
+    most = float(said.split(" to ")[1].split(" N")[0])
+    assert most == pytest.approx(needed(1.5 * TIP), rel=0.05)
+    assert "level 4 has it" in said
+    assert f"{np.sqrt(squared(TIP)) / (2 * np.pi):.5g} Hz" in said
+    own = float(said.split("the curves need ")[1].split(" N")[0])
+    assert own == pytest.approx(needed(TIP), rel=2e-3)  # between nine states of a level
+
+
+def test_without_a_measured_one_the_range_of_forces_is_said(identified):
+    said = why_no_resonance(*identified, 100.0, 1.5)
+    assert said.startswith("there these curves need 0 to ")
+    assert "measured" not in said
+
+
+def test_levels_on_one_side_have_no_resonance():
+    level, omega, force, velocity = exact(per_level=9)
+    data = stated(level, omega, force, velocity)
+    found = measured_resonances(data, 0, 1.0)
+    assert [one.level for one in found] == [0, 1, 2, 3, 4]
+    assert found[-1].force == pytest.approx(needed(TIP), rel=1e-9)  # a state lies there
+    assert measured_resonances(data.select(np.angle(velocity) > 0.05), 0, 1.0) == []
+    assert measured_resonances(data, 0, -1.0) == []
+
+
+@pytest.mark.parametrize(
+    ("participation", "force", "said"),
+    [
+        (-3.0, 1.0, r"only 0 of 5 are: 5 have negative damping.*`participation`.*wrong sign"),
+        (3.0, 1e7, r"no real natural frequency\..*in newtons"),
+    ],
+)
+def test_why_no_state_has_a_point_is_said(participation, force, said):
+    """Too few states to name wrong phases or units by themselves."""
+    level, omega, forces, velocity = (a[20:25] for a in exact(per_level=9, widest=50))
+    data = stated(level, omega, forces * force, velocity)
+    one = sj.model.linear_modes([OMEGA], [0.012], [[SHAPE]], [participation])
+    if force > 1:  # where it leads, a force far too large asks for a negative stiffness
+        data = dataclasses.replace(data, velocity=np.abs(data.velocity) * np.exp(-1.4j))
+    with pytest.raises(ValueError, match=said):
+        sj.identify_backbone(data, one)
