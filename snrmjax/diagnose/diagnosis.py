@@ -20,7 +20,6 @@ from snrmjax.diagnose.checks.cross_validation import (
     without_level,
 )
 from snrmjax.diagnose.checks.level_variance import states_level_errors, with_level_variance
-from snrmjax.diagnose.checks.probabilities import considered_answers, probabilities_of
 from snrmjax.diagnose.checks.verdict import (
     Verdict,
     judge,
@@ -152,9 +151,7 @@ def diagnose_model(
         completed=completed.model,
         completed_status=completed.status,
         force_gain=1.0 if force is None else force.value,
-        probabilities=probabilities_of(
-            considered_answers(found, sum(not one.beyond for one in judgement.open_questions))
-        ),
+        probabilities=dict(judgement.probabilities),
     )
     without, refused = _completed_without_levels(misfit, model, fit)
     unconverged = _unconverged(found)

@@ -394,8 +394,8 @@ def test_beside_a_force_that_may_be_nothing_no_mode_close_by_is_asked(gain_std, 
     """It could be all that is seen: the measured suspended beam then had a gain of 5e-6 N/V."""
     kinds = []
 
-    def noted(misfit, scales, some):
-        kinds.extend(some)
+    def noted(misfit, **settings):
+        kinds.extend(settings["kinds"])
         raise InterruptedError
 
     monkeypatch.setattr("snrmjax.diagnose.diagnosis.find_effects", noted)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose.checks.doubts import Doubt
+from snrmjax.diagnose.checks.probabilities import without_effects
 from snrmjax.diagnose.checks.verdict import Judgement, Verdict
 from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
@@ -65,11 +66,17 @@ def with_answer_checked(
     if refuted:
         reasons = tuple(one.reason for one in refuted)
         open_questions = (*refuted, *judgement.open_questions)
-        return Judgement(Verdict.UNKNOWN, (*reasons, *judgement.reasons), open_questions)
+        return Judgement(
+            Verdict.UNKNOWN,
+            (*reasons, *judgement.reasons),
+            open_questions,
+            without_effects(judgement.probabilities),
+        )
     if not found:
         return judgement
     reasons = (*judgement.reasons, *(one.reason for one in found))
-    return Judgement(Verdict.AMBIGUOUS, reasons, (*judgement.open_questions, *found))
+    open_questions = (*judgement.open_questions, *found)
+    return Judgement(Verdict.AMBIGUOUS, reasons, open_questions, judgement.probabilities)
 
 
 def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:

@@ -24,10 +24,10 @@ class Doubt(NamedTuple):
     decide_by: str
     refutes: bool = False
     identical: bool = False  # the other law changes all that was measured alike
-    beyond: bool = False  # the levels that determine the parameters
 
 
-_WIDER = "widen the range of levels at both ends and record the second and third harmonics"
+WIDER = "widen the range of levels at both ends and record the second and third harmonics"
+"""The measurement that tells most laws apart."""
 
 
 def doubts(
@@ -77,14 +77,14 @@ def doubts(
         if kind in wide
     ]
     if len(effects) > 2:
-        found.append(Doubt("three effects together can fit most laws.", _WIDER))
+        found.append(Doubt("three effects together can fit most laws.", WIDER))
     alike = [pair for pair in combinations(effects, 2) if _act_alike(*pair)]
     if alike:
         found.append(
             Doubt(
                 f"{' and '.join(alike[0])} change the same part of the force balance: together "
                 "they may stand for one law that the library does not have.",
-                _WIDER,
+                WIDER,
             )
         )
     elif len(effects) > 1 and any(_resonance(kind) for kind in effects):
@@ -92,7 +92,7 @@ def doubts(
             Doubt(
                 "a further mode beside another effect can fit a law that the library does not "
                 "have.",
-                f"step finely through the frequency of the further mode, or {_WIDER}",
+                f"step finely through the frequency of the further mode, or {WIDER}",
             )
         )
     return found
@@ -192,7 +192,7 @@ def _of_exponent(effect: str, located: tuple[Located, ...], own_power: float | N
             f"the {part} changes with the power {exponent:.2f} ± {std:.2f} of the amplitude, "
             f"not with the power {expected:.3g} of {effect}."
         )
-        return [Doubt(reason, _WIDER, refutes=True)]
+        return [Doubt(reason, WIDER, refutes=True)]
     return [
         _doubt(one)
         for one in EFFECTS[effect].imitations

@@ -5,7 +5,7 @@ They were learnt from generated tests (`benchmarks/blind_sets`, half `developmen
 on others by `benchmarks/blind_sets/reliability.py`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import comb
 from typing import NamedTuple
 
@@ -21,14 +21,14 @@ from snrmjax.model.effects import EFFECTS
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 # Prior odds, of so many effects of the library to none; each kind is as probable as any other.
-_EFFECTS = (1.0, 0.4, 0.025, 0.0025)
+_EFFECTS = (1.0, 0.44, 0.033, 0.0034)
 # Of a misfit beside an answer that no effect of the library explains, to none.
-_DISCREPANCY = 0.06
+_DISCREPANCY = 0.1
 # Of a law outside the library that acts like an answer, to that answer: for every doubt that names
 # one, and without any.
-_IMITATION, _UNNAMED = 0.33, 0.005
+_IMITATION, _UNNAMED = 0.4, 0.004
 # Of noise that is stated wrong by more than `_TOLERATED`, to noise stated right.
-_WRONG_NOISE = 0.3
+_WRONG_NOISE = 0.5
 
 _STATED = 0.1  # 1σ of the logarithm of noise over stated noise, where it is stated right
 _TOLERATED, _MOST = 0.25, np.log(4.0)  # of that logarithm, where it is stated wrong
@@ -62,6 +62,17 @@ def probabilities_of(answers: Iterable[ConsideredAnswer]) -> dict[str, float]:
     total = logsumexp(list(weights.values()))
     order = sorted(weights, key=lambda name: -weights[name])
     return {name: float(np.exp(weights[name] - total)) for name in order}
+
+
+def without_effects(probabilities: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities where no effect can be an answer: theirs are those of `unknown`.
+
+    >>> without_effects({"cubic_damping": 0.75, "none": 0.25, "unknown": 0.0})
+    {'none': 0.25, 'unknown': 0.75}
+    """
+    others = {name: probabilities.get(name, 0.0) for name in (NONE, NOISE_REJECTED)}
+    kept = {name: value for name, value in others.items() if name in probabilities}
+    return {**kept, UNKNOWN: 1.0 - sum(kept.values())}
 
 
 def log_evidence(model: Marginal) -> float:

@@ -4,20 +4,25 @@ Noise that is stated too small makes every misfit larger by one factor, everywhe
 order. What grows with the level, or what neighbours along the resonance share, is physics.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtr
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels
 from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
-from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, part_of, wider_than_measured
+from snrmjax.diagnose.checks.doubts import WIDER, Doubt, doubts, grows, part_of, wider_than_measured
 from snrmjax.diagnose.checks.patterns import UNLIKELY, along, left_curve, pattern
+from snrmjax.diagnose.checks.probabilities import (
+    NOISE_REJECTED,
+    UNKNOWN,
+    considered_answers,
+    probabilities_of,
+)
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -27,7 +32,11 @@ _MISSED_BY_ONE = 0.01  # and below which one of several effects that fit equally
 _AS_NOISE = 1.3  # times the noise, by which a doubted answer may miss a level at most
 _FAR = 2.0  # times the noise, by which the top level is missed where nothing proves the law
 _TOLERATED = 1.7  # variance over the stated one that neighbouring states may show
-_WRONG_NOISE = 4.0  # 1σ of the noise that neighbouring states show
+_MORE_THAN_ALL_ELSE = 0.5  # probability
+# Probabilities of a law outside the library: from which on there is no answer, and up to which an
+# answer may be named. An answer that is wrong costs more than one that is called ambiguous.
+_NO_ANSWER, _NO_DOUBT = 0.9, 0.1
+_SMOOTH = "what is left is small, but smoother than noise."
 _LOUD = 2.0  # times the noise that neighbouring states scatter, from which on it is mentioned
 
 
@@ -104,6 +113,7 @@ class Judgement(NamedTuple):
     verdict: Verdict
     reasons: tuple[str, ...] = ()
     open_questions: tuple[Doubt, ...] = ()
+    probabilities: Mapping[str, float] = MappingProxyType({})
 
 
 def judge(
@@ -114,31 +124,34 @@ def judge(
 ) -> Judgement:
     """The verdict on what a search found. The first rule that applies decides.
 
-    1. `noise_rejected`: the misfit is improbably small for the stated noise, or neighbouring
-       states scatter more than it allows without any pattern in what is left.
-    2. `unknown`: what is left is improbable as noise, or a free curve of amplitude or of test
-       order still explains a part of it.
+    1. `noise_rejected`: noise of another size than stated is more probable than all else, and
+       what is left has no pattern.
+    2. `unknown`: a law outside the library has a probability of 0.9 or more (`probabilities`).
     3. `none`: no effect was needed.
     4. `unknown`: a doubt refutes the law, as a contradicting power of amplitude does (`doubts`).
     5. `unknown`: a level that was left out of the fit is missed (`refuted_by_levels`).
-    6. `ambiguous`: the top level, left out, proves nothing; or a law that was not tried could do
-       the same (`doubts`); or several effects fit about equally well.
+    6. `ambiguous`: the top level, left out, proves nothing; or a law outside the library has a
+       probability above 0.1, as with one that could do the same (`doubts`); or several effects fit
+       about equally well.
     7. `named`: none of these.
 
     Arguments: `located` are the parts of the misfit before any effect was named; `levels` are
     None where there are too few to leave one out.
     """
-    judgement = judge_fit(found, neighbours)
-    if not judgement.verdict.is_answer:
-        return judgement
-    verdict, reasons = judgement.verdict, judgement.reasons
     open_questions = _doubts(found, located)
-    if open_questions:
+    probabilities = probabilities_of(considered_answers(found, len(open_questions)))
+    judgement = judge_fit(found, neighbours, probabilities)
+    verdict, reasons = judgement.verdict, tuple(doubt.reason for doubt in open_questions)
+    if judgement.reasons or not found.fit.kinds:
+        return judgement
+    if not open_questions and probabilities[UNKNOWN] > _NO_DOUBT:
+        open_questions = [_outside(found, probabilities[UNKNOWN])]
+        reasons = (open_questions[0].reason,)
+    if verdict.is_answer and open_questions:
         refuted = any(doubt.refutes for doubt in open_questions)
         verdict = Verdict.UNKNOWN if refuted else Verdict.AMBIGUOUS
-        reasons = tuple(doubt.reason for doubt in open_questions)
     if levels is None or not verdict.is_answer:
-        return Judgement(verdict, reasons, tuple(open_questions))
+        return Judgement(verdict, reasons, tuple(open_questions), probabilities)
     missed = refuted_by_levels(
         levels,
         doubted=not all(doubt.identical for doubt in open_questions),
@@ -146,65 +159,92 @@ def judge(
         parts_missing=bool(found.misfit.predictions.chosen.phase_unknown[:, 0].any()),
     )
     if missed is not None:
-        return Judgement(Verdict.UNKNOWN, (missed, *reasons), tuple(open_questions))
+        reasons = (missed, *reasons)
+        return Judgement(Verdict.UNKNOWN, reasons, tuple(open_questions), probabilities)
     unproved = unproved_beyond(levels.outer)
     if unproved is not None:
         verdict, reasons = Verdict.AMBIGUOUS, (*reasons, unproved.reason)
         open_questions = [*open_questions, unproved]
-    return Judgement(verdict, reasons, tuple(open_questions))
+    return Judgement(verdict, reasons, tuple(open_questions), probabilities)
 
 
-def judge_fit(found: FoundEffects, neighbours: NeighbourNoise) -> Judgement:
-    """The verdict by what the fit leaves alone: rules 1 to 3 of `judge`, else 6 or 7."""
-    noise, noise_std = neighbours
-    n = found.misfit.n_rows - len(found.fit.values)
-    reduced = found.fit.chi_square / n
-    too_good = float(chdtr(n, found.fit.chi_square))
+def judge_fit(
+    found: FoundEffects, neighbours: NeighbourNoise, probabilities: Mapping[str, float]
+) -> Judgement:
+    """The verdict by what the fit leaves alone: rules 1 to 3 of `judge`, else 6 or 7.
+
+    Where no noise is stated, what an answer leaves counts as noise: only what is improbable even
+    so speaks against it.
+    """
     stated = found.misfit.predictions.chosen.noise_stated
-    if stated and too_good < UNLIKELY:
-        return Judgement(
-            Verdict.NOISE_REJECTED,
-            (
-                f"the misfit is {np.sqrt(reduced):.2g} times the stated noise: the noise is "
-                "overstated, and smaller effects may be hidden by it.",
-            ),
-        )
     improbable = found.p_value < UNLIKELY
-    structure = curve = None
-    if improbable:
-        structure = pattern(found.misfit, found.fit)
-    elif found.fit.kinds and stated:  # else what is left counts as noise, whatever it is
-        curve = left_curve(found.misfit, found.fit)
-    loud = noise - 1 > (0.5 if improbable else 1.0) * _WRONG_NOISE * noise_std
-    if stated and loud and structure is None:
-        return Judgement(
-            Verdict.NOISE_REJECTED,
-            (
-                f"neighbouring states scatter {np.sqrt(noise):.2g} times as much as the stated "
-                "noise allows: the noise is understated; state it correctly before an effect is "
-                "named.",
-            ),
-        )
-    if chi_square_p_value(found.fit.chi_square / tolerated(noise, structure), n) < UNLIKELY:
-        reasons = ["no effect of the library explains what is left."]
-        if structure is not None:
-            reasons.append(structure)
-        if noise > _LOUD**2:
-            taken, or_not = ("stated noise", ", or leave that column out,")
-            if not stated:
-                taken, or_not = ("misfit that is taken as noise", "")
-            reasons.append(
-                f"from point to point the data scatter {np.sqrt(noise):.2g} times more than the "
-                f"{taken}: put the scatter of a repeated test into velocity_std_m_s{or_not} and "
-                "diagnose again."
-            )
-        return Judgement(Verdict.UNKNOWN, tuple(reasons))
-    if curve is not None:
-        return Judgement(Verdict.UNKNOWN, (curve,))
+    structure = pattern(found.misfit, found.fit) if improbable else None
+    of_noise = probabilities.get(NOISE_REJECTED, 0.0)
+    if structure is None and of_noise > _MORE_THAN_ALL_ELSE:
+        reason = _of_noise(found, neighbours)
+        return Judgement(Verdict.NOISE_REJECTED, (reason,), (), probabilities)
+    # Of misfits with a pattern the size is not that of noise.
+    wrong = probabilities.get(UNKNOWN, 0.0) + (of_noise if structure is not None else 0.0)
+    if wrong >= _NO_ANSWER if stated else improbable:
+        reasons = _of_misfit(found, neighbours, structure)
+        return Judgement(Verdict.UNKNOWN, reasons, (), probabilities)
     if not found.fit.kinds:
-        return Judgement(Verdict.NOTHING_MISSING)
+        return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
     unclear = any(len(group) > 1 for group in found.classes)
-    return Judgement(Verdict.AMBIGUOUS if unclear else Verdict.NAMED)
+    verdict = Verdict.AMBIGUOUS if unclear else Verdict.NAMED
+    return Judgement(verdict, (), (), probabilities)
+
+
+def _of_noise(found: FoundEffects, neighbours: NeighbourNoise) -> str:
+    """Why the noise is not as stated, in words."""
+    n = found.misfit.n_rows - len(found.fit.values)
+    times = np.sqrt(found.fit.chi_square / n)
+    if times < 1:
+        return (
+            f"the misfit is {times:.2g} times the stated noise: the noise is overstated, and "
+            "smaller effects may be hidden by it."
+        )
+    scatter = np.sqrt(max(neighbours.variance, 1.0))
+    return (
+        f"the misfit is {times:.2g} times the stated noise and has no pattern, and neighbouring "
+        f"states scatter {scatter:.2g} times as much as it allows: the noise is understated; state "
+        "it correctly before an effect is named."
+    )
+
+
+def _of_misfit(
+    found: FoundEffects, neighbours: NeighbourNoise, structure: str | None
+) -> tuple[str, ...]:
+    """What is left that no effect explains, in words; nothing where doubts alone say so."""
+    stated = found.misfit.predictions.chosen.noise_stated
+    curve = structure or left_curve(found.misfit, found.fit)
+    if found.p_value >= UNLIKELY:
+        smooth = () if found.fit.kinds else (_SMOOTH,)
+        return smooth if curve is None else (curve,)
+    reasons = ["no effect of the library explains what is left."]
+    if curve is not None:
+        reasons.append(curve)
+    if neighbours.variance > _LOUD**2:
+        taken, or_not = ("stated noise", ", or leave that column out,")
+        if not stated:
+            taken, or_not = ("misfit that is taken as noise", "")
+        reasons.append(
+            f"from point to point the data scatter {np.sqrt(neighbours.variance):.2g} times more "
+            f"than the {taken}: put the scatter of a repeated test into velocity_std_m_s{or_not} "
+            "and diagnose again."
+        )
+    return tuple(reasons)
+
+
+def _outside(found: FoundEffects, probability: float) -> Doubt:
+    """The doubt that a misfit leaves which is small, but smooth as that of another law."""
+    curve = left_curve(found.misfit, found.fit)
+    return Doubt(
+        f"a law outside the library has a probability of {100 * probability:.0f} %: "
+        f"{_SMOOTH if curve is None else curve}",
+        WIDER,
+        identical=True,
+    )
 
 
 def _doubts(found: FoundEffects, located: tuple[Located, ...]) -> list[Doubt]:
@@ -254,12 +294,9 @@ def _scatter(
     return NeighbourNoise(value, value * float(np.sqrt(2 / (0.51 * len(every)))))
 
 
-def tolerated(noise: float, structure: str | None = None) -> float:
-    """Variance that counts as noise: stated a little too small it is no sign of further physics.
-
-    It is the stated one where what is left has a pattern.
-    """
-    return float(np.clip(noise, 1.0, _TOLERATED)) if structure is None else 1.0
+def tolerated(noise: float) -> float:
+    """Variance that counts as noise: stated a little too small it is no sign of further physics."""
+    return float(np.clip(noise, 1.0, _TOLERATED))
 
 
 def refuted_by_levels(
@@ -320,5 +357,4 @@ def unproved_beyond(outer: HeldOut) -> Doubt | None:
         "proves the law there.",
         f"measure levels between level {outer.level} and the one below it, or above it",
         identical=True,
-        beyond=True,
     )

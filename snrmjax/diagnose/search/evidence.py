@@ -56,7 +56,8 @@ class FittedAnswer(NamedTuple):
         arms, left = self.arms, self.left
         lower = np.linalg.cholesky(np.eye(arms.shape[1]) + arms.T @ arms)
         own = solve_triangular(lower, arms.T @ np.column_stack([left, directions]), lower=True)
-        square = float(left @ left - own[:, 0] @ own[:, 0])
+        # At the best fit no parameter would lower χ²: where a fit ended before, none is said to.
+        square = float(left @ left)
         volume = -float(np.sum(np.log(np.diag(lower))))
         overlap = directions.T @ directions - own[:, 1:].T @ own[:, 1:]
         along = directions.T @ left - own[:, 1:].T @ own[:, 0]
@@ -74,10 +75,13 @@ class FittedAnswer(NamedTuple):
 
 def fitted_answer(misfit: WeightedMisfit, fit: EffectFit) -> FittedAnswer | None:
     """A fit with the priors of its parameters; None where it has no motion."""
+    left = misfit.noise.decorrelated(fit.rows)
+    if not fit.kinds:
+        return FittedAnswer((), left, np.zeros((len(left), 0)))
     scales = scales_of(misfit.predictions)
     law = coordinates(fit.labels, scales.amplitude)
     slopes = law.slopes(fit.values, fit.slopes)
-    left, arms = misfit.noise.decorrelated(fit.rows), misfit.noise.decorrelated(slopes.T).T
+    arms = misfit.noise.decorrelated(slopes.T).T
     if not (np.all(np.isfinite(left)) and np.all(np.isfinite(arms))):
         return None
     width = np.zeros(len(fit.values))

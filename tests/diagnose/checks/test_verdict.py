@@ -7,6 +7,7 @@ import pytest
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels, held_out
 from snrmjax.diagnose.checks.patterns import pattern
+from snrmjax.diagnose.checks.probabilities import considered_answers, probabilities_of
 from snrmjax.diagnose.checks.verdict import (
     NeighbourNoise,
     judge_fit,
@@ -43,7 +44,12 @@ def misfit_of(order=None, shared=None, phase_unknown=False):
     whiten = np.tile(np.eye(2), (len(LEVEL), 1, 1))
     states = SimpleNamespace(level=LEVEL[order], velocity=np.exp(1j * ANGLE[order])[:, None])
     chosen = SimpleNamespace(
-        states=states, rows=np.arange(len(LEVEL)), n_levels=LEVELS, noise_stated=True
+        states=states,
+        rows=np.arange(len(LEVEL)),
+        n_levels=LEVELS,
+        noise_stated=True,
+        orders=(),
+        sensors=(0,),
     )
     chosen.phase_unknown = np.full((len(LEVEL), 1), phase_unknown)
     return SimpleNamespace(
@@ -61,21 +67,23 @@ def noise(seed=0):
 
 def verdict_on(misfit, rows):
     fit = fit_to(rows)
-    return judge_fit(FoundEffects(misfit, fit, fit, (), ()), neighbour_noise(misfit, fit))
+    found = FoundEffects(misfit, fit, fit, (), ())
+    probabilities = probabilities_of(considered_answers(found, 0))
+    return judge_fit(found, neighbour_noise(misfit, fit), probabilities)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_twice_as_large_everywhere_is_refused_as_noise(seed):
     misfit = misfit_of()
     assert pattern(misfit, fit_to(2 * noise(seed))) is None
-    verdict, reasons, _ = verdict_on(misfit, 2 * noise(seed))
+    verdict, reasons, *_ = verdict_on(misfit, 2 * noise(seed))
     assert verdict == "noise_rejected"
     assert "understated" in reasons[0]
 
 
 def test_scatter_that_grows_with_the_level_is_no_noise():
     rows = noise() * np.repeat(1.0 + LEVEL, 2)
-    verdict, reasons, _ = verdict_on(misfit_of(), rows)
+    verdict, reasons, *_ = verdict_on(misfit_of(), rows)
     assert verdict == "unknown"
     assert reasons[1].startswith("level 4 is fitted ")
     assert reasons[1].endswith(" times worse than the others: something is missing there.")
@@ -99,28 +107,23 @@ def test_what_neighbours_along_the_resonance_share_is_no_noise():
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
     shuffled = np.random.default_rng(1).permutation(len(LEVEL))
     mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
-    verdict, reasons, _ = verdict_on(misfit_of(shuffled), mixed)
+    verdict, reasons, *_ = verdict_on(misfit_of(shuffled), mixed)
     assert verdict == "unknown"
     assert "along the resonance" in reasons[1]
 
 
-def test_an_answer_beside_which_a_free_curve_explains_something_is_none():
+def test_a_fit_beside_which_a_free_curve_explains_something_is_none():
     """Too little for all of χ², and all of it in one curve: a jump, in units of noise."""
     jump = np.zeros(N_ROWS)
     jump[::2] = np.where(np.arange(len(LEVEL)) < len(LEVEL) / 2, -0.8, 0.8)
-    slopes = np.zeros((N_ROWS, 0))
-    fit = fit_to(noise(1) + jump, slopes, kinds=("cubic_stiffness",))
-    misfit = misfit_of()
-    found = FoundEffects(misfit, fit, fit_to(noise(1)), (("cubic_stiffness",),), ())
-    assert found.p_value > 1e-3
-    verdict, reasons, _ = judge_fit(found, NOISE)
+    misfit, fit = misfit_of(), fit_to(noise(1) + jump)
+    assert FoundEffects(misfit, fit, fit, (), ()).p_value > 1e-3
+    verdict, reasons, *_ = verdict_on(misfit, noise(1) + jump)
     assert verdict == "unknown"
     assert "order of the test" in reasons[0]
+    assert verdict_on(misfit, noise(1)).verdict == "none"
     misfit.predictions.chosen.noise_stated = False  # then it counts as noise
-    assert judge_fit(found, NOISE) == ("named", (), ())
-    misfit.predictions.chosen.noise_stated = True
-    plain = found._replace(fit=fit_to(noise(1), slopes, kinds=("cubic_stiffness",)))
-    assert judge_fit(plain, NOISE) == ("named", (), ())
+    assert verdict_on(misfit, noise(1) + jump).verdict == "none"
 
 
 def test_what_neighbours_in_the_test_share_is_no_noise():
@@ -128,7 +131,7 @@ def test_what_neighbours_in_the_test_share_is_no_noise():
         [np.random.default_rng(k).permutation(PER_LEVEL) + PER_LEVEL * k for k in range(LEVELS)]
     )
     rows = noise() + 1.5 * np.repeat(np.sin(np.pi * ANGLE), 2)
-    verdict, reasons, _ = verdict_on(misfit_of(shuffled), rows)
+    verdict, reasons, *_ = verdict_on(misfit_of(shuffled), rows)
     assert verdict == "unknown"
     assert "order of the test" in reasons[1]
 
@@ -232,3 +235,20 @@ def test_open_parameters_excuse_a_level_predicted_worse_where_parts_are_missing(
         refuted_by_levels(HeldOutLevels(certain, outer), doubted=False, parts_missing=True)
         is not None
     )
+
+
+def judged(unknown, rejected=0.0, classes=(("cubic_stiffness",),)):
+    """The verdict on noise that an answer leaves, with made-up probabilities."""
+    misfit = misfit_of()
+    fit = fit_to(noise(1), kinds=("cubic_stiffness",))
+    found = FoundEffects(misfit, fit, fit, classes, ())
+    probabilities = {"unknown": unknown, "noise_rejected": rejected}
+    return judge_fit(found, NOISE, probabilities).verdict
+
+
+def test_probabilities_decide_between_an_answer_and_none():
+    assert judged(0.05) == "named"
+    assert judged(0.85) == "named"  # `judge` adds a doubt
+    assert judged(0.95) == "unknown"
+    assert judged(0.3, rejected=0.6) == "noise_rejected"
+    assert judged(0.05, classes=(("cubic_stiffness", "quintic_stiffness"),)) == "ambiguous"

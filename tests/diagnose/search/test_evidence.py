@@ -15,8 +15,12 @@ from snrmjax.diagnose.search.evidence import FittedAnswer, fitted_answer
 
 
 def made_up(seed, parameters):
+    """An answer at its best fit: no parameter would lower what is left."""
     rng = np.random.default_rng(seed)
-    return FittedAnswer(("a",), 2 * rng.normal(size=30), 3 * rng.normal(size=(30, parameters)))
+    left, arms = 2 * rng.normal(size=30), 3 * rng.normal(size=(30, parameters))
+    if parameters:
+        left = left - arms @ np.linalg.lstsq(arms, left)[0]
+    return FittedAnswer(("a",), left, arms)
 
 
 @pytest.mark.parametrize("parameters", [0, 3])
@@ -30,6 +34,13 @@ def test_a_linear_answer_has_the_density_of_a_normal_distribution(parameters, sc
         truth = multivariate_normal.logpdf(one.left, cov=scale**2 * covariance)
         said = marginal.log_likelihood(np.array([scale]))[0] - 15 * np.log(2 * np.pi)
         assert said == pytest.approx(truth, rel=1e-10)
+
+
+def test_a_fit_that_ended_early_is_not_credited_with_what_a_step_might_gain():
+    one, early = made_up(1, 3), made_up(1, 3)
+    early = early._replace(left=early.left + 4 * early.arms[:, 0])
+    assert early.marginal().chi_square == pytest.approx(float(early.left @ early.left))
+    assert early.marginal().volume == one.marginal().volume
 
 
 def test_evidence_of_an_effect_is_the_integral_over_its_prior():
