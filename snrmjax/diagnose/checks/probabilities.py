@@ -67,7 +67,7 @@ def probabilities_of(answers: Iterable[ConsideredAnswer]) -> dict[str, float]:
 def without_effects(probabilities: Mapping[str, float]) -> dict[str, float]:
     """Probabilities where no effect can be an answer: theirs are those of `unknown`.
 
-    >>> without_effects({"cubic_damping": 0.75, "none": 0.25, "unknown": 0.0})
+    >>> without_effects({"an_effect": 0.75, "none": 0.25, "unknown": 0.0})
     {'none': 0.25, 'unknown': 0.75}
     """
     others = {name: probabilities.get(name, 0.0) for name in (NONE, NOISE_REJECTED)}
