@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.checks.instruments import saying_what_is_undetermined
+from snrmjax.identify.checks.next_family import trying_the_next_family
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.family_base import AbstractFamily
 from snrmjax.identify.joint.fitting import (
@@ -160,10 +161,7 @@ class JointFit(AbstractResult):
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Largest displacement (m) and velocity (m/s) of the mode, as measured.
-
-        No gain of a level moves them.
-        """
+        """Largest displacement (m) and velocity (m/s), as measured: no gain moves them."""
         motion, level = self.motion(), np.asarray(self.unknowns.level * self.prior.level)
         recorded = np.exp(level[np.asarray(self.data.level), 0])
         pair = (np.asarray(motion.displacement), np.abs(np.asarray(motion.velocity)))
@@ -280,6 +278,7 @@ class JointFit(AbstractResult):
 @on_one_core
 @naming_wrong_phases
 @saying_what_is_undetermined(LEVEL_ERRORS)
+@trying_the_next_family
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -311,7 +310,8 @@ def fit_jointly(
     the drive is known. `modes` may be a structure, which also states the 1σ of what the states of a
     level share: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
     `level_phase_std` (rad), where given, stand in place of the first two.
-    Returns a `JointFit`, whose `status` says whether it converged.
+    Returns a `JointFit`, whose `status` says whether it converged; where families are chosen here,
+    those of the next best fit that did.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
     than there are data, a gain, an offset or a phase that the data do not determine, and a fit
     whose residuals become infinite or undefined.

@@ -65,6 +65,29 @@ def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
     assert "not converged" in repr(fit)
 
 
+def test_where_the_chosen_family_does_not_converge_the_next_best_is_taken(monkeypatch):
+    """One kind of damping is made to use up its steps: what else fits is tried."""
+    asked = {"backbone": "polynomial:1@displacement", "level_gain_std": 0.01}
+    data = noisy(4, gain=0.01)
+    chosen = sj.fit_jointly(data, modes(), **asked)
+    whole, failing = joint_fit.fitted, chosen.unknowns.modal_damping.kind
+
+    def some_fail(*given):
+        found = whole(*given)
+        failed = found.unknowns.modal_damping.kind == failing
+        return found._replace(status=FitStatus.STEP_LIMIT) if failed else found
+
+    monkeypatch.setattr(joint_fit, "fitted", some_fail)
+    fit = sj.fit_jointly(data, modes(), **asked)
+    assert fit.converged
+    assert fit.unknowns.squared_frequency.label == chosen.unknowns.squared_frequency.label
+    assert fit.unknowns.modal_damping.kind != failing
+    assert "did not converge; these are the next best that did" in fit.notes[0]
+    (mine,) = (c for c in fit.families.candidates if c.chosen and c.curve == "damping")
+    assert mine.family == fit.unknowns.modal_damping.kind
+    assert len(fit.families.candidates) == len(chosen.families.candidates)
+
+
 def test_a_fit_that_is_not_finite_is_an_error(monkeypatch):
     whole = joint_fit.fitted
 
