@@ -296,18 +296,22 @@ def _near(fit: JointFit, velocity: float) -> _Reached:
 def _at_velocity(
     vector: Array, unravel: Unravel, velocity: Array, near: Array
 ) -> tuple[Array, Array]:
-    def of(vector: Array) -> Array:
-        return curve_values(unravel(vector), velocity, near)
+    def of(vector: Array) -> tuple[Array, Array]:
+        values = curve_values(unravel(vector), velocity, near)
+        return values, values
 
-    return of(vector), jax.jacfwd(of)(vector)
+    slopes, values = jax.jacfwd(of, has_aux=True)(vector)
+    return values, slopes
 
 
 @compiled
 def _at_displacement(vector: Array, unravel: Unravel, x: Array) -> tuple[Array, Array, Array]:
-    def of(vector: Array) -> Array:
+    def of(vector: Array) -> tuple[Array, tuple[Array, Array]]:
         squared, damping = unravel(vector).squared_frequency, unravel(vector).modal_damping
         speed = _speed(squared, x)
         pair = [curve(curve.amplitude(x, speed)) for curve in (squared, damping)]
-        return jnp.stack(pair, axis=1)
+        values = jnp.stack(pair, axis=1)
+        return values, (values, speed)
 
-    return of(vector), jax.jacfwd(of)(vector), _speed(unravel(vector).squared_frequency, x)
+    slopes, (values, speed) = jax.jacfwd(of, has_aux=True)(vector)
+    return values, slopes, speed

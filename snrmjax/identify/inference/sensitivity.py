@@ -20,6 +20,7 @@ from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
     BalanceProblem,
     Unknowns,
+    nearest_errors,
     slopes_by_error,
     weighting_at,
 )
@@ -29,7 +30,6 @@ from snrmjax.identify.joint.joint_fit import (
 )
 from snrmjax.identify.joint.residuals import (
     all_residuals,
-    error_corrections,
     whitened,
 )
 from snrmjax.numerics.compiled import compiled
@@ -161,7 +161,7 @@ def _second_order(
             velocity=data.velocity * jnp.exp(error[:, 1] + 1j * error[:, 2]),
             correction=data.correction - error,
         )
-        errors, own = error_corrections(unknowns, erring)
+        errors, own = nearest_errors(unknowns, erring)
         return whitened(unknowns, erring.with_data(correction=errors), own)
 
     def as_it_is(unknowns: Unknowns, error: Array) -> Array:

@@ -15,7 +15,7 @@ from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     Unknowns,
     Weighting,
-    weighting_at,
+    nearest_errors,
 )
 from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
 from snrmjax.identify.joint.residual_autocorrelation import (
@@ -27,7 +27,6 @@ from snrmjax.identify.joint.residuals import (
     LevelPattern,
     all_residuals,
     corrected_residuals,
-    error_corrections,
     on_levels,
 )
 from snrmjax.identify.joint.variance_components import VarianceComponents
@@ -173,9 +172,8 @@ def _linearised(
 ) -> _Linear:
     """Residuals and slopes, with the whitening given or `anew` with that of these unknowns."""
     unknowns = unravel(vector)
-    recorded = (problem.data.correction, weighting_at(unknowns, problem))
     given = (problem.data.correction, weighting)
-    fresh = jax.lax.cond(correcting, lambda: error_corrections(unknowns, problem), lambda: recorded)
+    fresh = nearest_errors(unknowns, problem, correcting)
     errors, weighting = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, given)
     problem = problem.with_data(correction=errors)
 

@@ -324,28 +324,43 @@ def weighting_at(unknowns: Unknowns, problem: BalanceProblem) -> Weighting:
     Reference: orthogonal distance regression; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput.
     8 (1987) 1052, doi:10.1137/0908085.
     """
-    slopes = slopes_by_error(unknowns, problem)
-    offset = -jnp.einsum("sie,se->si", slopes, problem.data.correction)
-    return Weighting(whitener(slopes, problem.data.std), offset)
+    return _weighting(slopes_by_error(unknowns, problem), problem.data)
 
 
-def nearest_errors(unknowns: Unknowns, problem: BalanceProblem) -> Float[Array, "state input"]:
+def _weighting(slopes: Float[Array, "state part input"], data: BalanceData) -> Weighting:
+    offset = -jnp.einsum("sie,se->si", slopes, data.correction)
+    return Weighting(whitener(slopes, data.std), offset)
+
+
+def nearest_errors(
+    unknowns: Unknowns, problem: BalanceProblem, correcting: Bool[Array, ""] | bool = True
+) -> tuple[Float[Array, "state input"], Weighting]:
     """The most likely errors with which every state balances, from its present correction on.
 
     Each step solves the balance made straight at the last one's end: what is left of the balance
     falls by the ratio of a state's error to the curves' length.
+    Returns the errors, as they are unless `correcting`, and the weighting there.
     """
+    steps = jnp.where(correcting, _STEPS, 0) if isinstance(correcting, jax.Array) else _STEPS
 
-    def step(errors: Array, _: None) -> tuple[Array, None]:
-        slopes = slopes_by_error(unknowns, problem.with_data(correction=errors))
-        whiten = whitener(slopes, problem.data.std)
-        balance = force_balance(unknowns, problem, errors)
-        straight = balance - jnp.einsum("sie,se->si", slopes, errors)
-        whitened = jnp.einsum("sij,sj->si", whiten, straight)
-        found = -jnp.einsum("sje,sij,si->se", slopes, whiten, whitened) * problem.data.std**2
-        return jnp.clip(found, -_FARTHEST, _FARTHEST), None
+    def step(_: Array, state: tuple[Array, Array, Weighting]) -> tuple[Array, Array, Weighting]:
+        # One more evaluation than steps, for the weighting at the end: a second copy of it outside
+        # the loop would compile as long as the loop.
+        errors = state[0]
+        at = problem.with_data(correction=errors)
+        slopes = slopes_by_error(unknowns, at)
+        own = _weighting(slopes, at.data)
+        whitened = jnp.einsum(
+            "sij,sj->si", own.whiten, force_balance(unknowns, problem, errors) + own.offset
+        )
+        found = -jnp.einsum("sje,sij,si->se", slopes, own.whiten, whitened) * problem.data.std**2
+        return jnp.clip(found, -_FARTHEST, _FARTHEST), errors, own
 
-    return jax.lax.scan(step, problem.data.correction, length=_STEPS)[0]
+    start = problem.data.correction
+    n = len(start)
+    none = Weighting(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
+    _, errors, weighting = jax.lax.fori_loop(0, steps + 1, step, (start, start, none))
+    return errors, weighting
 
 
 def slopes_by_error(

@@ -70,12 +70,6 @@ def level_of_residuals(unravel: Unravel, data: BalanceData) -> Int[Array, " resi
     return jnp.concatenate([*own, jnp.full(nobody, -1)])
 
 
-def error_corrections(unknowns: Unknowns, problem: BalanceProblem) -> tuple[Array, Weighting]:
-    """Corrections of the states for their most likely errors, and their weighting there."""
-    errors = nearest_errors(unknowns, problem)
-    return errors, weighting_at(unknowns, problem.with_data(correction=errors))
-
-
 def corrected_residuals(
     vector: Array,
     unravel: Unravel,
@@ -90,7 +84,7 @@ def corrected_residuals(
     """
     errors, own = jax.lax.cond(
         correcting,
-        lambda at: error_corrections(unravel(at), problem),
+        lambda at: nearest_errors(unravel(at), problem),
         lambda _: (problem.data.correction, weighting),
         jax.lax.stop_gradient(vector),
     )
@@ -244,12 +238,17 @@ def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
     )
     still = jnp.zeros_like(unknowns.level)
     # Every level's error moves its own states only: one push forward for all levels.
-    kinds = still.shape[1]
-    directions = jnp.broadcast_to(jnp.eye(kinds)[:, None, :], (kinds, *still.shape))
-    push = jax.vmap(lambda d: jax.jvp(lambda b: balance(b, other), (still,), (d,))[1])
-    by_level = jnp.moveaxis(push(directions), 0, 2)
-    others = jax.jacfwd(lambda o: balance(still, o))(other)
-    columns = [others[0][..., None], others[1][..., None], others[2][..., None], others[3]]
+    kinds, n_linear = still.shape[1], unknowns.linear.shape[0]
+    units = jnp.eye(kinds + 3 + n_linear)
+    present, push = jax.linearize(balance, still, other)
+
+    def pushed(unit: Array) -> Array:
+        of_levels = jnp.broadcast_to(unit[:kinds], still.shape)
+        gain, offset, phase = unit[kinds : kinds + 3]
+        return push(of_levels, (gain, offset, phase, unit[kinds + 3 :]))
+
+    slopes = jnp.moveaxis(mapped(pushed, units), 0, 2)
+    by_level, by_other = slopes[..., :kinds], slopes[..., kinds:]
     motion = motion_of(unknowns, problem, data.correction)
     # The balance is linear in the values of both curves.
     by_damping = motion.velocity / (problem.constant_of(unknowns) * motion.force)
@@ -260,13 +259,13 @@ def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
         both = jnp.stack([slope.real, slope.imag], axis=1) * share[:, None]
         return jnp.einsum("sij,sj->si", weighting.whiten, both)
 
-    nominal = balance(still, other) - jnp.einsum("sie,se->si", by_level, level)
-    nominal = nominal - jnp.einsum("sio,o->si", others[3], unknowns.linear)
+    nominal = present - jnp.einsum("sie,se->si", by_level, level)
+    nominal = nominal - jnp.einsum("sio,o->si", by_other[..., 3:], unknowns.linear)
     return (
         *(nominal, parts(by_squared, 1 + level[:, 2])),
         parts(by_damping, 1 + level[:, 3]),
         by_level,
-        jnp.concatenate(columns, axis=2),
+        by_other,
         *(motion.displacement, jnp.abs(motion.velocity)),
         unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency)),
         unknowns.modal_damping(motion.amplitude(unknowns.modal_damping)),

@@ -20,6 +20,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     LeftOut,
     PointSample,
     fit_curve,
+    linearised_on_host,
     log_slope,
     place_knots,
     predict_left_out,
@@ -151,12 +152,37 @@ class Backbone(AbstractResult):
             return jnp.asarray(amplitude)
         return jnp.asarray(amplitude) * self.natural_frequency(amplitude)
 
-    @compiled
     def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
         """All that the backbone says at some amplitudes, with standard deviations (1σ).
 
-        The two curves' errors are taken as independent.
+        The two curves' errors are taken as independent. Differentiable; numbers that nothing is
+        differentiated by are evaluated by the host, where nothing compiles.
         """
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, amplitude))):
+            return self._values(amplitude)
+        return self._values_on_host(np.asarray(amplitude, dtype=float))
+
+    def _values_on_host(self, amplitude: Float[np.ndarray, " point"]) -> BackboneValues:
+        squared, by_squared = linearised_on_host(self.squared_frequency, amplitude)
+        modal, by_modal = linearised_on_host(self.modal_damping, amplitude)
+        variance, modal_variance = (
+            np.einsum("pk,kl,pl->p", slopes, np.asarray(covariance), slopes)
+            for slopes, covariance in (
+                (by_squared, self.squared_frequency_covariance),
+                (by_modal, self.modal_damping_covariance),
+            )
+        )
+        omega = np.sqrt(np.where(squared > 0, squared, np.nan))
+        omega_std = np.sqrt(np.maximum(variance, 0.0)) / (2 * omega)
+        modal_std = np.sqrt(np.maximum(modal_variance, 0.0))
+        zeta = modal / (2 * omega)
+        zeta_std = np.hypot(modal_std / (2 * omega), zeta * omega_std / omega)
+        speed = amplitude if self.argument == "velocity" else amplitude * omega
+        found = (speed, omega, omega_std, zeta, zeta_std, modal, modal_std)
+        return BackboneValues(*map(jnp.asarray, found))
+
+    @compiled
+    def _values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
         squared = CurveFit(self.squared_frequency, self.squared_frequency_covariance)
         damping = CurveFit(self.modal_damping, self.modal_damping_covariance)
         omega = self.natural_frequency(amplitude)

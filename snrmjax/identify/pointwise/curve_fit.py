@@ -357,16 +357,30 @@ def values_on_host(
     curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]
 ) -> Float[np.ndarray, " point"]:
     """A curve at some amplitudes in NumPy: nothing compiles for one more number of them."""
+    return linearised_on_host(curve, amplitude)[0]
+
+
+def linearised_on_host(
+    curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]
+) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point knot"]]:
+    """The same, and its derivatives by the values at the knots (central differences)."""
     knots, values = np.asarray(curve.knots), np.asarray(curve.values)
-    squared = curve.kind == PchipCurve.kind
+    n, squared = len(knots), curve.kind == PchipCurve.kind
     x, at = (knots**2, amplitude**2) if squared else (knots, amplitude)
-    cubic = squared and len(knots) > 2
-    slopes, _ = slopes_at_knots(x, values, cubic=cubic)
-    inside = KnotTerms.of(np.clip(at, x[0], x[-1]), x, cubic=cubic).curve(values, slopes)
-    if len(knots) < 2:
-        return inside
-    ends = slopes if cubic else np.diff(values) / np.diff(x)
-    return inside + ends[0] * np.minimum(at - x[0], 0) + ends[-1] * np.maximum(at - x[-1], 0)
+    cubic = squared and n > 2
+    slopes, by_values = slopes_at_knots(x, values, cubic=cubic)
+    terms = KnotTerms.of(np.clip(at, x[0], x[-1]), x, cubic=cubic)
+    inside, by_inside = terms.curve(values, slopes), terms.curve(np.eye(n), by_values)
+    if n < 2:
+        return inside, by_inside
+    if not cubic:
+        by_values = np.diff(np.eye(n), axis=0) / np.diff(x)[:, None]
+        slopes = by_values @ values
+    below, above = np.minimum(at - x[0], 0), np.maximum(at - x[-1], 0)
+    return (
+        inside + slopes[0] * below + slopes[-1] * above,
+        by_inside + np.outer(below, by_values[0]) + np.outer(above, by_values[-1]),
+    )
 
 
 def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
