@@ -88,6 +88,26 @@ def _close_mode(rng: Draw, base: Baseline) -> dict[str, float]:
     return {"constant": _sign(rng), "frequency": 1 + float(away), "damping_ratio": float(damping)}
 
 
+def _two_gaps(rng: Draw, base: Baseline) -> dict[str, float]:
+    gap, outer = rng.uniform(0.2, 0.4), rng.uniform(0.6, 0.8)
+    second = rng.choice([-0.7, 1.5])
+    return {"stiffness": 1.0, "gap": gap, "outer_gap": outer, "second": float(second)}
+
+
+def _cable(rng: Draw, base: Baseline) -> dict[str, float]:
+    return {"stiffness": 1.0, "gap": rng.uniform(0.2, 0.5), "width": rng.uniform(0.05, 0.12)}
+
+
+def _valanis(rng: Draw, base: Baseline) -> dict[str, float]:
+    slip, curvature = rng.uniform(0.15, 0.5), rng.uniform(0.4, 0.8)
+    return {"stiffness": 1.0, "slip_displacement": slip, "curvature_exponent": curvature}
+
+
+def _lap(rng: Draw, base: Baseline) -> dict[str, float]:
+    slip, exponent = rng.uniform(0.25, 0.7), rng.uniform(1.2, 3.0)
+    return {"stiffness": 1.0, "slip_displacement": slip, "exponent": exponent}
+
+
 def _harmonics(rng: Draw, base: Baseline) -> dict[str, float]:
     return {"second": _sign(rng), "third": _sign(rng) * float(rng.uniform(0.4, 1.5))}
 
@@ -138,13 +158,33 @@ OUTSIDE: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str
 }
 """Kinds that the library does not look for; `close_mode` is compared with some answers."""
 
+LAWS: dict[str, tuple[Callable[[Draw, Baseline], dict[str, float]], tuple[str, ...]]] = {
+    "tanh_spring": (_with("stiffness", 0.3, 0.9, "width"), ("stiffness",)),
+    "logarithmic_spring": (_with("stiffness", 0.2, 0.6, "width"), ("stiffness",)),
+    "sinh_spring": (_with("stiffness", 0.25, 0.5, "width"), ("stiffness",)),
+    "trilinear_spring": (_two_gaps, ("stiffness",)),
+    "power_contact": (_one("stiffness", False), ("stiffness",)),
+    "exponential_contact": (_with("stiffness", 0.3, 0.6, "width"), ("stiffness",)),
+    "magnet_gap": (_with("stiffness", 1.8, 3.0, "gap"), ("stiffness",)),
+    "slack_cable": (_cable, ("stiffness",)),
+    "stribeck_friction": (_with("force", 0.15, 0.5, "width"), ("force",)),
+    "threshold_damper": (_with("coefficient", 0.25, 0.6, "gap"), ("coefficient",)),
+    "aerodynamic_damping": (_one("coefficient", False), ("coefficient",)),
+    "squeeze_film": (_with("coefficient", 1.25, 2.0, "gap"), ("coefficient",)),
+    "sine_damping": (_with("coefficient", 0.6, 1.2, "width"), ("coefficient",)),
+    "dahl": (_with("stiffness", 0.15, 0.6, "slip_displacement"), ("stiffness",)),
+    "valanis": (_valanis, ("stiffness",)),
+    "weibull_lap": (_lap, ("stiffness",)),
+}
+"""Laws of displacement, velocity or slip that no formula of the library has; see `laws`."""
+
 IN_HARMONICS_ONLY = ("bilinear_stiffness", "force_harmonics")
 IN_TEST_ORDER = ("frequency_drift", "frequency_jump", "warming")
 
 
 def draw_effect(kind: str, rng: Draw, base: Baseline) -> Effect:
     """The shape of one effect, at unit size."""
-    shape, scaled = {**SHAPES, **OUTSIDE}[kind]
+    shape, scaled = {**SHAPES, **OUTSIDE, **LAWS}[kind]
     values = {f"{kind}.{name}": value for name, value in shape(rng, base).items()}
     return Effect(kind, values, tuple(f"{kind}.{name}" for name in scaled))
 
@@ -182,7 +222,7 @@ def first_order_change(effect: Effect, at: Points, base: Baseline) -> np.ndarray
     def shifted(s: np.ndarray | float) -> np.ndarray:
         return 2 * s + 2j * base.damping * w * s
 
-    if kind in ("jenkins_slider", "lugre", "bouc_wen"):
+    if kind in ("jenkins_slider", "lugre", "bouc_wen", "dahl", "valanis", "weibull_lap"):
         return _slider(q, w, effect.get("stiffness"), effect.get("slip_displacement"))
     if kind == "iwan_microslip":
         c, p = effect.get("coefficient"), effect.get("exponent")

@@ -8,6 +8,7 @@ named `kind.parameter`, one value a lane; a term acts where its parameters are g
 from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
+import laws
 import numpy as np
 from jax import Array
 
@@ -70,10 +71,11 @@ MEMORYLESS: dict[str, Callable[[Array, Array, Parameters], Array]] = {
         p["asymmetric_damping.coefficient"] * jnp.maximum(u, 0.0) ** 2
     ),
     "rubbing": lambda y, u, p: _rubbing(y, u, p),
+    **laws.MEMORYLESS,
 }
 """f(y, u), on the left of y'' + 2ζy' + y + … = P cos Ωt."""
 
-N_FAST = {"lugre": 1, "bouc_wen": 1, "delayed_feedback": 2}
+N_FAST = {"lugre": 1, "bouc_wen": 1, "delayed_feedback": 2, **dict.fromkeys(laws.FAST, 1)}
 """Internal states with a rate of their own, by kind."""
 
 
@@ -89,6 +91,8 @@ def fast_rate(kind: str, y: Array, u: Array, states: Array, p: Parameters) -> Ar
     if kind == "delayed_feedback":  # two lags in series
         lag = p["delayed_feedback.lag"]
         return jnp.stack([(y - states[0]) / lag, (states[0] - states[1]) / lag])
+    if kind in laws.FAST:
+        return laws.fast_rate(kind, u, states[0], p)[None]
     z, slip = states[0], p[f"{kind}.slip_displacement"]
     if kind == "lugre":
         stribeck = jnp.exp(-((u / (0.3 * p["lane.speed"])) ** 2))
@@ -97,7 +101,7 @@ def fast_rate(kind: str, y: Array, u: Array, states: Array, p: Parameters) -> Ar
     return (u - share**1.5 * (0.7 * u + 0.3 * jnp.abs(u) * z / (slip * share)))[None]
 
 
-SLIDERS = {"jenkins_slider": 1, "iwan_microslip": 60}
+SLIDERS = {"jenkins_slider": 1, "iwan_microslip": 60, **laws.SLIDERS}
 """Sliders (a spring to a block that slips) by kind; an Iwan element is an array of them."""
 
 _EDGE = np.linspace(0.0, 1.0, SLIDERS["iwan_microslip"] + 1)
@@ -111,6 +115,8 @@ def sliders(kind: str, p: Parameters) -> tuple[Array, Array]:
     Iwan: the backbone −c x^p has the stiffness density c p (p − 1) s^(p−2) over the slip
     displacement s, here put into cells that are even in s^(p−1), as s runs to `IWAN_RANGE`.
     """
+    if kind in laws.SLIDERS:
+        return laws.lap_sliders(p)
     if kind == "jenkins_slider":
         return p["jenkins_slider.stiffness"][None], p["jenkins_slider.slip_displacement"][None]
     c, power = p["iwan_microslip.coefficient"], p["iwan_microslip.exponent"]

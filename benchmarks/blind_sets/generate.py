@@ -1,7 +1,7 @@
 """Blind data sets for `snrmjax diagnose`: truth by time integration, with the errors of a test.
 
 Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
-     [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1]
+     [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1] [--laws]
 
 Writes DIR/sets/NAME.csv and NAME.toml (the baseline model, which lacks the effect) and, apart from
 them, DIR/keys/NAME.json (the truth). No code is shared with the package that is tested.
@@ -22,10 +22,15 @@ from truth import Truth, calibrated
 
 
 def generate(
-    half: str, seed: int, only: int | None = None, names: list[str] | None = None
+    half: str,
+    seed: int,
+    only: int | None = None,
+    names: list[str] | None = None,
+    *,
+    laws: bool = False,
 ) -> tuple[list[Case], list[Truth]]:
     """Draw and simulate the sets of one half, the first `only` of them or those of some names."""
-    cases = draw_cases(half, seed)[:only]
+    cases = draw_cases(half, seed, laws=laws)[:only]
     if names is not None:
         cases = [case for case in cases if case.name in names]
     truths = calibrated(cases)
@@ -41,6 +46,7 @@ def main() -> None:
     parser.add_argument("--names", type=lambda text: text.split(","))
     parser.add_argument("--requests", type=Path)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--laws", action="store_true", help="laws outside the library instead")
     options = parser.parse_args()
     begin = time.perf_counter()
     sets, keys = options.out / "sets", options.out / "keys"
@@ -50,7 +56,9 @@ def main() -> None:
     if options.requests is not None:
         requests = json.loads(options.requests.read_text(encoding="utf-8"))
         options.names = list(requests)
-    cases, truths = generate(options.half, options.seed, options.only, options.names)
+    cases, truths = generate(
+        options.half, options.seed, options.only, options.names, laws=options.laws
+    )
     for case, truth in zip(cases, truths, strict=True):
         if case.name in requests:
             request = requests[case.name]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
-from effects import OUTSIDE, SHAPES, Baseline, Effect, draw_effect
+from effects import LAWS, OUTSIDE, SHAPES, Baseline, Effect, draw_effect
 from flat_beam import FLAT_BEAM
 from strength import Errors, first_order_size
 
@@ -94,6 +94,17 @@ def all_plans() -> list[Plan]:
     return plans
 
 
+def law_plans(repeats: int = 3) -> list[Plan]:
+    """Sets of laws that no formula of the library has, and twenty without any effect."""
+    plans = [Plan("none", harmonics=k % 2 == 0, level_errors=k % 4 == 3) for k in range(20)]
+    for n, kind in enumerate(LAWS):
+        plans += [
+            Plan("law", (kind,), 1.0, harmonics=(n + k) % 3 > 0, level_errors=(n + k) % 5 == 4)
+            for k in range(repeats)
+        ]
+    return plans
+
+
 def _levels(rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[int, ...]]:
     n = int(rng.integers(4, 7))
     return tuple(np.geomspace(1 / rng.uniform(3.5, 10), 1.0, n).tolist()), tuple(range(n))
@@ -156,9 +167,9 @@ def draw_case(plan: Plan, index: int, half: str, seed: int) -> Case:
     )  # fmt: skip
 
 
-def draw_cases(half: str, seed: int) -> list[Case]:
-    """All sets of one half; the names are shuffled."""
-    plans = all_plans()
+def draw_cases(half: str, seed: int, *, laws: bool = False) -> list[Case]:
+    """All sets of one half, or those of laws outside the library; the names are shuffled."""
+    plans = law_plans() if laws else all_plans()
     order = np.random.default_rng([seed, 77, HALVES.index(half)]).permutation(len(plans))
     cases = []
     for index, (plan, place) in enumerate(zip(plans, order, strict=True)):

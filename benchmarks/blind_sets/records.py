@@ -149,7 +149,7 @@ def baseline_model(case: Case, truth: Truth) -> dict:
 def key(case: Case, truth: Truth) -> dict:
     """The truth about one set."""
     plan = case.plan
-    outside = plan.group == "outside"
+    outside = plan.group in ("outside", "law")
     parameters: dict[str, float] = {}
     for effect in case.effects:
         parameters |= physical_parameters(case, effect, truth)
@@ -178,6 +178,9 @@ def key(case: Case, truth: Truth) -> dict:
             "damping_ratio": case.base.damping,
             "cubic": case.base.cubic,
             "displacement_scale": case.displacement,
+            "shape": case.shape,
+            "largest": float(np.max(np.abs(truth.velocity[1]) / truth.frequency)),
+            "fastest": float(np.max(np.abs(truth.velocity[1]))),
         },
         "levels": len(case.base.peaks),
         "rows": len(truth.level),

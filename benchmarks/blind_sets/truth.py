@@ -100,7 +100,7 @@ def lane_table(cases: list[Case]) -> Lanes:
     names = sorted({name for row in rows for name in row})
     # Shapes (a gap, an exponent) need a harmless value in lanes without their effect.
     harmless = {name: max(row.get(name, 0.0) for row in rows) for name in names}
-    sizes = ("gap", "width", "lag", "slip_displacement", "exponent")
+    sizes = ("gap", "width", "lag", "slip_displacement", "exponent")  # ends of names
     parameters = {
         name: np.array(
             [row.get(name, harmless[name] if name.endswith(sizes) else 0.0) for row in rows]

@@ -105,7 +105,7 @@ class Predictions:
     force_gain_std: float
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
-    _stored: programs.Stored
+    motions: programs.Stored
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
@@ -205,7 +205,7 @@ class Predictions:
                     group.model,
                     programs.Settings(group.names, self.compared, len(self.model.effects), quick),
                     programs.Wanted(*asked[:2]),
-                    self._stored,
+                    self.motions,
                     programs.Trials(*parts),
                     programs.StateTrials(*asked[2:]),
                 )
@@ -257,7 +257,7 @@ def predictions_of(
         force_gain_std=force_gain_std,
         stated={name: (numbers[name], std) for name, std in stated_stds(model).items()},
         group=_all_effects(model, _scales(model, chosen)),
-        _stored=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
+        motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
     )
 
 

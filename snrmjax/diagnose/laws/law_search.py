@@ -1,0 +1,179 @@
+"""The parts of a law that data ask for, and their secants, by a few rounds of Gauss and Newton."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.diagnose.laws.law_columns import TABLES, LawColumns, LawKnots, law_columns
+from snrmjax.diagnose.laws.law_prior import (
+    PARTS,
+    LawPosterior,
+    LawProblem,
+    best_processes,
+    posterior,
+)
+from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
+
+_KNOTS = 24
+_FIRST, _LAST = 0.25, 1.02  # knot, over the smallest and the largest amplitude that was measured
+_FIRST_SLIP = 0.1  # slip displacement, over the smallest amplitude
+_MOST = 3  # parts of a law
+_STARTS = 2  # parts from which further ones are sought
+_ROUNDS, _HALVINGS = 6, 5
+_SEARCHED = 3  # rounds in which parts are chosen
+_SETTLED = 0.05  # rms change of the rows, in units of noise, that ends the rounds
+
+
+class LawFit(NamedTuple):
+    """A law fitted to a weighted misfit."""
+
+    misfit: WeightedMisfit  # with errors passed on as the law passes them
+    knots: LawKnots
+    units: dict[str, Float[np.ndarray, " knot"]]  # of the secants of every part
+    columns: LawColumns  # at the law
+    problem: LawProblem  # linearised there
+    posterior: LawPosterior
+    rivals: tuple[str, ...]  # parts, each of which would do about as well in place of the first
+    settled: bool
+
+    @property
+    def rows(self) -> Float[np.ndarray, " row"]:
+        """Misfits that are left, in units of noise."""
+        return self.misfit.noise.noise_units(self.columns.columns[None])[0]
+
+    @property
+    def secants(self) -> Float[np.ndarray, "table knot"]:
+        """The mean of the secants, table by table."""
+        return secants_of(self.posterior.parts, self.posterior.mean, self.units)
+
+
+def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
+    """The law that explains a misfit best, whatever it explains; None where none has a motion.
+
+    A second and a third part are added while the evidence gains as much as an effect must.
+    """
+    predictions, scales = misfit.predictions, scales_of(misfit.predictions)
+    knots = knots_of(predictions)
+    units = {}
+    for name, part in PARTS.items():
+        is_stiffness = part.tables[0] in (0, 5)
+        size = scales.change / (1.0 if is_stiffness else scales.frequency)
+        units[name] = np.full(_KNOTS, size)
+    # Where the linear frequency was measured, little slips.
+    units["slip"] = units["slip"] * knots.slip / knots.slip[-1]
+    everything = np.ones(TABLES, dtype=bool)
+    secants = np.zeros((TABLES, _KNOTS))
+    columns = law_columns(predictions, knots, secants, everything)
+    if not np.isfinite(columns.columns).all():
+        return None
+    settled = False
+    parts: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    for number in range(_ROUNDS):
+        problem = law_problem(misfit, columns, secants, knots, units)
+        # First one part alone: errors are not passed on yet as the law does.
+        if number < _SEARCHED:
+            parts, rivals = _parts(problem, 1 if number == 0 else _MOST)
+        found = posterior(problem, parts)
+        aim = secants_of(parts, found.mean, units)
+        change = (aim - secants).reshape(-1)
+        for _ in range(_HALVINGS):
+            ahead = law_columns(predictions, knots, aim, everything, columns)
+            if np.isfinite(ahead.columns).all():
+                break
+            aim = 0.5 * (aim + secants)
+        else:
+            return None
+        # A step that changes no row any more, in the weighting of the step before.
+        moved = (columns.by_secant.reshape(*columns.columns.shape, -1) @ change)[None]
+        moved = misfit.noise.decorrelated(misfit.noise.noise_units(moved)[0])
+        settled = bool(np.sqrt(np.mean(moved**2)) < _SETTLED)
+        secants, columns = aim, ahead
+        misfit = misfit.reweighted(columns.passed_on)
+        if settled and number > 0:
+            break
+    problem = law_problem(misfit, columns, secants, knots, units)
+    final = posterior(problem, parts)._replace(mean=found.mean)
+    return LawFit(misfit, knots, units, columns, problem, final, rivals, settled)
+
+
+def knots_of(predictions: Predictions) -> LawKnots:
+    """Knots over the measured range of motion of the mode of interest."""
+    states, modes = predictions.chosen.states, predictions.model.modes
+    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
+    v = np.abs(np.asarray(states.velocity)[:, 0] / shape)
+    q = v / np.asarray(states.frequency)
+
+    def between(size: np.ndarray, first: float) -> np.ndarray:
+        return np.geomspace(first * float(size.min()), _LAST * float(size.max()), _KNOTS)
+
+    return LawKnots(between(q, _FIRST), between(v, _FIRST), between(q, _FIRST_SLIP))
+
+
+def law_problem(
+    misfit: WeightedMisfit,
+    columns: LawColumns,
+    secants: Float[np.ndarray, "table knot"],
+    knots: LawKnots,
+    units: dict[str, Float[np.ndarray, " knot"]],
+) -> LawProblem:
+    """The misfit as a linear function of the secants, as it is at some of them."""
+    noise = misfit.noise
+    by = np.moveaxis(columns.by_secant.reshape(*columns.columns.shape, -1), 2, 0)
+    arms = noise.noise_units(by).T
+    rows = noise.noise_units(columns.columns[None])[0] - arms @ secants.reshape(-1)
+    arms = noise.decorrelated(arms.T).T.reshape(len(rows), TABLES, -1)
+    own, place = {}, {}
+    for name, part in PARTS.items():
+        signed = (
+            sign * arms[:, table] for table, sign in zip(part.tables, part.signs, strict=True)
+        )
+        own[name] = units[name] * sum(signed)
+        place[name] = np.log(knots_of_table(knots, part.tables[0]))
+    whole = np.concatenate(list(own.values()), axis=1)
+    return LawProblem(whole.T @ whole, -whole.T @ noise.decorrelated(rows), place)
+
+
+def knots_of_table(knots: LawKnots, table: int) -> Float[np.ndarray, " knot"]:
+    """Where a table of secants has its knots."""
+    return knots[(0, 0, 1, 1, 0, 2)[table]]
+
+
+def secants_of(
+    parts: Sequence[str],
+    values: Float[np.ndarray, "*entry secant"],
+    units: dict[str, Float[np.ndarray, " knot"]],
+) -> Float[np.ndarray, "*entry table knot"]:
+    """Tables of secants from those of some parts, in units plainly seen."""
+    own = values.reshape(*values.shape[:-1], len(parts), -1)
+    found = np.zeros((*values.shape[:-1], TABLES, own.shape[-1]))
+    for k, name in enumerate(parts):
+        for table, sign in zip(PARTS[name].tables, PARTS[name].signs, strict=True):
+            found[..., table, :] += sign * units[name] * own[..., k, :]
+    return found
+
+
+def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The parts with the best evidence, added one by one, and the rivals of the first."""
+    alone = {part: best_processes(problem, (part,))[1] for part in PARTS}
+    order = sorted(PARTS, key=lambda part: alone[part])
+    best: tuple[str, ...] = (order[0],)
+    cost = alone[order[0]]
+    rivals = tuple(part for part in order[1:] if alone[part] < cost + AS_GOOD)
+    for first in order[:_STARTS]:
+        own, own_cost = (first,), alone[first]
+        while len(own) < most:
+            costs = {
+                part: best_processes(problem, (*own, part))[1] for part in PARTS if part not in own
+            }
+            added = min(costs, key=lambda part: costs[part])
+            if costs[added] > own_cost - DETECTED:
+                break
+            own, own_cost = (*own, added), costs[added]
+        if own_cost < cost - (DETECTED if len(own) > len(best) else 0.0):
+            best, cost = own, own_cost
+    return best, rivals if len(best) == 1 else ()
