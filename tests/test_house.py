@@ -42,6 +42,8 @@ SUB_ROOMS = {
     "diagnose.misfit": set(),
     "diagnose.search": {"diagnose.misfit"},
     "diagnose.checks": {"diagnose.misfit", "diagnose.search"},
+    "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
+    "report.laws": {"report.style", "report.html"},
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
 }
 NUMERICAL = set(ROOMS) - {"io", "report"}

@@ -31,6 +31,7 @@ from snrmjax.diagnose.design.recommendation import recommendation, recommended_t
 from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
 from snrmjax.diagnose.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
 from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
+from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
@@ -77,7 +78,8 @@ def diagnose_model(
     Where the force is known as a drive voltage only, a first value of its gain is found and the
     gain is free. Where neither noise nor errors of levels are stated, both are estimated: the
     noise is what the answer leaves, and the level-to-level variance what no smooth curves of
-    amplitude explain.
+    amplitude explain. Where no effect of the library explains the data, a law that does is drawn
+    from them (`laws.law_answer`), if their noise and their forces are known.
 
     Returns a `Diagnosis`; `checks.verdict.judge` has the rules of its verdict. Raises `ValueError`
     for too few states, an unknown force or sensors other than the model's.
@@ -175,7 +177,7 @@ def diagnose_model(
     notes += [*notes_on_stated_parameters(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
     notes += _notes_on_fits(found, unconverged)
-    return Diagnosis(
+    diagnosis = Diagnosis(
         verdict=judgement.verdict,
         answer=answer,
         decide_by=recommendation(
@@ -197,6 +199,43 @@ def diagnose_model(
         notes=tuple(note for note in notes if note),
         force_misfit=_force_misfit(misfit, found.baseline, fit),
         data=data,
+    )
+    known = predictions.chosen.noise_stated and force_gain_std == 0 and not unknown.any()
+    if judgement.verdict is not Verdict.UNKNOWN or not known:
+        return diagnosis
+    law = law_answer(found, model)
+    return diagnosis if law is None else _with_law(diagnosis, law)
+
+
+def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
+    """A diagnosis with a drawn law in place of effects that do not explain the data."""
+    misfit, nothing = law.misfit, baseline_fit(law.misfit)
+    answer = diagnosis.answer._replace(
+        effects=law.kinds,
+        candidates=((law.kinds[0], *law.rivals), *((kind,) for kind in law.kinds[1:])),
+        parameters={},
+        status=MinimisationStatus.CONVERGED,
+        completed=law.completed,
+        completed_status=CompletedStatus.COMPLETED,
+        laws=law.laws,
+    )
+    checks = diagnosis.checks._replace(
+        p_value=law.p_value,
+        noise_scale=float(np.sqrt(law.noise)),
+        completed_without=law.completed_without,
+    )
+    return dataclasses.replace(
+        diagnosis,
+        verdict=Verdict.DRAWN,
+        answer=answer,
+        decide_by=law.decide_by,
+        discriminating_test=None,
+        gap=Gap(
+            rms_misfit(misfit, nothing), rms_misfit(misfit, law.fit), *(law.levels or (None, None))
+        ),
+        checks=checks,
+        notes=(*law.notes, *misfit.predictions.chosen.notes),
+        force_misfit=_force_misfit(misfit, nothing, law.fit),
     )
 
 

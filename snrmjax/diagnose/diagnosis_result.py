@@ -13,6 +13,7 @@ from snrmjax.diagnose.checks.probabilities import answer_name
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
 from snrmjax.diagnose.completed_model import CompletedStatus
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
+from snrmjax.diagnose.laws.law_table import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.measure.states import SteadyStates
@@ -46,6 +47,7 @@ class Answer(NamedTuple):
     completed_status: CompletedStatus
     force_gain: float  # acting force over recorded one, where a gain was free; else 1
     probabilities: dict[str, float]  # of all answers considered; effects are joined by `+`
+    laws: tuple[DrawnLaw, ...] = ()  # where the verdict is `DRAWN`, the most important first
 
 
 class Gap(NamedTuple):
@@ -123,6 +125,8 @@ class Diagnosis(AbstractResult):
     def probability(self) -> float:
         """That the answer given is right: its verdict, or one effect of every class."""
         verdict = Verdict(self.verdict)
+        if verdict is Verdict.DRAWN:  # what no effect of the library explains
+            return self.probabilities.get(Verdict.UNKNOWN.value, 0.0)
         if not verdict.is_answer:
             return self.probabilities.get(verdict.value, 0.0)
         given = {answer_name(kinds) for kinds in product(*self.candidates)}
@@ -137,6 +141,13 @@ class Diagnosis(AbstractResult):
     def verdict_sentence(self) -> str:
         """The verdict in one plain sentence."""
         before, after = self.gap.before, self.gap.after
+        if self.answer.laws:
+            names = "; beside it ".join(law.name for law in self.answer.laws)
+            return (
+                f"The model lacks a force that no effect of the library explains, drawn from the "
+                f"data: {names}. With it the misfit falls from {before:.1f} to {after:.1f} times "
+                "the noise."
+            )
         return verdict_sentence(Verdict(self.verdict), self.candidates, before, after)
 
     def summary(self) -> tuple[str, ...]:

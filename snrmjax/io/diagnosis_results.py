@@ -5,8 +5,10 @@ from collections.abc import Sequence
 
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.laws.law_table import DrawnLaw
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.diagnose.search.locating import Located
+from snrmjax.model.effect_metadata import Argument
 
 
 def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse] = ()) -> dict:
@@ -18,18 +20,25 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     `states` and how far off resonance in phase, the `harmonics` with the noise that they need, the
     `quantity` in which the models differ most, the expected gain of χ² over the rival that is
     separated least well and the gain that is needed; `calibration_too` if effects stay open that
-    only a calibration separates. `probability` is that of the answer given: of its verdict, or of
+    only a calibration separates. With the verdict `drawn` there is a `law`: see `DrawnLaw`; of a
+    damping that depends on the displacement `force_n` is the force at `at_velocity_m_s`, beyond
+    `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that were needed beside it
+    have tables of their own. `probability` is that of the answer given: of its verdict, or of
     the members of its classes; `probabilities` are those of all answers considered. `tried` has
     every fit that was compared with its `status`.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
+    laws = [_law(one) for one in diagnosis.answer.laws]
+    if laws[1:]:
+        laws[0]["further"] = laws[1:]
     return {
         "verdict": diagnosis.verdict.value,
         "effects": list(diagnosis.effects),
         "candidates": [list(group) for group in diagnosis.candidates],
         "probabilities": diagnosis.probabilities,
         "probability": diagnosis.probability,
+        **({"law": laws[0]} if laws else {}),
         "decide_by": diagnosis.decide_by,
         "request": _test(diagnosis.discriminating_test),
         "located": [_part(part) for part in diagnosis.located],
@@ -105,6 +114,18 @@ def _test(test: DiscriminatingTest | None) -> dict | None:
         "settles": test.settles,
         "calibration_too": test.calibration_too,
     }
+
+
+def _law(law: DrawnLaw) -> dict:
+    is_velocity = law.argument is Argument.VELOCITY
+    table: dict = {
+        "class": law.name,
+        "velocity_m_s" if is_velocity else "displacement_m": law.at.tolist(),
+        "force_n": law.force.tolist(),
+        "force_std_n": law.force_std.tolist(),
+        "measured_up_to": law.largest,
+    }
+    return table if law.passing is None else table | {"at_velocity_m_s": law.passing}
 
 
 def _part(part: Located) -> dict:

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from snrmjax.diagnose.checks.probabilities import NOISE_REJECTED, NONE, UNKNOWN
 from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, probability_in_words
+from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
+from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.former_answer import FormerAnswer
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
@@ -23,7 +24,7 @@ from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_shape import shape_of
-from snrmjax.model.effects import EFFECTS
+from snrmjax.model.effects import EFFECTS, LAWS, effect_class
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_figures import (
     at_curve_force,
@@ -45,6 +46,7 @@ from snrmjax.report.html import (
     with_error,
     write_report,
 )
+from snrmjax.report.laws.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 
 _SHOWN = 10  # candidates
@@ -144,7 +146,9 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """The figures that need no simulation, by the names of their files."""
     figures = {"residuals": misfit_figure(diagnosis), "candidates": candidates_figure(diagnosis)}
     found = found_effects(diagnosis)
-    if found is not None:
+    if diagnosis.answer.laws:
+        figures["laws"] = drawn_laws_figure(diagnosis.answer.laws)
+    elif found is not None:
         data = diagnosis.data
         sensor = data.sensors[diagnosis.force_misfit.sensor]
         figures["laws"] = effect_laws_figure(found, data, sensor=sensor)
@@ -164,7 +168,7 @@ def diagnosis_report(
     Arguments: `figures` by the names that `diagnosis_figures` gives them, and `responses`;
     `predicted` resonances of the levels; `done` names the inputs.
     """
-    captions = {**_CAPTIONS}
+    captions = {**_CAPTIONS} | ({"laws": LAW_CAPTION} if diagnosis.answer.laws else {})
     if holds_response(diagnosis.data, predicted):
         captions["responses"] += _HELD_RESPONSE
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
@@ -214,7 +218,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
     rows.append(("misfit of the force (rms)", misfit))
-    rows.append(("probability of this answer", probability_in_words(diagnosis.probability)))
+    rows.append(("probability of this answer", in_words(diagnosis.probability)))
     for place, out in (
         ("misfit of a level between others", gap.interpolated),
         ("misfit of the largest level", gap.extrapolated),
@@ -261,7 +265,8 @@ def _effects_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure]) ->
     figures = [shown["laws"]] if "laws" in shown else []
     unsure = diagnosis.verdict == Verdict.UNKNOWN
     heading = "The best attempt, which does not explain the data" if unsure else "What is missing"
-    return Section(heading, text, figures, [table])
+    tables = law_tables(diagnosis.answer.laws) or [table]
+    return Section(heading, text, figures, tables)
 
 
 def _comparison_section(
@@ -295,15 +300,11 @@ def _candidates_section(diagnosis: Diagnosis, shown: Mapping[str, ReportFigure])
         if step
     ]
     rows = [
-        (_answer_in_words(name), probability_in_words(value))
+        (_OTHER_ANSWERS.get(name) or _readable(name.replace("+", " with ")), in_words(value))
         for name, value in list(diagnosis.probabilities.items())[:_SHOWN]
     ]
     tables.insert(0, ReportTable(("answer", "probability"), rows, _PROBABILITIES))
     return Section("What else was considered", (), [shown["candidates"]], tables)
-
-
-def _answer_in_words(name: str) -> str:
-    return _OTHER_ANSWERS.get(name) or _readable(name.replace("+", " with "))
 
 
 def _step(number_of: int, count: int) -> str:
@@ -345,22 +346,22 @@ def _value_and_unit(kind: str, name: str, pair: tuple[float, float]) -> tuple[st
 
 def _description(kind: str) -> str:
     """What an effect is physically and where it shows, as its class states it."""
-    shape = shape_of(EFFECTS[kind])
-    return f"{EFFECTS[kind].description} {shape.sentence if shape else ''}".strip()
+    shape = shape_of(effect_class(kind))
+    return f"{effect_class(kind).description} {shape.sentence if shape else ''}".strip()
 
 
 def _unit(kind: str, name: str) -> str:
-    unit = EFFECTS[kind].parameters()[name].unit.replace("kg^1/2", "√kg")
+    unit = effect_class(kind).parameters()[name].unit.replace("kg^1/2", "√kg")
     return "" if unit == "1" else unit
 
 
 def _meaning(kind: str, name: str) -> str:
-    return EFFECTS[kind].parameters()[name].meaning or _words(name)
+    return effect_class(kind).parameters()[name].meaning or _words(name)
 
 
 def _readable(text: str) -> str:
     """A sentence of the diagnosis with the effects' names in words."""
-    for kind in sorted(EFFECTS, key=len, reverse=True):
+    for kind in sorted((*EFFECTS, *LAWS), key=len, reverse=True):
         text = re.sub(rf"\b{kind}\b", effect_name(kind), text, flags=re.IGNORECASE)
     return text
 

@@ -30,7 +30,7 @@ def held_out(
     baseline's stated uncertainty are predicted too; its own gain and phase are not. `noise` is
     the variance over the stated one for which probabilities are given.
     """
-    out = _rows_of(misfit, level)
+    out = rows_of_level(misfit, level)
     n_out = int(out.sum())
     before, _ = _chi_square_of(misfit, baseline, out)
     after, open_too = _chi_square_of(misfit, fit, out)
@@ -84,7 +84,7 @@ class FitWithoutLevel(NamedTuple):
 
 def without_level(misfit: WeightedMisfit, fit: EffectFit, level: int) -> FitWithoutLevel:
     """One step from the whole fit to the best one without a level's rows."""
-    kept = ~_rows_of(misfit, level)
+    kept = ~rows_of_level(misfit, level)
     change, rows, _ = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
     number = int(misfit.level_numbers[level])
@@ -96,7 +96,8 @@ def rms_misfit(misfit: WeightedMisfit, fit: EffectFit) -> float:
     return float(np.sqrt(misfit.chi_square(fit.rows) / misfit.n_rows))
 
 
-def _rows_of(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"]:
+def rows_of_level(misfit: WeightedMisfit, level: int) -> Bool[np.ndarray, " row"]:
+    """Which rows are those of a level, by its place."""
     levels = np.asarray(misfit.predictions.chosen.states.level)
     return np.asarray(levels[misfit.noise.state] == level)
 
@@ -131,11 +132,23 @@ def _refitted(
 def _chi_square_of(
     misfit: WeightedMisfit, fit: EffectFit, out: Bool[np.ndarray, " row"]
 ) -> tuple[float, float]:
-    """χ² of rows left out, with the fitted parameters taken as known and as uncertain.
-
-    By one factor of the covariance with the rows left out last, where nothing large cancels.
-    """
+    """χ² of rows left out, with the fitted parameters taken as known and as uncertain."""
     _, rows, root = _refitted(misfit, fit, ~out)
+    return chi_square_of_level(misfit, rows, root, out)
+
+
+def chi_square_of_level(
+    misfit: WeightedMisfit,
+    rows: Float[np.ndarray, " row"],
+    root: Float[np.ndarray, "row any"],
+    out: Bool[np.ndarray, " row"],
+) -> tuple[float, float]:
+    """χ² of rows left out, given the others, with parameters taken as known and as uncertain.
+
+    Arguments: `rows` of a fit to the others; `root` of the covariance of the parameters' part of
+    the rows. By one factor of the covariance with the rows left out last, where nothing large
+    cancels.
+    """
     shared, n_out = misfit.noise.shared, int(out.sum())
     last = np.argsort(out, kind="stable")
     lower = np.linalg.cholesky(np.eye(len(shared)) + shared[last] @ shared[last].T)

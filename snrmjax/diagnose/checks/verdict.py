@@ -46,13 +46,14 @@ class Verdict(StrEnum):
     NOTHING_MISSING = "none"
     NAMED = "named"
     AMBIGUOUS = "ambiguous"
+    DRAWN = "drawn"
     UNKNOWN = "unknown"
     NOISE_REJECTED = "noise_rejected"
 
     @property
     def is_answer(self) -> bool:
         """Whether effects are given as an answer."""
-        return self in (Verdict.NAMED, Verdict.AMBIGUOUS)
+        return self in (Verdict.NAMED, Verdict.AMBIGUOUS, Verdict.DRAWN)
 
 
 def verdict_sentence(

@@ -42,11 +42,14 @@ PARTS = {
     "odd spring": LawPart((0, 1), (1.0, 1.0)),
     "even spring": LawPart((0, 1), (1.0, -1.0)),
     "odd damper": LawPart((2, 3), (1.0, 1.0)),
-    "even damper": LawPart((2, 3), (1.0, -1.0)),
     "film": LawPart((4,), (1.0,)),
     "slip": LawPart((5,), (1.0,), not_negative=True),
 }
-"""Parts of laws, by what they are called here; tables are those of `LawColumns`."""
+"""Parts of laws, by what they are called here; tables are those of `LawColumns`.
+
+A damper that differs between the directions is not among them: its even part acts as that of a
+spring does, for the square of the velocity is what the square of the displacement lacks.
+"""
 
 
 class LawProblem(NamedTuple):
@@ -57,6 +60,7 @@ class LawProblem(NamedTuple):
 
     gram: Float[np.ndarray, "secant secant"]
     pull: Float[np.ndarray, " secant"]
+    square: float  # yᵀy
     place: dict[str, Float[np.ndarray, " knot"]]  # logarithms of where the knots are
 
     def of(self, parts: Sequence[str]) -> Int[np.ndarray, " secant"]:

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.laws.law_columns import TABLES, LawColumns, LawKnots, law_columns
 from snrmjax.diagnose.laws.law_prior import (
@@ -19,7 +20,7 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
 
 _KNOTS = 24
-_FIRST, _LAST = 0.25, 1.02  # knot, over the smallest and the largest amplitude that was measured
+_FIRST = 0.25  # knot, over the smallest amplitude that was measured; the last is at the largest
 _FIRST_SLIP = 0.1  # slip displacement, over the smallest amplitude
 _MOST = 3  # parts of a law
 _STARTS = 2  # parts from which further ones are sought
@@ -44,6 +45,11 @@ class LawFit(NamedTuple):
     def rows(self) -> Float[np.ndarray, " row"]:
         """Misfits that are left, in units of noise."""
         return self.misfit.noise.noise_units(self.columns.columns[None])[0]
+
+    @property
+    def criterion(self) -> float:
+        """−2 ln of the evidence, but for what it is without a misfit: as Schwarz's criterion."""
+        return self.problem.square + self.posterior.cost
 
     @property
     def secants(self) -> Float[np.ndarray, "table knot"]:
@@ -109,7 +115,7 @@ def knots_of(predictions: Predictions) -> LawKnots:
     q = v / np.asarray(states.frequency)
 
     def between(size: np.ndarray, first: float) -> np.ndarray:
-        return np.geomspace(first * float(size.min()), _LAST * float(size.max()), _KNOTS)
+        return np.geomspace(first * float(size.min()), float(size.max()), _KNOTS)
 
     return LawKnots(between(q, _FIRST), between(v, _FIRST), between(q, _FIRST_SLIP))
 
@@ -120,22 +126,35 @@ def law_problem(
     secants: Float[np.ndarray, "table knot"],
     knots: LawKnots,
     units: dict[str, Float[np.ndarray, " knot"]],
+    kept: Bool[np.ndarray, " row"] | None = None,
 ) -> LawProblem:
-    """The misfit as a linear function of the secants, as it is at some of them."""
+    """The misfit as a linear function of the secants, as it is at some of them; by some rows."""
     noise = misfit.noise
     by = np.moveaxis(columns.by_secant.reshape(*columns.columns.shape, -1), 2, 0)
     arms = noise.noise_units(by).T
     rows = noise.noise_units(columns.columns[None])[0] - arms @ secants.reshape(-1)
-    arms = noise.decorrelated(arms.T).T.reshape(len(rows), TABLES, -1)
-    own, place = {}, {}
+    whole, place = [], {}
     for name, part in PARTS.items():
-        signed = (
-            sign * arms[:, table] for table, sign in zip(part.tables, part.signs, strict=True)
-        )
-        own[name] = units[name] * sum(signed)
+        n = len(units[name])
+        signed = [
+            sign * arms[:, table * n : (table + 1) * n]
+            for table, sign in zip(part.tables, part.signs, strict=True)
+        ]
+        whole.append(units[name] * sum(signed))
         place[name] = np.log(knots_of_table(knots, part.tables[0]))
-    whole = np.concatenate(list(own.values()), axis=1)
-    return LawProblem(whole.T @ whole, -whole.T @ noise.decorrelated(rows), place)
+    both = np.column_stack([*whole, rows])
+    if kept is None:
+        both = noise.decorrelated(both.T).T
+    else:
+        both = solve_triangular(noise.of_rows(kept), both[kept], lower=True)
+    columns_of, left = both[:, :-1], both[:, -1]
+    gram, pull = columns_of.T @ columns_of, -columns_of.T @ left
+    return LawProblem(gram, pull, float(left @ left), place)
+
+
+def problem_of(fit: LawFit, kept: Bool[np.ndarray, " row"]) -> LawProblem:
+    """The problem of a fitted law by some of the rows."""
+    return law_problem(fit.misfit, fit.columns, fit.secants, fit.knots, fit.units, kept)
 
 
 def knots_of_table(knots: LawKnots, table: int) -> Float[np.ndarray, " knot"]:
@@ -165,7 +184,8 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
     cost = alone[order[0]]
     rivals = tuple(part for part in order[1:] if alone[part] < cost + AS_GOOD)
     for first in order[:_STARTS]:
-        own, own_cost = (first,), alone[first]
+        own: tuple[str, ...] = (first,)
+        own_cost = alone[first]
         while len(own) < most:
             costs = {
                 part: best_processes(problem, (*own, part))[1] for part in PARTS if part not in own

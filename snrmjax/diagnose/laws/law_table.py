@@ -16,19 +16,17 @@ from snrmjax.model.library.free_laws import (
     DisplacementDampingLaw,
     SlipLaw,
     StiffnessLaw,
-    UnevenDampingLaw,
     UnevenStiffnessLaw,
 )
 
 SURE = 1.96
 """1σ of a 95 % band."""
 
-_TWO_SIDED = {"even spring", "even damper"}
+_TWO_SIDED = {"even spring"}
 _KINDS = {
     "odd spring": StiffnessLaw.kind,
     "even spring": UnevenStiffnessLaw.kind,
     "odd damper": DampingLaw.kind,
-    "even damper": UnevenDampingLaw.kind,
     "film": DisplacementDampingLaw.kind,
     "slip": SlipLaw.kind,
 }
@@ -80,8 +78,7 @@ def law_effects(fit: LawFit, secants: Float[np.ndarray, "table knot"]) -> list[A
             own = UnevenStiffnessLaw(x, w[0] * x, w[1] * x) if two_sided else None
             found.append(own or StiffnessLaw(x, w[0] * x))
         elif group[0].endswith("damper"):
-            own_damper = UnevenDampingLaw(v, w[2] * v, w[3] * v) if two_sided else None
-            found.append(own_damper or DampingLaw(v, w[2] * v))
+            found.append(DampingLaw(v, w[2] * v))
         elif group[0] == "film":
             found.append(DisplacementDampingLaw(x, w[4]))
         else:
@@ -151,7 +148,8 @@ def _modal_table(
     mean = post.mean @ force
     std = np.sqrt(np.maximum(np.einsum("ex,ef,fx->x", force, post.covariance, force), 0.0))
     rest = len(at) // 2 if two_sided else 0
-    return *(np.insert(one, rest, 0.0) for one in (at, mean, std)), two_sided
+    at, mean, std = (np.insert(one, rest, 0.0) for one in (at, mean, std))
+    return at, mean, std, two_sided
 
 
 def _words(group: tuple[str, ...], at: np.ndarray, force: np.ndarray, std: np.ndarray) -> str:

@@ -1,0 +1,255 @@
+"""Where no effect of the library explains the data, an answer by a law that is drawn from them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from snrmjax.diagnose.checks.cross_validation import (
+    HeldOut,
+    HeldOutLevels,
+    chi_square_of_level,
+    held_out_places,
+    rows_of_level,
+)
+from snrmjax.diagnose.checks.patterns import UNLIKELY, left_curve, pattern
+from snrmjax.diagnose.checks.verdict import neighbour_noise, refuted_by_levels, tolerated
+from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
+from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
+from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.model_search import DETECTED, FoundEffects
+from snrmjax.model.effect_base import AbstractEffect, AbstractMemoryless
+from snrmjax.model.effect_metadata import Argument
+from snrmjax.model.effect_shape import shape_of
+from snrmjax.model.effects import EFFECTS
+from snrmjax.model.parameters import with_parameters
+from snrmjax.model.structures import Structure
+
+_CLOSEST = 2  # laws of the library that a note compares with
+
+
+class LawAnswer(NamedTuple):
+    """A law that passed all checks, and what it makes of the model."""
+
+    laws: tuple[DrawnLaw, ...]
+    kinds: tuple[str, ...]  # of the effects of the completed model
+    rivals: tuple[str, ...]  # kinds that would do about as well as the first
+    fit: EffectFit
+    misfit: WeightedMisfit
+    p_value: float
+    noise: float  # variance over the stated one, that neighbouring states show
+    levels: HeldOutLevels | None
+    completed: Structure
+    completed_without: dict[int, Structure]
+    notes: tuple[str, ...]
+    decide_by: str | None
+
+
+def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
+    """A law in place of the effects that a search found, if it explains the data; else None.
+
+    It must do so as an effect must: what is left is noise without a pattern, and a level between
+    others that was left out of the fit is predicted; and where the effects do not fit, its evidence
+    must be better than theirs. A law that acts with a memory must do so alone: Masing's rule ties
+    its damping to its stiffness.
+    """
+    misfit = found.misfit
+    fit = fit_laws(misfit)
+    if fit is None or not fit.settled:
+        return None
+    parts = fit.posterior.parts
+    # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
+    rejected = found.p_value < UNLIKELY
+    if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - DETECTED:
+        return None
+    if any(law_kind(part) == law_kind("slip") for part in parts) and len(parts) > 1:
+        return None
+    as_effect = _as_effect_fit(fit)
+    neighbours = neighbour_noise(fit.misfit, as_effect)
+    freedom = round(fit.misfit.n_rows - fit.posterior.freedom)
+    p_value = chi_square_p_value(as_effect.chi_square, freedom)
+    structure = pattern(fit.misfit, as_effect) if p_value < UNLIKELY else None
+    allowed = tolerated(neighbours.variance, structure)
+    if chi_square_p_value(as_effect.chi_square / allowed, freedom) < UNLIKELY:
+        return None
+    if left_curve(fit.misfit, as_effect) is not None:
+        return None
+    without = {place: _without(fit, place) for place in held_out_places(fit.misfit)}
+    levels = None
+    if without:
+        pairs = [_held_out(fit, place, one, allowed) for place, one in without.items()]
+        levels = HeldOutLevels(*pairs)
+        # The top one is predicted by extrapolation, of which a law of any shape promises nothing.
+        inner = levels.inner
+        if refuted_by_levels(HeldOutLevels(inner, inner), doubted=False) is not None:
+            return None
+    laws = tuple(drawn_tables(fit))
+    effects = law_effects(fit, fit.secants)
+    completed = _completed(model, fit.misfit.baseline_parameters(as_effect.rows), effects)
+    numbers = fit.misfit.level_numbers
+    completed_without = {}
+    for place, one in without.items():
+        kept = ~rows_of_level(fit.misfit, place)
+        rows = _rows(fit, one)
+        own = law_effects(fit, secants_of(parts, one.mean, fit.units))
+        baseline = fit.misfit.baseline_parameters(rows, kept)
+        completed_without[int(numbers[place])] = _completed(model, baseline, own)
+    return LawAnswer(
+        laws=laws,
+        kinds=tuple(effect.kind for effect in effects),
+        rivals=tuple(law_kind(part) for part in fit.rivals),
+        fit=as_effect,
+        misfit=fit.misfit,
+        p_value=p_value,
+        noise=neighbours.variance,
+        levels=levels,
+        completed=completed,
+        completed_without=completed_without,
+        notes=tuple(_notes(fit, laws, levels, found)),
+        decide_by=_decide_by(fit),
+    )
+
+
+def _arms(fit: LawFit) -> Float[np.ndarray, "row secant"]:
+    """Slopes of the rows by the secants of the law's parts, in units plainly seen."""
+    by, noise = fit.columns.by_secant, fit.misfit.noise
+    n = by.shape[-1]
+    units = secants_of(fit.posterior.parts, np.eye(n * len(fit.posterior.parts)), fit.units)
+    columns = np.einsum("sctk,etk->esc", by, units)
+    return noise.noise_units(columns).T
+
+
+def _rows(fit: LawFit, other: LawPosterior) -> Float[np.ndarray, " row"]:
+    """Misfits with other secants, to first order, in units of noise."""
+    return fit.rows + _arms(fit) @ (other.mean - fit.posterior.mean)
+
+
+def _as_effect_fit(fit: LawFit) -> EffectFit:
+    nothing = np.zeros(len(fit.posterior.mean))
+    kinds = tuple(law_kind(part) for part in fit.posterior.parts)
+    labels = tuple(f"{kind}_{k}" for k, kind in enumerate(kinds))
+    square = fit.misfit.chi_square(fit.rows)
+    anywhere = nothing - np.inf, nothing + np.inf
+    return EffectFit(kinds, labels, fit.posterior.mean, square, fit.rows, _arms(fit), *anywhere)
+
+
+def _without(fit: LawFit, place: int) -> LawPosterior:
+    """The same parts of a law by all levels but one, sizes and reaches chosen without it too."""
+    problem = problem_of(fit, ~rows_of_level(fit.misfit, place))
+    return posterior(problem, fit.posterior.parts)
+
+
+def _held_out(fit: LawFit, place: int, without: LawPosterior, noise: float) -> HeldOut:
+    """A level left out of the fit, predicted by the others."""
+    misfit, out = fit.misfit, rows_of_level(fit.misfit, place)
+    values, vectors = np.linalg.eigh(without.covariance)
+    root = _arms(fit) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    none = np.zeros((misfit.n_rows, 0))
+    before, _ = chi_square_of_level(misfit, baseline_fit(misfit).rows, none, out)
+    after, open_too = chi_square_of_level(misfit, _rows(fit, without), root, out)
+    n = int(out.sum())
+    return HeldOut(
+        int(misfit.level_numbers[place]),
+        float(np.sqrt(before / n)),
+        float(np.sqrt(after / n)),
+        chi_square_p_value(after / noise, n),
+        chi_square_p_value(open_too / noise, n),
+    )
+
+
+def _completed(
+    model: Structure, baseline: dict[str, float], effects: Sequence[AbstractEffect]
+) -> Structure:
+    """The model with its own parameters at their most likely values, and with a law."""
+    moved = model
+    if baseline:
+        moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
+    return dataclasses.replace(moved, effects=(*model.effects, *effects))
+
+
+def _notes(
+    fit: LawFit,
+    laws: tuple[DrawnLaw, ...],
+    levels: HeldOutLevels | None,
+    found: FoundEffects,
+) -> list[str]:
+    first = laws[0]
+    unit = "m/s" if first.argument is Argument.VELOCITY else "m"
+    notes = [
+        f"no effect of the library explains the data; the law is drawn from them with "
+        f"{fit.posterior.freedom:.1f} effective parameters. It was measured up to "
+        f"{first.largest:.3g} {unit}: beyond, it goes on straight, which nothing proves."
+    ]
+    if levels is not None:
+        inner, outer = levels
+        notes.append(
+            f"level {inner.level}, left out, is predicted by interpolation: {inner.after:.2g} "
+            f"times the noise ({inner.before:.2g} before); the top level {outer.level} by "
+            f"extrapolation: {outer.after:.2g} ({outer.before:.2g} before)."
+        )
+    if _odd_alone(fit):
+        notes.append("without harmonics the odd part of the force alone is seen.")
+    if fit.rivals:
+        notes.append(f"{' or '.join(map(law_kind, fit.rivals))} would do about as well.")
+    return notes + _closest(fit, first, found)
+
+
+def _odd_alone(fit: LawFit) -> bool:
+    return not fit.misfit.predictions.chosen.orders and fit.posterior.parts[0].startswith("odd")
+
+
+def _decide_by(fit: LawFit) -> str | None:
+    """The measurement that would settle what kind of law it is."""
+    if fit.rivals:
+        return (
+            "Record harmonics 2 and 3 of the velocity (with their noise floor) at the largest "
+            "level: their sign and size tell a force of the velocity from one of the displacement."
+        )
+    if _odd_alone(fit):
+        return (
+            "Record harmonic 2 of the velocity (with its noise floor) at the largest level: it "
+            "shows whether the force is the same in both directions."
+        )
+    return None
+
+
+def _closest(fit: LawFit, law: DrawnLaw, found: FoundEffects) -> list[str]:
+    """Where the laws of the library that fit best alone leave the band."""
+    modes = fit.misfit.model.modes
+    j = modes.mode_of_interest
+    size = abs(float(modes.mode_shape[fit.misfit.predictions.chosen.sensors[0], j]))
+    notes: list[str] = []
+    for row in found.table[0] if found.table else ():
+        effect = EFFECTS[row.kind]
+        shape = shape_of(effect)
+        if not issubclass(effect, AbstractMemoryless) or shape is None:
+            continue
+        if shape.argument is not law.argument or not np.isfinite(row.gain):
+            continue
+        own = effect(*(jnp.asarray(value) for value in row.parameters.values()))
+        at = jnp.asarray(law.at / size)
+        zero = jnp.zeros_like(at)
+        pair = (zero, at) if law.argument is Argument.VELOCITY else (at, zero)
+        force = np.asarray(own.cycle_force(*pair)) / size
+        beyond = np.abs(force - law.force) > SURE * law.force_std + 1e-12 * np.abs(law.force).max()
+        notes.append(_where_beyond(row.kind, law, beyond))
+        if len(notes) == _CLOSEST:
+            break
+    return notes
+
+
+def _where_beyond(kind: str, law: DrawnLaw, beyond: Bool[np.ndarray, " knot"]) -> str:
+    unit = "m/s" if law.argument is Argument.VELOCITY else "m"
+    if not beyond.any():
+        return f"{kind}, fitted alone, stays within the 95 % band of the law."
+    at = law.at[beyond]
+    return (
+        f"{kind}, fitted alone, leaves the 95 % band of the law between {at.min():.3g} and "
+        f"{at.max():.3g} {unit}."
+    )

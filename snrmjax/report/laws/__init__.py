@@ -1,0 +1,1 @@
+"""Laws that a diagnosis draws, as figures and tables."""
