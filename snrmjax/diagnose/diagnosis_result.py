@@ -141,14 +141,8 @@ class Diagnosis(AbstractResult):
     def verdict_sentence(self) -> str:
         """The verdict in one plain sentence."""
         before, after = self.gap.before, self.gap.after
-        if self.answer.laws:
-            names = "; beside it ".join(law.name for law in self.answer.laws)
-            return (
-                f"The model lacks a force that no effect of the library explains, drawn from the "
-                f"data: {names}. With it the misfit falls from {before:.1f} to {after:.1f} times "
-                "the noise."
-            )
-        return verdict_sentence(Verdict(self.verdict), self.candidates, before, after)
+        names = [[law.name] for law in self.answer.laws] or self.candidates
+        return verdict_sentence(Verdict(self.verdict), names, before, after)
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult.summary`."""

@@ -61,8 +61,8 @@ def verdict_sentence(
 ) -> str:
     """A verdict in one plain sentence.
 
-    Arguments: `classes` has every effect of the answer with those that fit as well; misfits
-    before and after it in units of noise.
+    Arguments: `classes` has every effect of the answer with those that fit as well, or drawn laws
+    in words; misfits before and after it in units of noise.
     """
     found = _listed([group[0] for group in classes], "and")
     falls = f"the misfit falls from {_times(before)} to {_times(after)} times the noise"
@@ -80,6 +80,12 @@ def verdict_sentence(
     if verdict is Verdict.UNKNOWN:
         start = "Something is missing that no effect of the library explains reliably"
         return f"{start}; the best attempt is {found}: {falls}." if found else f"{start}."
+    if verdict is Verdict.DRAWN:
+        names = "; beside it ".join(group[0] for group in classes)
+        return (
+            f"The model lacks a force that no effect of the library explains, drawn from the data: "
+            f"{names}. With it {falls}."
+        )
     if verdict is Verdict.NAMED:
         return f"The model lacks {found}: {with_it} {falls}, and nothing else explains as much."
     if any(len(group) > 1 for group in classes):
