@@ -117,7 +117,7 @@ def test_effects_that_could_not_be_fitted_are_named():
 def test_every_verdict_has_a_sentence_of_its_own():
     classes = (("cubic_damping", "quadratic_damping"),)
     sentences = [verdict_sentence(one, classes, 4.0, 1.0) for one in Verdict]
-    assert len(set(sentences)) == len(Verdict) == 5
+    assert len(set(sentences)) == len(Verdict) == 6
     assert all(one[0].isupper() and one.endswith(".") for one in sentences)
     told = verdict_sentence(Verdict.AMBIGUOUS, classes, 4.0, 1.0)
     assert "cubic_damping or quadratic_damping" in told
