@@ -61,7 +61,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     """
     misfit = found.misfit
     fit = fit_laws(misfit)
-    if fit is None or not fit.settled:
+    if fit is None or not fit.settled or fit.posterior.cost > -DETECTED:
         return None
     parts = fit.posterior.parts
     # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
@@ -75,7 +75,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     freedom = round(fit.misfit.n_rows - fit.posterior.freedom)
     p_value = chi_square_p_value(as_effect.chi_square, freedom)
     structure = pattern(fit.misfit, as_effect) if p_value < UNLIKELY else None
-    allowed = tolerated(neighbours.variance, structure)
+    allowed = tolerated(neighbours.variance) if structure is None else 1.0
     if chi_square_p_value(as_effect.chi_square / allowed, freedom) < UNLIKELY:
         return None
     if left_curve(fit.misfit, as_effect) is not None:
