@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "tests" / "diagnose"
@@ -29,6 +30,7 @@ def blind():
         "integration",
         "plans",
         "records",
+        "reliability",
         "score",
         "strength",
         "sweep",
@@ -454,6 +456,40 @@ def test_the_scorer_finds_no_miss_in_true_answers_and_every_miss_in_wrong_ones(
     blind.score.print_misses(wrong)
     assert len(capsys.readouterr().out.splitlines()) == len(keys)
     assert all(r.confidently_wrong for r in wrong)
+
+
+def test_chance_allows_what_a_binomial_distribution_does(blind):
+    for n, p in ((20, 0.7), (103, 0.99), (4, 0.5), (0, 0.5)):
+        fewest, most = blind.reliability.limits([p] * n)
+        assert (fewest, most) == tuple(int(k) for k in binom.ppf((0.025, 0.975), n, p))
+    mixed = blind.reliability.limits([0.2, 0.9, 0.9, 0.2])
+    assert mixed == blind.reliability.limits([0.9, 0.2, 0.2, 0.9])
+
+
+def test_reliability_counts_true_answers_as_right_and_others_as_wrong(blind, tmp_path):
+    keys = json.loads((EXAMPLES / "keys.json").read_text())
+    said = 0.97
+    for folder, told in (("true", answer), ("wrong", lambda k: answer(k, "named", ["added_mass"]))):
+        for name, key in keys.items():
+            place = tmp_path / folder / name
+            place.mkdir(parents=True)
+            (place / "diagnosis.json").write_text(json.dumps(told(key) | {"probability": said}))
+    (tmp_path / "keys").mkdir()
+    for name, key in keys.items():
+        (tmp_path / "keys" / f"{name}.json").write_text(json.dumps(key))
+    true, wrong = (
+        blind.reliability.read_stated(tmp_path / "keys", tmp_path / folder)
+        for folder in ("true", "wrong")
+    )
+    assert len(true) == len(wrong) == len(keys)
+    assert all(one.right for one in true)
+    assert not any(one.right for one in wrong)
+    *low, last = blind.reliability.binned(true)
+    assert [len(one.members) for one in low] == [0, 0, 0, 0]
+    assert (last.right, last.holds) == (len(keys), True)
+    assert not blind.reliability.binned(wrong)[-1].holds
+    blind.reliability.draw(blind.reliability.binned(true), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def test_the_examples_are_sets_with_their_keys(blind):

@@ -127,16 +127,14 @@ def draw(bins: Sequence[Bin], file: Path) -> None:
             said, one.right / n, "o",
             color="#0072b2" if one.holds else "#d55e00", label="found" if number == 0 else None,
         )  # fmt: skip
-        left = said > 0.85
         axes.annotate(
-            f"{one.right} of {n}", (said, one.right / n), fontsize=8,
-            xytext=(-9 if left else 9, -3), textcoords="offset points",
-            ha="right" if left else "left",
+            f"{one.right} of {n}", (said, min(one.fewest, one.right) / n), fontsize=8,
+            xytext=(0, -5), textcoords="offset points", ha="center", va="top",
         )  # fmt: skip
-    axes.set(xlim=(0, 1.02), ylim=(0, 1.04), aspect="equal")
+    axes.set(xlim=(0, 1.1), ylim=(-0.06, 1.04), aspect="equal")
     axes.set_xlabel("stated probability of the answer given")
     axes.set_ylabel("share of right answers")
-    axes.legend(loc="upper left", frameon=False, fontsize=8)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, frameon=False, fontsize=8)
     figure.tight_layout()
     figure.savefig(file, dpi=150)
     plt.close(figure)

@@ -1,0 +1,141 @@
+"""Is Laplace's evidence of an answer that of nested sampling, where that is doubtful?
+
+Run: python benchmarks/evidence_nested.py --sets DIR/sets SET:KIND[+KIND] … [--live 100]
+with sets of `blind_sets/generate.py`; needs `pip install dynesty`.
+
+Evidence of an effect with thresholds, exponents or a further mode is an integral over parameters
+that data may hardly determine. Its logarithm by Laplace's approximation, as diagnoses use it, is
+compared with that of dynesty (Speagle 2020, doi:10.1093/mnras/staa278) under the same priors:
+Cauchy's of strengths, flat ones of what is bounded. One JSON line a case: both, the sampler's 1σ,
+its likelihood calls and seconds, and the odds of the effect to `none`.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, parameter_labels
+from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.effect_fit import (
+    EffectFit,
+    baseline_fit,
+    fit_effect,
+    with_errors_passed_on,
+)
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
+from snrmjax.diagnose.search.evidence import fitted_answer
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.model.effect_metadata import MotionScales
+
+_FARTHEST = 0.4999  # of a Cauchy distribution on each side
+
+
+def prior_transform(
+    misfit: WeightedMisfit, kinds: list[str]
+) -> tuple[tuple[str, ...], Callable[[np.ndarray], np.ndarray]]:
+    """From the unit cube to parameters, by the stated priors of every effect in turn."""
+    scales = scales_of(misfit.predictions)
+    ones = [candidate(kind, scales) for kind in kinds]
+    labels = tuple(label for kind in kinds for label in parameter_labels(kind))
+    law = coordinates(labels, scales.amplitude)
+    starts = np.concatenate([np.median(np.abs(_inward(one, scales)), axis=0) for one in ones])
+    lower = np.concatenate([one.lower for one in ones])
+    upper = np.concatenate([one.upper for one in ones])
+    first = np.cumsum([0, *[len(one.unit) for one in ones]])[:-1]
+
+    def transform(unit: np.ndarray) -> np.ndarray:
+        values = np.zeros(len(unit))
+        for k, u in enumerate(unit):
+            flat = np.isfinite(upper[k] - lower[k]) and k not in first
+            if flat:
+                values[k] = lower[k] + u * (upper[k] - lower[k])
+            elif lower[k] == 0:
+                values[k] = starts[k] * np.tan(np.pi * _FARTHEST * u)
+            else:
+                values[k] = starts[k] * np.tan(np.pi * 2 * _FARTHEST * (u - 0.5))
+        return law.outward(values)
+
+    return labels, transform
+
+
+def _inward(one: EffectCandidate, scales: MotionScales) -> np.ndarray:
+    law = coordinates(parameter_labels(one.kind), scales.amplitude)
+    return law.inward(np.array(one.starts))
+
+
+def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
+    """Both evidences of one answer, beside that of the baseline, in nats."""
+    import dynesty
+
+    model = read_model(folder / f"{name}.toml")
+    misfit = weighted_misfit(
+        predictions_of(model, read_steady_states(folder / f"{name}.csv", model))
+    )
+    scales = scales_of(misfit.predictions)
+
+    def fitted() -> EffectFit:
+        fit = baseline_fit(misfit)
+        for kind in kinds:
+            fit = fit_effect(misfit, candidate(kind, scales), fit)
+        return fit
+
+    misfit = with_errors_passed_on(misfit, fitted())
+    fit = fitted()
+    answer, nothing = (fitted_answer(misfit, one) for one in (fit, baseline_fit(misfit)))
+    one = np.ones(1)
+    laplace, none = (float(each.marginal().log_likelihood(one)[0]) for each in (answer, nothing))
+    labels, transform = prior_transform(misfit, kinds)
+    calls = 0
+
+    def log_likelihood(values: np.ndarray) -> float:
+        nonlocal calls
+        calls += 1
+        found = misfit.predicted(misfit.predictions.group, labels, values[None], slopes=False)
+        rows = misfit.noise.noise_units(found.columns)
+        square = misfit.chi_square(rows[0])
+        return -0.5 * square if np.isfinite(square) else -1e100
+
+    begin = time.perf_counter()
+    # Random walks: the posterior of a further mode is a narrow, bent valley.
+    sampler = dynesty.NestedSampler(
+        log_likelihood,
+        transform,
+        len(labels),
+        nlive=live,
+        sample="rwalk",
+        rstate=np.random.default_rng(1),
+    )
+    sampler.run_nested(dlogz=0.1, print_progress=False)
+    found = sampler.results
+    return {
+        "set": name,
+        "answer": "+".join(kinds),
+        "fit": fit.status.value,
+        "laplace": round(laplace - none, 2),
+        "nested": round(float(found.logz[-1]) - none, 2),
+        "nested_std": round(float(found.logzerr[-1]), 2),
+        "calls": calls,
+        "seconds": round(time.perf_counter() - begin, 1),
+    }
+
+
+def main() -> None:
+    """One line a case."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--sets", type=Path, required=True)
+    parser.add_argument("--live", type=int, default=100)
+    parser.add_argument("cases", nargs="+", help="SET:KIND[+KIND]")
+    options = parser.parse_args()
+    for case in options.cases:
+        name, _, kinds = case.partition(":")
+        print(json.dumps(compared(options.sets, name, kinds.split("+"), options.live)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
