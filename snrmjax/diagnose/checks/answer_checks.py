@@ -14,7 +14,6 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undetermined
 
 _MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
-_NOISES = 3.0  # 1σ of a stated error of the levels, that may be missed too
 _PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
 _FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
 
@@ -107,9 +106,8 @@ def _remedy() -> str:
 def _on_forces(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
     """That the completed model does not reproduce the forces of the test."""
     missed = missed_forces(misfit, fit)
-    level_gain = float(misfit.model.level_stds[0])
     worst = max(missed, key=lambda level: missed[level])
-    if missed[worst] < max(_MISSED, _NOISES * level_gain):
+    if missed[worst] < _MISSED:
         return None
     reason = (
         "the completed model does not reproduce the measured responses: for the motions of level "
@@ -122,20 +120,16 @@ def _on_forces(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
 def missed_forces(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, float]:
     """By level: relative misfit (rms) of the force that the completed model needs.
 
-    With the baseline's own parameters and the gain of the force at their most likely values;
-    errors of a level stay in. Infinite where the model has no such motion.
+    Less the errors that states share: those of levels, of the baseline's own parameters and of a
+    free gain, at their most likely values. Over the force that acted by that gain.
     """
-    group, predictions = misfit.predictions.group, misfit.predictions
-    values = group.values.copy()
-    values[[group.place(label) for label in fit.labels]] = fit.values
-    for name, value in misfit.baseline_parameters(fit.rows).items():
-        values[group.place(name)] = value
-    gain = gain_found(misfit, fit)
-    column = predictions.of(group, values[None]).columns[0, :, :2]
-    needed = (1 + column[:, 0] + 1j * column[:, 1]) / (1.0 if gain is None else gain.value)
-    left = np.where(np.isfinite(needed), np.abs(needed - 1), np.inf)
-    level = np.asarray(predictions.level_numbers)
-    return {int(k): float(np.sqrt(np.mean(left[level == k] ** 2))) for k in np.unique(level)}
+    noise, gain = misfit.noise, gain_found(misfit, fit)
+    rows = np.zeros(noise.known.shape)
+    rows[noise.state, noise.column] = noise.without_shared(fit.rows)
+    columns = np.einsum("sij,sj->si", np.linalg.pinv(noise.whiten), rows)[:, :2]
+    left = np.sum(columns**2, axis=1) / (1.0 if gain is None else gain.value) ** 2
+    level = np.asarray(misfit.predictions.level_numbers)
+    return {int(k): float(np.sqrt(np.mean(left[level == k]))) for k in np.unique(level)}
 
 
 def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
