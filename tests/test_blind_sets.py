@@ -28,6 +28,7 @@ def blind():
         "forces",
         "further",
         "integration",
+        "laws",
         "plans",
         "records",
         "reliability",
@@ -502,3 +503,27 @@ def test_the_examples_are_sets_with_their_keys(blind):
         assert len(rows) == keys[path.stem]["rows"]
         assert ("velocity_h2_re_m_s" in rows[0]) == keys[path.stem]["harmonics"]
         assert model["mode"][0]["participation"] > 0
+
+
+def test_laws_outside_the_library_have_the_curves_that_are_scored(blind):
+    laws, x = blind.laws, np.array([0.1, 0.3, 0.6])
+    dahl = {"dahl.stiffness": 0.2, "dahl.slip_displacement": 0.25}
+    # dz/dx = 1 − z/s from rest: z = s(1 − e^(−x/s)), beside the stuck spring.
+    first = 0.2 * (0.25 * (1 - np.exp(-x / 0.25)) - x)
+    np.testing.assert_allclose(laws.true_curve("dahl", dahl, x), first, rtol=1e-5)
+    lap = {"weibull_lap.stiffness": 0.2, "weibull_lap.slip_displacement": 0.25}
+    lap["weibull_lap.exponent"] = 1.0
+    # ∫ (x − s)⁺ over exponential slip limits: x − 0.25(1 − e^(−x/0.25)); 48 quantiles.
+    lost = 0.2 * (x - 0.25 * (1 - np.exp(-x / 0.25)))
+    np.testing.assert_allclose(laws.true_curve("weibull_lap", lap, x), -lost, rtol=0.01)
+    rng, base = np.random.default_rng(1), blind.effects.Baseline(0.01, 0.0, (0.2, 1.0))
+    for kind in (kind for kind, of in laws.OF.items() if of == "displacement"):
+        drawn = blind.effects.draw_effect(kind, rng, base).parameters
+        force = laws.true_curve(kind, drawn, np.array([-1e-4, 0.0, 1e-4]))
+        # The slope at rest is taken out: what is left there is x^1.5 at most.
+        assert force[1] == 0.0
+        assert np.abs(force).max() < 2e-6
+    plans = blind.plans.law_plans()
+    assert {plan.kinds[0] for plan in plans if plan.kinds} == set(laws.OF)
+    assert len(laws.OF) == 16
+    assert sum(plan.group == "none" for plan in plans) == 20
