@@ -5,11 +5,14 @@ cubic damping or by van der Pol's, which differ in their third harmonics only.
 """
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from truths.balanced_sets import balanced, quadratic
+from truths.balanced_sets import linear_model as balanced_model
 from truths.growing_damping import (
     GROWTH,
     NOISE,
@@ -26,7 +29,8 @@ from typer.testing import CliRunner
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
-from snrmjax.io.measurement_plans import read_further_states
+from snrmjax.diagnose.measurement_plan import measurement_plan
+from snrmjax.io.measurement_plans import read_further_states, write_plan
 
 
 def answer(omega, force, kind, rng):
@@ -187,3 +191,64 @@ def test_what_changed_names_old_and_new_answers():
     for word in ("a 50 % → 0 %", "b 40 % → 90 %", "c 10 % → 0 %", "e now 10 %"):
         assert word in said
     assert "d " not in said.partition("Probabilities:")[2]
+
+
+@pytest.fixture(scope="module")
+def doubted():
+    """Quadratic damping without harmonics: a drag of one direction has the same fundamental."""
+    return sj.diagnose_model(balanced_model(), balanced(quadratic))
+
+
+def test_where_no_test_was_compared_the_largest_level_is_measured_again(doubted):
+    assert (doubted.verdict, doubted.discriminating_test) == ("ambiguous", None)
+    plan = measurement_plan(doubted)
+    first = doubted.data.select(np.asarray(doubted.data.level) == 4)
+    order = np.argsort(first.frequency)
+    np.testing.assert_allclose(plan.states.frequency, np.asarray(first.frequency)[order])
+    np.testing.assert_allclose(plan.states.force, np.asarray(first.force)[order])
+    np.testing.assert_array_equal(plan.states.level, 5)
+    assert (plan.harmonics, plan.harmonic_std) == ((2, 3), None)
+
+
+def test_where_harmonics_are_there_the_range_of_levels_is_widened(doubted):
+    data = doubted.data
+    seen = np.full((data.n_states, 1, 2), 1e-3 + 0j)
+    known = dataclasses.replace(data, harmonics=seen, harmonic_order=(2, 3))
+    plan = measurement_plan(dataclasses.replace(doubted, data=known))
+    force, level = np.asarray(plan.states.force), np.asarray(plan.states.level)
+    before, own = np.asarray(data.force), np.asarray(data.level)
+    assert set(level) == {5, 6}
+    assert force[level == 5].max() == pytest.approx(0.5 * before[own == 0].max())
+    assert force[level == 6].max() == pytest.approx(1.5 * before[own == 4].max())
+
+
+def test_nothing_open_has_no_plan(doubted):
+    for verdict in (sj.diagnose.Verdict.NAMED, sj.diagnose.Verdict.NOISE_REJECTED):
+        assert measurement_plan(dataclasses.replace(doubted, verdict=verdict)) is None
+    assert measurement_plan(dataclasses.replace(doubted, decide_by=None)) is None
+
+
+def test_a_plan_is_in_volts_where_the_test_was(doubted, tmp_path):
+    """0.5 V for a newton; what was filled in joins the states of the first test, not others."""
+    volts = dataclasses.replace(doubted.data, drive=0.5 * doubted.data.force)
+    plan = measurement_plan(dataclasses.replace(doubted, data=volts))
+    write_plan(tmp_path / "plan.csv", plan)
+    with (tmp_path / "plan.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert "force_n" not in rows[0]
+    assert "force_std_n" not in rows[0]
+    said = [float(row["drive_v"]) for row in rows]
+    np.testing.assert_allclose(said, 0.5 * np.asarray(plan.states.force), rtol=1e-5)
+    for row in rows:
+        row.update((name, "0.001") for name, text in row.items() if text == "")
+    with (tmp_path / "plan.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    with pytest.raises(ValueError, match=r"must have the column `force_n`.*plan.csv has `drive_v`"):
+        read_further_states(tmp_path / "plan.csv", balanced_model(), doubted.data)
+    joined = read_further_states(tmp_path / "plan.csv", balanced_model(), volts)
+    assert joined.n_states == doubted.data.n_states + len(rows)
+    assert joined.harmonic_order == (2, 3)
+    recorded = np.isfinite(np.asarray(joined.harmonics)).all(axis=(1, 2))
+    np.testing.assert_array_equal(recorded, np.arange(joined.n_states) >= doubted.data.n_states)
