@@ -131,12 +131,14 @@ def test_a_forgotten_harmonic_is_refused_too(asked, tmp_path):
     fill(plan, "cubic_damping")
     with plan.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    rows[3]["velocity_h3_im_m_s"] = ""
+    rows[3]["velocity_h3_re_m_s"] = rows[3]["velocity_h3_im_m_s"] = ""
     with plan.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    with pytest.raises(ValueError, match=r"`velocity_h3_im_m_s` must be .* row 5 of filled\.csv"):
+    with pytest.raises(
+        ValueError, match=r"`velocity_h3_re_m_s` must be filled in .* row 5 of filled\.csv"
+    ):
         read_further_states(plan, linear_model(), measured())
 
 

@@ -28,6 +28,19 @@ class TestJoining:
             np.testing.assert_array_equal(joined.level, [0, 1, 2])
             np.testing.assert_array_equal(joined.velocity[:, 0], [0.6, 0.6 + 0.1j, 0.6 + 0.2j])
 
+    def test_harmonics_that_a_test_lacks_are_not_measured_and_others_kept(self):
+        (one,) = parts_of(1)
+        third = {"harmonics": np.array([[[0.3j]]]), "harmonic_order": (3,)}
+        both = {"harmonics": np.array([[[0.2, 0.5j]]]), "harmonic_order": (2, 3)}
+        two, three = (
+            sj.measure.steady_states([k], [500.0 + k], [1.0], [0.6], **columns)
+            for k, columns in ((1, third), (2, both))
+        )
+        joined = sj.measure.join_steady_states(one, two, three)
+        assert joined.harmonic_order == (2, 3)
+        expected = [[np.nan, np.nan], [np.nan, 0.3j], [0.2, 0.5j]]
+        np.testing.assert_array_equal(np.abs(joined.harmonics[:, 0]), np.abs(expected))
+
     @pytest.mark.parametrize("nothing", [(), ([],), ((),)])
     def test_nothing_is_refused(self, nothing):
         with pytest.raises(ValueError, match="nothing to join"):
