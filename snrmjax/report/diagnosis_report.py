@@ -15,6 +15,7 @@ from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.former_answer import FormerAnswer
+from snrmjax.diagnose.held_velocity import held_curves
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
@@ -27,7 +28,6 @@ from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, LAWS, effect_class
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_figures import (
-    at_curve_force,
     candidates_figure,
     comparison_figure,
     effect_laws_figure,
@@ -47,11 +47,15 @@ from snrmjax.report.html import (
     write_report,
 )
 from snrmjax.report.laws.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
+from snrmjax.report.simulation_figures import (
+    HELD_CAPTION,
+    held_velocity_figure,
+    holds_response,
+)
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 
 _SHOWN = 10  # candidates
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
-_RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
 
 _CAPTIONS = {
     "laws": (
@@ -82,10 +86,6 @@ _OTHER_ANSWERS = {
     UNKNOWN: "something that no effect of the library explains",
     NOISE_REJECTED: "the noise is not as stated",
 }
-_HELD_RESPONSE = (
-    " These levels hold the response, not the force: lines of constant force meet a level at its "
-    "resonance only, and pale dots were measured under forces between those of the lines."
-)
 
 
 def write_diagnosis(
@@ -129,7 +129,12 @@ def with_responses(diagnosis: Diagnosis, model: Structure) -> tuple[list[LevelRe
     """
     data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
     levels, before, after = predict_levels(diagnosis, model)
-    return levels, comparison_figure(before, after, data, sensor=data.sensors[sensor])
+    name, completed = data.sensors[sensor], diagnosis.completed
+    if completed is None or not holds_response(data, levels):
+        return levels, comparison_figure(before, after, data, sensor=name)
+    given = held_curves(model, data, sensor)
+    found = held_curves(completed, data, sensor, diagnosis.answer.force_gain)
+    return levels, held_velocity_figure(given, found, data, name)
 
 
 def _incomplete(predicted: Sequence[LevelResponse]) -> list[str]:
@@ -170,7 +175,7 @@ def diagnosis_report(
     """
     captions = {**_CAPTIONS} | ({"laws": LAW_CAPTION} if diagnosis.answer.laws else {})
     if holds_response(diagnosis.data, predicted):
-        captions["responses"] += _HELD_RESPONSE
+        captions["responses"] = HELD_CAPTION
     shown = {name: ReportFigure(figure, captions[name]) for name, figure in figures.items()}
     return Report(
         title=title,
@@ -185,14 +190,6 @@ def diagnosis_report(
             _limits_section(diagnosis),
         ],
     )
-
-
-def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
-    """Whether the force changes along the levels of a test, which then hold the response."""
-    if not predicted:
-        return False
-    same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > _RESPONSE_CONTROLLED)
 
 
 def readable_verdict(diagnosis: Diagnosis) -> str:

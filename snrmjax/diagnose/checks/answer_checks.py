@@ -15,6 +15,7 @@ from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undet
 
 _MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
 _PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
+_MOVED_GAIN = 0.05  # of its logarithm, by which a right law moves a gain that smooth curves gave
 _FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
 
 
@@ -91,6 +92,13 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
         )
         return Doubt(reason, _remedy(), refutes=True)
     said = force_gain_undetermined(gain.std, gain.farthest)
+    if not said and abs(np.log(gain.value)) > _MOVED_GAIN:
+        reason = (
+            f"the answer moves the force gain by {100 * (gain.value - 1):+.2g} %: smooth curves of "
+            "amplitude need the former one, and beside a free gain these data hardly determine the "
+            "law."
+        )
+        return Doubt(reason, _remedy())
     if not said:
         return None
     if "cannot" in said:

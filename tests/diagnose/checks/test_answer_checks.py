@@ -73,7 +73,16 @@ def test_a_free_gain_is_found_with_its_error():
     risen = [np.sum((misfit.base + misfit.noise.shared[:, 0] * g) ** 2) + g**2 for g in moved]
     curvature = np.polyfit(moved, risen, 2)[0]
     assert gain.std == pytest.approx(curvature**-0.5 / 1.5, rel=0.01)
-    assert with_answer_checked(NAMED, misfit, fit, {}) == NAMED
+    assert max(missed_forces(misfit, fit).values()) < 0.03
+
+
+@pytest.mark.parametrize(("factor", "named"), [(1.02, True), (1.2, False)])
+def test_an_answer_that_moves_the_gain_is_not_named(factor, named):
+    """Smooth curves of amplitude had given the gain of 1."""
+    misfit = misfit_of(factor, force_gain_std=1.0)
+    judged = with_answer_checked(NAMED, misfit, baseline_fit(misfit), {})
+    assert judged.verdict is (Verdict.NAMED if named else Verdict.AMBIGUOUS)
+    assert named or "moves the force gain by +20 %" in judged.reasons[0]
 
 
 def test_a_gain_that_the_answer_moves_far_away_is_none():

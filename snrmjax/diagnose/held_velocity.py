@@ -1,0 +1,56 @@
+"""Forces that a model needs to hold the velocity of a level, as tests that control it record."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.identify.calibrate.inverse_force import inverse_force
+from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.model.structures import Structure
+
+_POINTS = 81  # of a curve
+_ORDER = 5  # harmonics of the motion
+
+
+class HeldCurve(NamedTuple):
+    """The force that holds one velocity amplitude, over frequency."""
+
+    level: int
+    velocity: float  # m/s
+    frequency: np.ndarray  # rad/s
+    force: np.ndarray  # N; NaN where no motion was found
+
+
+def held_curves(
+    model: Structure, data: SteadyStates, sensor: int, force_gain: float = 1.0
+) -> list[HeldCurve]:
+    """Forces with which a model holds every level's median velocity, by inverse harmonic balance.
+
+    Arguments: `sensor` whose velocity is held; `force_gain` is acting over recorded force, where
+    the answer is the recorded one.
+    """
+    level, omega = np.asarray(data.level), np.asarray(data.frequency)
+    speed, force = np.abs(np.asarray(data.velocity))[:, sensor], np.asarray(data.force)
+    good = np.asarray(data.measured)[:, sensor] & np.isfinite(force) & (speed > 0)
+    numbers = np.unique(level[good])
+    rows = []
+    for number in numbers:
+        mine = good & (level == number)
+        held = float(np.median(speed[mine]))
+        for one in np.linspace(omega[mine].min(), omega[mine].max(), _POINTS):
+            rows.append((number, one, float(np.median(force[mine])), held))
+    of, at, load, held_speed = (np.array(column) for column in zip(*rows, strict=True))
+    seen = np.arange(len(data.sensors)) == sensor
+    states = steady_states(
+        of.astype(int),
+        at,
+        load,
+        held_speed[:, None] * seen + 0j,
+        sensors=data.sensors,
+        measured=np.tile(seen, (len(of), 1)),
+    )
+    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=_ORDER).force))
+    return [
+        HeldCurve(int(k), float(held_speed[of == k][0]), at[of == k], needed[of == k] / force_gain)
+        for k in numbers
+    ]
