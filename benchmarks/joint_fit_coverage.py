@@ -1,6 +1,7 @@
 """Do the 95 % bands of a joint fit contain the truth in 95 of 100 tests?
 
 Run: python benchmarks/joint_fit_coverage.py [--tests 500] [--beam flat|curved] [--seed 0]
+     [--pointwise]
 
 Exact steady states of each beam (harmonic balance, 15 harmonics; flat beam: a stepped sine, stable
 states within 60° of resonance; curved beam: a phase-locked loop, within 1.2°) get the errors of a
@@ -144,16 +145,21 @@ def recorded(
     )
 
 
-def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
-    """Errors in units of the stated 1σ."""
+def erring(case: Case, truth: Truth, seed: int) -> sj.measure.SteadyStates:
+    """The states of one test, with their errors."""
     rng = np.random.default_rng(seed)
     n, levels = len(truth.level), np.unique(truth.level, return_inverse=True)[1]
     gain = ERRORS["gain"] * rng.normal(size=levels.max() + 1)[levels]
     own = ERRORS["amplitude"] * rng.normal(size=n) + 1j * ERRORS["phase"] * rng.normal(size=n)
     velocity = truth.velocity * np.exp(gain + own)
     force = truth.force * np.exp(ERRORS["force"] * rng.normal(size=n))
+    return recorded(case, truth, force, velocity, ERRORS)
+
+
+def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
+    """Errors in units of the stated 1σ."""
     fit = sj.fit_jointly(
-        recorded(case, truth, force, velocity, ERRORS),
+        erring(case, truth, seed),
         case.model.modes,
         level_gain_std=ERRORS["gain"] if level_known else 1e-9,
         **FAMILY,
@@ -187,14 +193,34 @@ def one_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
     return row
 
 
+def one_pointwise_test(case: Case, truth: Truth, seed: int, *, level_known: bool) -> dict:
+    """The same of points and curves through them."""
+    modes, stated = case.model.modes, ERRORS["gain"] if level_known else 0.0
+    known = sj.model.structure(modes, level_gain_std=stated)
+    found = sj.identify_backbone(erring(case, truth, seed), known)
+    values = found.fit.backbone.values(truth.at)
+    frequency = (values.natural_frequency - truth.natural_frequency) / values.natural_frequency_std
+    damping = (values.modal_damping - truth.damping) / values.modal_damping_std
+    return {
+        "frequency": np.asarray(frequency).tolist(),
+        "damping": np.asarray(damping).tolist(),
+        "frequency_band": float(np.mean(values.natural_frequency_std / values.natural_frequency)),
+        "damping_band": float(np.mean(values.modal_damping_std / values.modal_damping)),
+        "noise": max(found.fit.noise_scale),
+        "families": ["points"],
+        "notes": list(found.notes),
+    }
+
+
 _STATE: dict = {}
 
 
-def _work(job: tuple[str, int, bool]) -> dict:
-    beam, seed, level_known = job
+def _work(job: tuple[str, int, bool, bool]) -> dict:
+    beam, seed, level_known, by_points = job
     if beam not in _STATE:
         _STATE[beam] = truth_of(CASES[beam])
-    return one_test(CASES[beam], _STATE[beam], seed, level_known=level_known)
+    verb = one_pointwise_test if by_points else one_test
+    return verb(CASES[beam], _STATE[beam], seed, level_known=level_known)
 
 
 def report(beam: str, rows: list[dict], level_known: bool, seconds: float) -> None:
@@ -236,12 +262,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--level-known", action="store_true", help="only with the level's error")
+    parser.add_argument("--pointwise", action="store_true", help="points and curves through them")
     parser.add_argument("--fit", default="auto,auto", help="families, as the command takes them")
     chosen = parser.parse_args()
     FAMILY.update(zip(("backbone", "damping"), chosen.fit.split(","), strict=True))
     for beam in chosen.beam or list(CASES):
         for level_known in (True,) if chosen.level_known else (True, False):
-            jobs = [(beam, chosen.seed + k, level_known) for k in range(chosen.tests)]
+            seeds, how = range(chosen.seed, chosen.seed + chosen.tests), chosen.pointwise
+            jobs = [(beam, seed, level_known, how) for seed in seeds]
             begin = time.perf_counter()
             if chosen.workers > 1:
                 # A fork of a process that has begun with JAX may wait for ever.

@@ -55,7 +55,9 @@ class ErrorSizes(NamedTuple):
 
 
 def error_sizes(
-    errors: list[Float[np.ndarray, " point"]], std: list[Float[np.ndarray, " point"]]
+    errors: list[Float[np.ndarray, " point"]],
+    std: list[Float[np.ndarray, " point"]],
+    shared: list[Float[np.ndarray, "point kind"]] | None = None,
 ) -> ErrorSizes:
     """How large the errors of points and of whole levels are, from predicting left-out levels.
 
@@ -63,21 +65,24 @@ def error_sizes(
     prediction from the other levels, taken as half as large in variance, which is what two
     neighbours with errors of their own give: τ² = ⟨mean²⟩/1.5 − ⟨s²/Σ std⁻²⟩.
 
-    Arguments: errors and stated 1σ of every left-out level. τ is 0 for fewer than three levels,
-    and where the means do not exceed s² by more than their own standard error √(2/levels).
+    Arguments: errors and stated 1σ of every left-out level, and the 1σ of the errors that a level
+    is known to share, of which τ is what comes on top. τ is 0 for fewer than three levels, and
+    where the means do not exceed the rest by more than their own standard error √(2/levels).
     """
-    within, count, means, floors = 0.0, 0, [], []
-    for error, spread in zip(errors, std, strict=True):
+    within, count, means, floors, known = 0.0, 0, [], [], []
+    for k, (error, spread) in enumerate(zip(errors, std, strict=True)):
         weight = 1.0 / spread**2
         mean = float(np.sum(weight * error) / np.sum(weight))
         within += float(np.sum(weight * (error - mean) ** 2))
         count += len(error) - 1
         means.append(mean**2)
         floors.append(1.0 / float(np.sum(weight)))
+        if shared is not None:
+            known.append(float(np.sum((weight @ shared[k] / np.sum(weight)) ** 2)))
     squared = within / count if count > 0 else 0.0
     if len(means) < 3:
         return ErrorSizes(float(np.sqrt(squared)), 0.0)
-    expected = squared * np.mean(floors)
+    expected = squared * np.mean(floors) + (np.mean(known) if known else 0.0)
     level = np.mean(means) / 1.5 - expected
     shared = level > np.sqrt(2 / len(means)) * expected
     return ErrorSizes(float(np.sqrt(squared)), float(np.sqrt(level)) if shared else 0.0)

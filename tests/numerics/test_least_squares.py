@@ -101,6 +101,18 @@ def drawn_levels(rng, s, tau, n_levels=10, n_points=6):
     return list(error[1:-1] - predicted[:, None]), list(std[1:-1])
 
 
+def test_what_levels_are_known_to_share_is_not_found_again():
+    rng = np.random.default_rng(4)
+    both, on_top = [], []
+    for _ in range(300):
+        errors, std = drawn_levels(rng, 0.2, 0.5)
+        both.append(error_sizes(errors, std).level_std)
+        on_top.append(error_sizes(errors, std, [np.full((6, 1), 0.3)] * 10).level_std)
+    # 0.5² is 0.3² and 0.4²; of the few draws in which nothing is left the rest is lost.
+    gone = np.mean(np.square(both)) - np.mean(np.square(on_top))
+    assert gone == pytest.approx(0.3**2, rel=0.1)
+
+
 @pytest.mark.parametrize(("s", "tau"), [(1.0, 0.0), (1.0, 2.0), (0.2, 1.0), (3.0, 0.5)])
 def test_error_sizes_on_synthetic_levels(s, tau):
     rng = np.random.default_rng(2)

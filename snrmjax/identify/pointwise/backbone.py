@@ -14,7 +14,6 @@ from snrmjax.identify.pointwise.backbone_points import (
     off_resonance_error_factor,
 )
 from snrmjax.identify.pointwise.curve_fit import (
-    AS_STATED,
     AbstractPointwiseCurve,
     CurveFit,
     LeftOut,
@@ -248,6 +247,7 @@ def fit_backbone(
     family: CurveFamily = "spline",
     n_knots: int | None = None,
     anchor: bool = False,
+    level_stds: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
 ) -> BackboneFit:
     """Fit smooth or piecewise linear curves of ω̃² and 2ζ̃ω̃ to identified points.
 
@@ -256,12 +256,14 @@ def fit_backbone(
 
     Points are weighted by the stated noise carried through the inversion, the error of their
     amplitude included; where no noise is stated, all have the same relative error of amplitude
-    and phase, whose size the scatter gives. What the points of a level share is estimated and
-    enters the bands.
+    and phase, whose size the scatter gives. What the points of a level share enters the bands:
+    what is stated of it, and what the levels scatter beyond that, which is estimated.
 
     Arguments: `n_knots` of each curve, by default up to 60, with a roughness penalty chosen
     by how well left-out levels are predicted; `anchor` pins both curves at the linear mode at
-    zero amplitude and reports how far this moves them.
+    zero amplitude and reports how far this moves them; `level_stds` are the 1σ that the states of
+    a level share, as `Structure.level_stds` has them: relative gain, phase (rad), natural frequency
+    (rad/s) and damping ratio.
     Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
     Not differentiable: knots and smoothing are chosen on the host.
@@ -277,14 +279,13 @@ def fit_backbone(
         raise ValueError(f'`family` must be "spline" or "piecewise_linear", not {family!r}.')
     relative = np.asarray(points.relative_std)[use]
     stated = bool(np.all(np.isfinite(relative)))
-    free = _fit_pair(points, use, relative, stated, family, n_knots, None)
+    settings = (relative, stated, level_stds, family, n_knots)
+    free = _fit_pair(points, use, *settings, None)
     pair, report = free, None
     j, r = modes.mode_of_interest, reference_sensor(modes)
     omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     if anchor:
-        pair = _fit_pair(
-            points, use, relative, stated, family, n_knots, (omega**2, 2 * zeta * omega)
-        )
+        pair = _fit_pair(points, use, *settings, (omega**2, 2 * zeta * omega))
         report = _anchor_report(
             (free[0][0], free[1][0]),
             (pair[0][0], pair[1][0]),
@@ -321,6 +322,7 @@ def _fit_pair(
     use: np.ndarray,
     relative: np.ndarray,
     stated: bool,
+    level_stds: tuple[float, float, float, float],
     family: CurveFamily,
     n_knots: int | None,
     anchor: tuple[float, float] | None,
@@ -337,24 +339,28 @@ def _fit_pair(
     errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
     far = 1.0 if stated else off_resonance_error_factor(np.asarray(points.mode_velocity))[use]
 
+    gain, phase, *own_stds = level_stds
+    natural = np.asarray(points.natural_frequency)[use]
+
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
         knots = place_knots(amplitude, level, n_knots or min(MOST_KNOTS, len(amplitude) // 2))
         if fixed is not None:
             knots = np.concatenate([[0.0], knots])
         slope = np.zeros(len(amplitude))
-        for first in (True, False):
+        # The error of the amplitude matters along the slope, which a first fit tells. It is as
+        # smooth as the second: weights by the slopes of a rough curve follow the noise.
+        for _ in range(2):
             moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
             std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
             std = np.maximum(std * far, 1e-12 * np.max(np.abs(values[component])))
-            sample = PointSample(amplitude, values[component], std, level)
-            smoothing, sizes = 1e-6, AS_STATED
-            if not first:
-                weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
-                smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
+            own = 2 * natural * own_stds[component]
+            shared = np.column_stack([gain * moved[:, 1], phase * moved[:, 2], own])
+            sample = PointSample(amplitude, values[component], std, level, shared)
+            weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
+            smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
             used = sizes._replace(noise_scale=1.0) if stated else sizes
             best = fit_curve(family, knots, smoothing, sample, fixed_first=fixed, sizes=used)
-            # The error of the amplitude matters along the slope: known after a first fit.
             slope = log_slope(best.curve, amplitude)
         return best, sizes
 
@@ -376,7 +382,8 @@ def _best_smoothing(
     """
     if len(np.unique(points.level)) < 3:
         # One or two levels: leave out every third point in turn instead.
-        points = points._replace(level=np.argsort(np.argsort(points.amplitude)) % 3)
+        every_third = np.argsort(np.argsort(points.amplitude)) % 3
+        points = points._replace(level=every_third, shared=None)
     tried = [predict_left_out(family, knots, weight, points, fixed) for weight in weights]
     best = min(tried, key=lambda one: one.score)
     # Levels that no curve predicts must not decide here either.

@@ -128,6 +128,8 @@ class PointSample(NamedTuple):
     values: Float[np.ndarray, " point"]
     std: Float[np.ndarray, " point"]  # 1σ, or relative sizes where the scale is not known
     level: np.ndarray  # (point,): points of one level share a part of their errors
+    # 1σ of the errors that are known to be shared by the points of a level.
+    shared: Float[np.ndarray, "point kind"] | None = None
 
 
 def place_knots(
@@ -179,18 +181,21 @@ def fit_curve(
     free, n = problem.free, len(knots)
     design = problem.condensed.terms.curve(np.eye(n), by_values)
     _, level = np.unique(points.level, return_inverse=True)
+    together = [np.full(len(level), sizes.level_std)]
+    together += [] if points.shared is None else list(points.shared.T)
     result = penalised_least_squares(
         design[:, free],
         np.zeros(len(design)),
         np.ones(len(design)),
-        problem.condensed.of_groups(1 / problem.spread, level),
+        np.concatenate(
+            [problem.condensed.of_groups(one / points.std, level) for one in together], axis=1
+        ),
         problem.rough[:, free],
         np.zeros(len(problem.rough)),
     )
     covariance = np.zeros((n, n))
-    tau = sizes.level_std / problem.unit
     covariance[free, free] = (
-        sizes.noise_scale**2 * result.unshared_covariance + tau**2 * result.shared_covariance
+        sizes.noise_scale**2 * result.unshared_covariance + result.shared_covariance
     )
     return CurveFit(
         curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * problem.unit)),
@@ -220,7 +225,7 @@ def _problem(
     points: PointSample,
     fixed_first: float | None,
 ) -> _Problem:
-    amplitude, values, std, _ = points
+    amplitude, values, std, *_ = points
     unit = float(np.max(np.abs(values)))
     target, spread = np.asarray(values) / unit, np.asarray(std) / unit
     information = np.sum(1.0 / spread**2) / len(knots)
@@ -296,7 +301,7 @@ def predict_left_out(
     Points outside the amplitudes of the other levels are left aside: they would be continued,
     not interpolated.
     """
-    amplitude, values, std, level = points
+    amplitude, values, std, level, shared = points
     problem = _problem(kind, knots, smoothing, points, fixed_first)
     at_knots, slopes, by_values = _settle(problem)
     n = len(knots)
@@ -308,7 +313,7 @@ def predict_left_out(
     others = _all_but_one([np.asarray(np.linalg.qr(rows[own], mode="r")) for own in members])
     lowest = _lowest_of_others(np.array([amplitude[own].min() for own in members]))
     highest = -_lowest_of_others(np.array([-amplitude[own].max() for own in members]))
-    errors, spreads = [], []
+    errors, spreads, known = [], [], []
     for own, kept, low, high in zip(members, others, lowest, highest, strict=True):
         left = own[(amplitude[own] >= low) & (amplitude[own] <= high)]
         if not left.size:
@@ -317,13 +322,14 @@ def predict_left_out(
         predicted = (current[left] + design[left] @ step) * problem.unit
         errors.append(values[left] - predicted)
         spreads.append(std[left])
+        known.append(np.zeros((left.size, 0)) if shared is None else shared[left])
     if not errors:
         return LeftOut(np.inf, AS_STATED, np.zeros(0))
     pairs = zip(errors, spreads, strict=True)
     squares = np.array([np.mean((error / spread) ** 2) for error, spread in pairs])
     # A few levels that no curve predicts, at a sharp bend, must not decide for all.
     score = float(np.mean(np.sort(squares)[: -(-3 * len(squares) // 4)]))
-    return LeftOut(score, error_sizes(errors, spreads), squares)
+    return LeftOut(score, error_sizes(errors, spreads, known), squares)
 
 
 def _all_but_one(parts: list[np.ndarray]) -> list[np.ndarray]:

@@ -73,18 +73,23 @@ def identify_backbone(
     """Backbone and damping of the mode of interest from near-resonant steady states.
 
     `identify_points`, then `fit_backbone`; their arguments are described there. `modes` may also be
-    the structure that has them. Where no noise is stated, the standard deviations of the points
-    come from the scatter about the curves.
+    the structure that has them: the errors of levels that it states then enter the bands. Where no
+    noise is stated, the standard deviations of the points come from the scatter about the curves.
     Returns an `Identification` whose `notes` say in words what the reader of the file did not use,
     what was left out, what the noise turned out to be and how far an anchor moved the curves.
     Not differentiable, since curves are chosen: differentiate `identify_points`.
     Reference: Kwarta & Allen, section 2.2.
     """
+    stds = modes.level_stds if isinstance(modes, Structure) else (0.0, 0.0, 0.0, 0.0)
     modes = modes_of(modes)
     points = identify_points(data, modes, amplitude=amplitude, measure=measure)
-    fit = fit_backbone(points, modes, family=family, n_knots=n_knots, anchor=anchor)
+    fit = fit_backbone(
+        points, modes, family=family, n_knots=n_knots, anchor=anchor, level_stds=stds
+    )
     if not fit.noise_stated:
-        points = errors_from_scatter(points, fit)
+        points = errors_from_scatter(
+            points, fit, level_gain=stds[0], level_phase=stds[1], frequency_std=stds[2]
+        )
     return Identification(points, fit, (*data.notes, *_notes(points, fit, modes)))
 
 

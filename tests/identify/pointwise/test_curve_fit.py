@@ -267,7 +267,12 @@ class TestFit:
                     ).curve.values
                 )
             )
-        fit = fit_curve(kind, KNOTS, 1e-6, PointSample(amplitude, truth, std, level), sizes=sizes)
+        points = PointSample(amplitude, truth, std, level)
+        fit = fit_curve(kind, KNOTS, 1e-6, points, sizes=sizes)
+        # An error that levels are known to share counts as one that was found: here as two halves.
+        halves = points._replace(shared=np.full((60, 2), 0.05 / np.sqrt(2)))
+        known = fit_curve(kind, KNOTS, 1e-6, halves, sizes=ErrorSizes(1.5, 0.0))
+        np.testing.assert_allclose(known.covariance, fit.covariance, rtol=1e-9, atol=1e-15)
         # 400 draws know a standard deviation to 3.5 %; four of them, and the spline's curvature.
         np.testing.assert_allclose(
             np.sqrt(np.diag(fit.covariance)), np.std(found, axis=0, ddof=1), rtol=0.15
