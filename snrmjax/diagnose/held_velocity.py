@@ -1,15 +1,19 @@
 """Forces that a model needs to hold the velocity of a level, as tests that control it record."""
 
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 
 _POINTS = 81  # of a curve
 _ORDER = 5  # harmonics of the motion
+_SAME_FORCE = 0.05  # relative: further from a level's force a state is drawn pale
+_RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
 
 
 class HeldCurve(NamedTuple):
@@ -54,3 +58,18 @@ def held_curves(
         HeldCurve(int(k), float(held_speed[of == k][0]), at[of == k], needed[of == k] / force_gain)
         for k in numbers
     ]
+
+
+def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
+    """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
+    force, each = np.asarray(data.force), np.asarray(list(forces))
+    away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
+    return ~(away > _SAME_FORCE)
+
+
+def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
+    """Whether the force changes along the levels of a test, which then hold the response."""
+    if not predicted:
+        return False
+    same = at_curve_force(data, [one.force for one in predicted])
+    return bool(np.mean(~same) > _RESPONSE_CONTROLLED)

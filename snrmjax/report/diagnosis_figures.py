@@ -1,7 +1,7 @@
 """Figures of a diagnosis: what disagrees, before and after, and the laws of what was found."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.diagnose.held_velocity import HeldCurve, at_curve_force
 from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
@@ -50,11 +51,15 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 
 _SHOWN = 10  # candidates
 _LARGEST = 5.0  # misfit, in units of noise, at the end of the colour scale
-_SAME_FORCE = 0.05  # relative: further from a level's force a state is drawn pale
 _SAMPLES = 361  # of a cycle
 _AS_IT_IS = ("Hz", "periods", "%", "%, °", "1", "√kg m/s²")  # units without prefixes
 _PEOPLE = ("Coulomb", "Jenkins", "Iwan", "Van der Pol")
 _SINGLE_VALUED = 0.02  # of a force's range, between going there and coming back
+HELD_CAPTION = (
+    "These levels hold the response, not the force: the force that holds each level's median "
+    "velocity against frequency, without and with the effects that were found, over the measured "
+    "forces. Lines should pass through the dots; the force is smallest at resonance."
+)
 
 
 def effect_name(kind: str) -> str:
@@ -181,11 +186,35 @@ def comparison_figure(
     return figure
 
 
-def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
-    """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
-    force, each = np.asarray(data.force), np.asarray(list(forces))
-    away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
-    return ~(away > _SAME_FORCE)
+def held_velocity_figure(
+    before: Sequence[HeldCurve], after: Sequence[HeldCurve], data: SteadyStates, sensor: str
+) -> Figure:
+    """Force against frequency at held velocity, of two models side by side, over what was measured.
+
+    Arguments: curves of the model as given and of the completed one (`held_curves`).
+    """
+    r = sensor_index(data.sensors, sensor)
+    good = np.asarray(data.measured)[:, r]
+    frequency, force = np.asarray(data.frequency)[good] / HERTZ, np.asarray(data.force)[good]
+    unit = unit_for(force, "N")
+    figure, grid = panels(PAGE, 3.3, 1, 2)
+    top = 1.2 * float(np.nanmax(force)) / unit.size
+    for axes, curves, colour, name in (
+        (grid[0, 0], before, "0.35", "model as given"),
+        (grid[0, 1], after, IDENTIFIED, "completed model"),
+    ):
+        marks(axes, frequency, force / unit.size, {**DOT, "zorder": 4}, "measured")
+        for k, curve in enumerate(curves):
+            label = name if k == 0 else None
+            shown = curve.force / unit.size
+            axes.plot(curve.frequency / HERTZ, shown, color=colour, **CURVE, label=label)
+        axes.set(ylim=(0.0, top))
+    what = f"Force amplitude ({unit.name})"
+    name_axes(grid[0, 0], "(a) model as given, velocity held", "Frequency (Hz)", what)
+    name_axes(grid[0, 1], "(b) completed model, velocity held", "Frequency (Hz)", "")
+    grid[0, 1].tick_params(labelleft=False)
+    legend(figure)
+    return figure
 
 
 class _Curve(NamedTuple):

@@ -15,7 +15,7 @@ from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.former_answer import FormerAnswer
-from snrmjax.diagnose.held_velocity import held_curves
+from snrmjax.diagnose.held_velocity import held_curves, holds_response
 from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
@@ -28,11 +28,13 @@ from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, LAWS, effect_class
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_figures import (
+    HELD_CAPTION,
     candidates_figure,
     comparison_figure,
     effect_laws_figure,
     effect_name,
     found_effects,
+    held_velocity_figure,
     misfit_figure,
 )
 from snrmjax.report.figures import save_figures
@@ -47,11 +49,6 @@ from snrmjax.report.html import (
     write_report,
 )
 from snrmjax.report.laws.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.simulation_figures import (
-    HELD_CAPTION,
-    held_velocity_figure,
-    holds_response,
-)
 from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
 
 _SHOWN = 10  # candidates

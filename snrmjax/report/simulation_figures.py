@@ -9,13 +9,9 @@ from jaxtyping import Array, Float
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from snrmjax.diagnose.held_velocity import HeldCurve
-from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.signals import peak_amplitude
-from snrmjax.measure.states import SteadyStates
-from snrmjax.report.diagnosis_figures import at_curve_force
-from snrmjax.report.sampling import BAND, sensor_index, velocity_of
+from snrmjax.report.sampling import BAND, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
     COLUMN,
@@ -47,13 +43,6 @@ from snrmjax.report.style import (
 from snrmjax.simulate.solutions.controlled import DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch, ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
-
-_RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
-HELD_CAPTION = (
-    "These levels hold the response, not the force: the force that holds each level's median "
-    "velocity against frequency, without and with the effects that were found, over the measured "
-    "forces. Lines should pass through the dots; the force is smallest at resonance."
-)
 
 
 def simulated_response_figure(
@@ -321,43 +310,4 @@ def bars_figure(orders: Sequence[int], amplitudes: np.ndarray, below: str, besid
     figure, ((axes,),) = panels(COLUMN, 3.4, 1, 1)
     axes.semilogy(orders, np.maximum(good.T, 1e-300), **DOT)
     name_axes(axes, f"{len(good)} records", below, beside)
-    return figure
-
-
-def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
-    """Whether the force changes along the levels of a test, which then hold the response."""
-    if not predicted:
-        return False
-    same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > _RESPONSE_CONTROLLED)
-
-
-def held_velocity_figure(
-    before: Sequence[HeldCurve], after: Sequence[HeldCurve], data: SteadyStates, sensor: str
-) -> Figure:
-    """Force against frequency at held velocity, of two models side by side, over what was measured.
-
-    Arguments: curves of the model as given and of the completed one (`held_curves`).
-    """
-    r = sensor_index(data.sensors, sensor)
-    good = np.asarray(data.measured)[:, r]
-    frequency, force = np.asarray(data.frequency)[good] / HERTZ, np.asarray(data.force)[good]
-    unit = unit_for(force, "N")
-    figure, grid = panels(PAGE, 3.3, 1, 2)
-    top = 1.2 * float(np.nanmax(force)) / unit.size
-    for axes, curves, colour, name in (
-        (grid[0, 0], before, "0.35", "model as given"),
-        (grid[0, 1], after, IDENTIFIED, "completed model"),
-    ):
-        marks(axes, frequency, force / unit.size, {**DOT, "zorder": 4}, "measured")
-        for k, curve in enumerate(curves):
-            label = name if k == 0 else None
-            shown = curve.force / unit.size
-            axes.plot(curve.frequency / HERTZ, shown, color=colour, **CURVE, label=label)
-        axes.set(ylim=(0.0, top))
-    what = f"Force amplitude ({unit.name})"
-    name_axes(grid[0, 0], "(a) model as given, velocity held", "Frequency (Hz)", what)
-    name_axes(grid[0, 1], "(b) completed model, velocity held", "Frequency (Hz)", "")
-    grid[0, 1].tick_params(labelleft=False)
-    legend(figure)
     return figure
