@@ -80,8 +80,10 @@ def _states(diagnosis: Diagnosis, parts: list[_Part]) -> SteadyStates:
     first = int(np.asarray(data.level).max()) + 1
     level = np.concatenate([np.full(len(part[0]), first + k) for k, part in enumerate(parts)])
     seen = np.asarray(data.measured)
-    force_std, velocity_std, phase_std = np.nanmedian(
-        np.where(seen[:, :, None], np.asarray(relative_errors(data)), np.nan)[:, sensor], axis=0
+    errors = np.asarray(relative_errors(data))[seen[:, sensor], sensor]
+    stated_errors = (column[np.isfinite(column)] for column in errors.T)
+    force_std, velocity_std, phase_std = (
+        float(np.median(some)) if some.size else np.nan for some in stated_errors
     )
     n, wide = len(frequency), (len(frequency), len(data.sensors))
     alone = np.broadcast_to(seen.any(axis=0), wide)

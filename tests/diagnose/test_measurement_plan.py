@@ -224,6 +224,16 @@ def test_where_harmonics_are_there_the_range_of_levels_is_widened(doubted):
     assert force[level == 6].max() == pytest.approx(1.5 * before[own == 4].max())
 
 
+def test_a_plan_states_no_errors_where_none_were_stated(doubted, tmp_path):
+    silent = {name: np.full((45, 1), np.nan) for name in ("velocity_std", "phase_std")}
+    data = dataclasses.replace(doubted.data, force_std=np.full(45, np.nan), **silent)
+    write_plan(tmp_path / "plan.csv", measurement_plan(dataclasses.replace(doubted, data=data)))
+    with (tmp_path / "plan.csv").open(newline="") as file:
+        (header, *rows) = csv.reader(file)
+    assert [name for name in header if "std" in name] == ["harmonic_std_m_s"]
+    assert len(rows) == 9
+
+
 def test_nothing_open_has_no_plan(doubted):
     for verdict in (sj.diagnose.Verdict.NAMED, sj.diagnose.Verdict.NOISE_REJECTED):
         assert measurement_plan(dataclasses.replace(doubted, verdict=verdict)) is None
