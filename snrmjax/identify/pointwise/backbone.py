@@ -178,7 +178,7 @@ class Backbone(AbstractResult):
         zeta_std = np.hypot(modal_std / (2 * omega), zeta * omega_std / omega)
         speed = amplitude if self.argument == "velocity" else amplitude * omega
         found = (speed, omega, omega_std, zeta, zeta_std, modal, modal_std)
-        return BackboneValues(*map(jnp.asarray, found))
+        return BackboneValues(*jax.device_put(found))
 
     @compiled
     def _values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
@@ -301,8 +301,8 @@ def fit_backbone(
         squared_frequency_covariance=squared.covariance,
         modal_damping_covariance=damping.covariance,
         modal_constant=modes.mode_shape[r, j] * modes.participation[j],
-        smallest=jnp.asarray(amplitude.min()),
-        largest=jnp.asarray(amplitude.max()),
+        smallest=jax.device_put(amplitude.min()),
+        largest=jax.device_put(amplitude.max()),
         argument=points.argument,
         sensor=points.sensor,
     )

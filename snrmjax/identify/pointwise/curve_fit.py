@@ -198,8 +198,8 @@ def fit_curve(
         sizes.noise_scale**2 * result.unshared_covariance + result.shared_covariance
     )
     return CurveFit(
-        curve=CURVES[kind](jnp.asarray(knots), jnp.asarray(at_knots * problem.unit)),
-        covariance=jnp.asarray(covariance * problem.unit**2),
+        curve=CURVES[kind](*jax.device_put((knots, at_knots * problem.unit))),
+        covariance=jax.device_put(covariance * problem.unit**2),
     )
 
 

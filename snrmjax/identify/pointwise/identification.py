@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.pointwise.backbone import BackboneFit, CurveFamily, fit_backbone
@@ -122,7 +121,7 @@ def errors_from_scatter(
     return eqx.tree_at(
         lambda p: (p.natural_frequency_std, p.damping_ratio_std),
         points,
-        (jnp.asarray(natural_std), jnp.asarray(damping_std)),
+        jax.device_put((natural_std, damping_std)),
     )
 
 

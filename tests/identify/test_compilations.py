@@ -1,0 +1,30 @@
+"""An identification of other numbers, levels and knots compiles nothing anew."""
+
+import numpy as np
+from truths.exact_states import exact, modes
+
+import snrmjax as sj
+
+
+def states(seed, levels):
+    rng = np.random.default_rng(seed)
+    _, omega, force, velocity = exact()
+    own = rng.normal(size=len(omega)) + 1j * rng.normal(size=len(omega))
+    level = np.arange(len(omega)) * levels // len(omega)
+    return sj.measure.steady_states(level, omega, force, velocity * np.exp(0.01 * own))
+
+
+def test_points_and_curves_of_as_many_states(compilations):
+    found = sj.identify_backbone(states(0, 5), modes())
+    found.fit.backbone.values(np.linspace(*(float(x) for x in ends(found)), 50))
+    # Most of a first identification's time is compilation: all curves are the host's.
+    assert len(compilations) <= 16
+    del compilations[:]
+    for seed, levels in ((1, 5), (2, 9), (3, 15)):
+        again = sj.identify_backbone(states(seed, levels), modes())
+        again.fit.backbone.values(np.linspace(*(float(x) for x in ends(again)), 60 + seed))
+    assert len(compilations) == 0
+
+
+def ends(found):
+    return found.fit.backbone.smallest, found.fit.backbone.largest
