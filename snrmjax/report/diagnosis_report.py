@@ -16,7 +16,12 @@ from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.former_answer import FormerAnswer
 from snrmjax.diagnose.held_velocity import held_curves, holds_response
-from snrmjax.diagnose.response_prediction import LevelResponse, PhaseResonance, predict_levels
+from snrmjax.diagnose.response_prediction import (
+    LevelResponse,
+    PhaseResonance,
+    predict_levels,
+    with_resonances_checked,
+)
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
@@ -105,6 +110,7 @@ def write_diagnosis(
     if simulate and found.effects and found.completed is not None:
         predicted, figures["responses"] = with_responses(found, model)
         found = dataclasses.replace(found, notes=(*found.notes, *_incomplete(predicted)))
+        found = with_resonances_checked(found, model, predicted)
     write_summary(folder / "diagnosis.json", summarise_diagnosis(found, predicted))
     if found.completed is not None:
         write_model(folder / "model.toml", found.completed)
