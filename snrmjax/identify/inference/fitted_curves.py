@@ -175,7 +175,7 @@ def as_backbone(
         modal_damping_covariance=jnp.asarray(np.nan_to_num(covariance[1])),
         modal_constant=fit.problem.constant_of(fit.unknowns),
         smallest=jnp.asarray(measured.min()),
-        largest=jnp.asarray(measured.max()),
+        largest=jnp.asarray(fit.largest[0]),
         argument="displacement",
         sensor=fit.modes.sensors[fit.data.sensor],
     )

@@ -6,7 +6,7 @@ from truths.exact_states import GAIN, driven, modes
 
 import snrmjax as sj
 from snrmjax.identify.checks.instruments import notes_on_instruments
-from snrmjax.identify.inference.fitted_curves import values_to_the_largest
+from snrmjax.identify.inference.fitted_curves import as_backbone, values_to_the_largest
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
 
 
@@ -54,6 +54,7 @@ def test_the_velocity_axis_ends_where_it_was_measured():
     measured = float(np.max(np.abs(np.asarray(data.velocity))))
     speed = np.asarray(values_to_the_largest(fit, 5).velocity)
     assert speed[-1] == pytest.approx(measured, rel=0.002)  # the level's noise is 0.1 %
+    assert float(as_backbone(fit).largest) == pytest.approx(fit.largest[0], rel=1e-12)
 
 
 class _Fit:
