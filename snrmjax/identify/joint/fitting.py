@@ -43,6 +43,7 @@ _ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
 _MOST_STEPS = 200  # of Levenberg–Marquardt in a round
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
 _SETTLED = 0.1  # of the squared distance, in standard deviations, that a last round may move
+_LEAST_LEFT = 0.25  # of the residuals, that no number of unknowns can take
 _ROBUST = 2.5  # whitened residuals beyond it lose weight under the robust loss
 
 
@@ -103,7 +104,7 @@ def fitted(
     for turn in range(most):
         # What a wrong noise would take for errors can lead far away from the records.
         trusted = stated and not components.contradicts_upward
-        widened = 1.0 if trusted else components.noise
+        widened = 1.0 if trusted else components.unit
         problem = problem.with_data(std=stated_std * widened)
         if not trusted:
             problem = problem.with_data(correction=jnp.zeros_like(problem.data.correction))
@@ -116,14 +117,14 @@ def fitted(
         answer = _linearised(vector, *given, linear.weighting, correcting, correcting)
         problem = problem.with_data(correction=answer.correction[:n])
         residuals = np.asarray(answer.residuals)[:n]
-        if not np.isfinite(float(answer.cost)):
+        jacobian = np.asarray(answer.jacobian)[:, program.own]
+        if not (np.isfinite(float(answer.cost)) and np.all(np.isfinite(jacobian))):
             unknown, none_known = len(program.own), np.full(2, np.nan)
             covariance = np.full((unknown, unknown), np.nan)
             ended = (problem, components, residuals, none_known, FitStatus.NOT_FINITE)
             return Fitted(
                 Unravel(start, free)(np.asarray(program.vector)[program.own]), covariance, *ended
             )
-        jacobian = np.asarray(answer.jacobian)[:, program.own]
         if robust:
             weight = np.sqrt(np.asarray(problem.data.weight))
             lower = _ROBUST / np.maximum(np.linalg.norm(residuals, axis=1) / weight, 1e-9)
@@ -131,14 +132,20 @@ def fitted(
         settled = float(linear.cost) - float(answer.cost) < _SETTLED
         if turn == most - 1 or (settled and turn >= fewest - 1):
             break
-        dof = max(residuals.size - degrees_spent(jacobian, residuals.size), 1.0)
+        share = 1.0 if trusted else components.independent
+        # An unknown takes as much of correlated residuals as of the states that count.
+        spent = degrees_spent(jacobian, residuals.size) / share
+        dof = max(residuals.size - spent, _LEAST_LEFT * residuals.size, 1.0)
         noise = max(widened * float(np.sqrt(np.sum(residuals**2) / dof)), 1e-12)
-        components = components._replace(noise=noise, noise_std=noise / float(np.sqrt(2 * dof)))
+        noise_std = noise / float(np.sqrt(2 * share * dof))
+        components = components._replace(noise=noise, noise_std=noise_std)
     levels = along_resonance(np.asarray(problem.data.level), np.asarray(problem.data.frequency))
     alike, root = residual_autocorrelation(residuals, levels), root_of_inverse(jacobian)
     rows = jacobian[: 2 * n_padded].reshape(-1, 2, len(root))[:n]
     # What is left of overstated noise shares no more than it has.
     size = components.noise**2 if stated and components.contradicts_downward else 1.0
+    if not trusted and components.independent < 1:
+        size = 0.0  # the fit itself has counted the states for fewer
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),

@@ -72,6 +72,9 @@ class PriorStd(eqx.Module):
     # Of the residual modes' natural frequencies (rad/s) and damping ratios, then, relative, of the
     # modal mass of the mode of interest.
     linear: Float[Array, " deviation"]
+    # 1 where a gain of the force is free: gains of levels are then the force's, and the measured
+    # velocities stay what they are; 0 where the force is known.
+    gain_of_force: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.0))
 
 
 class BalanceProblem(eqx.Module):
@@ -141,7 +144,8 @@ def stated_prior(
     mass = UNSTATED_MODAL_MASS_STD if stated is None else float(stated[modes.mode_of_interest])
     each = (modes.natural_frequency_std, modes.damping_ratio_std)
     linear = [*(np.asarray(std)[keep] for std in each), [0.0 if "force_gain" in free else mass]]
-    return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)))
+    of_force = jnp.asarray(float("force_gain" in free))
+    return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
 
 
 def with_known_mass(problem: BalanceProblem) -> BalanceProblem:
@@ -258,10 +262,11 @@ def motion_of(
     """
     data, prior = problem.data, problem.prior
     level = (unknowns.level * prior.level)[data.level]
-    gain = jnp.exp(unknowns.log_force_gain + error[:, 0])
+    of_force = prior.gain_of_force * level[:, 0]
+    gain = jnp.exp(unknowns.log_force_gain + of_force + error[:, 0])
     force = data.force * gain + unknowns.force_offset * jnp.min(data.force)
     phase = error[:, 2] - level[:, 1] - unknowns.instrument_phase
-    velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + 1j * phase)
+    velocity = data.velocity * jnp.exp(error[:, 1] - level[:, 0] + of_force + 1j * phase)
     linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
     residual = residual_velocity(linear, jnp.asarray(data.frequency), force)
     own = velocity - jnp.sum(data.share * residual, axis=1)

@@ -1,5 +1,6 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -368,15 +369,19 @@ def fit_jointly(
         chosen = select(first_guess, problem, components_too=False)
         first = finite_fit(fit_from(chosen, first_guess, problem, _ROUGHLY))
     prior = problem.prior
-    guess, corrected = as_guess(first, problem)
+    guess, corrected = first_guess, problem
+    if first.status != FitStatus.STEP_LIMIT:  # which may have ended anywhere
+        guess, corrected = as_guess(first, problem)
     chosen = select(guess, corrected, components_too=True)
-    best = finite_fit(fit_from(chosen, guess, corrected, _ROUNDS))
+    best = fit_from(chosen, guess, corrected, _ROUNDS)
     if best.status != FitStatus.CONVERGED or (stated and best.components.contradicts_upward):
         # Where levels differ so much that no fit without that comes near, the guess is better.
         other = select(first_guess, problem, components_too=True)
-        again = finite_fit(fit_from(other, first_guess, problem, _ROUNDS))
-        if again.components.noise < _CLEARLY_LESS * best.components.noise:
+        again = fit_from(other, first_guess, problem, _ROUNDS)
+        better = again.components.noise < _CLEARLY_LESS * best.components.noise
+        if best.status == FitStatus.NOT_FINITE or (better and again.status != FitStatus.NOT_FINITE):
             chosen, best = other, again
+    finite_fit(best)
 
     def told(found: Fitted, families: FamilyChoice) -> JointFit:
         components, last = found.components, found.problem
@@ -447,4 +452,4 @@ def _started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:
 def _with_components(prior: PriorStd, components: VarianceComponents, n_levels: int) -> PriorStd:
     """Levels' errors as stated, or as estimated and as much wider as few levels leave open."""
     found = few_levels_factor(n_levels) * jnp.array(components.level)
-    return PriorStd(jnp.where(prior.level > 0, prior.level, found), prior.linear)
+    return dataclasses.replace(prior, level=jnp.where(prior.level > 0, prior.level, found))

@@ -46,6 +46,15 @@ def residual_autocorrelation(
     return np.array(found)
 
 
+def independent_share(correlation: Float[np.ndarray, " part"]) -> float:
+    """Share of the states that tell something of their own, by the mean of both parts.
+
+    n values of a first-order process with correlation ρ tell its mean as well as n(1 − ρ)/(1 + ρ)
+    independent ones.
+    """
+    return float(np.mean((1 - correlation) / (1 + correlation)))
+
+
 def _correlation(
     residuals: Float[np.ndarray, " state"], levels: list[Int[np.ndarray, " place"]], lag: int
 ) -> tuple[float, int]:

@@ -22,6 +22,11 @@ from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, BalanceProblem, Unknowns
 from snrmjax.identify.joint.initial_guess import levels_apart, most_parameters
 from snrmjax.identify.joint.ranking import Compared, FamilyCandidate, RivalCurve, Trial, ranked
+from snrmjax.identify.joint.residual_autocorrelation import (
+    along_resonance,
+    independent_share,
+    residual_autocorrelation,
+)
 from snrmjax.identify.joint.residuals import BalanceSlopes, balance_slopes
 from snrmjax.identify.joint.smoothness import (
     curve_columns,
@@ -45,6 +50,7 @@ from snrmjax.identify.joint.variance_components import (
 
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating the level-to-level variance
+_ALIKE = 0.1  # relative change of a share of states that ends the search for it
 _STEPS = 4  # of Gauss–Newton for a family that is not linear in its parameters
 _STILL_FALLING = 0.1  # of χ², by which one step more would lower an unfinished fit
 # Times the likeliest size of bends. With that itself bands hold a curve at 95 of 100 amplitudes,
@@ -212,11 +218,6 @@ class _Scoring(NamedTuple):
         return self._replace(components=components)
 
     @property
-    def noise(self) -> float:
-        """By which residuals exceed the stated noise."""
-        return self.components.noise
-
-    @property
     def level_std(self) -> Float[np.ndarray, " error"]:
         """1σ of the levels' errors."""
         return np.array(self.components.level)
@@ -241,21 +242,23 @@ class _Scoring(NamedTuple):
                 np.tile(self.level_std, self.data.n_levels),
             ]
         )
-        return Linearised(
-            residuals.reshape(-1) / self.noise, slopes / self.noise, std, np.zeros(len(std))
-        )
+        unit = self.components.unit
+        return Linearised(residuals.reshape(-1) / unit, slopes / unit, std, np.zeros(len(std)))
 
     def estimated(
         self, squared: AbstractFamily, damping: AbstractFamily, *, look: bool
     ) -> VarianceComponents:
-        """What noise and levels say beyond these curves, with nothing but the stated known."""
+        """What noise and levels say beyond these curves, with nothing but the stated known.
+
+        Where what is left has one sign over many states they count as fewer (`independent_share`):
+        what levels seem to differ by may be a law that the curves do not have.
+        """
         problem = self.linearised(squared, damping)
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
         std = problem.prior_std.copy()
         std[first:] = np.tile(self.stated_std, self.data.n_levels)
-        raw = Linearised(
-            problem.residuals * self.noise, problem.slopes * self.noise, std, problem.deviation
-        )
+        unit = self.components.unit
+        raw = Linearised(problem.residuals * unit, problem.slopes * unit, std, problem.deviation)
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
         for kind in self.apart:
             # Levels vary about their common part: that is the gain's, the mass's or the phase's.
@@ -263,7 +266,30 @@ class _Scoring(NamedTuple):
             raw.slopes[:, index[:, kind]] = own - own.mean(axis=1, keepdims=True)
         pair = (squared, damping)
         bends = [self.bends(problem, pair, k) for k in range(2) if _is_smooth(pair[k])]
-        return estimated_components(raw, index, look=look, bends=bends)
+        found = estimated_components(raw, index, look=look, bends=bends)
+        if not look:
+            return found
+        for _ in range(_ROUNDS):
+            own = std.copy()
+            own[index] = found.level
+            for some, size in zip(bends, found.bends, strict=True):
+                own[some.places] = size
+            independent = self._independent_share(raw, own, found.unit)
+            if abs(np.log(independent / found.independent)) < _ALIKE:
+                break
+            asked = (raw, index)
+            found = estimated_components(*asked, bends=bends, independent=independent)
+        return found
+
+    def _independent_share(
+        self, raw: Linearised, std: Float[np.ndarray, " unknown"], unit: float
+    ) -> float:
+        """Share of independent states, by what a fit with these 1σ leaves along every level."""
+        scaled = Linearised(raw.residuals / unit, raw.slopes / unit, std, raw.deviation)
+        left = (scaled.residuals + scaled.slopes @ solved(scaled)).reshape(-1, 2)
+        levels = along_resonance(np.asarray(self.data.level), np.asarray(self.data.frequency))
+        size = np.sqrt(np.mean(left**2, axis=0))
+        return independent_share(residual_autocorrelation(left / size, levels))
 
     def jitter(self, guess: Unknowns) -> float:
         """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
@@ -273,7 +299,7 @@ class _Scoring(NamedTuple):
         """
         problem = self.linearised(guess.squared_frequency, guess.modal_damping)
         left = (problem.residuals + problem.slopes @ solved(problem)).reshape(-1, 2)
-        arm = self.known.by_squared * self.known.squared[:, None] / self.noise
+        arm = self.known.by_squared * self.known.squared[:, None] / self.components.unit
         length = np.sum(arm**2, axis=1)
         along = np.sum(arm * left, axis=1) ** 2
         size = np.sum(left**2, axis=1)
@@ -287,7 +313,11 @@ class _Scoring(NamedTuple):
         start = np.log([0.5, 0.5 / np.sqrt(np.median(length))])
         found = minimize(criterion, start, method="Nelder-Mead")
         alone = 2 * len(left) * (np.log(np.sum(size) / (2 * len(left))) + 1)
-        return float(np.exp(found.x[1])) if found.fun < alone - _CLEARLY else 0.0
+        return (
+            float(np.exp(found.x[1]))
+            if found.fun < alone - _CLEARLY / self.components.independent
+            else 0.0
+        )
 
     def improved(
         self, squared: AbstractFamily, damping: AbstractFamily, steps: int

@@ -29,6 +29,12 @@ class VarianceComponents(NamedTuple):
     unbounded: tuple[
         int, ...
     ] = ()  # kinds of error left out: largest likelihood at a size that no test has
+    independent: float = 1.0  # share of the states that count, where neighbours err alike
+
+    @property
+    def unit(self) -> float:
+        """What residuals are counted in: the noise, larger where few states are independent."""
+        return self.noise / float(np.sqrt(self.independent))
 
     @property
     def contradicts_upward(self) -> bool:
@@ -73,6 +79,7 @@ def estimated_components(
     *,
     look: bool = True,
     bends: Sequence[Bends] = (),
+    independent: float = 1.0,
 ) -> VarianceComponents:
     """Restricted maximum likelihood of the noise and of what levels share beyond what is stated.
 
@@ -82,11 +89,15 @@ def estimated_components(
     likeliest at sizes no test has, as a gain of levels may be beside a force gain that nobody
     knows, is none.
     `bends` of curves are estimated along with them: rough curves and levels that differ explain
-    the same residuals.
-    Reference: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545.
+    the same residuals. Where neighbouring states err alike only a share of them is `independent`:
+    the likelihood counts for so much less, and what it must gain to believe in an error of levels
+    stays the same.
+    References: Patterson & Thompson, Biometrika 58 (1971) 545, doi:10.1093/biomet/58.3.545; for a
+    likelihood that counts for less, Pauli, Racugno & Ventura, Stat. Sin. 21 (2011) 149.
     """
     n_errors = index.shape[1]
-    likelihood = _Likelihood.of(problem, (*index.T, *(some.places for some in bends)))
+    groups = (*index.T, *(some.places for some in bends))
+    likelihood = _Likelihood.of(problem, groups).of_a_share(independent)
     ends = (*[(_NOTHING, _LARGEST)] * n_errors, *(some.ends for some in bends))
     present = [float(problem.prior_std[some.places[0]]) for some in bends]
     stated = np.array([*problem.prior_std[index[0]], *present])
@@ -134,6 +145,7 @@ def estimated_components(
         level=tuple(found.std[:n_errors].tolist()),
         bends=tuple(found.std[n_errors:].tolist()),
         unbounded=tuple(sorted(unbounded)),
+        independent=independent,
     )
 
 
@@ -167,8 +179,8 @@ class _Likelihood(NamedTuple):
     gram: np.ndarray
     pull: np.ndarray
     total: float
-    rows: int
-    dof: int
+    rows: float
+    dof: float
     prior_std: np.ndarray
     groups: tuple[np.ndarray, ...]  # of unknowns that have a 1σ in common
 
@@ -181,6 +193,17 @@ class _Likelihood(NamedTuple):
         n = len(residuals)
         dof = max(n - int(np.sum(~bound)), 1)
         return cls(x.T @ x, x.T @ residuals, float(residuals @ residuals), n, dof, std, groups)
+
+    def of_a_share(self, independent: float) -> "_Likelihood":
+        """The likelihood where only a share of the states tells something of its own."""
+        spent = self.rows - self.dof
+        return self._replace(
+            gram=independent * self.gram,
+            pull=independent * self.pull,
+            total=independent * self.total,
+            rows=spent + independent * self.dof,
+            dof=independent * self.dof,
+        )
 
     def value_and_slopes(
         self, noise: float, of_groups: np.ndarray
