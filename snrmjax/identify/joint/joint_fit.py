@@ -164,7 +164,8 @@ class JointFit(AbstractResult):
     def largest(self) -> tuple[float, float]:
         """Largest displacement (m) and velocity (m/s), as measured: no gain moves them."""
         motion, level = self.motion(), np.asarray(self.unknowns.level * self.prior.level)
-        recorded = np.exp(level[np.asarray(self.data.level), 0])
+        of_velocity = 1 - float(self.prior.gain_of_force)
+        recorded = np.exp(of_velocity * level[np.asarray(self.data.level), 0])
         pair = (np.asarray(motion.displacement), np.abs(np.asarray(motion.velocity)))
         displacement, velocity = (float(np.max(recorded * size)) for size in pair)
         return displacement, velocity
@@ -398,7 +399,8 @@ def fit_jointly(
         if np.any((np.asarray(prior.level) == 0) & (np.asarray(last.prior.level) > 0)):
             errors = np.asarray(found.unknowns.level * last.prior.level)
             force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
-            notes += notes_on_level_errors(errors, numbers, np.array(force))
+            scaled = bool(prior.gain_of_force > 0)
+            notes += notes_on_level_errors(errors, numbers, np.array(force), of_force=scaled)
         notes += notes_on_stated_errors(np.asarray(found.unknowns.level), level_std)
         notes += notes_on_modal_mass(found.unknowns, last, found.covariance)
         notes += notes_on_autocorrelation(found.autocorrelation)

@@ -253,16 +253,23 @@ def notes_on_level_errors(
     found: Float[np.ndarray, "level error"],
     numbers: Sequence[int],
     force: Float[np.ndarray, " level"],
+    *,
+    of_force: bool = False,
 ) -> tuple[str, ...]:
     """By how much the fit scaled each level's velocities and turned their phases.
+
+    With `of_force` a level's gain is the force's, and the velocities are as measured.
 
     Arguments: `found` the errors of every level (`LEVEL_ERRORS`), zero where a kind of error is
     none of the fit's unknowns; `numbers` the levels' own numbers; `force` of every level, or its
     drive voltage.
     """
     notes = []
+    scaled = ("scaled the velocities", 100 * np.expm1(-found[:, 0]), " %")
+    if of_force:
+        scaled = ("scaled the forces", 100 * np.expm1(found[:, 0]), " %")
     changes = (
-        ("scaled the velocities", 100 * np.expm1(-found[:, 0]), " %"),
+        scaled,
         ("turned the phases of the velocity", -np.degrees(found[:, 1]), "°"),
     )
     for done, change, unit in changes:

@@ -50,6 +50,7 @@ from snrmjax.identify.joint.variance_components import (
 
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating the level-to-level variance
+_OF_INSTRUMENTS = tuple(LEVEL_ERRORS.index(name) for name in ("gain", "phase"))
 _ALIKE = 0.1  # relative change of a share of states that ends the search for it
 _STEPS = 4  # of Gauss–Newton for a family that is not linear in its parameters
 _STILL_FALLING = 0.1  # of χ², by which one step more would lower an unfinished fit
@@ -181,7 +182,6 @@ class _Scoring(NamedTuple):
     stated_std: Float[np.ndarray, " error"]  # of the levels' errors
     folds: list[np.ndarray]  # rows of every left-out part
     components: VarianceComponents
-    apart: tuple[int, ...] = ()  # of the levels' errors: those whose common part is an unknown
 
     @classmethod
     def of(cls, problem: BalanceProblem, known: BalanceSlopes, free: tuple[str, ...]) -> "_Scoring":
@@ -205,12 +205,6 @@ class _Scoring(NamedTuple):
             stated_std=stated,
             folds=[np.repeat(left_out == k, 2) for k in np.unique(left_out)],
             components=VarianceComponents(1.0, 0.0, tuple(stated.tolist())),
-            apart=tuple(
-                kind
-                for kind, name in enumerate(LEVEL_ERRORS)
-                if (name == "gain" and ("force_gain" in free or prior.linear[-1] > 0))
-                or (name == "phase" and "instrument_phase" in free)
-            ),
         )
 
     def with_components(self, components: VarianceComponents) -> "_Scoring":
@@ -260,8 +254,9 @@ class _Scoring(NamedTuple):
         unit = self.components.unit
         raw = Linearised(problem.residuals * unit, problem.slopes * unit, std, problem.deviation)
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
-        for kind in self.apart:
-            # Levels vary about their common part: that is the gain's, the mass's or the phase's.
+        for kind in _OF_INSTRUMENTS:
+            # What all levels have in common tells nothing of how much they differ: it is an error
+            # of the whole test, or of the law.
             own = raw.slopes[:, index[:, kind]]
             raw.slopes[:, index[:, kind]] = own - own.mean(axis=1, keepdims=True)
         pair = (squared, damping)
