@@ -144,12 +144,11 @@ def fitted(
     rows = jacobian[: 2 * n_padded].reshape(-1, 2, len(root))[:n]
     # What is left of overstated noise shares no more than it has.
     size = components.noise**2 if stated and components.contradicts_downward else 1.0
-    if not trusted and components.independent < 1:
-        size = 0.0  # the fit itself has counted the states for fewer
+    counted = 1.0 if trusted else components.independent
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
-        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels),
+        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels, counted),
         problem=problem,
         components=components,
         residuals=residuals,

@@ -338,7 +338,7 @@ def fit_jointly(
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
-    request = FamilyRequest(parse_family(backbone), parse_family(damping), released)
+    request = FamilyRequest(parse_family(backbone), parse_family(damping), released, stated)
 
     def select(guess: Unknowns, problem: BalanceProblem, *, components_too: bool) -> Selection:
         # Where no noise is stated a smooth curve would bend for levels whose gains differ.
@@ -399,8 +399,8 @@ def fit_jointly(
         if np.any((np.asarray(prior.level) == 0) & (np.asarray(last.prior.level) > 0)):
             errors = np.asarray(found.unknowns.level * last.prior.level)
             force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
-            scaled = bool(prior.gain_of_force > 0)
-            notes += notes_on_level_errors(errors, numbers, np.array(force), of_force=scaled)
+            of_force = bool(prior.gain_of_force > 0)
+            notes += notes_on_level_errors(errors, numbers, np.array(force), of_force=of_force)
         notes += notes_on_stated_errors(np.asarray(found.unknowns.level), level_std)
         notes += notes_on_modal_mass(found.unknowns, last, found.covariance)
         notes += notes_on_autocorrelation(found.autocorrelation)

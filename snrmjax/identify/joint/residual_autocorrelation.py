@@ -73,23 +73,25 @@ def added_covariance(
     jacobian: Float[np.ndarray, "state part unknown"],
     correlation: Float[np.ndarray, " part"],
     levels: list[Int[np.ndarray, " place"]],
+    counted: float = 1.0,
 ) -> Float[np.ndarray, "unknown unknown"]:
     """What correlated residuals add to the covariance (JᵀJ)⁻¹ of a least-squares fit.
 
     The fit is the same, and its covariance (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with residuals k states apart
     correlated by the k-th power of that of neighbours. What this process has less of than white
     noise, differences between neighbours, does not make a band narrower.
-    Arguments: `root` K with (JᵀJ)⁻¹ = KKᵀ; `jacobian` of the whitened residuals of the states.
+    Arguments: `root` K with (JᵀJ)⁻¹ = KKᵀ; `jacobian` of the states' whitened residuals; the share
+    of the states that the fit `counted`, which is in these residuals already.
     Reference: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610, with an
     autoregressive process of first order in place of their weights.
     """
     excess = np.zeros((root.shape[1], root.shape[1]))
     for part, rho in enumerate(correlation):
-        if rho == 0:
+        if rho == 0 and counted == 1:
             continue
         for some in levels:
             arms = jacobian[some, part] @ root
-            excess += arms.T @ _of_neighbours(arms, rho)
+            excess += counted * arms.T @ _of_neighbours(arms, rho) - (1 - counted) * arms.T @ arms
     values, directions = np.linalg.eigh(excess)
     arms = root @ directions * np.sqrt(np.maximum(values, 0.0))
     return arms @ arms.T

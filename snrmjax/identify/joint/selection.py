@@ -69,11 +69,12 @@ class SelectionStatus(IntEnum):
 
 
 class FamilyRequest(NamedTuple):
-    """What the user asks of both curves, and which unknowns of the measurement are free."""
+    """What is asked of both curves, which unknowns are free, and whether noise is stated."""
 
     backbone: Choice
     damping: Choice
     free: tuple[str, ...]
+    stated: bool = True
 
 
 class Selection(NamedTuple):
@@ -113,7 +114,7 @@ def select_families(
     ]
 
     def scoring(problem: BalanceProblem, at: Unknowns) -> tuple[_Scoring, Unknowns]:
-        blank = _Scoring.of(problem, balance_slopes(at, problem), request.free)
+        blank = _Scoring.of(problem, balance_slopes(at, problem), request)
         pair = (at.squared_frequency, at.modal_damping)
         own = blank.with_components(blank.estimated(*pair, look=components_too))
         curves = own.bending(pair, own.components.bends, alike=not components_too)
@@ -181,14 +182,17 @@ class _Scoring(NamedTuple):
     levels: Float[np.ndarray, "row unknown"]  # slopes by the levels' errors
     stated_std: Float[np.ndarray, " error"]  # of the levels' errors
     folds: list[np.ndarray]  # rows of every left-out part
+    noise_stated: bool
     components: VarianceComponents
 
     @classmethod
-    def of(cls, problem: BalanceProblem, known: BalanceSlopes, free: tuple[str, ...]) -> "_Scoring":
+    def of(
+        cls, problem: BalanceProblem, known: BalanceSlopes, request: FamilyRequest
+    ) -> "_Scoring":
         """With the noise and the errors of levels as stated."""
         data, prior = problem.data, problem.prior
         names = ("force_gain", "force_offset", "instrument_phase")
-        keep = [k for k, name in enumerate(names) if name in free]
+        keep = [k for k, name in enumerate(names) if name in request.free]
         n_linear = prior.linear.shape[0]
         keep += [3 + k for k in range(n_linear)]
         left_out = np.asarray(data.level)
@@ -204,6 +208,7 @@ class _Scoring(NamedTuple):
             levels=level_columns(known.by_level, np.asarray(data.level), data.n_levels),
             stated_std=stated,
             folds=[np.repeat(left_out == k, 2) for k in np.unique(left_out)],
+            noise_stated=request.stated,
             components=VarianceComponents(1.0, 0.0, tuple(stated.tolist())),
         )
 
@@ -244,8 +249,9 @@ class _Scoring(NamedTuple):
     ) -> VarianceComponents:
         """What noise and levels say beyond these curves, with nothing but the stated known.
 
-        Where what is left has one sign over many states they count as fewer (`independent_share`):
-        what levels seem to differ by may be a law that the curves do not have.
+        Where what is left is larger than the stated noise, or none is stated, and has one sign over
+        many states, they count as fewer (`independent_share`): what levels seem to differ by may be
+        a law that the curves do not have.
         """
         problem = self.linearised(squared, damping)
         first, n_errors = problem.slopes.shape[1] - self.levels.shape[1], len(LEVEL_ERRORS)
@@ -262,7 +268,8 @@ class _Scoring(NamedTuple):
         pair = (squared, damping)
         bends = [self.bends(problem, pair, k) for k in range(2) if _is_smooth(pair[k])]
         found = estimated_components(raw, index, look=look, bends=bends)
-        if not look:
+        believed = self.noise_stated and not found.contradicts_upward
+        if not look or believed:
             return found
         for _ in range(_ROUNDS):
             own = std.copy()
