@@ -1,5 +1,6 @@
 """Rounds of fitting the curves and estimating the noise anew, until both belong together."""
 
+import dataclasses
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from jaxtyping import Array
 
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
+    PriorStd,
     Unknowns,
     Weighting,
     nearest_errors,
@@ -29,7 +31,8 @@ from snrmjax.identify.joint.residuals import (
     corrected_residuals,
     on_levels,
 )
-from snrmjax.identify.joint.variance_components import VarianceComponents
+from snrmjax.identify.joint.selection import Selection
+from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 
@@ -236,3 +239,19 @@ def as_guess(found: Fitted, problem: BalanceProblem) -> tuple[Unknowns, BalanceP
     raw = found.unknowns.level * found.problem.prior.level
     guess = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
     return guess, problem.with_data(correction=found.problem.data.correction)
+
+
+def started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:
+    """The chosen curves, and the guess's deviations of levels in units of their new 1σ."""
+    unit = jnp.where(prior.level > 0, prior.level, 1.0)
+    level = jnp.where(prior.level > 0, guess.level / unit, 0.0)
+    pair = (chosen.squared_frequency, chosen.modal_damping)
+    return eqx.tree_at(
+        lambda u: (u.squared_frequency, u.modal_damping, u.level), guess, (*pair, level)
+    )
+
+
+def with_components(prior: PriorStd, components: VarianceComponents, n_levels: int) -> PriorStd:
+    """Levels' errors as stated, or as estimated and as much wider as few levels leave open."""
+    found = few_levels_factor(n_levels) * jnp.array(components.level)
+    return dataclasses.replace(prior, level=jnp.where(prior.level > 0, prior.level, found))

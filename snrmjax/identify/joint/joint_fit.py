@@ -1,6 +1,5 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,6 +20,8 @@ from snrmjax.identify.joint.fitting import (
     as_guess,
     finite_fit,
     fitted,
+    started,
+    with_components,
 )
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
@@ -62,7 +63,6 @@ from snrmjax.identify.joint.selection import (
     SelectionStatus,
     select_families,
 )
-from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -349,10 +349,10 @@ def fit_jointly(
     def fit_from(
         chosen: Selection, guess: Unknowns, problem: BalanceProblem, rounds: tuple[int, int]
     ) -> Fitted:
-        level = _with_components(problem.prior, chosen.components, measured.n_levels)
+        level = with_components(problem.prior, chosen.components, measured.n_levels)
         std = problem.data.std.at[:, 3].set(chosen.jitter)
         noisy = BalanceProblem(problem.with_data(std=std).data, modes, level)
-        start = _started(guess, chosen, level)
+        start = started(guess, chosen, level)
         return fitted(
             start, noisy, chosen.components, FitSettings(released, stated, robust, rounds)
         )
@@ -439,19 +439,3 @@ def fit_jointly(
         else:
             failed.append(FailedRival(one.curve, one.family.label, one.weight, found.status))
     return told(best, FamilyChoice(chosen.table, tuple(rivals), tuple(failed), chosen.status))
-
-
-def _started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:
-    """The chosen curves, and the guess's deviations of levels in units of their new 1σ."""
-    unit = jnp.where(prior.level > 0, prior.level, 1.0)
-    level = jnp.where(prior.level > 0, guess.level / unit, 0.0)
-    pair = (chosen.squared_frequency, chosen.modal_damping)
-    return eqx.tree_at(
-        lambda u: (u.squared_frequency, u.modal_damping, u.level), guess, (*pair, level)
-    )
-
-
-def _with_components(prior: PriorStd, components: VarianceComponents, n_levels: int) -> PriorStd:
-    """Levels' errors as stated, or as estimated and as much wider as few levels leave open."""
-    found = few_levels_factor(n_levels) * jnp.array(components.level)
-    return dataclasses.replace(prior, level=jnp.where(prior.level > 0, prior.level, found))

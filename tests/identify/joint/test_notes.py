@@ -139,7 +139,7 @@ class TestStatedErrorsOfLevels:
         known = dataclasses.replace(modes(), modal_mass_std=jnp.zeros(1))
         fit = sj.fit_jointly(large, known, level_gain_std=0.005, **TRUE)
         (note,) = (one for one in fit.notes if "levels deviate by" in one)
-        # The stated error holds them back, and neighbours miss alike: they tell less than the whole.
+        # The stated error holds them back, and neighbours miss alike: they tell not all of it.
         told = float(re.search(r"ask for at least ([\d.]+) % in gain", note)[1])
         assert 0.5 < told < 4.0
         assert "their mean is +" in note
