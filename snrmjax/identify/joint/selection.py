@@ -50,6 +50,7 @@ from snrmjax.identify.joint.variance_components import (
 
 _CLEARLY = 20.0  # of −2 log likelihood, to believe in a kind of noise that nobody stated
 _ROUNDS = 3  # of choosing families and estimating the level-to-level variance
+_FEW = 2  # levels, of which one difference would be left
 _OF_INSTRUMENTS = tuple(LEVEL_ERRORS.index(name) for name in ("gain", "phase"))
 _ALIKE = 0.1  # relative change of a share of states that ends the search for it
 _STEPS = 4  # of Gauss–Newton for a family that is not linear in its parameters
@@ -260,7 +261,7 @@ class _Scoring(NamedTuple):
         unit = self.components.unit
         raw = Linearised(problem.residuals * unit, problem.slopes * unit, std, problem.deviation)
         index = first + np.arange(self.levels.shape[1]).reshape(-1, n_errors)
-        for kind in _OF_INSTRUMENTS:
+        for kind in _OF_INSTRUMENTS if self.data.n_levels > _FEW else ():
             # What all levels have in common tells nothing of how much they differ: it is an error
             # of the whole test, or of the law.
             own = raw.slopes[:, index[:, kind]]
