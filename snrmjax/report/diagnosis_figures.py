@@ -179,11 +179,7 @@ def comparison_figure(
             axes.text(0.99, 0.99, text, fontsize=SMALL, color="0.3", **place)
         axes.set(xlim=ends, ylim=(0.0, top))
     level = f"Velocity amplitude ({unit.name})"
-    name_axes(grid[0, 0], "(a) model as given", "Frequency (Hz)", level)
-    name_axes(grid[0, 1], "(b) completed model", "Frequency (Hz)", "")
-    grid[0, 1].tick_params(labelleft=False)
-    legend(figure)
-    return figure
+    return _named_side_by_side(figure, grid, level)
 
 
 def held_velocity_figure(
@@ -210,8 +206,13 @@ def held_velocity_figure(
             axes.plot(curve.frequency / HERTZ, shown, color=colour, **CURVE, label=label)
         axes.set(ylim=(0.0, top))
     what = f"Force amplitude ({unit.name})"
-    name_axes(grid[0, 0], "(a) model as given, velocity held", "Frequency (Hz)", what)
-    name_axes(grid[0, 1], "(b) completed model, velocity held", "Frequency (Hz)", "")
+    return _named_side_by_side(figure, grid, what, ", velocity held")
+
+
+def _named_side_by_side(figure: Figure, grid: np.ndarray, what: str, condition: str = "") -> Figure:
+    """Two panels of models over frequency that share the axis of `what`, named."""
+    name_axes(grid[0, 0], f"(a) model as given{condition}", "Frequency (Hz)", what)
+    name_axes(grid[0, 1], f"(b) completed model{condition}", "Frequency (Hz)", "")
     grid[0, 1].tick_params(labelleft=False)
     legend(figure)
     return figure

@@ -31,14 +31,24 @@ def held_out(
     the variance over the stated one for which probabilities are given.
     """
     out = rows_of_level(misfit, level)
-    n_out = int(out.sum())
     before, _ = _chi_square_of(misfit, baseline, out)
-    after, open_too = _chi_square_of(misfit, fit, out)
+    return held_out_by(misfit, level, before, _chi_square_of(misfit, fit, out), noise)
+
+
+def held_out_by(
+    misfit: WeightedMisfit, level: int, before: float, after: tuple[float, float], noise: float
+) -> HeldOut:
+    """A level left out of a fit by its χ²: `before` and `after` any effect.
+
+    `after` is what `chi_square_of_level` returns.
+    """
+    n_out = int(rows_of_level(misfit, level).sum())
+    known, open_too = after
     return HeldOut(
         int(misfit.level_numbers[level]),
         float(np.sqrt(before / n_out)),
-        float(np.sqrt(after / n_out)),
-        chi_square_p_value(after / noise, n_out),
+        float(np.sqrt(known / n_out)),
+        chi_square_p_value(known / noise, n_out),
         chi_square_p_value(open_too / noise, n_out),
     )
 

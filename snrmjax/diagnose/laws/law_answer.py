@@ -12,6 +12,7 @@ from snrmjax.diagnose.checks.cross_validation import (
     HeldOut,
     HeldOutLevels,
     chi_square_of_level,
+    held_out_by,
     held_out_places,
     rows_of_level,
 )
@@ -155,15 +156,8 @@ def _held_out(fit: LawFit, place: int, without: LawPosterior, noise: float) -> H
     root = _arms(fit) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     none = np.zeros((misfit.n_rows, 0))
     before, _ = chi_square_of_level(misfit, baseline_fit(misfit).rows, none, out)
-    after, open_too = chi_square_of_level(misfit, _rows(fit, without), root, out)
-    n = int(out.sum())
-    return HeldOut(
-        int(misfit.level_numbers[place]),
-        float(np.sqrt(before / n)),
-        float(np.sqrt(after / n)),
-        chi_square_p_value(after / noise, n),
-        chi_square_p_value(open_too / noise, n),
-    )
+    after = chi_square_of_level(misfit, _rows(fit, without), root, out)
+    return held_out_by(misfit, place, before, after, noise)
 
 
 def _completed(

@@ -22,7 +22,7 @@ from snrmjax.model.effect_metadata import (
     Symmetry,
     parameter,
 )
-from snrmjax.model.library.friction import AbstractSliders, Sliders, slipped_position
+from snrmjax.model.library.friction import AbstractSliders, Sliders
 from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
 
 Knots = Float[Array, " knot"]
@@ -218,15 +218,3 @@ class SlipLaw(AbstractLaw, AbstractSliders):
     def sliders(self) -> Sliders:
         """See `AbstractSliders.sliders`."""
         return Sliders(jnp.asarray(self.stiffness), jnp.asarray(self.slip_displacement))
-
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`."""
-        return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
-
-    def quick_cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
-        return slipped_position(displacement, self.sliders().slip_displacement) @ -self.stiffness

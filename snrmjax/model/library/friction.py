@@ -133,6 +133,19 @@ class AbstractSliders(AbstractHysteresis):
         """See `AbstractHysteresis.settled_states`."""
         return settled_positions(displacement, self.sliders().slip_displacement)
 
+    def cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """See `AbstractForce.cycle_force`."""
+        return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
+
+    def quick_cycle_force(
+        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
+    ) -> Float[Array, " time"]:
+        """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
+        sliders = self.sliders()
+        return slipped_position(displacement, sliders.slip_displacement) @ -sliders.stiffness
+
 
 class JenkinsSlider(AbstractSliders):
     """A spring k_t that slips at x_s: f = k_t (q − z) − k_t q with |q − z| ≤ x_s.
@@ -166,19 +179,6 @@ class JenkinsSlider(AbstractSliders):
     def sliders(self) -> Sliders:
         """See `AbstractSliders.sliders`."""
         return Sliders(jnp.asarray(self.stiffness)[None], jnp.asarray(self.slip_displacement)[None])
-
-    def cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.cycle_force`."""
-        return self.settled_states(displacement, velocity) @ -self.sliders().stiffness
-
-    def quick_cycle_force(
-        self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """See `AbstractForce.quick_cycle_force`: over a cycle between two turning points."""
-        position = slipped_position(displacement, jnp.asarray(self.slip_displacement)[None])[:, 0]
-        return -self.stiffness * position
 
 
 class IwanMicroslip(AbstractSliders):
