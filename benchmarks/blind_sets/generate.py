@@ -1,7 +1,7 @@
 """Blind data sets for `snrmjax diagnose`: truth by time integration, with the errors of a test.
 
 Run: python benchmarks/blind_sets/generate.py --half development|scoring --out DIR
-     [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1] [--laws]
+     [--only N] [--names NAME,NAME…] [--requests FILE.json] [--seed 1] [--laws first|fresh]
 
 Writes DIR/sets/NAME.csv and NAME.toml (the baseline model, which lacks the effect) and, apart from
 them, DIR/keys/NAME.json (the truth). No code is shared with the package that is tested.
@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from further import answered
-from plans import HALVES, Case, draw_cases
+from plans import HALVES, LAW_SETS, Case, draw_cases
 from records import write_set
 from truth import Truth, calibrated
 
@@ -27,7 +27,7 @@ def generate(
     only: int | None = None,
     names: list[str] | None = None,
     *,
-    laws: bool = False,
+    laws: str | None = None,
 ) -> tuple[list[Case], list[Truth]]:
     """Draw and simulate the sets of one half, the first `only` of them or those of some names."""
     cases = draw_cases(half, seed, laws=laws)[:only]
@@ -46,7 +46,13 @@ def main() -> None:
     parser.add_argument("--names", type=lambda text: text.split(","))
     parser.add_argument("--requests", type=Path)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--laws", action="store_true", help="laws outside the library instead")
+    parser.add_argument(
+        "--laws",
+        choices=LAW_SETS,
+        nargs="?",
+        const="first",
+        help="laws instead",
+    )
     options = parser.parse_args()
     begin = time.perf_counter()
     sets, keys = options.out / "sets", options.out / "keys"

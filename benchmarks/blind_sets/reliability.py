@@ -7,9 +7,10 @@ Run, with keys and diagnoses of sets (`generate.py`, `snrmjax diagnose`; both ma
 Every diagnosis states a `probability` of the answer that it gives. An answer is right where it has
 as many classes as there are true effects and each of these stands in a class of its own; `none`
 where nothing is missing, or nothing that the columns show; `unknown` where the law is outside the
-library; `noise_rejected` where the noise is stated wrong. In five bins of the stated probability
-the number of right answers is compared with what the stated probabilities themselves allow by
-chance (95 %). Prints one JSON line, and the sets of a bin outside its limits to the standard error.
+library; a drawn law where it is that of the generator (`drawn`); `noise_rejected` where the noise
+is stated wrong. In five bins of the stated probability the number of right answers is compared with
+what the stated probabilities themselves allow by chance (95 %). Prints one JSON line, and the sets
+of a bin outside its limits to the standard error.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from drawn import RIGHT
 from score import Result
 
 EDGES = (0.0, 0.4, 0.6, 0.8, 0.95, 1.0)
@@ -58,6 +60,8 @@ def is_right(result: Result) -> bool:
     key, verdict = result.key, result.verdict
     if key["group"] == "noise_wrong":
         return verdict == "noise_rejected"
+    if verdict == "drawn":
+        return result.drawing == RIGHT
     if key["outside"]:
         named = key["outside"] in {kind for group in result.classes for kind in group}
         return verdict == "unknown" or (named and len(result.classes) == 1)

@@ -8,7 +8,11 @@ miss, and draws the confusion matrix. How a row is counted:
 - in class: each true effect stands in a class of its own among `candidates`;
 - not seen: an effect that changes nothing in the columns given (`none` is then right as well);
 - confidently wrong: `named` or `ambiguous` with a true effect in no class (`unknown` is p < 1e-3);
-- outside the library: `unknown`, or `ambiguous` with a held-out gap within 1.3 noise floors;
+- drawn: right where the true force is inside the drawn band over 90 % of the measured range, be it
+  an effect of the library or a law outside (`drawn`). It names nothing, so it stands in no class;
+  wrong, or where there is no such force, it is confidently wrong, on a set without effects too;
+- outside the library: `unknown`, drawn right, or `ambiguous` with a held-out gap within 1.3 noise
+  floors;
 - gap closed: 1 − (after − floor)/(before − floor) on the held-out level, where before > 1.5 floors.
 """
 
@@ -21,10 +25,12 @@ from itertools import permutations
 from pathlib import Path
 
 import numpy as np
+from drawn import RIGHT, WRONG, judged_drawing
 
 VISIBLE_UNITS = 1.0  # an effect below this distance per point is not seen in the columns given
 WITHIN_NOISE = 1.3
 ANSWERED = ("named", "ambiguous")
+DRAWN = "drawn"
 # The sign of these is a matter of the added mode's own sign, or of the side of the mean.
 SIGN_FREE = ("internal_resonance_1_3.coefficient", "internal_resonance_1_2.coefficient")
 SIGN_FREE_WITHOUT_HARMONICS = (
@@ -89,18 +95,27 @@ class Result:
         return max(units.get(name, 0.0) for name in names) >= VISIBLE_UNITS
 
     @property
+    def drawing(self) -> str:
+        """How a drawn law counts; empty where none was drawn."""
+        if self.diagnosis is None or self.verdict != DRAWN:
+            return ""
+        return judged_drawing(self.key, self.diagnosis)[0]
+
+    @property
     def confidently_wrong(self) -> bool:
-        """Named something whose classes leave a true effect out."""
+        """Named something whose classes leave a true effect out, or drew a force that is not so."""
+        if self.verdict == DRAWN:
+            return self.drawing == WRONG
         return self.verdict in ANSWERED and (not self.key["effects"] or not self.in_class)
 
     @property
     def honest_outside(self) -> bool:
-        """Unknown, or an ambiguous answer that predicts the level left out."""
+        """Unknown, a true force drawn, or an ambiguous answer that predicts the level left out."""
         if self.verdict == "ambiguous" and self.diagnosis is not None:
             gap = self.diagnosis["gap"]
             after = gap.get("held_out_after")
             return after is not None and after <= WITHIN_NOISE * gap.get("noise_floor", 1.0)
-        return self.verdict == "unknown"
+        return self.verdict == "unknown" or self.drawing == RIGHT
 
 
 def read_results(sets: Path, keys: Path, diagnoses: Path) -> list[Result]:
@@ -149,7 +164,7 @@ def gaps_closed(results: list[Result]) -> tuple[list[float], list[str]]:
     """Share of the excess gap closed on the held-out level, and the sets made worse by 10 %."""
     closed, worse = [], []
     for r in results:
-        if r.diagnosis is None or not r.answered:
+        if r.diagnosis is None or not (r.answered or r.verdict == DRAWN):
             continue
         gap = r.diagnosis["gap"]
         before, after = gap.get("held_out_before"), gap.get("held_out_after")
@@ -203,15 +218,15 @@ def print_table(results: list[Result]) -> None:
             _row("  an effect too many", "", share(strong, lambda r: r.extra))
     for strength in (0.5, 0.25):
         weak = [r for r in of("one_effect", strength=strength) if r.seen]
-        honest = share(weak, lambda r: r.in_class or r.verdict == "none")
+        honest = share(weak, lambda r: r.in_class or r.verdict == "none" or r.drawing == RIGHT)
         bars = (">= 95 %", ">= 75 %") if strength == 0.25 else ("", "")
-        _row(f"one effect at {strength:g}: in class or none", bars[0], honest)
+        _row(f"one effect at {strength:g}: in class, drawn or none", bars[0], honest)
         _row("  in class", bars[1], share(weak, lambda r: r.in_class))
     unseen = [r for r in of("one_effect") if not r.seen]
     _row(
         "not seen: in class or none", "", share(unseen, lambda r: r.in_class or r.verdict == "none")
     )
-    known = [r for r in results if r.key["group"] != "outside"]
+    known = [r for r in results if not r.key["outside"]]
     _row("confidently wrong", "<= 2 %", share(known, lambda r: r.confidently_wrong))
     two = of("two_effects")
     _row("two effects: exact", ">= 85 %", share(two, lambda r: r.exact))
@@ -223,6 +238,8 @@ def print_table(results: list[Result]) -> None:
         share(outside, lambda r: r.honest_outside),
     )
     _row("  unknown", "", share(outside, lambda r: r.verdict == "unknown"))
+    drawings = [r for r in results if r.verdict == DRAWN]
+    _row("drawn laws: right, of all groups", "", share(drawings, lambda r: r.drawing == RIGHT))
     closed, worse = gaps_closed([r for r in results if r.key["effects"]])
     middle = f"median {100 * np.median(closed):.1f} % of {len(closed)}" if closed else "-"
     _row("excess gap closed on the held-out level", "median >= 95 %", middle)
@@ -255,7 +272,7 @@ def missed(r: Result) -> bool:
         return r.verdict != "none"
     if group == "noise_wrong":
         return r.verdict != "noise_rejected"
-    if group == "outside":
+    if group in ("outside", "law"):
         return not r.honest_outside
     if group == "one_effect" and (r.key["strength"] < 1 or not r.seen) and r.verdict == "none":
         return False
@@ -272,7 +289,7 @@ def print_misses(results: list[Result]) -> None:
             print(
                 f"{k['name']} {k['group']} x{k['strength']:g} {truth} "
                 f"[{'H' if k['harmonics'] else 'F'}{'L' if k['level_errors'] else ''} "
-                f"S={units}] -> {r.verdict} {'+'.join(r.answered) or '-'} {r.classes}"
+                f"S={units}] -> {r.drawing or r.verdict} {'+'.join(r.answered) or '-'} {r.classes}"
             )
 
 
@@ -282,7 +299,7 @@ def confusion(results: list[Result]) -> tuple[list[str], list[str], np.ndarray]:
     foreign = sorted({r.key["outside"] for r in results if r.key["outside"]})
     answers = sorted({kind for r in results for kind in r.answered} | set(known))
     rows = [*known, "none", "noise_wrong", *foreign]
-    columns = [*answers, "none", "unknown", "noise_rejected", "missing"]
+    columns = [*answers, "none", "unknown", DRAWN, "noise_rejected", "missing"]
     counts = np.zeros((len(rows), len(columns)), dtype=int)
     for r in results:
         truths = list(r.key["effects"]) or [r.key["outside"] or "none"]
