@@ -134,27 +134,39 @@ def judged(job: tuple[str, int]) -> dict[str, np.ndarray]:
     data = sj.measure.steady_states(level, frequency, force, velocity)
     modes = sj.model.linear_modes([OWN], [0.002], [[MASS**-0.5]], [MASS**-0.5])
     speed, natural, ratio = truth(effect)
-    fit = sj.fit_jointly(data, modes)
+    fit, points = sj.fit_jointly(data, modes), sj.identify_backbone(data, modes)
+    errors, bands = scores(fit, points, speed, natural, ratio)
     joint = sj.identify.fitted_values(fit, speed)
-    # Damping is relative to the modal mass that a fit found: compared by the force that it is.
-    found = float(fit.problem.modal_mass_of(fit.unknowns)) / MASS
-    points = sj.identify_backbone(data, modes).fit.backbone.values(speed / natural)
     return {
-        "joint": np.array(
-            [
-                (joint.natural_frequency - natural) / joint.natural_frequency_std,
-                (joint.damping_ratio * found - ratio) / (joint.damping_ratio_std * found),
-            ]
-        ),
-        "pointwise": np.array(
-            [
-                (points.natural_frequency - natural) / points.natural_frequency_std,
-                (points.damping_ratio - ratio) / points.damping_ratio_std,
-            ]
-        ),
-        "joint_band": np.median(joint.natural_frequency_std) / HERTZ,
+        **errors,
+        "joint_band": np.median(bands["joint"][0] * natural) / HERTZ,
         "joint_error": np.abs(np.asarray(joint.natural_frequency) - natural) / HERTZ,
     }
+
+
+def scores(
+    fit: sj.identify.JointFit,
+    points: sj.identify.Identification,
+    speed: np.ndarray,
+    natural: np.ndarray,
+    ratio: np.ndarray,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Errors over 1σ of frequency and damping by both ways at true phase resonances, and their 1σ.
+
+    Arguments: `speed` in m/s, `natural` in rad/s and the damping `ratio` of the truths, relative to
+    the model's modal mass. The 1σ are relative to the truth. Rows: frequency, damping.
+    """
+    joint = sj.identify.fitted_values(fit, speed)
+    # Damping is relative to the modal mass that a fit found: compared by the force that it is.
+    found = float(fit.problem.modal_mass_of(fit.unknowns) * abs(fit.problem.modal_constant))
+    curve = points.fit.backbone.values(speed / natural)
+    errors, bands = {}, {}
+    for way, values, mass in (("joint", joint, found), ("pointwise", curve, 1.0)):
+        std = np.array([values.natural_frequency_std, mass * values.damping_ratio_std])
+        given = np.array([values.natural_frequency, mass * values.damping_ratio])
+        errors[way] = (given - [natural, ratio]) / std
+        bands[way] = std / [natural, ratio]
+    return errors, bands
 
 
 def main() -> None:
