@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.identify.inference.agreement import compare_with_pointwise
 from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
@@ -202,7 +203,9 @@ def identify_jointly(
         banded = fitted_response(fit, force, largest_amplitude_ratio=ratio)
         predictions.append(Prediction(force, *without_bands(fit, banded), drive, tuple(banded)))
     advice = next_measurements(fit, settings.further) if settings.further else None
+    agreement = compare_with_pointwise(data, model, fit)
     notes = [*data.notes, *found.notes]
+    notes += agreement.notes() if agreement is not None else ()
     if fit.drive_known_only:
         place = fit.names().index("force_gain")
         std = float(np.sqrt(fit.covariance[place, place]))
@@ -223,7 +226,7 @@ def identify_jointly(
         "amplitude": "displacement, fundamental",
         "curves": " and ".join(joint_results.described(curve) for curve in pair),
     }
-    fitted = reported_fit(fit, tuple(advice or ()))
+    fitted = reported_fit(fit, tuple(advice or ()), agreement)
     ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
     fields = (data, model, found, tuple(predictions), tuple(dict.fromkeys(notes)), values, words)
@@ -409,6 +412,7 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
         banded = [response for one in found.predictions for response in one.banded]
         fit = joint_results.summarise_fit(found.fitted.fit, banded, found.fitted.shares)
         summary["joint_fit"] = fit
+        summary["agreement"] = joint_results.summarise_agreement(found.fitted.agreement)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
