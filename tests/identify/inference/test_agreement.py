@@ -66,6 +66,7 @@ def test_a_wrong_modal_mass_sets_them_apart_and_is_the_reason(apart):
     assert "1.06" not in note
     (reason,) = apart.reasons
     assert "modal mass of 0.1767 kg" in reason  # 1.06/6 kg, of the model
+    assert "levels" not in reason  # the mass alone explains it
     found = float(reason.split("found ")[1].split(" ")[0])
     assert found == pytest.approx(1 / (SHAPE * PARTICIPATION), rel=0.01)
     left = float(reason.split("at most ")[1].split(" ")[0])
