@@ -1,9 +1,7 @@
 """Models: a structure in and out, as TOML."""
 
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -18,6 +16,7 @@ from snrmjax.io.files import (
     suggestion,
     write_atomically,
 )
+from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import Entries
@@ -37,7 +36,7 @@ from snrmjax.model.potential import (
     polynomial_potential,
 )
 from snrmjax.model.structures import Structure, structure
-from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE, Rule
+from snrmjax.numerics.rules import BELOW_ONE, IN_RANGE_HZ, NOT_NEGATIVE, NOT_ZERO, POSITIVE
 
 _MODE_KEYS = ("frequency_hz", "damping_ratio", "shape", "participation")
 _MODE_STD_KEYS = ("frequency_std_hz", "damping_ratio_std", "modal_mass_std")
@@ -57,68 +56,6 @@ _TOP_KEYS = (
 )
 
 
-class _Table(NamedTuple):
-    """A table of the file and its place as messages name it."""
-
-    entries: Mapping[str, object]
-    place: str
-
-    def refusal(self, key: str, expected: str, value: object) -> ValueError:
-        """The error for one value."""
-        return ValueError(f"`{key}` must be {expected}, but {self.place} has {shown(value)}.")
-
-    def check_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
-        """Refuse keys that are not known and the lack of required ones."""
-        required = tuple(required)
-        missing = [key for key in required if key not in self.entries]
-        known = (*required, *optional)
-        for key in self.entries:
-            if key not in known:
-                near = suggestion(key, missing) or suggestion(key, known)
-                raise ValueError(f"{self.place} has the unknown key {shown(key)}{near}.")
-        if missing:
-            raise ValueError(f"{self.place} lacks the key `{missing[0]}`.")
-
-    def number(self, key: str, *rules: Rule, default: float | None = None) -> float:
-        """A finite number that keeps its rules."""
-        if default is not None and key not in self.entries:
-            return default
-        value = self.entries[key]
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.refusal(key, "a number", value)
-        if not abs(value) < float("inf") or (isinstance(value, int) and abs(value) > 10**300):
-            raise self.refusal(key, "a finite number", value)
-        for rule in rules:
-            if not rule.good(value):
-                raise self.refusal(key, rule.expected, value)
-        return float(value)
-
-    def numbers(self, key: str, *rules: Rule) -> list[float]:
-        """A list of finite numbers that keep their rules."""
-        value = self.entries[key]
-        if not isinstance(value, list):
-            raise self.refusal(key, "a list of numbers", value)
-        return [
-            _Table({key: one}, f"{self.place}, knot {k + 1},").number(key, *rules)
-            for k, one in enumerate(value)
-        ]
-
-    def table(self, key: str, place: str) -> "_Table":
-        """A table inside this one."""
-        value = self.entries.get(key, {})
-        if not isinstance(value, dict):
-            raise self.refusal(key, "a table", value)
-        return _Table(value, place)
-
-    def tables(self, key: str, file: str) -> list["_Table"]:
-        """A list of tables at the top of a file."""
-        value = self.entries.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-            found = f"[{key}]" if isinstance(value, dict) else shown(value)
-            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {found}.")
-        return [_Table(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]
-
-
 def read_model(path: FilePath) -> Structure:
     """Read a structure from a TOML: its modes, potential, effects and shared errors.
 
@@ -134,15 +71,8 @@ def read_model(path: FilePath) -> Structure:
 
 
 def _read(text: str, file: str, stem: str) -> Structure:
-    try:
-        entries = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file} is not valid TOML: {error}.") from error
-    except ValueError as error:  # Python's limit on the digits of an integer
-        raise ValueError(f"{file} has a number of too many digits.") from error
-    except RecursionError as error:
-        raise ValueError(f"{file} is not valid TOML: it nests too deeply.") from error
-    top = _Table(entries, file)
+    top = parsed_toml(text, file)
+    entries = top.entries
     top.check_keys((), _TOP_KEYS)
     name = entries.get("name", stem)
     if not isinstance(name, str):
@@ -164,7 +94,7 @@ def _read(text: str, file: str, stem: str) -> Structure:
     )
 
 
-def _modes(top: _Table, file: str) -> LinearModes:
+def _modes(top: TomlTable, file: str) -> LinearModes:
     flexible, rigid = top.tables("mode", file), top.tables("rigid_body_mode", file)
     if not flexible:
         raise ValueError(f"{file} must have at least one mode with a shape, under [[mode]].")
@@ -222,7 +152,7 @@ def _modes(top: _Table, file: str) -> LinearModes:
     )
 
 
-def _shape(mode: _Table) -> dict[str, float]:
+def _shape(mode: TomlTable) -> dict[str, float]:
     """The shape of one mode: its value at each sensor."""
     table = mode.table("shape", f"the shape of {mode.place}")
     if not table.entries:
@@ -236,7 +166,7 @@ def _shape(mode: _Table) -> dict[str, float]:
     return {sensor: table.number(sensor) for sensor in table.entries}
 
 
-def _potential(table: _Table, n_modes: int) -> PolynomialPotential:
+def _potential(table: TomlTable, n_modes: int) -> PolynomialPotential:
     coefficients: dict[Monomial, float] = {}
     spread: dict[Monomial, float] = {}
     for key, value in table.entries.items():
@@ -249,7 +179,7 @@ def _potential(table: _Table, n_modes: int) -> PolynomialPotential:
                 f"{table.place} has the monomial {key!r} twice (the order of the modes is free)."
             )
         if isinstance(value, dict):
-            entry = _Table(value, f"monomial {key!r} in {table.place}")
+            entry = TomlTable(value, f"monomial {key!r} in {table.place}")
             entry.check_keys(("coefficient",), ("std",))
             coefficients[monomial] = entry.number("coefficient")
             spread[monomial] = entry.number("std", NOT_NEGATIVE, default=0.0)
@@ -258,7 +188,7 @@ def _potential(table: _Table, n_modes: int) -> PolynomialPotential:
     return polynomial_potential(coefficients, n_modes, coefficient_std=spread)
 
 
-def _effect(table: _Table) -> AbstractEffect:
+def _effect(table: TomlTable) -> AbstractEffect:
     if "kind" not in table.entries:
         raise ValueError(f"{table.place} lacks the key `kind`.")
     kind = table.entries["kind"]
@@ -267,7 +197,7 @@ def _effect(table: _Table) -> AbstractEffect:
     every = (*EFFECTS, *LAWS)
     if kind in every:
         wanted = effect_class(kind).parameters()
-        table = _Table(table.entries, f"{table.place} ({kind})")
+        table = TomlTable(table.entries, f"{table.place} ({kind})")
         table.check_keys(("kind", *wanted))
         values: dict[str, float | np.ndarray] = {
             name: table.number(name, *one.rules)
@@ -300,7 +230,7 @@ def write_model(path: FilePath, model: Structure) -> None:
     write_atomically(path, text)
 
 
-def _modal_mass_std(flexible: Sequence[_Table]) -> list[float] | None:
+def _modal_mass_std(flexible: Sequence[TomlTable]) -> list[float] | None:
     """As stated, for a mode without it as where nobody stated any; None if no mode has one."""
     if not any("modal_mass_std" in table.entries for table in flexible):
         return None

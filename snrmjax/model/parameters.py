@@ -12,8 +12,14 @@ from jaxtyping import Array, Float
 from snrmjax.model.effect_metadata import Entries
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import BELOW_ONE, NOT_ZERO, POSITIVE, Rule
 
-_MODE_FIELDS = ("natural_frequency", "damping_ratio", "participation")
+_MODE_RULES = {
+    "natural_frequency": (POSITIVE,),
+    "damping_ratio": (BELOW_ONE,),
+    "participation": (NOT_ZERO,),
+}
+_MODE_FIELDS = tuple(_MODE_RULES)
 
 
 def parameter_names(model: Structure) -> tuple[str, ...]:
@@ -50,6 +56,14 @@ def checked_names(model: Structure, names: Sequence[str]) -> tuple[str, ...]:
         if list(names).count(name) > 1:
             raise ValueError(f"`parameters` names {name!r} twice.")
     return tuple(names)
+
+
+def parameter_rules(model: Structure, name: str) -> tuple[Rule, ...]:
+    """What the number that a name of `parameter_names` stands for must be, as in a model file."""
+    part, entry, field, _ = _places(model)[name]
+    if part == "effects":
+        return model.effects[entry].parameters()[field].rules
+    return _MODE_RULES.get(field, ())
 
 
 def parameter_value(model: Structure, name: str) -> Float[Array, ""]:

@@ -1,0 +1,106 @@
+"""Tables of a TOML file whose errors name file, table, key, value and what was expected."""
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+from snrmjax.io.files import shown, suggestion
+from snrmjax.numerics.rules import Rule
+
+
+def parsed_toml(text: str, file: str) -> "TomlTable":
+    """The top of a TOML file. Raises `ValueError` that names the file where it is none."""
+    try:
+        return TomlTable(tomllib.loads(text), file)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file} is not valid TOML: {error}.") from error
+    except ValueError as error:  # Python's limit on the digits of an integer
+        raise ValueError(f"{file} has a number of too many digits.") from error
+    except RecursionError as error:
+        raise ValueError(f"{file} is not valid TOML: it nests too deeply.") from error
+
+
+class TomlTable(NamedTuple):
+    """A table of the file and its place as messages name it."""
+
+    entries: Mapping[str, object]
+    place: str
+
+    def refusal(self, key: str, expected: str, value: object) -> ValueError:
+        """The error for one value."""
+        return ValueError(f"`{key}` must be {expected}, but {self.place} has {shown(value)}.")
+
+    def check_keys(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
+        """Refuse keys that are not known and the lack of required ones."""
+        required = tuple(required)
+        missing = [key for key in required if key not in self.entries]
+        known = (*required, *optional)
+        for key in self.entries:
+            if key not in known:
+                near = suggestion(key, missing) or suggestion(key, known)
+                raise ValueError(f"{self.place} has the unknown key {shown(key)}{near}.")
+        if missing:
+            raise ValueError(f"{self.place} lacks the key `{missing[0]}`.")
+
+    def number(self, key: str, *rules: Rule, default: float | None = None) -> float:
+        """A finite number that keeps its rules."""
+        if default is not None and key not in self.entries:
+            return default
+        value = self.entries[key]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.refusal(key, "a number", value)
+        if not abs(value) < float("inf") or (isinstance(value, int) and abs(value) > 10**300):
+            raise self.refusal(key, "a finite number", value)
+        for rule in rules:
+            if not rule.good(value):
+                raise self.refusal(key, rule.expected, value)
+        return float(value)
+
+    def numbers(self, key: str, *rules: Rule, each: str = "knot") -> list[float]:
+        """A list of finite numbers that keep their rules; messages call one of them `each`."""
+        value = self.entries[key]
+        if not isinstance(value, list):
+            raise self.refusal(key, "a list of numbers", value)
+        return [
+            TomlTable({key: one}, f"{self.place}, {each} {k + 1},").number(key, *rules)
+            for k, one in enumerate(value)
+        ]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text."""
+        value = self.entries.get(key, default)
+        if not isinstance(value, str):
+            raise self.refusal(key, "a text", value)
+        return value
+
+    def whole(self, key: str, at_least: int, default: int | None = None) -> int:
+        """A whole number that is not below `at_least`."""
+        value = self.entries.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < at_least:
+            raise self.refusal(key, f"a whole number from {at_least} on", value)
+        return value
+
+    def choice(self, key: str, known: Iterable[str], default: str | None = None) -> str:
+        """A text out of those known."""
+        known, value = tuple(known), self.text(key, default)
+        if value not in known:
+            near = suggestion(value, known)
+            if near:
+                raise ValueError(f"{self.place} has the unknown `{key}` {shown(value)}{near}.")
+            raise self.refusal(key, f"one of {', '.join(known)}", value)
+        return value
+
+    def table(self, key: str, place: str) -> "TomlTable":
+        """A table inside this one."""
+        value = self.entries.get(key, {})
+        if not isinstance(value, dict):
+            raise self.refusal(key, "a table", value)
+        return TomlTable(value, place)
+
+    def tables(self, key: str, file: str) -> list["TomlTable"]:
+        """A list of tables at the top of a file."""
+        value = self.entries.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+            found = f"[{key}]" if isinstance(value, dict) else shown(value)
+            raise ValueError(f"`{key}` must be tables under [[{key}]], but {file} has {found}.")
+        return [TomlTable(entry, f"{key} {k + 1} of {file}") for k, entry in enumerate(value)]

@@ -1,0 +1,6 @@
+"""Sweeps and uncertainty studies: many members of one model, stored as one labelled data set."""
+
+import lazy_loader
+
+# The public names are in `__init__.pyi`; each module is imported with its first name.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+"""What a study can compute for every member: one class each."""

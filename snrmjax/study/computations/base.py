@@ -1,0 +1,131 @@
+"""What is computed for every member of a study, and what comes out of it."""
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.model.structures import Structure
+
+MEMBER = "member"
+FORCE = "force_n"
+TEXT = "text"
+
+
+class Output(NamedTuple):
+    """One quantity of the store: its dimensions, kind, unit and meaning.
+
+    The first dimension is `member`, or one of the ragged dimensions, along which every member has
+    its own number of rows.
+    """
+
+    dimensions: tuple[str, ...]
+    kind: str  # "f8", "i4", "i1" or "text"
+    unit: str
+    meaning: str
+
+
+class Axis(NamedTuple):
+    """A dimension whose values are the same for every member."""
+
+    values: np.ndarray
+    unit: str
+    meaning: str
+
+
+class Members(NamedTuple):
+    """Some members of a study, in order."""
+
+    models: Sequence[Structure]
+    forces: Float[np.ndarray, "member force"] | None  # N, where `force_n` varies or is given
+    seeds: Sequence[int]  # of each member's own noise
+
+
+class AbstractComputation(eqx.Module):
+    """One kind of thing that a study computes; `kind` is its name in study files."""
+
+    kind: ClassVar[str]
+    members_a_chunk: ClassVar[int]  # small enough to lose, large enough to be worth a file
+    driven: ClassVar[bool]  # by forces: `forces_n` is needed, or `force_n` varies
+
+    @abc.abstractmethod
+    def outputs(self) -> dict[str, Output]:
+        """What every member gives, by name; `status` says how its computation ended."""
+
+    @abc.abstractmethod
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """The outputs of some members, in order; a member that fails has its status and NaN."""
+
+    def axes(self) -> dict[str, Axis]:
+        """Dimensions beside `member` and `force_n` whose values all members share."""
+        return {}
+
+
+class OfForces(eqx.Module):
+    """The forces of a study, all of which every member is computed for."""
+
+    values: Float[np.ndarray, " force"] | None = None  # N; None: `force_n` varies
+
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """Of what has one value for every member and force."""
+        several = self.values is not None and len(self.values) > 1
+        return (MEMBER, FORCE) if several else (MEMBER,)
+
+    def axes(self) -> dict[str, Axis]:
+        """The forces, where there are several."""
+        if self.values is None or len(self.values) < 2:
+            return {}
+        return {FORCE: Axis(self.values, "N", "force amplitude")}
+
+    def of(self, members: Members) -> Float[np.ndarray, "member force"]:
+        """The forces of each member."""
+        if members.forces is not None:
+            return members.forces
+        return np.tile(np.asarray(self.values), (len(members.models), 1))
+
+    def shaped(self, values: np.ndarray) -> np.ndarray:
+        """Values of all members and forces, in the order of members, with their dimensions."""
+        if len(self.dimensions) == 1:
+            return values
+        return values.reshape(-1, len(np.asarray(self.values)), *values.shape[1:])
+
+
+def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -> dict[str, Any]:
+    """Rows of members for which there is nothing but a status."""
+    found = {}
+    for name, one in outputs.items():
+        shape = tuple(sizes.get(dimension, 0) for dimension in one.dimensions)
+        if one.kind == TEXT:
+            found[name] = np.full(shape, status if name == "status" else "")
+        elif one.kind.startswith("f"):
+            found[name] = np.full(shape, np.nan)
+        else:
+            found[name] = np.zeros(shape, dtype=one.kind)
+    return found
+
+
+def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Rows of members after one another."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def one_by_one(
+    members: Members, compute: Callable[[Structure, np.ndarray | None, int], dict], **failed: Any
+) -> dict[str, np.ndarray]:
+    """Rows of members that are computed singly; a `ValueError` becomes the member's status.
+
+    `failed` are the rows of a member that could not be computed, without its status.
+    """
+    parts = []
+    for k, model in enumerate(members.models):
+        force = None if members.forces is None else members.forces[k]
+        try:
+            parts.append(compute(model, force, members.seeds[k]))
+        except ValueError as error:
+            reason = str(error).splitlines()[0]
+            parts.append({**failed, "status": np.array([f"refused: {reason}"])})
+    return joined(parts)

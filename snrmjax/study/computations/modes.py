@@ -1,0 +1,95 @@
+"""Nonlinear normal modes of the members, and their damped modes."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+
+from snrmjax.model.structures import Structure
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.solutions.controlled import damped_normal_mode
+from snrmjax.simulate.solutions.normal_modes import nonlinear_normal_mode
+from snrmjax.study.computations.base import (
+    MEMBER,
+    TEXT,
+    AbstractComputation,
+    Members,
+    Output,
+    one_by_one,
+)
+
+_AT = ("point",)
+_SUMMARY = {
+    "status": Output((MEMBER,), TEXT, "", "how the mode ended"),
+    "n_points": Output((MEMBER,), "i4", "1", "points of the mode"),
+    "end_frequency_hz": Output((MEMBER,), "f8", "Hz", "frequency of the last point"),
+    "end_velocity_m_s": Output((MEMBER,), "f8", "m/s", "velocity of the last point"),
+    "point_frequency_hz": Output(_AT, "f8", "Hz", "natural frequency"),
+    "point_velocity_m_s": Output(_AT, "f8", "m/s", "velocity fundamental at the first sensor"),
+}
+
+
+class NormalModes(AbstractComputation):
+    """The undamped nonlinear normal mode of interest up to a frequency (rad/s)."""
+
+    kind: ClassVar[str] = "nnm"
+    members_a_chunk: ClassVar[int] = 32
+    driven: ClassVar[bool] = False
+
+    to_frequency: float
+    harmonic_order: int = eqx.field(static=True, default=9)
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        return {**_SUMMARY, "point_energy_j": Output(_AT, "f8", "J", "energy of the motion")}
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        return one_by_one(members, self._one, **_nothing("point_energy_j"))
+
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        found = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
+        speed = np.abs(found.velocity[:, 1, 0])
+        return {**_rows(found.status, found.frequency, speed), "point_energy_j": found.energy}
+
+
+class DampedModes(AbstractComputation):
+    """The damped nonlinear mode of interest up to a velocity (m/s)."""
+
+    kind: ClassVar[str] = "damped_nnm"
+    members_a_chunk: ClassVar[int] = 32
+    driven: ClassVar[bool] = False
+
+    largest_velocity: float
+    harmonic_order: int = eqx.field(static=True, default=9)
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        return {**_SUMMARY, "point_damping_ratio": Output(_AT, "f8", "1", "damping ratio")}
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        return one_by_one(members, self._one, **_nothing("point_damping_ratio"))
+
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        found = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
+        rows = _rows(found.status, found.frequency, np.abs(found.velocity[:, 1, 0]))
+        return {**rows, "point_damping_ratio": found.damping_ratio}
+
+
+def _rows(status: CurveStatus, frequency: np.ndarray, speed: np.ndarray) -> dict:
+    last = (frequency[-1] / HERTZ, speed[-1]) if len(frequency) else (np.nan, np.nan)
+    return {
+        "status": np.array([status.name.lower()]),
+        "n_points": np.array([len(frequency)], dtype="i4"),
+        "end_frequency_hz": np.array([last[0]]),
+        "end_velocity_m_s": np.array([last[1]]),
+        "point_frequency_hz": frequency / HERTZ,
+        "point_velocity_m_s": speed,
+    }
+
+
+def _nothing(further: str) -> dict:
+    none = _rows(CurveStatus.INVALID, np.zeros(0), np.zeros(0))
+    return {**none, further: np.zeros(0)}

@@ -1,0 +1,219 @@
+"""Forced responses of the members: their peaks, resonances and folds, or the whole curves."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.model.structures import Structure
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.continuation.continuation import CurveStatus
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
+from snrmjax.simulate.solutions.isolated_responses import isolated_responses
+from snrmjax.study.computations.base import (
+    TEXT,
+    AbstractComputation,
+    Axis,
+    Members,
+    OfForces,
+    Output,
+)
+
+_GRID = "frequency_hz"
+_ISOLATED = {
+    "n_isolated": ("i4", "1", "isolated responses that were found"),
+    "isolated_peak_velocity_m_s": ("f8", "m/s", "highest velocity of an isolated response"),
+}
+_FOLD = ("fold_frequency_hz", "fold_velocity_m_s")
+
+
+class ResponseRange(eqx.Module):
+    """Which responses: frequencies in rad/s, and how they are computed."""
+
+    from_frequency: float
+    to_frequency: float
+    harmonic_order: int = eqx.field(static=True, default=9)
+    stability: bool = eqx.field(static=True, default=True)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The frequencies in rad/s."""
+        return self.from_frequency, self.to_frequency
+
+    @property
+    def settings(self) -> ResponseSettings:
+        """As simulations have them."""
+        return ResponseSettings(harmonic_order=self.harmonic_order, stability=self.stability)
+
+
+class Peaks(AbstractComputation):
+    """Highest peak, strongest phase resonance and all folds of every forced response.
+
+    With `grid_points` also the highest and the lowest velocity of the response at that many
+    frequencies: what the response bands of a report are made of. With `isolated` also the responses
+    that are not connected to those of small motion (takes several times as long).
+    """
+
+    kind: ClassVar[str] = "peaks"
+    members_a_chunk: ClassVar[int] = 128
+    driven: ClassVar[bool] = True
+
+    within: ResponseRange
+    forces: OfForces = OfForces()
+    grid_points: int = eqx.field(static=True, default=0)
+    isolated: bool = eqx.field(static=True, default=False)
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        at = self.forces.dimensions
+        named = {
+            "status": Output(at, TEXT, "", "how the curve ended"),
+            "n_points": Output(at, "i4", "1", "points of the curve"),
+            "peak_frequency_hz": Output(at, "f8", "Hz", "frequency of the highest peak"),
+            "peak_velocity_m_s": Output(at, "f8", "m/s", "velocity at the highest peak"),
+            "resonance_frequency_hz": Output(at, "f8", "Hz", "strongest phase resonance"),
+            "resonance_velocity_m_s": Output(at, "f8", "m/s", "velocity at phase resonance"),
+            "n_folds": Output(at, "i4", "1", "folds of the curve"),
+            "n_not_located": Output(at, "i4", "1", "events that are there but were not located"),
+            "fold_frequency_hz": Output(("fold",), "f8", "Hz", "frequency of a fold"),
+            "fold_velocity_m_s": Output(("fold",), "f8", "m/s", "velocity at a fold"),
+        }
+        if self.grid_points:
+            for name, which in (("upper", "highest"), ("lower", "lowest")):
+                text = f"{which} velocity of the response at this frequency"
+                named[f"{name}_velocity_m_s"] = Output((*at, _GRID), "f8", "m/s", text)
+        if self.isolated:
+            named |= {name: Output(at, *rest) for name, rest in _ISOLATED.items()}
+        return named
+
+    def axes(self) -> dict[str, Axis]:
+        """See `AbstractComputation.axes`."""
+        axes = self.forces.axes()
+        if self.grid_points:
+            axes[_GRID] = Axis(self._grid / HERTZ, "Hz", "frequency of the force")
+        return axes
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        curves, summary = traced_members(self.within, self.forces, members)
+        folds = [_at_folds(parts) for parts in curves]
+        rows = {name: self.forces.shaped(values) for name, values in summary.items()}
+        rows |= dict(zip(_FOLD, np.concatenate(folds, axis=1), strict=True))
+        if self.grid_points:
+            bounds = np.array([velocity_bounds(parts, self._grid) for parts in curves])
+            rows["upper_velocity_m_s"] = self.forces.shaped(bounds[:, 1])
+            rows["lower_velocity_m_s"] = self.forces.shaped(bounds[:, 0])
+        if self.isolated:
+            found = [self._isolated(*one) for one in self._each(members, curves)]
+            for name, column in zip(_ISOLATED, zip(*found, strict=True), strict=True):
+                rows[name] = self.forces.shaped(np.array(column))
+        return rows
+
+    @property
+    def _grid(self) -> Float[np.ndarray, " frequency"]:
+        return np.linspace(*self.within.ends, self.grid_points)
+
+    def _each(self, members: Members, curves: Sequence[tuple[ResponseCurve, ...]]) -> list[tuple]:
+        loads = self.forces.of(members)
+        models = [m for m in members.models for _ in range(loads.shape[1])]
+        return list(zip(models, loads.ravel().tolist(), curves, strict=True))
+
+    def _isolated(self, model: Structure, force: float, known: Sequence[ResponseCurve]) -> tuple:
+        """How many isolated responses there are, and their highest velocity in m/s."""
+        if known[0].status == CurveStatus.INVALID:
+            return 0, np.nan
+        further = isolated_responses(
+            model, force, *self.within.ends, known=known, settings=self.within.settings
+        )
+        heights = [np.max(np.abs(c.velocity[:, 1, 0])) for c in further if len(c.frequency)]
+        return len(heights), max(heights, default=np.nan)
+
+
+class Curves(AbstractComputation):
+    """Whole forced responses, unstable parts included, point by point."""
+
+    kind: ClassVar[str] = "curves"
+    members_a_chunk: ClassVar[int] = 64
+    driven: ClassVar[bool] = True
+
+    within: ResponseRange
+    forces: OfForces = OfForces()
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        at = ("point",)
+        return {
+            **Peaks(self.within, self.forces).outputs(),
+            "point_frequency_hz": Output(at, "f8", "Hz", "frequency of the force"),
+            "point_velocity_re_m_s": Output(at, "f8", "m/s", "velocity in phase with the force"),
+            "point_velocity_im_m_s": Output(at, "f8", "m/s", "velocity a quarter period ahead"),
+            "point_stability": Output(at, "i1", "1", "1 stable, 0 unstable, -1 not computed"),
+            "point_branch": Output(at, "i1", "1", "number of the branch: a response may have two"),
+        }
+
+    def axes(self) -> dict[str, Axis]:
+        """See `AbstractComputation.axes`."""
+        return self.forces.axes()
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        curves, summary = traced_members(self.within, self.forces, members)
+        folds = np.concatenate([_at_folds(parts) for parts in curves], axis=1)
+        every = [(branch, one) for parts in curves for branch, one in enumerate(parts)]
+        velocity = np.concatenate([one.velocity[:, 1, 0] for _, one in every])
+        return {
+            **{name: self.forces.shaped(values) for name, values in summary.items()},
+            "fold_frequency_hz": folds[0],
+            "fold_velocity_m_s": folds[1],
+            "point_frequency_hz": np.concatenate([one.frequency for _, one in every]) / HERTZ,
+            "point_velocity_re_m_s": velocity.real,
+            "point_velocity_im_m_s": velocity.imag,
+            "point_stability": np.concatenate([one.stability for _, one in every]).astype("i1"),
+            "point_branch": np.concatenate([np.full(len(o.frequency), b) for b, o in every]).astype(
+                "i1"
+            ),
+        }
+
+
+def traced_members(
+    within: ResponseRange, forces: OfForces, members: Members
+) -> tuple[Sequence[tuple[ResponseCurve, ...]], dict[str, np.ndarray]]:
+    """The curves of every member and force, and their summary by the names of the store."""
+    loads = forces.of(members)
+    models = [m for m in members.models for _ in range(loads.shape[1])]
+    batch = forced_response_batch(models, loads.ravel(), *within.ends, settings=within.settings)
+    columns = {name: np.asarray(one.values) for name, one in batch.variables().items()}
+    columns.pop("member")
+    return batch.curves, columns
+
+
+def velocity_bounds(
+    curves: Sequence[ResponseCurve], frequencies: Float[np.ndarray, " frequency"]
+) -> Float[np.ndarray, "bound frequency"]:
+    """Lowest and highest velocity of a response at given frequencies (rad/s), NaN outside it."""
+    low, high = np.full(len(frequencies), np.inf), np.full(len(frequencies), -np.inf)
+    for one in curves:
+        speed = np.abs(one.velocity[:, 1, 0])
+        begin, end = one.frequency[:-1], one.frequency[1:]
+        for k in np.flatnonzero(begin != end).tolist():
+            left, right = sorted((begin[k], end[k]))
+            inside = slice(*np.searchsorted(frequencies, [left, right], side="left"))
+            share = (frequencies[inside] - begin[k]) / (end[k] - begin[k])
+            value = speed[k] + share * (speed[k + 1] - speed[k])
+            low[inside] = np.minimum(low[inside], value)
+            high[inside] = np.maximum(high[inside], value)
+        for edge in (0, -1) if len(speed) else ():
+            at = frequencies == one.frequency[edge]
+            low[at], high[at] = np.fmin(low[at], speed[edge]), np.fmax(high[at], speed[edge])
+    missing = ~np.isfinite(high)
+    return np.where(missing, np.nan, np.array([low, high]))
+
+
+def _at_folds(curves: Sequence[ResponseCurve]) -> Float[np.ndarray, "quantity fold"]:
+    """Frequency in Hz and velocity in m/s of all folds of a response."""
+    found = [(one, one.at_events("fold")) for one in curves]
+    frequency = np.concatenate([one.frequency[at] for one, at in found]) / HERTZ
+    return np.array([frequency, np.concatenate([np.abs(c.velocity[at, 1, 0]) for c, at in found])])

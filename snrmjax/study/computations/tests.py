@@ -1,0 +1,165 @@
+"""What a test of every member would find: virtual tests, identifications, diagnoses."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.diagnose.diagnosis import diagnose_model
+from snrmjax.identify.pointwise.identification import Identification, identify_backbone
+from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.virtual_test.phase_resonance_test import phase_resonance_test
+from snrmjax.simulate.virtual_test.recording import NO_ERRORS, MeasurementErrors, Recording
+from snrmjax.study.computations.base import (
+    MEMBER,
+    TEXT,
+    AbstractComputation,
+    Axis,
+    Members,
+    Output,
+    one_by_one,
+)
+from snrmjax.study.computations.responses import ResponseRange
+
+_SHARE = "relative_amplitude"
+_POINTS = 11  # of a curve over the measured range
+_CURVE = (MEMBER, _SHARE)
+_FOUND = {
+    "status": Output((MEMBER,), TEXT, "", "solved, or why not"),
+    "n_states": Output((MEMBER,), "i4", "1", "steady states of the test"),
+    "n_solved": Output((MEMBER,), "i4", "1", "steady states that the inverse method solved"),
+    "velocity_m_s": Output(_CURVE, "f8", "m/s", "velocity on the backbone"),
+    "natural_frequency_hz": Output(_CURVE, "f8", "Hz", "natural frequency"),
+    "natural_frequency_std_hz": Output(_CURVE, "f8", "Hz", "its standard deviation"),
+    "damping_ratio": Output(_CURVE, "f8", "1", "damping ratio"),
+    "damping_ratio_std": Output(_CURVE, "f8", "1", "its standard deviation"),
+}
+
+
+class AbstractIdentified(AbstractComputation):
+    """Backbone and damping by the pointwise inverse method, at shares of the amplitude range."""
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        return _FOUND
+
+    def axes(self) -> dict[str, Axis]:
+        """See `AbstractComputation.axes`."""
+        text = "place between the smallest (0) and the largest (1) measured amplitude"
+        return {_SHARE: Axis(np.linspace(0.0, 1.0, _POINTS), "1", text)}
+
+    def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
+        """One member's row."""
+        found: Identification = identify_backbone(data, model)
+        backbone, status = found.fit.backbone, np.asarray(found.points.status)
+        ends = float(backbone.smallest), float(backbone.largest)
+        values = backbone.values(jnp.asarray(np.linspace(*ends, _POINTS)))
+        row = {
+            "velocity_m_s": values.velocity,
+            "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,
+            "natural_frequency_std_hz": np.asarray(values.natural_frequency_std) / HERTZ,
+            "damping_ratio": values.damping_ratio,
+            "damping_ratio_std": values.damping_ratio_std,
+        }
+        return {
+            "status": np.array(["solved"]),
+            "n_states": np.array([data.n_states], dtype="i4"),
+            "n_solved": np.array([np.sum(status == PointStatus.OK)], dtype="i4"),
+            **{name: np.asarray(one)[None] for name, one in row.items()},
+        }
+
+    def failed(self) -> dict[str, np.ndarray]:
+        """The row of a member for which nothing is found."""
+        counts = {name: np.zeros(1, dtype="i4") for name in ("n_states", "n_solved")}
+        curves = {k: np.full((1, _POINTS), np.nan) for k in _FOUND if _SHARE in _FOUND[k][0]}
+        return {**counts, **curves}
+
+
+class VirtualTests(AbstractIdentified):
+    """A virtual near-resonance test of every member with its own noise, then its identification.
+
+    `levels` are the forces of the test in N.
+    """
+
+    kind: ClassVar[str] = "virtual_test"
+    members_a_chunk: ClassVar[int] = 8
+    driven: ClassVar[bool] = True
+
+    within: ResponseRange
+    levels: Float[np.ndarray, " level"]
+    errors: MeasurementErrors = NO_ERRORS
+    points_per_level: int = eqx.field(static=True, default=5)
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        return one_by_one(members, self._one, **self.failed())
+
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        test = phase_resonance_test(
+            *(model, self.levels, *self.within.ends),
+            points_per_level=self.points_per_level,
+            recording=Recording(self.errors, seed=seed),
+        )
+        return self.identified(test.steady_states, model)
+
+
+class Identifications(AbstractIdentified):
+    """The same measured steady states identified with the linear modes of every member."""
+
+    kind: ClassVar[str] = "identify"
+    members_a_chunk: ClassVar[int] = 16
+    driven: ClassVar[bool] = False
+
+    data: SteadyStates
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        return one_by_one(members, self._one, **self.failed())
+
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        return self.identified(self.data, model)
+
+
+class Diagnoses(AbstractComputation):
+    """The same measured steady states diagnosed against the model of every member."""
+
+    kind: ClassVar[str] = "diagnose"
+    members_a_chunk: ClassVar[int] = 4
+    driven: ClassVar[bool] = False
+
+    data: SteadyStates
+
+    def outputs(self) -> dict[str, Output]:
+        """See `AbstractComputation.outputs`."""
+        at = (MEMBER,)
+        return {
+            "status": Output(at, TEXT, "", "answered, or why not"),
+            "verdict": Output(at, TEXT, "", "none, named, drawn, ambiguous, unknown, …"),
+            "effects": Output(at, TEXT, "", "the best single answer, joined by +"),
+            "probability": Output(at, "f8", "1", "of that answer"),
+            "gap_before": Output(at, "f8", "1", "misfit in units of the noise, model as given"),
+            "gap_after": Output(at, "f8", "1", "the same with the effects"),
+        }
+
+    def rows(self, members: Members) -> dict[str, np.ndarray]:
+        """See `AbstractComputation.rows`."""
+        numbers = {name: np.full(1, np.nan) for name, o in self.outputs().items() if o.kind == "f8"}
+        texts = {name: np.array([""]) for name in ("verdict", "effects")}
+        return one_by_one(members, self._one, **numbers, **texts)
+
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        found = diagnose_model(model, self.data)
+        name = "+".join(found.effects)
+        return {
+            "status": np.array(["answered"]),
+            "verdict": np.array([str(found.verdict.value)]),
+            "effects": np.array([name]),
+            "probability": np.array([found.probabilities.get(name or "none", np.nan)]),
+            "gap_before": np.array([found.gap.before]),
+            "gap_after": np.array([found.gap.after]),
+        }

@@ -1,0 +1,99 @@
+"""What a study is, in plain words and numbers: to recognise it, and to say what differs."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import inspect
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from snrmjax.io.files import shown
+from snrmjax.study.study import Study
+
+_LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
+_PACKAGES = ("snrmjax", "jax", "jaxlib", "numpy")
+
+
+class Difference(NamedTuple):
+    """One place at which two studies differ."""
+
+    place: str
+    here: object
+    there: object
+
+    def __str__(self) -> str:
+        """In words, as messages say it."""
+        return f"`{self.place}` is {shown(self.here)} here and {shown(self.there)} in the store"
+
+
+def description(study: Study) -> dict[str, Any]:
+    """The study, its model and the versions behind it as plain text and numbers."""
+    parts = {
+        field.name: _plain(getattr(study, field.name))
+        for field in dataclasses.fields(study)
+        if field.name != "members_a_chunk"
+    }
+    return {
+        "study": {**parts, "members_a_chunk": study.chunk_size},
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+    }
+
+
+def fingerprint(described: Mapping[str, Any]) -> str:
+    """A hash of a description: the same for the same study, and only for it."""
+    text = json.dumps(described, sort_keys=True, allow_nan=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def model_hash(study: Study) -> str:
+    """A hash of the base model alone."""
+    return fingerprint({"model": _plain(study.model)})
+
+
+def differences(here: Any, there: Any, place: str = "") -> list[Difference]:
+    """Where two descriptions differ, in the order of the first."""
+    if isinstance(here, dict) and isinstance(there, dict):
+        keys = [*here, *(key for key in there if key not in here)]
+        found = []
+        for key in keys:
+            inside = f"{place}.{key}" if place else str(key)
+            found += differences(here.get(key, "absent"), there.get(key, "absent"), inside)
+        return found
+    if isinstance(here, list) and isinstance(there, list) and len(here) == len(there):
+        numbered = enumerate(zip(here, there, strict=True))
+        return [d for k, (a, b) in numbered for d in differences(a, b, f"{place}[{k}]")]
+    same = here == there or (here != here and there != there)
+    return [] if same else [Difference(place.removeprefix("study."), here, there)]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, eqx.Module):
+        fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"kind": getattr(value, "kind", type(value).__name__), **fields}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {name: _plain(one) for name, one in value._asdict().items()}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return _plain_array(np.asarray(value))
+    if callable(value):
+        return f"{value.__module__}.{value.__qualname__} {_source_hash(value)}"
+    return value
+
+
+def _plain_array(array: np.ndarray) -> Any:
+    if array.size <= _LONGEST:
+        return array.tolist() if array.dtype.kind != "c" else [str(z) for z in array.ravel()]
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    return f"{array.dtype} array of shape {array.shape}, {digest[:16]}"
+
+
+def _source_hash(function: Any) -> str:
+    return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:16]

@@ -1,0 +1,274 @@
+"""A study from its plan to its data set: run, continued after any stop, in shards or on a cluster.
+
+Reference for the pattern (an immutable plan, files named by their content, a data set made of
+them at the end): the formulation is this package's own.
+"""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from snrmjax.study.chunks import (
+    FoundChunks,
+    StudyFolder,
+    found_chunks,
+    read_plan,
+    remove_leftovers,
+    write_plan,
+)
+from snrmjax.study.collect import collect_chunks, is_collected, stored_description
+from snrmjax.study.engine import Job, Progress, ProgressReport, receipts
+from snrmjax.study.identity import description, differences, fingerprint
+from snrmjax.study.study import Study, planned
+from snrmjax.study.workers import (
+    AbstractWorkers,
+    DaskCluster,
+    LocalProcesses,
+    available_cores,
+)
+
+if TYPE_CHECKING:
+    import xarray
+
+_SHOWN = 3  # differences that a refusal lists
+_SPARE = 1.2  # times the expected size that must be free
+
+
+class Shard(NamedTuple):
+    """One of several parts of a study that are computed apart: the `part`-th of `parts`."""
+
+    part: int  # from 1
+    parts: int
+
+
+class Expected(NamedTuple):
+    """What a run will take, from its first chunk."""
+
+    seconds: float
+    size: int  # bytes: chunks and data set
+    memory: int  # bytes in all workers together
+
+
+class StudyRun(NamedTuple):
+    """How a run ended."""
+
+    path: Path
+    members: int
+    failed: int  # members without a result, of those that this run computed
+    computed: int  # members that this run computed
+    missing_chunks: int  # that other shards have still to compute
+    damaged_chunks: int  # that were found and computed again
+    seconds: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether the data set is there."""
+        return self.missing_chunks == 0
+
+    def open(self) -> "xarray.Dataset":
+        """The data set. Raises `ValueError` while chunks are missing."""
+        return open_study(self.path)
+
+
+class RunSettings(NamedTuple):
+    """Who computes a study, and whom to tell how it stands."""
+
+    processes: int | None = None  # None: one for each core
+    scheduler: str | None = None  # address of a running Dask scheduler
+    shard: Shard | None = None
+    progress: ProgressReport | None = None  # called after each chunk
+    expected: Callable[[Expected], None] | None = None  # called after the first chunk
+
+
+HERE = RunSettings()
+
+
+def open_study(path: str | os.PathLike[str]) -> "xarray.Dataset":
+    """The data set of a study, its arrays read as they are used.
+
+    Returns an `xarray.Dataset` over `member` with the varied quantities as coordinates. Raises
+    `ValueError` where there is none.
+    """
+    import xarray
+
+    folder = StudyFolder(Path(path))
+    if stored_description(folder) is None:
+        state = "is not complete" if folder.work.exists() else "does not exist"
+        raise ValueError(f"the study {path} {state}: run it (again) first.")
+    return xarray.open_zarr(path, chunks=None, consolidated=True)
+
+
+def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings = HERE) -> StudyRun:
+    """Compute a study and store it as one data set; the same call continues what was stopped.
+
+    Chunks of members are computed by processes of this machine, each on one core, or by a Dask
+    cluster, and kept beside `out` in `out.parts`; when all are there they become `out`, a Zarr
+    store. Stopping at any moment loses chunks in flight only. Digits do not depend on how many
+    processes there are.
+
+    Arguments: `out` is the folder of the data set.
+    Returns a `StudyRun`. A member that fails is a row with its status.
+    Raises `ValueError` before anything is written for a study that cannot be run, and for an `out`
+    that has another study, that another process is at work on, or that cannot be written;
+    `ClusterGone` where the scheduler ends: call again.
+    """
+    plan = planned(study)
+    described = description(study)
+    folder = StudyFolder(Path(os.path.abspath(out)))
+    _check_settings(settings)
+    begin = time.perf_counter()
+    with _locked(folder, settings.shard):
+        _claim(folder, described)
+        if is_collected(folder, described):
+            return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
+        job = Job(plan, folder, fingerprint(described))
+        found = found_chunks(folder, job.fingerprint, study.n_chunks)
+        remove_leftovers(folder, found)
+        done = _computed(job, found, settings)
+        every = found_chunks(folder, job.fingerprint, study.n_chunks)
+        missing = study.n_chunks - len(every.whole)
+        if not missing:
+            with _words_for_disk(folder):
+                collect_chunks(plan, folder, described, every.whole)
+    return StudyRun(
+        folder.out,
+        *(len(plan.table), done.failed, done.done - done.done_before),
+        *(missing, len(found.damaged), time.perf_counter() - begin),
+    )
+
+
+def discard_chunks(out: str | os.PathLike[str]) -> None:
+    """Remove the chunks of a study whose data set is complete. Raises `ValueError` where it is not.
+
+    The data set stands alone then: it cannot be mended from its chunks any more.
+    """
+    folder = StudyFolder(Path(os.path.abspath(out)))
+    plan = read_plan(folder)
+    if plan is None or not is_collected(folder, plan):
+        raise ValueError(f"{out} is not complete: its chunks are still needed.")
+    shutil.rmtree(folder.work)
+
+
+def _computed(job: Job, found: FoundChunks, settings: RunSettings) -> Progress:
+    study, n = job.planned.study, len(job.planned.table)
+    before = sum(len(job.planned.rows_of(k)) for k in found.whole)
+    missing = [k for k in range(study.n_chunks) if k not in found.whole]
+    if settings.shard is not None:
+        missing = [k for k in missing if k % settings.shard.parts == settings.shard.part - 1]
+    state = Progress(n, before, 0, 0.0, before, 0, 0)
+    if not missing:
+        return state
+    begin = time.perf_counter()
+    workers = _workers(settings, len(missing))
+    try:
+        with _words_for_disk(job.folder):
+            for number, receipt in enumerate(receipts(job, workers, missing)):
+                state = state.with_receipt(receipt, time.perf_counter() - begin)
+                if number == 0:
+                    _announce(job, settings, state, receipt.seconds, workers.width)
+                if settings.progress is not None:
+                    settings.progress(state)
+    finally:
+        workers.close()
+    return state
+
+
+def _announce(job: Job, settings: RunSettings, state: Progress, seconds: float, width: int) -> None:
+    """Say what the run will take; refuse one for which the disk has no room."""
+    mine = state.done - state.done_before
+    left = (state.members - state.done) / mine
+    share = 1 if settings.shard is None else 1 / settings.shard.parts
+    # Chunks, and the data set that is made of them.
+    size = int(2 * state.size * state.members / mine)
+    expected = Expected(seconds * left * share / width, size, state.memory * width)
+    if settings.expected is not None:
+        settings.expected(expected)
+    free = shutil.disk_usage(job.folder.work).free
+    if free < _SPARE * 2 * state.size * left:
+        raise ValueError(
+            f"the study needs about {size / 1e6:.3g} MB, but {job.folder.out.parent} has "
+            f"{free / 1e6:.3g} MB left; the chunks that are done stay."
+        )
+
+
+def _workers(settings: RunSettings, n_chunks: int) -> AbstractWorkers:
+    if settings.scheduler is not None:
+        return DaskCluster(settings.scheduler)
+    return LocalProcesses(min(settings.processes or len(available_cores()), n_chunks))
+
+
+def _check_settings(settings: RunSettings) -> None:
+    if settings.processes is not None and settings.processes < 1:
+        raise ValueError(f"`processes` must be at least 1, but is {settings.processes}.")
+    if settings.processes is not None and settings.scheduler is not None:
+        raise ValueError("`processes` are of this machine: a scheduler has its own.")
+    if settings.shard is not None and not 1 <= settings.shard.part <= settings.shard.parts:
+        raise ValueError(
+            f"a shard i/n needs i from 1 to n, but is {settings.shard.part}/{settings.shard.parts}."
+        )
+
+
+def _claim(folder: StudyFolder, described: dict) -> None:
+    """Make the folder this study's, or see that it is."""
+    known = read_plan(folder) or stored_description(folder)
+    if known is None:
+        if folder.out.exists():
+            raise ValueError(f"{folder.out} is there already and no data set of a study.")
+        with _words_for_disk(folder):
+            write_plan(folder, described)
+        return
+    found = differences(described, known)
+    if found:
+        further = f" (and {len(found) - _SHOWN} more)" if len(found) > _SHOWN else ""
+        listed = "; ".join(str(one) for one in found[:_SHOWN])
+        raise ValueError(
+            f"{folder.out} has another study: {listed}{further}. Take another --out, or go back to "
+            "that study."
+        )
+    if read_plan(folder) is None and not is_collected(folder, described):
+        with _words_for_disk(folder):
+            write_plan(folder, described)
+
+
+@contextmanager
+def _locked(folder: StudyFolder, shard: Shard | None) -> Iterator[None]:
+    """Nobody else at work on the same study, or the same shard of it."""
+    from filelock import FileLock, Timeout
+
+    made = not folder.work.exists()
+    name = ".lock" if shard is None else f".lock-{shard.part}-of-{shard.parts}"
+    try:
+        with _words_for_disk(folder):
+            folder.work.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(folder.work / name, timeout=0).acquire()
+    except Timeout as error:
+        raise ValueError(
+            f"another process is at work on {folder.out}: wait until it ends."
+        ) from error
+    with lock:
+        try:
+            yield
+        finally:
+            if made and read_plan_exists(folder) is False:
+                shutil.rmtree(folder.work, ignore_errors=True)
+
+
+def read_plan_exists(folder: StudyFolder) -> bool:
+    """Whether a plan was written."""
+    return (folder.work / "plan.json").exists()
+
+
+@contextmanager
+def _words_for_disk(folder: StudyFolder) -> Iterator[None]:
+    """An error of the disk in one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"{folder.out} cannot be written: {error.strerror or error}. What is done stays; the "
+            "same command continues."
+        ) from error

@@ -1,0 +1,117 @@
+"""The members of a study: one row of values for every member."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.study.variations import AbstractVariation
+
+Method = Literal["grid", "list", "latin_hypercube", "sobol", "random"]
+MOST_MEMBERS = 100_000_000
+
+
+class Sampling(eqx.Module):
+    """How the members are chosen.
+
+    "grid": every combination of the values; "list": the first value of each quantity, the second
+    of each, and so on; the others draw `members` of them from the distributions.
+    """
+
+    method: Method = eqx.field(static=True)
+    members: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError` for an unknown method and for numbers that make no sense."""
+        if self.method not in get_args(Method):
+            raise ValueError(f"`method` must be one of {', '.join(get_args(Method))}.")
+        if self.members is not None and self.members < 1:
+            raise ValueError(f"`members` must be at least 1, but is {self.members}.")
+
+
+def number_of_members(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
+    """How many members a study has, before any of them is drawn.
+
+    Raises `ValueError` where that is not determined, contradicts itself or is more than a hundred
+    million.
+    """
+    if sampling.method in ("grid", "list"):
+        n = _counted_by_values(variations, sampling)
+        if sampling.members not in (None, n):
+            raise ValueError(
+                f"a {sampling.method} of these values has {n} members, but `members` is "
+                f"{sampling.members}: leave it out."
+            )
+    elif sampling.members is None:
+        raise ValueError(f"the method {sampling.method} needs `members`, how many to draw.")
+    else:
+        n = sampling.members
+    if n > MOST_MEMBERS:
+        raise ValueError(f"a study has at most {MOST_MEMBERS:.0e} members, but this has {n:.3g}.")
+    return n
+
+
+def _counted_by_values(variations: Sequence[AbstractVariation], sampling: Sampling) -> int:
+    sizes = {}
+    for one in variations:
+        values = one.grid()
+        if values is None:
+            raise ValueError(
+                f"a {sampling.method} goes through values, but {', '.join(one.names)} has a "
+                "distribution: give `values`, or a `range` with `points`, or another method."
+            )
+        sizes[one.names[0]] = len(values)
+    if not sizes:
+        raise ValueError(f"a {sampling.method} needs at least one quantity that varies.")
+    if sampling.method == "grid":
+        return math.prod(sizes.values())
+    if len(set(sizes.values())) > 1:
+        each = ", ".join(f"{name} {n}" for name, n in sizes.items())
+        raise ValueError(f"a list needs equally many values of each quantity, but has: {each}.")
+    return next(iter(sizes.values()))
+
+
+def drawn_members(
+    variations: Sequence[AbstractVariation], sampling: Sampling, seed: int
+) -> Float[np.ndarray, "member name"]:
+    """The value of every varied quantity for every member, in the order of the variations.
+
+    Draws by `scipy.stats.qmc`: Latin hypercube, scrambled Sobol' sequence (its first `members`
+    points), or independently.
+    """
+    n = number_of_members(variations, sampling)
+    width = sum(len(one.names) for one in variations)
+    if sampling.method in ("grid", "list"):
+        values = [np.asarray(one.grid()) for one in variations]
+        if sampling.method == "list":
+            return np.stack(values, axis=1)
+        return np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=1)
+    if width == 0:
+        return np.zeros((n, 0))
+    unit = _unit_cube(sampling.method, n, width, seed)
+    columns, begin = [], 0
+    for one in variations:
+        end = begin + len(one.names)
+        columns.append(one.quantiles(unit[:, begin:end]))
+        begin = end
+    return np.concatenate(columns, axis=1)
+
+
+def _unit_cube(method: Method, n: int, width: int, seed: int) -> Float[np.ndarray, "member name"]:
+    from scipy.stats import qmc
+
+    random = np.random.default_rng(seed)
+    if method == "latin_hypercube":
+        return qmc.LatinHypercube(width, rng=random).random(n)
+    if method == "sobol":
+        # A whole power of two, as the sequence wants it; its first points are the members.
+        return qmc.Sobol(width, rng=random).random_base2((n - 1).bit_length())[:n]
+    return random.random((n, width))
+
+
+def member_seed(seed: int, member: int) -> int:
+    """The seed of a member's own noise: of the study's seed and its number alone."""
+    return int(np.random.SeedSequence(seed, spawn_key=(member,)).generate_state(1)[0])

@@ -1,0 +1,197 @@
+"""A study: one model, what varies, what is computed; checked before anything runs."""
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.model.parameters import (
+    parameter_names,
+    parameter_rules,
+    parameter_value,
+    with_parameters,
+)
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.blocks import taken
+from snrmjax.numerics.rules import POSITIVE, Rule
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.study.computations.base import FORCE, AbstractComputation, Members
+from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
+from snrmjax.study.variations import AbstractVariation
+
+_IN_HERTZ = ".frequency_hz"  # beside `natural_frequency` in rad/s, as model files have it
+_STRANGE = 3.0  # times the model's frequency, beyond which a value is taken for another unit's
+
+
+class Study(eqx.Module):
+    """Many members of one model and what is computed for each.
+
+    `variations` name numbers of the model as `parameter_names` does ("mode_1.damping_ratio";
+    natural frequencies in rad/s, or as "mode_1.frequency_hz" in Hz), and `force_n`. With
+    `model_of`, a function of the varied values by name, they may name anything: it makes the
+    model of a member. `members_a_chunk` is how many are computed and stored together.
+    """
+
+    name: str = eqx.field(static=True)
+    model: Structure
+    computation: AbstractComputation
+    variations: tuple[AbstractVariation, ...] = ()
+    sampling: Sampling = Sampling("grid")
+    seed: int = eqx.field(static=True, default=0)
+    members_a_chunk: int | None = eqx.field(static=True, default=None)
+    model_of: Callable[[dict[str, float]], Structure] | None = eqx.field(static=True, default=None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The varied quantities."""
+        return tuple(name for one in self.variations for name in one.names)
+
+    @property
+    def n_members(self) -> int:
+        """How many members there are."""
+        return number_of_members(self.variations, self.sampling)
+
+    @property
+    def chunk_size(self) -> int:
+        """How many members are computed and stored together."""
+        return self.members_a_chunk or self.computation.members_a_chunk
+
+    @property
+    def n_chunks(self) -> int:
+        """How many chunks there are."""
+        return -(-self.n_members // self.chunk_size)
+
+
+class PlannedStudy(NamedTuple):
+    """A study whose members are drawn and were checked."""
+
+    study: Study
+    table: Float[np.ndarray, "member name"]
+
+    def rows_of(self, chunk: int) -> range:
+        """The numbers of the members of a chunk."""
+        size = self.study.chunk_size
+        return range(chunk * size, min((chunk + 1) * size, len(self.table)))
+
+    def members(self, numbers: Sequence[int]) -> Members:
+        """Some members with their models, forces and seeds."""
+        study, rows = self.study, self.table[list(numbers)]
+        seeds = [member_seed(study.seed, k) for k in numbers]
+        forces = rows[:, [study.names.index(FORCE)]] if FORCE in study.names else None
+        return Members(models_of(study, rows), forces, seeds)
+
+
+def planned(study: Study) -> PlannedStudy:
+    """The study with its members drawn and checked.
+
+    Raises `ValueError` for a quantity that the model does not have or that varies twice, for a
+    missing force or a needless one, for too many members, and for the first value that the model
+    cannot have.
+    """
+    if study.seed < 0:
+        raise ValueError(f"`seed` must be zero or positive, but is {study.seed}.")
+    if study.members_a_chunk is not None and study.members_a_chunk < 1:
+        raise ValueError(f"`members_a_chunk` must be at least 1, but is {study.members_a_chunk}.")
+    _check_names(study)
+    number_of_members(study.variations, study.sampling)
+    table = drawn_members(study.variations, study.sampling, study.seed)
+    _check_values(study, table)
+    return PlannedStudy(study, table)
+
+
+def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure]:
+    """The models of members with these values of the varied quantities."""
+    named = [k for k, name in enumerate(study.names) if name != FORCE]
+    if study.model_of is not None:
+        each = [dict(zip(study.names, row, strict=True)) for row in rows.tolist()]
+        return [study.model_of(values) for values in each]
+    if not named:
+        return [study.model] * len(rows)
+    own, units = zip(*(_own_name(study.names[k]) for k in named), strict=True)
+    together = _varied(study.model, own, rows[:, named] * np.array(units))
+    return [taken(together, k) for k in range(len(rows))]
+
+
+@eqx.filter_jit
+def _varied(model: Structure, names: tuple[str, ...], values: Array) -> Structure:
+    def one(row: Array) -> Structure:
+        return with_parameters(model, names, row)
+
+    arrays = jax.vmap(lambda row: eqx.filter(one(row), eqx.is_array))(jnp.asarray(values))
+    return eqx.combine(arrays, model)
+
+
+def _own_name(name: str) -> tuple[str, float]:
+    """The model's name of a quantity, and what to multiply its values with."""
+    if name.endswith(_IN_HERTZ):
+        return f"{name.removesuffix(_IN_HERTZ)}.natural_frequency", HERTZ
+    return name, 1.0
+
+
+def _check_names(study: Study) -> None:
+    names = study.names
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} varies twice.")
+    of_model = [name for name in names if name != FORCE]
+    if study.model_of is None:
+        known = parameter_names(study.model)
+        for name in of_model:
+            if _own_name(name)[0] not in known:
+                near = difflib.get_close_matches(name, (*known, FORCE), n=3, cutoff=0.5)
+                near = near or list(known[:3])
+                raise ValueError(
+                    f"the model does not have the parameter {name!r}; similar ones are "
+                    f"{', '.join(near)}."
+                )
+        own = [_own_name(name)[0] for name in of_model]
+        for name in own:
+            if own.count(name) > 1:
+                raise ValueError(f"{name} varies twice, in rad/s and in Hz.")
+    forces = getattr(study.computation, "forces", None)
+    given = forces is not None and forces.values is not None
+    if FORCE in names and (forces is None or given):
+        why = "`forces_n` is given too" if given else f"{study.computation.kind} has no one force"
+        raise ValueError(f"{FORCE} cannot vary: {why}.")
+    if forces is not None and not given and FORCE not in names:
+        raise ValueError(f"{study.computation.kind} needs `forces_n`, or {FORCE} to vary.")
+
+
+def _check_values(study: Study, table: Float[np.ndarray, "member name"]) -> None:
+    for k, name in enumerate(study.names):
+        values = table[:, k]
+        for rule in _rules(study, name):
+            bad = np.flatnonzero([not rule.good(value) for value in values.tolist()])
+            if bad.size:
+                raise ValueError(
+                    f"{name} must be {rule.expected}, but member {bad[0]} of the study has "
+                    f"{values[bad[0]]:g} ({bad.size} of {len(values)} members have such a value): "
+                    "narrow its range, or take a distribution that stays inside, such as lognormal."
+                )
+        _check_unit(study, name, values)
+
+
+def _rules(study: Study, name: str) -> tuple[Rule, ...]:
+    if name == FORCE:
+        return (POSITIVE,)
+    return () if study.model_of is not None else parameter_rules(study.model, _own_name(name)[0])
+
+
+def _check_unit(study: Study, name: str, values: np.ndarray) -> None:
+    """Refuse natural frequencies in Hz where rad/s are expected, and the other way round."""
+    own, unit = _own_name(name)
+    if study.model_of is not None or not own.endswith(".natural_frequency"):
+        return
+    given = float(np.asarray(parameter_value(study.model, own))) / unit
+    middle = float(np.median(values))
+    if not 1 / _STRANGE < middle / given < _STRANGE:
+        wanted = "Hz" if unit != 1.0 else "rad/s"
+        raise ValueError(
+            f"{name} is in {wanted}, {given:.6g} in the model, but its values are about "
+            f"{middle:.6g}: are they in the other unit?"
+        )

@@ -1,0 +1,212 @@
+"""Studies as TOML files."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from snrmjax.io.files import FilePath, file_name, read_text
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.io.toml_table import TomlTable, parsed_toml
+from snrmjax.io.units import DEGREE, HERTZ
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.rules import NOT_NEGATIVE, POSITIVE
+from snrmjax.simulate.virtual_test.recording import MeasurementErrors
+from snrmjax.study.computations.base import AbstractComputation, OfForces
+from snrmjax.study.computations.modes import DampedModes, NormalModes
+from snrmjax.study.computations.responses import Curves, Peaks, ResponseRange
+from snrmjax.study.computations.tests import Diagnoses, Identifications, VirtualTests
+from snrmjax.study.sampling import Sampling
+from snrmjax.study.study import FORCE, Study, planned
+from snrmjax.study.variations import (
+    AbstractVariation,
+    joint_normal,
+    listed,
+    lognormal,
+    normal,
+    ranged,
+    uniform,
+)
+
+_METHODS = ("grid", "list", "latin_hypercube", "sobol", "random")
+_RANGE = ("from_hz", "to_hz")
+_ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
+# Keys that each kind of computation needs and may have, beside those of every study.
+_KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "peaks": (_RANGE, ("forces_n", "harmonics", "stability", "grid_points", "isolated")),
+    "curves": (_RANGE, ("forces_n", "harmonics", "stability")),
+    "nnm": (("to_hz",), ("harmonics",)),
+    "damped_nnm": (("to_velocity_m_s",), ("harmonics",)),
+    "virtual_test": ((*_RANGE, "forces_n"), ("harmonics", "errors", "points_per_level")),
+    "identify": (("data",), ()),
+    "diagnose": (("data",), ()),
+}
+_EVERY = ("vary", "sample", "seed", "name", "members_a_chunk")
+
+
+def read_study(path: FilePath) -> Study:
+    """Read a study from a TOML: its model, what varies and what is computed.
+
+    The model's path (and that of data) is relative to the study's folder.
+    Returns the study. Raises `ValueError` that names file, table, key, value and what was expected;
+    the members are drawn and checked too.
+    """
+    file = file_name(path)
+    top = parsed_toml(read_text(path), file)
+    kind = top.choice("compute", _KEYS) if "compute" in top.entries else None
+    if kind is None:
+        raise ValueError(f"{file} lacks the key `compute`, one of {', '.join(_KEYS)}.")
+    needed, possible = _KEYS[kind]
+    # A key that another computation has is a mistake worth its own words.
+    top.check_keys(("model", "compute", *needed), (*possible, *_EVERY))
+    folder = Path(path).parent
+    model = read_model(folder / top.text("model"))
+    variations = tuple(_variation(one) for one in top.tables("vary", file))
+    study = Study(
+        name=top.text("name", Path(path).stem),
+        model=model,
+        computation=_computation(kind, top, folder, model, variations),
+        variations=variations,
+        sampling=_sampling(top, file, variations),
+        seed=top.whole("seed", 0, 0),
+        members_a_chunk=top.whole("members_a_chunk", 0, 0) or None,
+    )
+    try:
+        planned(study)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    return study
+
+
+def _sampling(top: TomlTable, file: str, variations: tuple[AbstractVariation, ...]) -> Sampling:
+    table = top.table("sample", f"[sample] of {file}")
+    table.check_keys((), ("method", "members"))
+    valued = all(one.grid() is not None for one in variations) and bool(variations)
+    method = table.choice("method", _METHODS, "grid" if valued else "random")
+    members = table.whole("members", 1) if "members" in table.entries else None
+    return Sampling(method, members)  # type: ignore[arg-type]
+
+
+def _variation(table: TomlTable) -> AbstractVariation:
+    place = table.place
+    try:
+        if "parameters" in table.entries:
+            return _joint(table)
+        if "parameter" not in table.entries:
+            raise ValueError(f"{place} lacks the key `parameter`.")
+        return _single(table)
+    except ValueError as error:
+        text = str(error)
+        raise (error if place in text else ValueError(f"{place} cannot be read: {text}")) from error
+
+
+def _single(table: TomlTable) -> AbstractVariation:
+    name = table.text("parameter")
+    ways = [key for key in ("values", "range", "distribution") if key in table.entries]
+    if len(ways) != 1:
+        found = " and ".join(f"`{key}`" for key in ways) or "none of them"
+        raise ValueError(
+            f"{table.place} ({name}) needs one of `values`, `range`, `distribution`, but has "
+            f"{found}."
+        )
+    if ways == ["values"]:
+        table.check_keys(("parameter", "values"))
+        return listed(name, np.array(table.numbers("values", each="value")))
+    if ways == ["range"]:
+        table.check_keys(("parameter", "range"), ("points",))
+        ends = table.numbers("range", each="end")
+        if len(ends) != 2:
+            raise table.refusal("range", "two numbers", table.entries["range"])
+        points = table.whole("points", 2) if "points" in table.entries else None
+        return ranged(name, ends[0], ends[1], points)
+    if table.choice("distribution", ("uniform", "normal", "lognormal")) == "uniform":
+        table.check_keys(("parameter", "distribution", "low", "high"))
+        return uniform(name, table.number("low"), table.number("high"))
+    table.check_keys(("parameter", "distribution", "mean", "std"))
+    make = normal if table.text("distribution") == "normal" else lognormal
+    return make(name, table.number("mean"), table.number("std"))
+
+
+def _joint(table: TomlTable) -> AbstractVariation:
+    table.check_keys(("parameters", "mean", "covariance"))
+    names, rows = table.entries["parameters"], table.entries["covariance"]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
+        raise table.refusal("parameters", "a list of names", names)
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        raise table.refusal("covariance", "a list of rows", rows)
+    each = [
+        TomlTable({"covariance": row}, f"{table.place}, row {k + 1},").numbers(
+            "covariance", each="entry"
+        )
+        for k, row in enumerate(rows)
+    ]
+    if len(each) != len(names) or any(len(row) != len(names) for row in each):
+        raise table.refusal("covariance", f"{len(names)} rows of {len(names)} numbers", rows)
+    return joint_normal(names, np.array(table.numbers("mean", each="entry")), np.array(each))
+
+
+def _computation(
+    kind: str,
+    top: TomlTable,
+    folder: Path,
+    model: Structure,
+    variations: tuple[AbstractVariation, ...],
+) -> AbstractComputation:
+    harmonics = top.whole("harmonics", 1, 9)
+    if kind == "nnm":
+        return NormalModes(top.number("to_hz", POSITIVE) * HERTZ, harmonics)
+    if kind == "damped_nnm":
+        return DampedModes(top.number("to_velocity_m_s", POSITIVE), harmonics)
+    if kind in ("identify", "diagnose"):
+        data = read_steady_states(os.fspath(folder / top.text("data")), model)
+        return Identifications(data) if kind == "identify" else Diagnoses(data)
+    ends = [top.number(key, POSITIVE) for key in _RANGE]
+    if not ends[0] < ends[1]:
+        raise ValueError(
+            f"`from_hz` must be below `to_hz`, but {top.place} has {ends[0]:g} and {ends[1]:g}."
+        )
+    within = ResponseRange(
+        ends[0] * HERTZ, ends[1] * HERTZ, harmonics, _flag(top, "stability", True)
+    )
+    forces = _forces(top)
+    if kind == "virtual_test":
+        levels = np.zeros(0) if forces is None else forces
+        per_level = top.whole("points_per_level", 1, 5)
+        return VirtualTests(within, levels, _errors(top), per_level)
+    varied = any(FORCE in one.names for one in variations)
+    if forces is None and not varied:
+        raise ValueError(f"{top.place} lacks the key `forces_n`, and {FORCE} does not vary.")
+    if kind == "curves":
+        return Curves(within, OfForces(forces))
+    grid = top.whole("grid_points", 0, 0)
+    return Peaks(within, OfForces(forces), grid, _flag(top, "isolated", False))
+
+
+def _forces(top: TomlTable) -> np.ndarray | None:
+    if "forces_n" not in top.entries:
+        return None
+    forces = top.numbers("forces_n", POSITIVE, each="force")
+    if not forces or len(set(forces)) < len(forces):
+        raise top.refusal("forces_n", "different forces, at least one", top.entries["forces_n"])
+    return np.array(forces)
+
+
+def _errors(top: TomlTable) -> MeasurementErrors:
+    table = top.table("errors", f"[errors] of {top.place}")
+    table.check_keys((), _ERRORS)
+    sizes = {key: table.number(key, NOT_NEGATIVE, default=0.0) for key in _ERRORS}
+    return MeasurementErrors(
+        sizes["amplitude"],
+        sizes["phase_deg"] * DEGREE,
+        sizes["force"],
+        sizes["level_gain"],
+        sizes["level_phase_deg"] * DEGREE,
+    )
+
+
+def _flag(top: TomlTable, key: str, default: bool) -> bool:
+    value = top.entries.get(key, default)
+    if not isinstance(value, bool):
+        raise top.refusal(key, "true or false", value)
+    return value
