@@ -19,7 +19,8 @@ ROOMS = {
     "diagnose": {"numerics", "model", "measure", "simulate", "identify"},
     # Files are on the roof: they hold what the numerical rooms find.
     "io": {"numerics", "model", "measure", "simulate", "identify", "diagnose"},
-    "report": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io"},
+    "study": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io"},
+    "report": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io", "study"},
 }
 # Within a room: what each sub-room may import beside itself. A module beside the sub-rooms may
 # import all of them; none of them imports it, unless it is named here.
@@ -45,8 +46,10 @@ SUB_ROOMS = {
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
     "report.laws": {"report.style", "report.html"},
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
+    # A study is made of computations, which know nothing of where and how often they run.
+    "study.computations": set(),
 }
-NUMERICAL = set(ROOMS) - {"io", "report"}
+NUMERICAL = set(ROOMS) - {"io", "study", "report"}
 MOST_MODULES = 12
 # The top of the package gives names to users; rooms name the module they mean.
 PUBLIC = "the package itself"

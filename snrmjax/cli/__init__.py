@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify, diagnose.
+"""The commands: demo, simulate, nnm, identify, diagnose, study.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -17,6 +17,7 @@ from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
 from snrmjax.cli.simulate_commands import nnm, simulate
+from snrmjax.cli.study_commands import study_app
 
 app = typer.Typer(
     name="snrmjax",
@@ -48,6 +49,8 @@ def _unwrapped(text: str) -> str:
 
 for _command, _examples in _EXAMPLES.items():
     app.command(help=_unwrapped(inspect.getdoc(_command) or ""), epilog=_examples)(_command)
+
+app.add_typer(study_app)
 
 
 def main() -> None:

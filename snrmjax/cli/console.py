@@ -9,22 +9,22 @@ from pathlib import Path
 
 from rich.console import Console
 
-_console = Console(stderr=True, highlight=False, soft_wrap=True)
+console = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def say(message: str) -> None:
     """A line on progress or on a result."""
-    _console.print(message, markup=False)
+    console.print(message, markup=False)
 
 
 def warn(message: str) -> None:
     """A note that the reader of the results should know."""
-    _console.print(f"note: {message}", style="yellow", markup=False)
+    console.print(f"note: {message}", style="yellow", markup=False)
 
 
 def refuse(message: str) -> None:
     """What is wrong with the input."""
-    _console.print(f"error: {message}", style="red", markup=False)
+    console.print(f"error: {message}", style="red", markup=False)
 
 
 @contextmanager

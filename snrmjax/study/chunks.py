@@ -105,14 +105,14 @@ def found_chunks(folder: StudyFolder, fingerprint: str, n_chunks: int) -> FoundC
     return FoundChunks(whole, tuple(damaged), tuple(foreign))
 
 
-def write_plan(folder: StudyFolder, described: Mapping[str, object]) -> None:
+def write_study_plan(folder: StudyFolder, described: Mapping[str, object]) -> None:
     """Write what the study is beside its chunks, once."""
     folder.chunks.mkdir(parents=True, exist_ok=True)
     text = json.dumps(described, indent=1, sort_keys=True)
     write_atomically(folder.work / PLAN, text + "\n")
 
 
-def read_plan(folder: StudyFolder) -> dict | None:
+def read_study_plan(folder: StudyFolder) -> dict | None:
     """What the study that is kept there is; None where there is none.
 
     Raises `ValueError` where the plan cannot be read.

@@ -16,9 +16,9 @@ from snrmjax.study.chunks import (
     FoundChunks,
     StudyFolder,
     found_chunks,
-    read_plan,
+    read_study_plan,
     remove_leftovers,
-    write_plan,
+    write_study_plan,
 )
 from snrmjax.study.collect import collect_chunks, is_collected, stored_description
 from snrmjax.study.engine import Job, Progress, ProgressReport, receipts
@@ -147,7 +147,7 @@ def discard_chunks(out: str | os.PathLike[str]) -> None:
     The data set stands alone then: it cannot be mended from its chunks any more.
     """
     folder = StudyFolder(Path(os.path.abspath(out)))
-    plan = read_plan(folder)
+    plan = read_study_plan(folder)
     if plan is None or not is_collected(folder, plan):
         raise ValueError(f"{out} is not complete: its chunks are still needed.")
     shutil.rmtree(folder.work)
@@ -214,12 +214,12 @@ def _check_settings(settings: RunSettings) -> None:
 
 def _claim(folder: StudyFolder, described: dict) -> None:
     """Make the folder this study's, or see that it is."""
-    known = read_plan(folder) or stored_description(folder)
+    known = read_study_plan(folder) or stored_description(folder)
     if known is None:
         if folder.out.exists():
             raise ValueError(f"{folder.out} is there already and no data set of a study.")
         with _words_for_disk(folder):
-            write_plan(folder, described)
+            write_study_plan(folder, described)
         return
     found = differences(described, known)
     if found:
@@ -229,9 +229,9 @@ def _claim(folder: StudyFolder, described: dict) -> None:
             f"{folder.out} has another study: {listed}{further}. Take another --out, or go back to "
             "that study."
         )
-    if read_plan(folder) is None and not is_collected(folder, described):
+    if read_study_plan(folder) is None and not is_collected(folder, described):
         with _words_for_disk(folder):
-            write_plan(folder, described)
+            write_study_plan(folder, described)
 
 
 @contextmanager

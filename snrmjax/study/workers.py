@@ -135,7 +135,8 @@ class DaskCluster(AbstractWorkers):
     def wait_for_one(self, futures: Iterable[Any]) -> list[Any]:
         """See `AbstractWorkers.wait_for_one`."""
         try:
-            ended = self._distributed.wait(list(futures), return_when="FIRST_COMPLETED")
+            with self._client.as_current():
+                ended = self._distributed.wait(list(futures), return_when="FIRST_COMPLETED")
         except (*self._gone, OSError) as error:
             raise self._left() from error
         return list(ended.done)

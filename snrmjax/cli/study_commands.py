@@ -1,0 +1,212 @@
+"""The commands `study run` and `study discard-chunks`."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from snrmjax.cli.console import console, say, warn
+from snrmjax.cli.options import FILES
+
+if TYPE_CHECKING:
+    from snrmjax.study.engine import Progress, ProgressReport
+    from snrmjax.study.run import Expected, Shard, StudyRun
+    from snrmjax.study.study import Study
+
+_QUIET_SECONDS = 30.0  # between lines of progress in a log
+_INTERRUPTED = 130
+
+study_app = typer.Typer(
+    name="study",
+    help="Sweeps and uncertainty studies: many members of one model in one data set.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+)
+
+StudyOut = Annotated[
+    Path,
+    typer.Option(
+        "--out",
+        help="The data set: a Zarr store that xarray opens. While it is not complete, and to mend "
+        "it, its parts are kept beside it in OUT.parts.",
+        metavar="OUT",
+        rich_help_panel=FILES,
+        show_default=False,
+    ),
+]
+
+
+@study_app.command(
+    epilog="Example: snrmjax study run study.toml --out study.zarr. On a batch queue, one task of "
+    "four: snrmjax study run study.toml --out study.zarr --shard 3/4"
+)
+def run(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="What varies and what is computed (TOML).", metavar="STUDY", show_default=False
+        ),
+    ],
+    out: StudyOut,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes of this machine, each on one core; by default one for every core.",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a running Dask scheduler whose workers see the same folders, such as "
+            "tcp://node1:8786.",
+            metavar="ADDRESS",
+            show_default=False,
+        ),
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            help="Compute the I-th of N parts only, on a shared folder; the one that ends last "
+            "makes the data set.",
+            metavar="I/N",
+            show_default=False,
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but what is wrong.")] = False,
+) -> None:
+    """Run a study, or continue one that was stopped: the same command again.
+
+    Writes the data set OUT. Stopped at any moment, it loses only what was being computed then.
+    """
+    from snrmjax.study.run import RunSettings, run_study
+    from snrmjax.study.study_file import read_study
+    from snrmjax.study.workers import ClusterGone
+
+    part = None if shard is None else _shard(shard)
+    study = read_study(file)
+    if not quiet:
+        _say_study(study)
+    try:
+        with _progress(quiet) as progress:
+            settings = RunSettings(
+                *(processes, scheduler, part, progress), None if quiet else _say_expected
+            )
+            done = run_study(study, out, settings)
+    except KeyboardInterrupt:
+        warn("stopped; the same command continues.")
+        sys.exit(_INTERRUPTED)
+    except ClusterGone as error:
+        warn(f"{error}; what is done stays, and the same command continues with a new one.")
+        sys.exit(1)
+    if not quiet:
+        _say_done(done, out)
+
+
+@study_app.command("discard-chunks")
+def discard(
+    store: Annotated[
+        Path,
+        typer.Argument(
+            help="The data set of a complete study.", metavar="STORE", show_default=False
+        ),
+    ],
+) -> None:
+    """Remove what a complete data set was made of, to save disk; it cannot be mended then."""
+    from snrmjax.study.run import discard_chunks
+
+    discard_chunks(store)
+    say(f"{store} stands alone now.")
+
+
+def _shard(text: str) -> "Shard":
+    from snrmjax.study.run import Shard
+
+    part, slash, parts = text.partition("/")
+    if not (slash and part.isdecimal() and parts.isdecimal()):
+        raise ValueError(f"`--shard` must be I/N, such as 2/8, but is {text!r}.")
+    return Shard(int(part), int(parts))
+
+
+def _say_study(study: "Study") -> None:
+    names = ", ".join(study.names) or "nothing but the noise"
+    say(
+        f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
+        f"chunks; {names} varies" + ("" if len(study.names) < 2 else " together")
+    )
+
+
+def _say_expected(expected: "Expected") -> None:
+    say(
+        f"after the first chunk: about {_duration(expected.seconds)} to go, {_bytes(expected.size)}"
+        f" on disk in the end, {_bytes(expected.memory)} of memory"
+    )
+
+
+def _say_done(done: "StudyRun", out: Path) -> None:
+    if done.damaged_chunks:
+        warn(f"{done.damaged_chunks} chunks were damaged; they were computed again.")
+    if done.failed:
+        warn(f"{done.failed} of {done.computed} members have no whole result: see `status`.")
+    if not done.complete:
+        say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
+    elif done.computed:
+        say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
+    else:
+        say(f"nothing was left to compute; {done.members} members are in {out}")
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator["ProgressReport | None"]:
+    """A bar on a terminal, a line now and then in a log, nothing where nobody wants it."""
+    if quiet:
+        yield None
+        return
+    if not console.is_terminal:
+        yield _Lines()
+        return
+    from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    with Bar(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("the first chunk compiles …", total=None)
+
+        def show(now: "Progress") -> None:
+            bar.update(task, completed=now.done, total=now.members, description=_line(now))
+
+        yield show
+
+
+class _Lines:
+    """Progress as lines, not more often than every half minute."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+
+    def __call__(self, now: "Progress") -> None:
+        """Say where the run stands."""
+        if now.done < now.members and time.monotonic() - self.last < _QUIET_SECONDS:
+            return
+        self.last = time.monotonic()
+        left = f", {_duration(now.seconds_left)} left" if now.done < now.members else ""
+        say(_line(now) + left)
+
+
+def _line(now: "Progress") -> str:
+    return f"{now.done}/{now.members} members, {now.failed} failed, {now.per_second:.3g}/s"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _bytes(size: int) -> str:
+    return f"{size / 1e9:.2g} GB" if size > 1e9 else f"{size / 1e6:.2g} MB"
