@@ -1,5 +1,5 @@
 # The ten verbs to start with, and the namespaces that hold the rest.
-from . import diagnose, identify, io, measure, model, plot, simulate
+from . import diagnose, identify, io, measure, model, plot, simulate, study
 from .diagnose.diagnosis import diagnose_model
 from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.optimal_design import next_measurements
@@ -29,4 +29,5 @@ __all__ = [
     "read_model",
     "read_steady_states",
     "simulate",
+    "study",
 ]

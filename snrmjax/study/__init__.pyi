@@ -5,30 +5,67 @@ from .run import RunSettings, Shard, StudyRun, discard_chunks, open_study, run_s
 from .sampling import Sampling
 from .study import Study
 from .study_file import read_study
+from .uncertainty.followed_motions import ResponseQuantities, response_quantities
+from .uncertainty.propagation import (
+    Propagation,
+    PropagationSettings,
+    propagate_uncertainty,
+)
+from .uncertainty.quantities import FunctionQuantities, MemberStatus
+from .uncertainty.scatter_study import ScatterStudy, scatter_study
+from .uncertainty.sensitivity import (
+    DerivativeBounds,
+    SobolIndices,
+    derivative_bounds,
+    sobol_indices,
+)
+from .uncertainty.uncertain_inputs import (
+    UncertainInputs,
+    correlated_inputs,
+    posterior_inputs,
+    uncertain_inputs,
+)
 from .variations import joint_normal, listed, lognormal, normal, ranged, uniform
 
 __all__ = [
     "Curves",
     "DampedModes",
+    "DerivativeBounds",
     "Diagnoses",
+    "FunctionQuantities",
     "Identifications",
+    "MemberStatus",
     "NormalModes",
     "Peaks",
+    "Propagation",
+    "PropagationSettings",
+    "ResponseQuantities",
     "ResponseRange",
     "RunSettings",
     "Sampling",
+    "ScatterStudy",
     "Shard",
+    "SobolIndices",
     "Study",
     "StudyRun",
+    "UncertainInputs",
     "VirtualTests",
+    "correlated_inputs",
+    "derivative_bounds",
     "discard_chunks",
     "joint_normal",
     "listed",
     "lognormal",
     "normal",
     "open_study",
+    "posterior_inputs",
+    "propagate_uncertainty",
     "ranged",
     "read_study",
+    "response_quantities",
     "run_study",
+    "scatter_study",
+    "sobol_indices",
+    "uncertain_inputs",
     "uniform",
 ]

@@ -143,6 +143,27 @@ def _periodic_motion(
     )
 
 
+def turning(
+    model: Structure, force: Float[Array, ""], motion: PeriodicMotion, condition: Condition
+) -> Float[Array, ""]:
+    """Which way the response curve turns at a fold or a peak; 1 for the other conditions.
+
+    The second derivative along the curve, scaled: of Ω at a fold (negative where the curve turns
+    back from higher frequencies), of |V₁|² at a peak (negative at a maximum).
+    """
+    if condition not in ("fold", "peak"):
+        return jnp.ones(())
+    model = simulated_structure(model)
+    scale = jnp.max(jnp.abs(motion.coefficients))
+    order = (motion.coefficients.shape[0] - 1) // 2
+    balance = harmonic_balance(model, force, scale, harmonic_order=order)
+    point = balance.point(motion.coefficients, motion.frequency)
+    border = _generic(point.shape[0])
+    tangent = _tangent_near(balance.linearised, point, border)
+    zero = jnp.zeros(())
+    return jax.jvp(lambda p: _test(balance, condition, zero, border, p), (point,), (tangent,))[1]
+
+
 def response_at_velocities(
     model: Structure,
     curve: ResponseCurve,
@@ -211,19 +232,7 @@ def _solved(
     border = jax.lax.stop_gradient(border)
 
     def test(balance: HarmonicBalance, target: Array, point: Point) -> Array:
-        if condition == "frequency":
-            return point[-1] - target / balance.frequency_scale
-        if condition == "velocity":
-            shape = balance.model.modes.mode_shape[0]
-            top = jnp.max(jnp.abs(shape)) ** 2
-            unit = balance.displacement_scale * balance.frequency_scale
-            return sensor_velocity(balance, point) - (target / unit) ** 2 / top
-        if condition == "phase_resonance":
-            return mode_velocity(balance, point).imag
-        tangent = _tangent_near(balance.linearised, point, border)
-        if condition == "fold":
-            return tangent[-1]
-        return jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
+        return _test(balance, condition, target, border, point)
 
     fixed, aim = jax.lax.stop_gradient((balance, target))
 
@@ -254,6 +263,25 @@ def _solved(
 
     # The root is known: this gives it the derivatives of the implicit function theorem.
     return jax.lax.custom_root(equations, root, lambda _, known: known, tangent_solve), converged
+
+
+def _test(
+    balance: HarmonicBalance, condition: Condition, target: Array, border: Point, point: Point
+) -> Array:
+    """What vanishes where the condition is met."""
+    if condition == "frequency":
+        return point[-1] - target / balance.frequency_scale
+    if condition == "velocity":
+        shape = balance.model.modes.mode_shape[0]
+        top = jnp.max(jnp.abs(shape)) ** 2
+        unit = balance.displacement_scale * balance.frequency_scale
+        return sensor_velocity(balance, point) - (target / unit) ** 2 / top
+    if condition == "phase_resonance":
+        return mode_velocity(balance, point).imag
+    tangent = _tangent_near(balance.linearised, point, border)
+    if condition == "fold":
+        return tangent[-1]
+    return jax.jvp(lambda p: sensor_velocity(balance, p), (point,), (tangent,))[1]
 
 
 def _tangent_near(linearised: Linearised, point: Point, border: Point) -> Point:
