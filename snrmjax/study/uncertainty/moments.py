@@ -1,6 +1,6 @@
 """Mean, deviation and 95 % range: from derivatives, and from members with their standard errors."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,9 @@ from snrmjax.study.uncertainty.quantities import Expansion
 STATISTICS = ("mean", "std", "lower", "upper")  # lower, upper: 2.5 and 97.5 % points
 ERRORS = ("mean", "std", "range")
 _TAILS = (0.025, 0.975)
-_POINTS = "hazen"  # member k of n stands for the share (k − ½)/n, as in a stratified sample
+_POINTS: Literal["hazen"] = (
+    "hazen"  # member k of n stands for the share (k − ½)/n, as in a stratified sample
+)
 _MEMBERS = 2**14  # of a quadratic, whose percentage points are read from them
 _SCALES = np.geomspace(1e-3, 1e3, 121)
 
