@@ -23,7 +23,7 @@ from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, periodic_
 from snrmjax.study.uncertainty.quantities import (
     AbstractQuantities,
     Expansion,
-    Members,
+    SolvedMembers,
     MemberStatus,
 )
 from snrmjax.study.uncertainty.uncertain_inputs import FORCE, UncertainInputs
@@ -78,11 +78,11 @@ class ResponseQuantities(AbstractQuantities):
         ]
         return Expansion(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def members(self, z: Float[np.ndarray, "member input"]) -> Members:
+    def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """See `AbstractQuantities`."""
         return self._followed(z, slopes=False)[0]
 
-    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[Members, np.ndarray]:
+    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
         """See `AbstractQuantities`."""
         return self._followed(z, slopes=True)
 
@@ -114,7 +114,7 @@ class ResponseQuantities(AbstractQuantities):
                         row[place : place + 2] = curve.frequency[k] / HERTZ, speed
         return found, batch.n_points > 0
 
-    def _followed(self, z: np.ndarray, *, slopes: bool) -> tuple[Members, np.ndarray]:
+    def _followed(self, z: np.ndarray, *, slopes: bool) -> tuple[SolvedMembers, np.ndarray]:
         rows = np.asarray(z, dtype=np.float64)
         possible = self.inputs.possible(rows)
         safe = np.where(possible[:, None], rows, 0.0)
@@ -133,7 +133,7 @@ class ResponseQuantities(AbstractQuantities):
         ceased = np.where(np.isnan(table), int(MemberStatus.CEASED), int(MemberStatus.FOUND))
         status = np.where(possible[:, None], ceased, int(MemberStatus.IMPOSSIBLE))
         gradients = np.where(np.isnan(table)[:, :, None], np.nan, np.concatenate(by_z, axis=1))
-        return Members(table, status), gradients
+        return SolvedMembers(table, status), gradients
 
 
 def response_quantities(

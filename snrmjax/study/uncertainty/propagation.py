@@ -26,7 +26,7 @@ from snrmjax.study.uncertainty.quantities import (
     MEMBER_MESSAGE,
     AbstractQuantities,
     Expansion,
-    Members,
+    SolvedMembers,
     MemberStatus,
 )
 from snrmjax.study.uncertainty.uncertain_inputs import UncertainInputs
@@ -59,7 +59,7 @@ class Convergence(eqx.Module):
 
 
 class TracedCheck(eqx.Module):
-    """Members whose whole response curve was traced, against the motions that were followed."""
+    """SolvedMembers whose whole response curve was traced, against the motions that were followed."""
 
     members: int  # that were traced
     agree: Int[np.ndarray, " quantity"]  # the curve has the same event
@@ -69,7 +69,7 @@ class TracedCheck(eqx.Module):
 class Propagation(AbstractResult):
     """Mean, standard deviation and 95 % range of quantities by four methods.
 
-    Members at which a quantity does not exist are left out of its statistics and counted in
+    SolvedMembers at which a quantity does not exist are left out of its statistics and counted in
     `status_counts`. `first_order_error` compares first order with the solved motions, both of the
     members of quasi-Monte Carlo: its mean in standard deviations, its standard deviation, and the
     farther end of its 95 % range in half widths. `scatter_limit` is the factor on all inputs'
@@ -86,7 +86,7 @@ class Propagation(AbstractResult):
     status_counts: Int[np.ndarray, "status quantity"]  # both samplings together, by `MemberStatus`
     first_order_error: Float[np.ndarray, "error quantity"]
     scatter_limit: Float[np.ndarray, "error quantity"]
-    members: Members  # of quasi-Monte Carlo
+    members: SolvedMembers  # of quasi-Monte Carlo
     traced: TracedCheck | None  # None where nothing can be traced
     names: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
@@ -245,7 +245,9 @@ def _convergence(sampled: np.ndarray, by_scrambling: np.ndarray) -> Convergence:
     )
 
 
-def _traced(quantities: AbstractQuantities, z: np.ndarray, found: Members) -> TracedCheck | None:
+def _traced(
+    quantities: AbstractQuantities, z: np.ndarray, found: SolvedMembers
+) -> TracedCheck | None:
     """The first members once more, from their whole curves."""
     if not isinstance(quantities, ResponseQuantities):
         return None

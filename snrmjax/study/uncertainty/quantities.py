@@ -44,7 +44,7 @@ class Expansion(NamedTuple):
     hessian: Float[np.ndarray, "quantity input input"]
 
 
-class Members(NamedTuple):
+class SolvedMembers(NamedTuple):
     """Quantities of members; NaN where the status is not `FOUND`."""
 
     values: Float[np.ndarray, "member quantity"]
@@ -63,13 +63,13 @@ class AbstractQuantities(eqx.Module):
         """Values, gradients and Hessians at the nominal inputs."""
 
     @abc.abstractmethod
-    def members(self, z: Float[np.ndarray, "member input"]) -> Members:
+    def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """The quantities of every member."""
 
     @abc.abstractmethod
     def gradients(
         self, z: Float[np.ndarray, "member input"]
-    ) -> tuple[Members, Float[np.ndarray, "member quantity input"]]:
+    ) -> tuple[SolvedMembers, Float[np.ndarray, "member quantity input"]]:
         """The quantities of every member and their derivatives by z."""
 
 
@@ -96,12 +96,12 @@ class FunctionQuantities(AbstractQuantities):
         value, gradient, hessian = _expanded(self, jnp.zeros(len(self.inputs.names)))
         return Expansion(np.asarray(value), np.asarray(gradient), np.asarray(hessian))
 
-    def members(self, z: Float[np.ndarray, "member input"]) -> Members:
+    def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """See `AbstractQuantities`."""
         (values,) = by_blocks(lambda rows: (_values(self, rows),), _BLOCK, np.asarray(z))
         return _finite_members(values)
 
-    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[Members, np.ndarray]:
+    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
         """See `AbstractQuantities`."""
         values, slopes = by_blocks(lambda rows: _with_slopes(self, rows), _BLOCK, np.asarray(z))
         return _finite_members(values), slopes
@@ -111,10 +111,10 @@ class FunctionQuantities(AbstractQuantities):
         return self.function(self.inputs.values(z))
 
 
-def _finite_members(values: np.ndarray) -> Members:
+def _finite_members(values: np.ndarray) -> SolvedMembers:
     finite = np.isfinite(values)
     status = np.where(finite, int(MemberStatus.FOUND), int(MemberStatus.NOT_FINITE))
-    return Members(np.where(finite, values, np.nan), status)
+    return SolvedMembers(np.where(finite, values, np.nan), status)
 
 
 @jitted
