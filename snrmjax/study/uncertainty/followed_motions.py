@@ -23,8 +23,8 @@ from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, periodic_
 from snrmjax.study.uncertainty.quantities import (
     AbstractQuantities,
     Expansion,
-    SolvedMembers,
     MemberStatus,
+    SolvedMembers,
 )
 from snrmjax.study.uncertainty.uncertain_inputs import FORCE, UncertainInputs
 

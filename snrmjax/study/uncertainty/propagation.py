@@ -26,8 +26,8 @@ from snrmjax.study.uncertainty.quantities import (
     MEMBER_MESSAGE,
     AbstractQuantities,
     Expansion,
-    SolvedMembers,
     MemberStatus,
+    SolvedMembers,
 )
 from snrmjax.study.uncertainty.uncertain_inputs import UncertainInputs
 
@@ -59,7 +59,7 @@ class Convergence(eqx.Module):
 
 
 class TracedCheck(eqx.Module):
-    """SolvedMembers whose whole response curve was traced, against the motions that were followed."""
+    """Members whose whole response curve was traced, against the motions that were followed."""
 
     members: int  # that were traced
     agree: Int[np.ndarray, " quantity"]  # the curve has the same event
