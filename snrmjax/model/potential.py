@@ -51,6 +51,20 @@ class PolynomialPotential(eqx.Module):
         flat = _products(displacement, basis) @ coefficients
         return flat.reshape(*displacement.shape[:-1], n, n)
 
+    def stiffness_of_rows(
+        self, displacement: Float[Array, "mode time point"]
+    ) -> Float[Array, "time mode mode point"]:
+        """Tangent stiffness ∂²V/∂q∂q of many motions at many times, in 1/s².
+
+        As `stiffness`, with the points along the last axis, where long loops are fast.
+        """
+        basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
+        n = self.n_modes
+        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), n * n)
+        _, times, points = displacement.shape
+        products = _products_of_rows(displacement.reshape(n, -1), basis)
+        return jnp.moveaxis((coefficients.T @ products).reshape(n, n, times, points), 2, 0)
+
 
 def polynomial_potential(
     coefficients: Mapping[str, float] | Mapping[Monomial, float],
@@ -178,18 +192,36 @@ def _products(
     displacement: Float[Array, "*batch mode"], monomials: tuple[Monomial, ...]
 ) -> Float[Array, "*batch monomial"]:
     """Π q_i for every monomial, built by multiplying a padding one in (index n = the one)."""
-    n = displacement.shape[-1]
     if not monomials:
         return jnp.zeros((*displacement.shape[:-1], 0), dtype=displacement.dtype)
-    longest = max(1, max(len(m) for m in monomials))
-    index = np.full((len(monomials), longest), n)
-    for row, monomial in enumerate(monomials):
-        index[row, : len(monomial)] = monomial
+    index = _factors(monomials, displacement.shape[-1])
     padded = jnp.concatenate([displacement, jnp.ones_like(displacement[..., :1])], axis=-1)
     product = padded[..., index[:, 0]]
-    for column in range(1, longest):
+    for column in range(1, index.shape[1]):
         product = product * padded[..., index[:, column]]
     return product
+
+
+def _products_of_rows(
+    displacement: Float[Array, "mode sample"], monomials: tuple[Monomial, ...]
+) -> Float[Array, "monomial sample"]:
+    """The same with the modes along the first axis."""
+    if not monomials:
+        return jnp.zeros((0, displacement.shape[1]), dtype=displacement.dtype)
+    index = _factors(monomials, displacement.shape[0])
+    padded = jnp.concatenate([displacement, jnp.ones_like(displacement[:1])])
+    product = padded[index[:, 0]]
+    for column in range(1, index.shape[1]):
+        product = product * padded[index[:, column]]
+    return product
+
+
+def _factors(monomials: tuple[Monomial, ...], n_modes: int) -> np.ndarray:
+    """The modes of every monomial in a row, filled up with the index of a one after them."""
+    index = np.full((len(monomials), max(1, max(len(m) for m in monomials))), n_modes)
+    for row, monomial in enumerate(monomials):
+        index[row, : len(monomial)] = monomial
+    return index
 
 
 @lru_cache(maxsize=256)

@@ -21,6 +21,7 @@ BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
 _BLOCK = 8  # intervals that one call works on
 _FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _INSIDE = 7  # points inside an interval that is looked at more closely
+_CROSSING = 2.5e-7  # of a step, to which the crossing of the circle is located
 
 
 class CurvePoints(NamedTuple):
@@ -367,34 +368,43 @@ def _located_bifurcations(
     without_one: Bool[np.ndarray, " crossing"],
     steps: StepControl,
 ) -> CurvePoints:
-    """Divide the intervals until the crossing is known to a millionth of a step.
+    """Where the last multiplier that crosses is on the circle, to a millionth of a step.
 
-    Where it is to be found `without_one`, crossings of +1 do not count.
+    Chandrupatla's method in the share of the step, with that multiplier's modulus. Where it is to
+    be found `without_one`, crossings of +1 do not count.
     """
-    member = taken(balance, 0)
-    low, high = np.zeros(len(crossings)), np.ones(len(crossings))
+    from scipy.optimize import elementwise  # not for curves without bifurcations
 
-    def counted(rows: np.ndarray, without: np.ndarray) -> np.ndarray:
-        return _outside(rows) - np.where(without, _beyond_one(rows), 0)
+    member, known = taken(balance, 0), np.asarray(curve.multipliers)
+    ends = np.stack([known[crossings], known[np.array(crossings) + 1]])
+    counts = _outside(ends) - np.where(without_one, _beyond_one(ends), 0)
+    last = np.max(counts, axis=0)
 
-    first = counted(np.asarray(curve.multipliers)[crossings], without_one)
-    for _ in range(7):
-        shares = low[:, None] + (high - low)[:, None] * (np.arange(_INSIDE) + 1) / (_INSIDE + 1)
-        owner = [0] * shares.size
-        position = np.repeat(crossings, _INSIDE).tolist()
-        found, tangents, ok = _points_between(
-            balance, [curve], owner, position, shares.reshape(-1).tolist(), steps
+    def height(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Modulus beyond the circle, of the multiplier that is outside at one end only."""
+        free = without_one[which][:, None] & _is_beyond_one(rows)
+        radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=1)
+        return radius[np.arange(len(rows)), -last[which]] - (1.0 + MARGIN)
+
+    every = np.arange(len(crossings))
+    first, second = (height(rows, every) for rows in ends)
+
+    def at(share: np.ndarray, which: np.ndarray) -> np.ndarray:
+        if np.all(share == 0.0) or np.all(share == 1.0):
+            return np.where(share == 0.0, first[which], second[which])
+        position = [crossings[e] for e in which.tolist()]
+        found, _, ok = _points_between(
+            balance, [curve], [0] * len(which), position, share.tolist(), steps
         )
-        rows = _multipliers_of(member, found)
-        count = counted(rows, np.repeat(without_one, _INSIDE))
-        count = np.where(ok, count, np.repeat(first, _INSIDE)).reshape(shares.shape)
-        beyond = count != first[:, None]
-        index = np.where(beyond.any(axis=1), np.argmax(beyond, axis=1), _INSIDE)
-        edges = np.concatenate([low[:, None], shares, high[:, None]], axis=1)
-        pick = np.arange(len(crossings))
-        low, high = edges[pick, index], edges[pick, index + 1]
-    owner, share = [0] * len(crossings), (0.5 * (low + high)).tolist()
+        values = height(_multipliers_of(member, found), which)
+        return np.where(ok & np.isfinite(values), values, first[which])
+
+    tolerances = {"xatol": _CROSSING, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
+    bracket = np.zeros(len(every)), np.ones(len(every))
+    located = elementwise.find_root(at, bracket, args=(every,), tolerances=tolerances)
+    owner, share = [0] * len(crossings), located.x.tolist()
     found, tangents, ok = _points_between(balance, [curve], owner, list(crossings), share, steps)
+    ok = ok & located.success
     rows = _multipliers_of(member, found)
     for _ in np.flatnonzero(~ok):
         curve = _with_missed(curve, "bifurcation")
@@ -411,8 +421,12 @@ def _outside(multipliers: np.ndarray) -> np.ndarray:
 
 def _beyond_one(multipliers: np.ndarray) -> np.ndarray:
     """How many multipliers are real and beyond +1, where a fold sends one of them."""
+    return np.sum(_is_beyond_one(multipliers), axis=-1)
+
+
+def _is_beyond_one(multipliers: np.ndarray) -> np.ndarray:
     real = np.abs(multipliers.imag) < 1e-9 * np.abs(multipliers)
-    return np.sum(real & (multipliers.real > 1.0 + MARGIN), axis=-1)
+    return real & (multipliers.real > 1.0 + MARGIN)
 
 
 def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:

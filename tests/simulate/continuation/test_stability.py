@@ -1,5 +1,7 @@
 """Floquet multipliers against exact ones, Mathieu's equation and integrated period maps."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -130,20 +132,46 @@ def test_product_of_multipliers_is_the_mean_damping():
         assert complex(found[0].prod()) == pytest.approx(wanted, rel=tolerance), kind
 
 
-def test_multipliers_converge_with_the_sixth_power_of_the_step(distance_between):
-    frequency, amplitude = np.array([0.4]), cosine([1.2])
-    model = one_mode(1.3, 0.01, {"1111": 0.25})
-    exact = floquet_multipliers(model, amplitude, frequency, steps_per_cycle=400)[0]
+@pytest.mark.parametrize(
+    ("effect", "power", "steps"),
+    [((), 4, (8, 16, 32)), (("cubic_damping",), 6, (8, 16))],
+    ids=["kicked", "magnus"],
+)
+def test_multipliers_converge_with_their_power_of_the_step(effect, power, steps, distance_between):
+    frequency, amplitude = np.array([0.03]), cosine([1.2])
+    effects = tuple(make_effect(kind, {"coefficient": 0.01}) for kind in effect)
+    model = one_mode(1.3, 0.01, {"1111": 0.25}, effects)
+    exact = floquet_multipliers(model, amplitude, frequency, steps_per_cycle=100)[0]
     errors = [
         distance_between(
             floquet_multipliers(model, amplitude, frequency, steps_per_cycle=n)[0], exact
         )
-        for n in (5, 10, 20)
+        for n in steps
     ]
-    assert errors[0] > 1e-8
     # Steps come in segments of 32: their numbers double to 10 %.
-    assert 30 < errors[0] / errors[1] < 130
-    assert errors[1] < 1e-6
+    for first, second in itertools.pairwise(errors):
+        assert 0.8 * power < np.log2(first / second) < 1.2 * power
+
+
+def test_both_methods_give_the_same_multipliers(distance_between):
+    """A force of strength zero takes the general way, which is of another order."""
+    potential = {"1111": -0.6, "112": 0.2, "1122": 10.0, "2222": 3.0}
+    modes = linear_modes([2.0, 9.0], [0.02, 0.01], [[1.0, 1.0]], [1.0, 0.3])
+    nothing = make_effect("cubic_damping", {"coefficient": 0.0})
+    x = np.zeros((3, 7, 2))
+    x[:, 0] = [-0.05, 0.02]
+    x[:, 1] = np.outer([0.2, 0.6, 1.6], [1.0, 0.1])
+    x[:, 4] = 0.05
+    frequency = np.array([1.6, 2.1, 2.4])
+    found, other = (
+        floquet_multipliers(
+            structure(modes, polynomial_potential(potential, 2), effects=e), x, frequency
+        )
+        for e in ((), (nothing,))
+    )
+    assert np.abs(found).max() > 1.05  # one of them is unstable
+    for one, two in zip(found, other, strict=True):
+        assert distance_between(one, two) < 1e-6 * max(np.abs(one).max(), 1.0)
 
 
 # ------------------------------------------------------------------- against maps of the motion

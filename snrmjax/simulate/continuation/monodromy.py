@@ -1,0 +1,290 @@
+"""Monodromy matrices: what small disturbances of a periodic motion become over one period."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from snrmjax.model.effect_base import AbstractForce, AbstractHysteresis
+from snrmjax.model.library.friction import AbstractSliders
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import compiled
+
+_MOST_SEGMENTS = 256
+_SEGMENT = 32  # steps whose propagators, or kicks, are computed side by side
+_KICKS = 3  # for every step of Magnus' method
+_LEAST_KICKS = 240
+_GAUSS = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
+
+
+class _Memory(NamedTuple):
+    """Sliders' part in the linearised motion."""
+
+    stiffness: Float[Array, "point slider"]
+    dragged: Bool[Array, "step point slider"]
+
+
+@compiled
+def monodromy(
+    model: Structure,
+    coefficients: Float[Array, "point coefficient mode"],
+    frequency: Float[Array, " point"],
+    steps_per_cycle: Float[Array, ""],
+) -> Float[Array, "point state state"]:
+    """The linearised map of (δq, δq̇ over the fastest natural frequency) over one period.
+
+    NaN where more steps would be needed than any sensible motion needs.
+    """
+    if any(isinstance(effect, AbstractForce) for effect in model.effects):
+        return _by_magnus(model, coefficients, frequency, steps_per_cycle)
+    return _by_kicks(model, coefficients, frequency, steps_per_cycle)
+
+
+def _by_kicks(
+    model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: Array
+) -> Float[Array, "point state state"]:
+    """The map of a potential: oscillators that a varying stiffness kicks at equal intervals.
+
+    Between kicks every mode moves by itself with its own damping and mean tangent stiffness,
+    which is exact; the kicks hold what varies and what couples, K(t). With K − h²K²/12 in place of
+    K the map is that of a fourth-order method but for a change of coordinates, which its
+    eigenvalues do not see. Points lie along the last axis, so that one instruction works on
+    several.
+    Reference: Takahashi & Imada, J. Phys. Soc. Jpn. 53 (1984) 3765, doi:10.1143/JPSJ.53.3765;
+    López-Marcos, Sanz-Serna & Skeel, SIAM J. Sci. Comput. 18 (1997) 223,
+    doi:10.1137/S1064827595288085.
+    """
+    n, n_points, own = model.n_modes, frequency.shape[0], np.arange(model.n_modes)
+    terms = model.linear_terms()
+    orders = np.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
+    rows = jnp.moveaxis(coefficients, 0, 2).reshape(coefficients.shape[1], n * n_points)
+    per_mass = (terms.mass[:, None] * frequency**2)[:, None, :]
+
+    def stiffness(tau: Array) -> Float[Array, "time mode mode point"]:
+        """The nonlinear part of the tangent stiffness over mΩ²."""
+        angle = tau[:, None] * orders
+        waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=2).reshape(len(tau), -1)
+        q = (rows[0] + waves @ rows[1:]).reshape(len(tau), n, n_points)
+        return model.potential.stiffness_of_rows(jnp.moveaxis(q, 1, 0)) / per_mass
+
+    varying = stiffness(2 * jnp.pi * jnp.arange(48) / 48)
+    mean = jnp.mean(varying, axis=0)[own, own]
+    linear = terms.stiffness[:, None] / per_mass[:, 0]
+    rate = jnp.max(jnp.sum(jnp.abs(varying.at[:, own, own].add(linear)), axis=2))
+    kicks = jnp.maximum(_KICKS * steps_per_cycle * jnp.nan_to_num(jnp.sqrt(rate)), _LEAST_KICKS)
+    n_segments, step = _segments(kicks, _KICKS * _MOST_SEGMENTS)
+    speed = jnp.max(terms.stiffness / terms.mass) ** 0.5 / frequency  # of δq̇, over Ω
+    damping = terms.damping[:, None] / (terms.mass[:, None] * frequency)
+    stay, go, back, last = (
+        part[:, None] for part in _oscillation(linear + mean, damping, step, speed)
+    )
+
+    def kick(state: tuple, stiffness: Array) -> tuple[tuple, None]:
+        q, v = state
+        q, v = stay * q + go * v, back * q + last * v
+        return (q, v - sum(stiffness[:, j, None] * q[j] for j in range(n))), None
+
+    def segment(number: Array, state: tuple) -> tuple:
+        tau = (number * _SEGMENT + jnp.arange(_SEGMENT) + 0.5) * step
+        k = stiffness(tau).at[:, own, own].add(-mean)
+        square = sum(k[:, :, j, None] * k[:, None, j] for j in range(n))
+        return jax.lax.scan(kick, state, (k - step**2 / 12 * square) * (step / speed))[0]
+
+    eye = jnp.broadcast_to(jnp.eye(2 * n)[:, :, None], (2 * n, 2 * n, n_points))
+    found = jnp.concatenate(jax.lax.fori_loop(0, n_segments, segment, (eye[:n], eye[n:])))
+    return jnp.where(n_segments > 0, jnp.moveaxis(found, 2, 0), jnp.nan)
+
+
+def _segments(steps: Array, most: int) -> tuple[Array, Array]:
+    """So many segments of steps for one period, none when they are too many; and the step."""
+    needed = jnp.ceil(steps / _SEGMENT)
+    # A motion that needs more is so far off that its tangents overflow anyway.
+    n_segments = jnp.where(needed <= most, needed, 0).astype(int)
+    return n_segments, 2 * jnp.pi / (n_segments * _SEGMENT)
+
+
+def _oscillation(stiffness: Array, damping: Array, step: Array, speed: Array) -> tuple:
+    """(q, q̇/speed) after a step from either: y″ + damping y′ + stiffness y = 0, of any sign."""
+    squared = stiffness - 0.25 * damping**2
+    rate = jnp.sqrt(jnp.maximum(jnp.abs(squared), 1e-16))
+    swings = squared > 0
+    even = jnp.where(swings, jnp.cos(rate * step), jnp.cosh(rate * step))
+    odd = jnp.where(swings, jnp.sin(rate * step), jnp.sinh(rate * step)) / rate
+    left = jnp.exp(-0.5 * damping * step)
+    stay, last = even + 0.5 * damping * odd, even - 0.5 * damping * odd
+    return left * stay, left * odd * speed, -left * stiffness * odd / speed, left * last
+
+
+def _by_magnus(
+    model: Structure, coefficients: Array, frequency: Array, steps_per_cycle: Array
+) -> Float[Array, "point state state"]:
+    """The map of a structure whose forces depend on velocity or history, in small steps.
+
+    Magnus' method of order 6 with steps that resolve the fastest tangent frequency of all points.
+    The propagators of a segment of steps are computed side by side and then applied one after the
+    other.
+    Reference: Blanes, Casas & Ros, BIT 40 (2000) 434, Eq. (3.10), doi:10.1023/A:1022311628317.
+    """
+    n, j, n_points = model.n_modes, model.modes.mode_of_interest, frequency.shape[0]
+    terms = model.linear_terms()
+    begin, friction, memory = _sliders(model, coefficients, frequency)
+    phases = 2 * jnp.pi * jnp.arange(48)[:, None] / 48
+    k, c = _tangents(model, friction, coefficients, frequency, phases)
+    rate = jnp.sqrt(jnp.max(jnp.sum(jnp.abs(k), axis=-1)))
+    cycles = jnp.nan_to_num(jnp.maximum(rate, 0.5 * jnp.max(c)))
+    n_segments, step = _segments(jnp.maximum(steps_per_cycle * cycles, 512), _MOST_SEGMENTS)
+    unit = jnp.sqrt(jnp.max(terms.stiffness / terms.mass)) / frequency  # of δq̇, over Ω
+    size = 2 * n + (memory is not None)
+
+    def generators(start: Array, held: Array | None) -> Array:
+        """The matrices A of y' = A y at the Gauss points of a segment's steps."""
+        tau = start + step * (jnp.arange(_SEGMENT)[:, None] + _GAUSS).reshape(-1)
+        k, c = _tangents(model, friction, coefficients, frequency, begin + tau[:, None])
+        a = jnp.zeros((len(tau), n_points, size, size))
+        if memory is not None and held is not None:
+            per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
+            dragged = jnp.repeat(jnp.sum(jnp.where(held, 0.0, per_mass), axis=2), 3, axis=0)
+            k = k.at[:, :, j, j].add(-dragged)
+            a = a.at[:, :, n + j, 2 * n].set(1.0 / unit)
+        own = np.arange(n)
+        a = a.at[:, :, own, n + own].set(unit[:, None])
+        a = a.at[:, :, n : 2 * n, :n].set(-k / unit[:, None, None])
+        a = a.at[:, :, n + own, n + own].set(-c)
+        return a.reshape(_SEGMENT, 3, n_points, size, size)
+
+    def segment(number: Array, state: tuple) -> tuple:
+        held = None
+        if memory is not None:
+            index = (number * _SEGMENT + jnp.arange(_SEGMENT)) * len(memory.dragged)
+            held = ~memory.dragged[index // (n_segments * _SEGMENT)]
+        start = number * _SEGMENT * step
+        propagators = _magnus(generators(start, held), step)
+
+        def advance(state: tuple, item: tuple) -> tuple[tuple, None]:
+            y, z = state
+            propagator, stuck = item
+            if memory is None:
+                return (propagator @ y, z), None
+            per_mass = memory.stiffness / (terms.mass[j] * frequency**2)[:, None]
+            pull = jnp.sum(jnp.where(stuck, per_mass, 0.0)[:, :, None] * z, axis=1)
+            y = propagator[:, :-1, :-1] @ y + propagator[:, :-1, -1:] * pull[:, None, :]
+            return (y, jnp.where(stuck[:, :, None], z, y[:, j, None, :])), None
+
+        return jax.lax.scan(advance, state, (propagators, held))[0]
+
+    y = jnp.broadcast_to(jnp.eye(2 * n), (n_points, 2 * n, 2 * n))
+    z = jnp.zeros((n_points, 0, 2 * n))
+    if memory is not None:
+        slips = jnp.any(memory.dragged, axis=0)
+        z = jnp.where(slips[:, :, None], y[:, j, None, :], 0.0)
+    y, _ = jax.lax.fori_loop(0, n_segments, segment, (y, z))
+    return jnp.where(n_segments > 0, y, jnp.nan)
+
+
+def _magnus(
+    generators: Float[Array, "step gauss point state state"], step: Array
+) -> Float[Array, "step point state state"]:
+    """Propagators over steps from y' = A(t) y at their three Gauss points."""
+
+    def bracket(a: Array, b: Array) -> Array:
+        return a @ b - b @ a
+
+    first, middle, last = (step * generators[:, i] for i in range(3))
+    slope = np.sqrt(15.0) / 3.0 * (last - first)
+    bend = 10.0 / 3.0 * (last - 2 * middle + first)
+    inner = bracket(middle, slope)
+    outer = -bracket(middle, 2 * bend + inner) / 60.0
+    exponent = middle + bend / 12.0
+    exponent = exponent + bracket(-20.0 * middle - bend + inner, slope + outer) / 240.0
+    return _exponential(exponent)
+
+
+def _exponential(matrix: Float[Array, "*batch state state"]) -> Float[Array, "*batch state state"]:
+    """e^M by Taylor's series of order 9 of M/16 and squaring: exact to rounding for |M| up to 3."""
+    x = matrix / 16.0
+    x2 = x @ x
+    x3 = x2 @ x
+    eye = jnp.eye(matrix.shape[-1])
+    high = eye / 720 + x / 5040 + x2 / 40320 + x3 / 362880
+    result = (high @ x3 + (eye / 6 + x / 24 + x2 / 120)) @ x3 + (eye + x + x2 / 2)
+    for _ in range(4):
+        result = result @ result
+    return result
+
+
+def _sliders(
+    model: Structure, coefficients: Array, frequency: Array
+) -> tuple[Array, list, _Memory | None]:
+    """Where a period begins, friction without memory, and the sliders along the motions.
+
+    The period begins at the largest displacement: there every slider that slips at all is being
+    dragged, so that its position is no state of its own.
+    """
+    if not model.hysteretic:
+        return jnp.zeros_like(frequency), [], None
+    j, n_samples = model.modes.mode_of_interest, 512
+    tau = 2 * jnp.pi * jnp.arange(n_samples) / n_samples
+    every = jnp.broadcast_to(tau[:, None], (n_samples, len(frequency)))
+    q, v = (part[:, :, j] for part in _states_at(coefficients, frequency, every))
+    largest = jnp.argmax(q, axis=0)
+    half_range = 0.5 * (jnp.max(q, axis=0) - jnp.min(q, axis=0))
+    typical = jnp.sqrt(jnp.mean(v**2, axis=0))
+    turned = jax.vmap(lambda row, k: jnp.roll(row, -k), in_axes=(1, 0))(q, largest)
+    friction, stiffness, dragged = [], [], []
+    for effect in model.hysteretic:
+        scaled = jax.vmap(effect.scaled_for)(half_range, typical)
+        if isinstance(effect, AbstractSliders):
+            sliders = jax.vmap(lambda e: e.sliders())(scaled)
+            position = jax.vmap(lambda e, q: e.settled_states(q, q))(scaled, turned)
+            moved = position != jnp.roll(position, -1, axis=1)
+            stiffness.append(sliders.stiffness)
+            dragged.append(jnp.moveaxis(moved, 1, 0))
+        else:
+            friction.append(scaled)
+    memory = None
+    if stiffness:
+        memory = _Memory(jnp.concatenate(stiffness, axis=1), jnp.concatenate(dragged, axis=2))
+    return tau[largest], friction, memory
+
+
+def _tangents(
+    model: Structure, friction: list, coefficients: Array, frequency: Array, tau: Array
+) -> tuple[Float[Array, "time point mode mode"], Float[Array, "time point mode"]]:
+    """K/mΩ² and C/mΩ (by mode) of all points at phases τ (time,) or (time, point)."""
+    j, (n_points, _, n) = model.modes.mode_of_interest, coefficients.shape
+    terms = model.linear_terms()
+    q, v = _states_at(coefficients, frequency, jnp.broadcast_to(tau.T, (n_points, len(tau))).T)
+    flat_q, flat_v = q.reshape(-1, n), v.reshape(-1, n)
+    k = model.tangent_stiffness(flat_q, flat_v).reshape(*q.shape, n)
+    viscous = model.tangent_damping(flat_q, flat_v).reshape(q.shape[:2])
+    for effect in friction:
+        viscous = viscous + _viscous_slope(effect, q[..., j], v[..., j])
+    c = jnp.broadcast_to(terms.damping, q.shape).at[..., j].add(viscous)
+    per_mass = terms.mass * frequency[:, None]
+    k = (k + jnp.diag(terms.stiffness)) / (per_mass * frequency[:, None])[:, :, None]
+    return k, c / per_mass
+
+
+def _viscous_slope(
+    effects: AbstractHysteresis, q: Float[Array, "time point"], v: Float[Array, "time point"]
+) -> Float[Array, "time point"]:
+    """∂f/∂q̇ of friction without memory, one effect for every point."""
+
+    def slope(effect: AbstractHysteresis, q: Array, v: Array) -> Array:
+        return jax.grad(effect.state_force, argnums=1)(q, v, effect.initial_states())
+
+    return jax.vmap(lambda q, v: jax.vmap(slope)(effects, q, v))(q, v)
+
+
+def _states_at(coefficients: Array, frequency: Array, tau: Array) -> tuple[Array, Array]:
+    """q and q̇ of all points at phases τ (time, point), as (time, point, mode)."""
+    orders = jnp.arange(1, (coefficients.shape[1] - 1) // 2 + 1)
+    angle = tau[..., None] * orders
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    mean, a, b = coefficients[:, 0], coefficients[:, 1::2], coefficients[:, 2::2]
+    q = mean + jnp.einsum("tph,phm->tpm", cosine, a) + jnp.einsum("tph,phm->tpm", sine, b)
+    rate = jnp.einsum("tph,phm->tpm", cosine, orders[:, None] * b)
+    rate = rate - jnp.einsum("tph,phm->tpm", sine, orders[:, None] * a)
+    return q, frequency[:, None] * rate
