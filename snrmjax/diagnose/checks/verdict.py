@@ -21,6 +21,7 @@ from snrmjax.diagnose.checks.probabilities import (
     UNKNOWN,
     considered_answers,
     probabilities_of,
+    without_effects,
 )
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
@@ -142,6 +143,8 @@ def judge(
        about equally well.
     7. `named`: none of these.
 
+    Answers that rules 4 and 5 refute leave their probability to `unknown`.
+
     Arguments: `located` are the parts of the misfit before any effect was named; `levels` are
     None where there are too few to leave one out.
     """
@@ -157,6 +160,7 @@ def judge(
     if verdict.is_answer and open_questions:
         refuted = any(doubt.refutes for doubt in open_questions)
         verdict = Verdict.UNKNOWN if refuted else Verdict.AMBIGUOUS
+        probabilities = without_effects(probabilities) if refuted else probabilities
     if levels is None or not verdict.is_answer:
         return Judgement(verdict, reasons, tuple(open_questions), probabilities)
     missed = refuted_by_levels(
@@ -166,8 +170,8 @@ def judge(
         parts_missing=bool(found.misfit.predictions.chosen.phase_unknown[:, 0].any()),
     )
     if missed is not None:
-        reasons = (missed, *reasons)
-        return Judgement(Verdict.UNKNOWN, reasons, tuple(open_questions), probabilities)
+        reasons, left = (missed, *reasons), without_effects(probabilities)
+        return Judgement(Verdict.UNKNOWN, reasons, tuple(open_questions), left)
     unproved = unproved_beyond(levels.outer)
     if unproved is not None:
         verdict, reasons = Verdict.AMBIGUOUS, (*reasons, unproved.reason)
@@ -180,10 +184,9 @@ def judge_fit(
 ) -> Judgement:
     """The verdict by what the fit leaves alone: rules 1 to 3 of `judge`, else 6 or 7.
 
-    Where no noise is stated, what an answer leaves counts as noise: only what is improbable even
-    so speaks against it.
+    Where no noise is stated, the probabilities take what the answer leaves for it, and decide by
+    the same rules: a misfit with a pattern is no noise of any size.
     """
-    stated = found.misfit.predictions.chosen.noise_stated
     improbable = found.p_value < UNLIKELY
     structure = pattern(found.misfit, found.fit) if improbable else None
     of_noise = probabilities.get(NOISE_REJECTED, 0.0)
@@ -192,7 +195,7 @@ def judge_fit(
         return Judgement(Verdict.NOISE_REJECTED, (reason,), (), probabilities)
     # Of misfits with a pattern the size is not that of noise.
     wrong = probabilities.get(UNKNOWN, 0.0) + (of_noise if structure is not None else 0.0)
-    if wrong >= _NO_ANSWER if stated else improbable:
+    if wrong >= _NO_ANSWER:
         reasons = _of_misfit(found, neighbours, structure)
         return Judgement(Verdict.UNKNOWN, reasons, (), probabilities)
     if not found.fit.kinds:

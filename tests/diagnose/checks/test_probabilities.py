@@ -8,14 +8,21 @@ from scipy.stats import norm
 from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
+from snrmjax.diagnose.checks.cross_validation import HeldOut, HeldOutLevels
 from snrmjax.diagnose.checks.probabilities import (
     ConsideredAnswer,
     answer_name,
     log_evidence,
     probabilities_of,
 )
+from snrmjax.diagnose.checks.verdict import NeighbourNoise, judge
 from snrmjax.diagnose.diagnosis_result import probability_in_words
+from snrmjax.diagnose.misfit.candidates import candidate
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.diagnose.search.evidence import Marginal
+from snrmjax.diagnose.search.model_search import FoundEffects
 
 
 def diagnosed(law, **settings):
@@ -72,6 +79,20 @@ def test_the_answer_given_has_the_probability_of_its_classes(damped):
     assert wider.probability == pytest.approx(both)
     unknown = dataclasses.replace(damped, verdict=sj.diagnose.Verdict.UNKNOWN)
     assert unknown.probability == own["unknown"]
+
+
+def test_an_answer_that_a_level_refutes_leaves_its_probability_to_unknown():
+    """The evidence of an answer knows nothing of a level that was left out of the fit."""
+    misfit = weighted_misfit(predictions_of(linear_model(), balanced(quadratic)))
+    kind = "quadratic_damping"
+    fit = fit_effect(misfit, candidate(kind, scales_of(misfit.predictions)))
+    found = FoundEffects(misfit, fit, baseline_fit(misfit), ((kind,),), ())
+    predicted, missed = HeldOut(3, 6.0, 1.0, 0.5, 0.5), HeldOut(3, 6.0, 4.0, 1e-9, 1e-9)
+    for level, verdict in ((predicted, "ambiguous"), (missed, "unknown")):
+        judged = judge(found, NeighbourNoise(1.0, 0.2), (), HeldOutLevels(level, level))
+        assert judged.verdict == verdict
+        assert judged.probabilities.get(kind, 0.0) > 0.5 or verdict == "unknown"
+        assert judged.probabilities["unknown"] > 0.99 or verdict == "ambiguous"
 
 
 def test_where_nothing_is_missing_that_is_the_most_probable():

@@ -122,8 +122,19 @@ def test_a_fit_beside_which_a_free_curve_explains_something_is_none():
     assert verdict == "unknown"
     assert "order of the test" in reasons[0]
     assert verdict_on(misfit, noise(1)).verdict == "none"
-    misfit.predictions.chosen.noise_stated = False  # then it counts as noise
-    assert verdict_on(misfit, noise(1) + jump).verdict == "none"
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_verdict_and_probabilities_agree_whether_noise_is_stated_or_not(stated):
+    """A wave along the levels is no noise of any size; noise without order is one of any."""
+    misfit = misfit_of()
+    misfit.predictions.chosen.noise_stated = stated
+    for size, unknown in ((0.0, False), (1.5, True)):
+        rows = noise(2) + size * np.repeat(np.sin(np.pi * ANGLE), 2)
+        # Where nothing is stated the search hands over misfits of the size of the noise.
+        rows = rows if stated else rows / np.sqrt(np.mean(rows**2))
+        verdict, _, _, probabilities = verdict_on(misfit, rows)
+        assert (verdict == "unknown") == (probabilities["unknown"] > 0.9) == unknown
 
 
 def test_what_neighbours_in_the_test_share_is_no_noise():
