@@ -12,10 +12,14 @@ from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undetermined
+from snrmjax.model.library.confusions import SIZE_OF_RESPONSE
+from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
 
 _MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
 _PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
 _MOVED_GAIN = 0.05  # of its logarithm, by which a right law moves a gain that smooth curves gave
+_LIKE_MASS = ("force_gain_error", "sensor_gain_error")
+_FAR_MASS = 3.0  # of 1σ of a modal mass of which none is stated, beyond which it is no reason
 _FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
 
 
@@ -33,6 +37,15 @@ def gain_found(misfit: WeightedMisfit, fit: EffectFit) -> GainFound | None:
     if prior == 0:
         return None
     value = 1 + prior * float(misfit.noise.shared_errors(fit.rows)[place])
+    std = prior * _shared_std(misfit, fit, place)
+    phase = np.angle(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
+    known_phase = ~misfit.predictions.chosen.phase_unknown[:, 0]
+    farthest = float(np.max(np.abs(phase[known_phase]), initial=0.0))
+    return GainFound(value, std / max(abs(value), 1e-12), farthest)
+
+
+def _shared_std(misfit: WeightedMisfit, fit: EffectFit, place: int) -> float:
+    """1σ that the data leave a shared error, in units of its prior's, beside an answer."""
     columns = np.concatenate([fit.slopes, misfit.noise.shared], axis=1)
     known = np.append(np.zeros(fit.slopes.shape[1]), np.ones(misfit.noise.shared.shape[1]))
     size = np.linalg.norm(np.vstack([columns, np.diag(known)]), axis=0)
@@ -40,11 +53,48 @@ def gain_found(misfit: WeightedMisfit, fit: EffectFit) -> GainFound | None:
     scaled = columns / size
     covariance = np.linalg.pinv(scaled.T @ scaled + np.diag(known / size**2), hermitian=True)
     at = fit.slopes.shape[1] + place
-    std = prior * float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
-    phase = np.angle(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
-    known_phase = ~misfit.predictions.chosen.phase_unknown[:, 0]
-    farthest = float(np.max(np.abs(phase[known_phase]), initial=0.0))
-    return GainFound(value, std / max(abs(value), 1e-12), farthest)
+    return float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
+
+
+class ModalMassFound(NamedTuple):
+    """The modal mass that an answer leaves, where the model states its error, in kg."""
+
+    value: float
+    std: float
+    model: float
+    stated_std: float  # relative
+
+
+def modal_mass_found(misfit: WeightedMisfit, fit: EffectFit) -> ModalMassFound | None:
+    """The modal mass as seen from force and sensor; None where the model states no error of it."""
+    modes, sensor = misfit.model.modes, misfit.predictions.chosen.sensors[0]
+    j = modes.mode_of_interest
+    name = f"mode_{j + 1}.participation"
+    if name not in misfit.predictions.stated:
+        return None
+    place = list(misfit.predictions.stated).index(name)
+    own, prior = misfit.predictions.stated[name]
+    step = float(misfit.noise.shared_errors(fit.rows)[place])
+    model = 1 / abs(float(modes.mode_shape[sensor, j]) * own)
+    mass = model * own / (own + prior * step)
+    relative = prior / abs(own)
+    return ModalMassFound(mass, mass * relative * _shared_std(misfit, fit, place), model, relative)
+
+
+def notes_on_modal_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
+    """That the data ask for another modal mass than the model's, inside its stated error."""
+    found = modal_mass_found(misfit, fit)
+    if found is None or abs(found.value - found.model) <= _PULLED * found.std:
+        return ()
+    beyond = ""
+    if abs(found.value / found.model - 1) > _PULLED * found.stated_std:
+        beyond = ", which is farther than that: check the linear test"
+    return (
+        f"the data say that the modal mass is {found.value:.4g} ± {found.std:.2g} kg; the model "
+        f"has {found.model:.4g} kg (1σ stated: {100 * found.stated_std:.2g} %){beyond}. A gain of "
+        "the force or of the sensor does the same, so that none of that size can be told from it: "
+        "calibrate both statically, or repeat a level with a known added mass.",
+    )
 
 
 def with_answer_checked(
@@ -54,13 +104,15 @@ def with_answer_checked(
 
     `unknown` where the gain of the force is not determined or has moved far from its first value,
     or where the completed model needs other forces than acted for the motions that were measured;
-    `ambiguous` where an effect's strength is smaller than its own 1σ.
+    `ambiguous` where an effect's strength is smaller than its own 1σ, or where a gain stands for
+    what an error of the modal mass, of which none is stated, could be as well.
 
     Arguments: `std` of the effects' parameters by name. Verdicts that give no answer stay.
     """
     if not judgement.verdict.is_answer:
         return judgement
     every = [_on_gain(misfit, fit), _on_forces(misfit, fit), *_on_strengths(fit, std)]
+    every += _on_modal_mass(misfit, fit)
     found = [one for one in every if one is not None]
     refuted = [one for one in found if one.refutes]
     if refuted:
@@ -146,7 +198,7 @@ def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[
     pulled = [
         f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}"
         for (name, (_, std)), step in zip(misfit.predictions.stated.items(), moved, strict=False)
-        if abs(step) > _PULLED
+        if abs(step) > _PULLED and not name.endswith(".participation")  # said of the modal mass
     ]
     if not pulled:
         return ()
@@ -154,6 +206,30 @@ def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[
         f"the answer moves {', '.join(pulled)}, as the model states it: check the linear test, or "
         "whether it was of another assembly.",
     )
+
+
+def _on_modal_mass(misfit: WeightedMisfit, fit: EffectFit) -> list[Doubt]:
+    """That a gain of force or sensor does what a wrong modal mass of the model does.
+
+    Where the model states the mass's error the fit has it, and a gain beyond that is one.
+    """
+    modes, found = misfit.model.modes, []
+    sensor, j = misfit.predictions.chosen.sensors[0], modes.mode_of_interest
+    mass = 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
+    values = dict(zip(fit.labels, fit.values.tolist(), strict=True))
+    for kind in fit.kinds if modes.modal_mass_std is None else ():
+        gain = values[parameter_labels(kind)[0]]
+        if kind not in _LIKE_MASS or abs(np.log1p(gain)) > _FAR_MASS * UNSTATED_MODAL_MASS_STD:
+            continue
+        found.append(
+            Doubt(
+                f"{kind} of {gain:+.2g} may be the modal mass: with {mass / (1 + gain):.4g} kg in "
+                f"place of the model's {mass:.4g} kg, of which no error is stated "
+                "(`modal_mass_std`), the model needs no such effect.",
+                SIZE_OF_RESPONSE.separated_by,
+            )
+        )
+    return found
 
 
 def _on_strengths(fit: EffectFit, std: Mapping[str, float]) -> list[Doubt]:

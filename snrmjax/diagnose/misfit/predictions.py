@@ -255,10 +255,25 @@ def predictions_of(
         own_columns=own_columns,
         level_numbers=np.asarray(data.level)[chosen.rows],
         force_gain_std=force_gain_std,
-        stated={name: (numbers[name], std) for name, std in stated_stds(model).items()},
+        stated={
+            name: (numbers[name], std)
+            for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
+        },
         group=_all_effects(model, _scales(model, chosen)),
         motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
     )
+
+
+def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
+    """1σ of the participation by the stated one of the modal mass 1/(Φ_r Φᵀb).
+
+    Beside a gain of all forces that is free the modal mass is one with it, and so the model's.
+    """
+    modes, j = model.modes, model.modes.mode_of_interest
+    if modes.modal_mass_std is None or force_gain_std > 0:
+        return {}
+    std = abs(float(modes.participation[j])) * float(modes.modal_mass_std[j])
+    return {f"mode_{j + 1}.participation": std} if std > 0 else {}
 
 
 def _all_effects(baseline: Structure, scales: MotionScales) -> Group:
