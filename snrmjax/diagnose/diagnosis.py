@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from snrmjax.diagnose.checks.answer_checks import (
     gain_found,
-    notes_on_modal_mass,
+    notes_on_found_mass,
     notes_on_stated_parameters,
     with_answer_checked,
 )
@@ -175,7 +175,7 @@ def diagnose_model(
     chosen = misfit.predictions.chosen
     phase = np.angle(np.asarray(chosen.states.velocity)[:, 0])
     notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
-    notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_modal_mass(misfit, fit)]
+    notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_found_mass(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
     notes += _notes_on_fits(found, unconverged)
     diagnosis = Diagnosis(

@@ -12,13 +12,13 @@ from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undetermined
-from snrmjax.model.library.confusions import SIZE_OF_RESPONSE
+from snrmjax.model.effects import EFFECTS
+from snrmjax.model.library.confusions import FORCE_OR_SENSOR_GAIN, SIZE_OF_RESPONSE
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
 
 _MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
 _PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
 _MOVED_GAIN = 0.05  # of its logarithm, by which a right law moves a gain that smooth curves gave
-_LIKE_MASS = ("force_gain_error", "sensor_gain_error")
 _FAR_MASS = 3.0  # of 1σ of a modal mass of which none is stated, beyond which it is no reason
 _FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
 
@@ -81,7 +81,7 @@ def modal_mass_found(misfit: WeightedMisfit, fit: EffectFit) -> ModalMassFound |
     return ModalMassFound(mass, mass * relative * _shared_std(misfit, fit, place), model, relative)
 
 
-def notes_on_modal_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
+def notes_on_found_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
     """That the data ask for another modal mass than the model's, inside its stated error."""
     found = modal_mass_found(misfit, fit)
     if found is None or abs(found.value - found.model) <= _PULLED * found.std:
@@ -218,8 +218,10 @@ def _on_modal_mass(misfit: WeightedMisfit, fit: EffectFit) -> list[Doubt]:
     mass = 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
     values = dict(zip(fit.labels, fit.values.tolist(), strict=True))
     for kind in fit.kinds if modes.modal_mass_std is None else ():
+        if FORCE_OR_SENSOR_GAIN not in EFFECTS[kind].confusions:
+            continue
         gain = values[parameter_labels(kind)[0]]
-        if kind not in _LIKE_MASS or abs(np.log1p(gain)) > _FAR_MASS * UNSTATED_MODAL_MASS_STD:
+        if abs(np.log1p(gain)) > _FAR_MASS * UNSTATED_MODAL_MASS_STD:
             continue
         found.append(
             Doubt(

@@ -9,7 +9,7 @@ from truths.balanced_sets import balanced, linear_model
 import snrmjax as sj
 from snrmjax.diagnose.checks.answer_checks import (
     modal_mass_found,
-    notes_on_modal_mass,
+    notes_on_found_mass,
     with_answer_checked,
 )
 from snrmjax.diagnose.checks.verdict import Judgement, Verdict
@@ -57,20 +57,20 @@ def test_a_stated_error_lets_the_data_find_it():
     left, missed = misfit.chi_square(fit.rows), certain.chi_square(baseline_fit(certain).rows)
     assert left < 1.5 * misfit.n_rows
     assert missed > left + 50
-    (note,) = notes_on_modal_mass(misfit, fit)
+    (note,) = notes_on_found_mass(misfit, fit)
     assert "stated: 5 %" in note
     assert "gain of the force or of the sensor does the same" in note
 
 
 def test_a_breach_of_the_stated_error_is_said():
     misfit = misfit_of(0.02)
-    (note,) = notes_on_modal_mass(misfit, baseline_fit(misfit))
+    (note,) = notes_on_found_mass(misfit, baseline_fit(misfit))
     assert "check the linear test" in note
 
 
 def test_the_right_mass_and_a_free_gain_take_no_word():
     misfit = misfit_of(0.05, wrong=1.0)
-    assert notes_on_modal_mass(misfit, baseline_fit(misfit)) == ()
+    assert notes_on_found_mass(misfit, baseline_fit(misfit)) == ()
     # A free gain of all forces is one with the mass: only one of them is free.
     free = misfit_of(0.05, force_gain_std=1.0)
     assert modal_mass_found(free, baseline_fit(free)) is None
