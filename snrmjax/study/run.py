@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from snrmjax.study.chunks import (
+    PLAN,
     FoundChunks,
     StudyFolder,
     found_chunks,
@@ -82,6 +83,7 @@ class RunSettings(NamedTuple):
     shard: Shard | None = None
     progress: ProgressReport | None = None  # called after each chunk
     expected: Callable[[Expected], None] | None = None  # called after the first chunk
+    workers: AbstractWorkers | None = None  # your own, in place of processes or a scheduler
 
 
 HERE = RunSettings()
@@ -121,10 +123,10 @@ def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings =
     folder = StudyFolder(Path(os.path.abspath(out)))
     _check_settings(settings)
     begin = time.perf_counter()
+    if is_collected(folder, described):
+        return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
     with _locked(folder, settings.shard):
         _claim(folder, described)
-        if is_collected(folder, described):
-            return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
         job = Job(plan, folder, fingerprint(described))
         found = found_chunks(folder, job.fingerprint, study.n_chunks)
         remove_leftovers(folder, found)
@@ -196,6 +198,8 @@ def _announce(job: Job, settings: RunSettings, state: Progress, seconds: float, 
 
 
 def _workers(settings: RunSettings, n_chunks: int) -> AbstractWorkers:
+    if settings.workers is not None:
+        return settings.workers
     if settings.scheduler is not None:
         return DaskCluster(settings.scheduler)
     return LocalProcesses(min(settings.processes or len(available_cores()), n_chunks))
@@ -215,9 +219,9 @@ def _check_settings(settings: RunSettings) -> None:
 def _claim(folder: StudyFolder, described: dict) -> None:
     """Make the folder this study's, or see that it is."""
     known = read_study_plan(folder) or stored_description(folder)
+    if folder.out.exists() and not (folder.out / ".zgroup").exists():
+        raise ValueError(f"{folder.out} is there already and no data set of a study.")
     if known is None:
-        if folder.out.exists():
-            raise ValueError(f"{folder.out} is there already and no data set of a study.")
         with _words_for_disk(folder):
             write_study_plan(folder, described)
         return
@@ -241,25 +245,20 @@ def _locked(folder: StudyFolder, shard: Shard | None) -> Iterator[None]:
 
     made = not folder.work.exists()
     name = ".lock" if shard is None else f".lock-{shard.part}-of-{shard.parts}"
-    try:
-        with _words_for_disk(folder):
-            folder.work.mkdir(parents=True, exist_ok=True)
+    with _words_for_disk(folder):
+        folder.work.mkdir(parents=True, exist_ok=True)
+        try:
             lock = FileLock(folder.work / name, timeout=0).acquire()
-    except Timeout as error:
-        raise ValueError(
-            f"another process is at work on {folder.out}: wait until it ends."
-        ) from error
+        except Timeout as error:  # before it is taken for an error of the disk, which it is too
+            raise ValueError(
+                f"another process is at work on {folder.out}: wait until it ends."
+            ) from error
     with lock:
         try:
             yield
         finally:
-            if made and read_plan_exists(folder) is False:
+            if made and not (folder.work / PLAN).exists():
                 shutil.rmtree(folder.work, ignore_errors=True)
-
-
-def read_plan_exists(folder: StudyFolder) -> bool:
-    """Whether a plan was written."""
-    return (folder.work / "plan.json").exists()
 
 
 @contextmanager

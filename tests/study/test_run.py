@@ -1,0 +1,262 @@
+"""Runs of whole studies in this process: what is computed, kept, refused and mended."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+import snrmjax as sj
+from snrmjax.study.run import RunSettings, Shard
+from snrmjax.study.worker import LOST
+from snrmjax.study.workers import WorkerDied
+
+from .conftest import InThisProcess, peak_velocity
+
+DAMPING = np.linspace(0.01, 0.03, 7)
+
+
+def here(**settings):
+    return RunSettings(workers=settings.pop("workers", InThisProcess()), **settings)
+
+
+def identical(one, other):
+    """Whether two folders have the same files with the same bytes."""
+    return subprocess.run(["diff", "-r", one, other], check=False).returncode == 0
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, request):
+    """A study that nothing disturbed."""
+    study = request.getfixturevalue("study_of_module")
+    out = tmp_path_factory.mktemp("study") / "study.zarr"
+    sj.study.run_study(study, out, here())
+    return out
+
+
+@pytest.fixture(scope="module")
+def study_of_module(linear_model, linear_peaks):
+    return sj.study.Study(
+        "damping of a linear mode",
+        linear_model,
+        linear_peaks([0.5]),
+        (sj.study.ranged("mode_1.damping_ratio", 0.01, 0.03, 7),),
+        members_a_chunk=3,
+    )
+
+
+def copied(finished, folder, *, with_data_set=True):
+    """A copy of a finished study, or of its parts alone."""
+    out = folder / finished.name
+    shutil.copytree(f"{finished}.parts", f"{out}.parts")
+    if with_data_set:
+        shutil.copytree(finished, out)
+    return out
+
+
+def chunk_files(out):
+    return sorted((out.parent / f"{out.name}.parts" / "chunks").glob("*.npz"))
+
+
+def test_every_member_has_the_peak_of_its_own_damping(finished):
+    data = sj.study.open_study(finished)
+    np.testing.assert_allclose(data["mode_1.damping_ratio"], DAMPING, rtol=1e-15)
+    assert set(data.status.values.tolist()) == {"upper_end"}
+    # Located peaks are polished by Newton's method; velocity is largest at the natural frequency.
+    np.testing.assert_allclose(data.peak_velocity_m_s, peak_velocity(0.5, DAMPING), rtol=1e-9)
+    np.testing.assert_allclose(data.peak_frequency_hz, 50.0, rtol=1e-6)
+    np.testing.assert_allclose(data.resonance_frequency_hz, 50.0, rtol=1e-9)
+    assert data.attrs["snrmjax_version"]
+    assert data.peak_velocity_m_s.attrs["units"] == "m/s"
+
+
+def test_several_forces_are_a_dimension(linear_model, linear_peaks, tmp_path):
+    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.02]),)
+    study = sj.study.Study("forces", linear_model, linear_peaks([0.5, 1.0, 2.0]), varied)
+    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    assert dict(data.sizes) == {"member": 2, "force_n": 3, "fold": 0}
+    expected = peak_velocity(np.array([0.5, 1.0, 2.0]), np.array([[0.01], [0.02]]))
+    np.testing.assert_allclose(data.peak_velocity_m_s, expected, rtol=1e-9)
+
+
+def test_force_and_frequency_in_hertz_vary_together(linear_model, linear_peaks, tmp_path):
+    varied = (
+        sj.study.listed("force_n", [0.5, 1.0]),
+        sj.study.listed("mode_1.frequency_hz", [48.0, 52.0]),
+    )
+    sampling = sj.study.Sampling("list")
+    study = sj.study.Study("both", linear_model, linear_peaks(), varied, sampling)
+    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    np.testing.assert_allclose(data.resonance_frequency_hz, [48.0, 52.0], rtol=1e-9)
+    expected = peak_velocity(np.array([0.5, 1.0]), 0.02) * 50 / np.array([48.0, 52.0])
+    np.testing.assert_allclose(data.resonance_velocity_m_s, expected, rtol=1e-9)
+
+
+def test_curves_are_ragged_rows_that_members_point_to(linear_model, study_of_module, tmp_path):
+    within = study_of_module.computation.within
+    forces = study_of_module.computation.forces
+    curves = sj.study.Curves(within, forces)
+    varied = (sj.study.listed("mode_1.damping_ratio", [0.01, 0.03]),)
+    study = sj.study.Study("curves", linear_model, curves, varied, members_a_chunk=1)
+    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    for k, damping in enumerate((0.01, 0.03)):
+        begin, n = int(data.first_point[k]), int(data.n_points[k])
+        rows = slice(begin, begin + n)
+        omega = 2 * np.pi * data.point_frequency_hz.values[rows]
+        own = 2 * np.pi * 50.0
+        linear = 1j * omega * 0.5 * 6.0 / (own**2 - omega**2 + 2j * damping * own * omega)
+        measured = data.point_velocity_re_m_s + 1j * data.point_velocity_im_m_s
+        # Points between events are corrected to `StepControl.tolerance`.
+        np.testing.assert_allclose(measured.values[rows], linear, rtol=1e-6)
+    assert int(data.n_points.sum()) == data.sizes["point"]
+
+
+def test_what_is_there_is_not_computed_again(study_of_module, finished, tmp_path):
+    out, workers = copied(finished, tmp_path), InThisProcess()
+    again = sj.study.run_study(study_of_module, out, here(workers=workers))
+    assert again.complete
+    assert (again.computed, workers.done) == (0, [])
+
+
+@pytest.mark.parametrize("harm", ["flip", "cut", "foreign", "temporary"])
+def test_a_damaged_chunk_is_found_and_computed_again(study_of_module, finished, tmp_path, harm):
+    out = copied(finished, tmp_path, with_data_set=False)
+    file = chunk_files(out)[1]
+    content = file.read_bytes()
+    if harm == "flip":
+        file.write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
+    elif harm == "cut":
+        file.write_bytes(content[:-10])
+    elif harm == "foreign":
+        file.rename(file.with_name(f"00000001-{'0' * 16}-{file.name[26:]}"))
+    else:
+        file.rename(file.with_name(".abc.tmp"))
+    workers = InThisProcess()
+    again = sj.study.run_study(study_of_module, out, here(workers=workers))
+    assert (again.computed, workers.done) == (3, ["compute_chunk"])
+    assert identical(finished, out)
+    assert len(list(chunk_files(out)[0].parent.iterdir())) == 3
+
+
+def test_a_damaged_data_set_is_made_again_from_its_chunks(study_of_module, finished, tmp_path):
+    out, workers = copied(finished, tmp_path), InThisProcess()
+    file = out / "peak_velocity_m_s" / "0"
+    file.write_bytes(file.read_bytes()[:-1] + b"x")
+    sj.study.run_study(study_of_module, out, here(workers=workers))
+    assert workers.done == []
+    assert identical(finished, out)
+
+
+def test_shards_make_the_same_data_set(study_of_module, finished, tmp_path):
+    out = tmp_path / finished.name
+    first = sj.study.run_study(study_of_module, out, here(shard=Shard(2, 2)))
+    assert not first.complete
+    assert first.missing_chunks == 2
+    with pytest.raises(ValueError, match="is not complete"):
+        first.open()
+    assert sj.study.run_study(study_of_module, out, here(shard=Shard(1, 2))).complete
+    assert identical(finished, out)
+
+
+def test_a_chunk_whose_process_dies_by_chance_is_computed(study_of_module, finished, tmp_path):
+    deaths = iter([True, False, True, True, False, False])
+
+    def before(function, *arguments):
+        if next(deaths, False):
+            raise WorkerDied("killed")
+
+    out = tmp_path / finished.name
+    sj.study.run_study(study_of_module, out, here(workers=InThisProcess(before)))
+    assert identical(finished, out)
+
+
+def test_a_member_that_kills_its_process_is_a_row_with_a_status(study_of_module, tmp_path):
+    def before(function, planned, *rest):
+        numbers = rest[0] if function.__name__ == "computed_rows" else planned.rows_of(rest[1])
+        if 4 in numbers:
+            raise WorkerDied("killed")
+
+    run = sj.study.run_study(
+        study_of_module, tmp_path / "s.zarr", here(workers=InThisProcess(before))
+    )
+    data = run.open()
+    assert run.failed == 1
+    assert data.status.values[4] == LOST
+    assert np.isnan(data.peak_velocity_m_s[4])
+    others = np.arange(7) != 4
+    expected = peak_velocity(0.5, DAMPING[others])
+    np.testing.assert_allclose(data.peak_velocity_m_s[others], expected, rtol=1e-9)
+
+
+def test_another_study_is_refused_with_what_differs(linear_model, linear_peaks, finished, tmp_path):
+    out = copied(finished, tmp_path)
+    varied = (sj.study.ranged("mode_1.damping_ratio", 0.01, 0.03, 7),)
+    other = sj.study.Study(
+        "damping of a linear mode", linear_model, linear_peaks([0.6]), varied, members_a_chunk=3
+    )
+    with pytest.raises(ValueError, match=r"forces\.values\[0\]` is 0.6 here and 0.5 in the store"):
+        sj.study.run_study(other, out, here())
+    assert identical(finished, out)
+
+
+def test_another_version_is_refused(study_of_module, finished, tmp_path, monkeypatch):
+    out = copied(finished, tmp_path)
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "99")
+    with pytest.raises(ValueError, match=r"versions\.jax` is '99' here"):
+        sj.study.run_study(study_of_module, out, here())
+
+
+def test_one_process_at_a_time(study_of_module, finished, tmp_path):
+    out = copied(finished, tmp_path, with_data_set=False)
+    with (
+        FileLock(f"{out}.parts/.lock"),
+        pytest.raises(ValueError, match="another process is at work"),
+    ):
+        sj.study.run_study(study_of_module, out, here())
+
+
+def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finished, tmp_path):
+    def before(function, planned, folder, number, identity):
+        if number == 2:
+            raise OSError(28, "No space left on device")
+
+    out = tmp_path / finished.name
+    with pytest.raises(ValueError, match=r"No space left on device\. What is done stays"):
+        sj.study.run_study(study_of_module, out, here(workers=InThisProcess(before)))
+    workers = InThisProcess()
+    sj.study.run_study(study_of_module, out, here(workers=workers))
+    assert workers.done == ["compute_chunk"]
+    assert identical(finished, out)
+
+
+def test_a_folder_that_is_no_study_is_left_alone(study_of_module, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    with pytest.raises(ValueError, match="no data set of a study"):
+        sj.study.run_study(study_of_module, tmp_path / "mine", here())
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_without_its_chunks_the_data_set_stands_alone(study_of_module, finished, tmp_path):
+    out, workers = copied(finished, tmp_path), InThisProcess()
+    sj.study.discard_chunks(out)
+    assert not (tmp_path / f"{out.name}.parts").exists()
+    assert sj.study.run_study(study_of_module, out, here(workers=workers)).complete
+    assert workers.done == []
+
+
+def test_a_model_may_be_made_of_other_numbers(linear_model, linear_peaks, tmp_path):
+    varied = (sj.study.listed("loss_factor", [0.02, 0.08]),)
+    study = sj.study.Study(
+        "loss factor", linear_model, linear_peaks([0.5]), varied, model_of=of_loss_factor
+    )
+    data = sj.study.run_study(study, tmp_path / "s.zarr", here()).open()
+    expected = peak_velocity(0.5, np.array([0.01, 0.04]))
+    np.testing.assert_allclose(data.peak_velocity_m_s, expected, rtol=1e-9)
+
+
+def of_loss_factor(values):
+    """A structure of its loss factor, which is twice the damping ratio."""
+    modes = sj.model.linear_modes([2 * np.pi * 50], [values["loss_factor"] / 2], [[2.0]], [3.0])
+    return sj.model.structure(modes)
