@@ -70,6 +70,22 @@ def test_the_covariance_is_that_of_repeated_straight_lines():
     np.testing.assert_allclose(found, np.cov(fits), rtol=0.05, atol=0.02 * found.max())
 
 
+@pytest.mark.parametrize("counted", [1.0, 0.5, 0.3])
+def test_states_that_count_for_less_have_the_covariance_of_what_correlates_them(counted):
+    at, rho = np.linspace(-1, 1, 40), 0.8
+    jacobian = np.stack([np.ones(40), at], axis=1)
+    along = rho ** np.abs(np.arange(40)[:, None] - np.arange(40))
+    solve = np.linalg.pinv(jacobian)
+    wanted = solve @ along @ solve.T  # whatever a fit counted its states for
+    # A share of the states: rows whitened with a noise that is larger by 1/√share.
+    scaled = np.sqrt(counted) * jacobian
+    inverse = np.linalg.inv(scaled.T @ scaled)
+    given = (np.linalg.cholesky(inverse), scaled[:, None, :], np.array([rho]), [np.arange(40)])
+    found = inverse + added_covariance(*given, counted)
+    # A constant and a slope vary by 6 to 9 times what white noise does: no share is above that.
+    np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-12)
+
+
 def test_no_band_becomes_narrower():
     jacobian = np.vander(np.linspace(-1, 1, 25), 5)
     inverse = np.linalg.inv(jacobian.T @ jacobian)

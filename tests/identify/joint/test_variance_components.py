@@ -56,6 +56,22 @@ def test_scatter_that_is_there_is_found_without_bias():
     assert np.mean([f.noise for f in found]) == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.parametrize("copies", [2, 4])
+def test_rows_that_are_repeated_tell_nothing_more(copies):
+    problem, index = sample(5, shared=0.02)
+    alone = estimated_components(problem, index)
+    repeated = problem._replace(
+        residuals=np.repeat(problem.residuals, copies),
+        slopes=np.repeat(problem.slopes, copies, axis=0),
+    )
+    found = estimated_components(repeated, index, independent=1 / copies)
+    # The search ends at 1e-2; the two unknowns of the curve are two of 240 rows, or of more.
+    assert found.level == pytest.approx(alone.level, rel=2e-2)
+    assert found.noise == pytest.approx(alone.noise, rel=2e-2)
+    assert found.noise_std == pytest.approx(alone.noise_std, rel=2e-2)
+    assert found.unit == pytest.approx(np.sqrt(copies) * alone.noise, rel=2e-2)
+
+
 def test_stated_scatter_is_kept_and_one_level_says_nothing():
     problem, index = sample(3, shared=0.02)
     problem.prior_std[index[:, 0]] = 0.05
