@@ -69,7 +69,7 @@ class TracedCheck(eqx.Module):
 class Propagation(AbstractResult):
     """Mean, standard deviation and 95 % range of quantities by four methods.
 
-    SolvedMembers at which a quantity does not exist are left out of its statistics and counted in
+    Members at which a quantity does not exist are left out of its statistics and counted in
     `status_counts`. `first_order_error` compares first order with the solved motions, both of the
     members of quasi-Monte Carlo: its mean in standard deviations, its standard deviation, and the
     farther end of its 95 % range in half widths. `scatter_limit` is the factor on all inputs'
