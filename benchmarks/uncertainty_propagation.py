@@ -1,6 +1,6 @@
 """Uncertainty of peak, folds and resonance: derivatives against members, and where they part.
 
-Run: python benchmarks/uncertainty_propagation.py [--members 2048] [--case NAME] [--figure FILE.png]
+Run: python benchmarks/uncertainty_propagation.py [--members 2048] [--case NAME] [--figures DIR]
 
 Both numerical beams of the method paper, each at a force where its folds are far apart and at one
 where they are near to merging. Uncertain and independent, 1σ at scale 1: natural frequency of
@@ -160,55 +160,22 @@ def indices(name: str, case: Case, members: int) -> None:
     tell(case=name, sobol_seconds=middle - begin, derivative_seconds=end - middle)
 
 
-def draw(
-    path: Path,
-    studies: dict[str, sj.study.ScatterStudy],
-    found: dict[str, dict[str, sj.study.Propagation]],
-) -> None:
-    """Errors against scatter, and members of a fold beside what first and second order say."""
-    import matplotlib.pyplot as plt
-    from scipy import stats
-
-    figure, axes = plt.subplots(2, len(studies), figsize=(4.2 * len(studies), 7), squeeze=False)
-    for column, (name, study) in enumerate(studies.items()):
-        upper, lower = axes[:, column]
-        for q, quantity in enumerate(study.names):
-            error = np.nanmax(study.first_order_error[:, :, q], axis=1)
-            style = "-" if quantity.endswith("_hz") else "--"
-            upper.loglog(study.scale, error, style, color=f"C{q // 2}", label=quantity)
-        upper.axhline(0.1, color="0.5", linewidth=0.8)
-        upper.set(title=name, xlabel="scale of the inputs' scatter", ylabel="error of first order")
-        upper.legend(fontsize=6)
-        result = found[name]["large"]
-        q = int(np.nanargmax(result.first_order_error.max(axis=0)))
-        values = result.members.values[:, q]
-        lower.hist(values[np.isfinite(values)], bins=60, density=True, color="0.8", label="members")
-        mean, std = result.statistics[0, :2, q]
-        x = np.linspace(mean - 4 * std, mean + 4 * std, 300)
-        lower.plot(x, stats.norm.pdf(x, mean, std), color="C3", label="first order")
-        for method, colour in ((0, "C3"), (1, "C0"), (3, "0.2")):
-            for end in result.statistics[method, 2:, q]:
-                lower.axvline(end, color=colour, linewidth=1, linestyle=":")
-        lower.set(xlabel=f"{result.names[q]}, large scatter", ylabel="density")
-        lower.legend(fontsize=7, title="dotted: 95 % (blue second order)", title_fontsize=6)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--members", type=int, default=2048, help="of each sampling")
     parser.add_argument("--case", choices=CASES, action="append", help="all by default")
-    parser.add_argument("--figure", type=Path, help="where to draw")
+    parser.add_argument("--figures", type=Path, help="folder to draw into")
     asked = parser.parse_args()
-    studies, found = {}, {}
     for name in asked.case or CASES:
-        found[name] = propagated(name, CASES[name], asked.members)
-        studies[name] = limits(name, CASES[name], asked.members // 2)
+        results = propagated(name, CASES[name], asked.members)
+        study = limits(name, CASES[name], asked.members // 2)
         indices(name, CASES[name], asked.members)
-    if asked.figure is not None:
-        draw(asked.figure, studies, found)
+        if asked.figures is not None:
+            asked.figures.mkdir(parents=True, exist_ok=True)
+            stem = name.replace(",", "").replace(" ", "_")
+            sj.plot.save_figure(asked.figures / f"{stem}_members.png", results["large"].plot())
+            sj.plot.save_figure(asked.figures / f"{stem}_errors.png", study.plot())
 
 
 if __name__ == "__main__":

@@ -30,6 +30,11 @@ from snrmjax.report.simulation_figures import (
     normal_mode_figure,
     simulated_response_figure,
 )
+from snrmjax.report.uncertainty.uncertainty_figures import (
+    propagation_figure,
+    scatter_figure,
+    sensitivity_figure,
+)
 
 __all__ = [
     "DampingSeries",
@@ -49,9 +54,12 @@ __all__ = [
     "next_measurements_figure",
     "normal_mode_figure",
     "profile_figure",
+    "propagation_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",
+    "scatter_figure",
+    "sensitivity_figure",
     "simulated_response_figure",
     "style",
 ]

@@ -45,6 +45,7 @@ SUB_ROOMS = {
     "diagnose.checks": {"diagnose.misfit", "diagnose.search"},
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
     "report.laws": {"report.style", "report.html"},
+    "report.uncertainty": {"report.style"},
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),

@@ -26,6 +26,7 @@ from snrmjax.measure.harmonic_fit import HarmonicFit
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
 from snrmjax.report.sampling import span_of
+from snrmjax.report.uncertainty import uncertainty_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.controlled import ControlledCurve, DampedModeBranch
 from snrmjax.simulate.solutions.forced_response import ResponseBatch
@@ -34,6 +35,9 @@ from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion
 from snrmjax.simulate.solutions.time_integration import IntegratedMotion
 from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
+from snrmjax.study.uncertainty.propagation import Propagation
+from snrmjax.study.uncertainty.scatter_study import ScatterStudy
+from snrmjax.study.uncertainty.sensitivity import SobolIndices
 
 
 @functools.singledispatch
@@ -215,3 +219,18 @@ def _(result: ForceCalibration, *, largest_drive: float = 1.0) -> Figure:
     drive = jnp.asarray(np.linspace(0.0, largest_drive, 50))
     given = map(np.asarray, (drive, result.force(drive), result.force_std(drive)))
     return simulation_figures.line_figure(*given, joined=True)
+
+
+@plot_result.register
+def _(result: Propagation) -> Figure:
+    return uncertainty_figures.propagation_figure(result)
+
+
+@plot_result.register
+def _(result: ScatterStudy) -> Figure:
+    return uncertainty_figures.scatter_figure(result)
+
+
+@plot_result.register
+def _(result: SobolIndices) -> Figure:
+    return uncertainty_figures.sensitivity_figure(result)

@@ -124,7 +124,10 @@ class ResponseQuantities(AbstractQuantities):
             def block(
                 some: np.ndarray, kind: EventKind = kind, motion: NominalMotion = motion
             ) -> tuple:
-                return _follow(self.base, self.inputs, kind, motion, some, slopes)
+                found = _follow(self.base, self.inputs, kind, motion, some)
+                if not slopes:
+                    return found[0], np.zeros((len(some), 2, some.shape[1]))
+                return found[0], _slopes(self.base, self.inputs, kind, found[1:], some)
 
             found, gradient = by_blocks(block, _BLOCK, safe)
             values.append(found)
@@ -303,12 +306,11 @@ def _follow(
     kind: EventKind,
     near: NominalMotion,
     z: Array,
-    slopes: bool,
-) -> tuple[Array, Array]:
-    """Frequency and velocity of every member and, on request, their derivatives by z."""
+) -> tuple[Array, Array, Array]:
+    """Frequency (Hz) and velocity of every member, and its coefficients and frequency (rad/s)."""
     size, speed = jnp.max(jnp.abs(near.coefficients)), near.frequency
 
-    def member(row: Array) -> tuple[Array, Array]:
+    def member(row: Array) -> tuple[Array, Array, Array]:
         def apart(one: tuple, other: tuple) -> Array:
             moved = jnp.max(jnp.abs(one[0] - other[0])) / size
             return jnp.maximum(moved, jnp.abs(one[1] - other[1]) / speed)
@@ -350,12 +352,20 @@ def _follow(
         zero, one = jnp.zeros(()), jnp.ones(())
         begin = _Way(zero, one, jnp.array(0), near.coefficients, near.frequency)
         end = jax.lax.while_loop(going, body, begin)
-        start, arrived = (end.coefficients, end.frequency), end.share >= 1
-
-        def pair(z: Array) -> Array:
-            return _pair(_motion(base, inputs, kind, start, z))
-
-        found = jnp.where(arrived, pair(row), jnp.nan)
-        return found, jax.jacfwd(pair)(row) if slopes else jnp.zeros((2, row.shape[0]))
+        arrived = end.share >= 1
+        start = (jnp.where(arrived, end.coefficients, jnp.nan), end.frequency)
+        return _pair(_motion(base, inputs, kind, start, row)), *start
 
     return mapped(member, z)
+
+
+@compiled
+def _slopes(
+    base: Base, inputs: UncertainInputs, kind: EventKind, starts: tuple[Array, Array], z: Array
+) -> Array:
+    """Derivatives of frequency and velocity by z, of members whose motion is known."""
+
+    def member(row: Array, *start: Array) -> Array:
+        return jax.jacfwd(lambda z: _pair(_motion(base, inputs, kind, start, z)))(row)
+
+    return mapped(member, z, *starts)

@@ -32,6 +32,7 @@ from snrmjax.study.uncertainty.quantities import (
 from snrmjax.study.uncertainty.uncertain_inputs import UncertainInputs
 
 METHODS = ("first_order", "second_order", "monte_carlo", "quasi_monte_carlo")
+METHOD_NAMES = ("first order", "second order", "Monte Carlo", "quasi-Monte Carlo")
 SAMPLINGS = METHODS[2:]
 WRONG = 0.1
 """Error of first order that is worth a note."""
@@ -99,11 +100,10 @@ class Propagation(AbstractResult):
         ]
         for q, name in enumerate(self.names):
             lines.append(f"{name}: {self.expansion.value[q]:.6g} at the nominal inputs")
-            for m, method in enumerate(METHODS):
+            for m, method in enumerate(METHOD_NAMES):
                 mean, std, lower, upper = self.statistics[m, :, q]
                 lines.append(
-                    f"  {method.replace('_', ' ')}: {mean:.6g} ± {std:.3g} (1σ), 95 % from"
-                    f" {lower:.6g} to {upper:.6g}"
+                    f"  {method}: {mean:.6g} ± {std:.3g} (1σ), 95 % from {lower:.6g} to {upper:.6g}"
                 )
         failed = n - self.status_counts[int(MemberStatus.FOUND)]
         lines.append(f"members: {n}, found of each quantity at least {n - int(failed.max())}")
