@@ -2,6 +2,7 @@
 
 import logging
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +64,32 @@ def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
     assert not fit.converged
     assert "steps" in fit.notes[0]
     assert "not converged" in repr(fit)
+
+
+def test_a_first_fit_that_used_up_its_steps_is_no_start(monkeypatch):
+    """It may have ended anywhere: here with gains of levels that no test has."""
+    whole, starts = joint_fit.fitted, []
+
+    def lost(start, problem, components, settings):
+        found = whole(start, problem, components, settings)
+        if settings.rounds != joint_fit._ROUGHLY:
+            starts.append(np.asarray(start.level))
+            return found
+        away = eqx.tree_at(lambda u: u.level, found.unknowns, found.unknowns.level + 50.0)
+        return found._replace(unknowns=away, status=FitStatus.STEP_LIMIT)
+
+    data = noisy(1, gain=0.01)
+    plain = sj.fit_jointly(data, modes(), level_gain_std=0.01, **TRUE)
+    monkeypatch.setattr(joint_fit, "fitted", lost)
+    fit = sj.fit_jointly(data, modes(), level_gain_std=0.01, **TRUE)
+    assert fit.converged
+    assert np.max(np.abs(starts[0])) < 10  # of 1σ
+    # The same curves, though their terms count at the largest amplitude of where a fit began.
+    values = [sj.identify.fitted_values(one, np.linspace(0.3, 0.9, 4)) for one in (fit, plain)]
+    for name in ("natural_frequency", "modal_damping"):
+        found, wanted = (getattr(each, name) for each in values)
+        # Both end where a round moves less than a tenth of the squared distance.
+        assert np.max(np.abs(found - wanted) / getattr(values[1], f"{name}_std")) < 0.3
 
 
 def test_where_the_chosen_family_does_not_converge_the_next_best_is_taken(monkeypatch):

@@ -42,3 +42,9 @@ def test_two_laws_have_a_panel_each_and_a_table_each():
     first, second = law_tables([SPRING, FILM])
     assert len(first.rows) == len(second.rows) == 4
     assert "hardening" in first.folded
+    number, shown = first.rows[2]
+    assert float(number) == pytest.approx(2.0)  # mm
+    assert "mm" in first.header[0]
+    value, error = (float(part) for part in shown.split("±"))
+    size = 1e3 if "(mN)" in first.header[1] else 1.0
+    assert (value, error) == pytest.approx((0.4 * size, 0.05 * size))
