@@ -3,7 +3,7 @@ from .computations.responses import Curves, Peaks, ResponseRange
 from .computations.tests import Diagnoses, Identifications, VirtualTests
 from .run import RunSettings, Shard, StudyRun, discard_chunks, open_study, run_study
 from .sampling import Sampling
-from .study import Study
+from .study import Study, planned
 from .study_file import read_study
 from .uncertainty.followed_motions import ResponseQuantities, response_quantities
 from .uncertainty.propagation import (
@@ -58,6 +58,7 @@ __all__ = [
     "lognormal",
     "normal",
     "open_study",
+    "planned",
     "posterior_inputs",
     "propagate_uncertainty",
     "ranged",

@@ -10,7 +10,7 @@ import numpy as np
 from snrmjax.study.chunks import StudyFolder, chunk_identity
 from snrmjax.study.computations.base import MEMBER, blank_rows, joined
 from snrmjax.study.study import PlannedStudy
-from snrmjax.study.worker import LOST, Receipt, compute_chunk, computed_rows, stored
+from snrmjax.study.tasks import LOST, Receipt, compute_chunk, computed_rows, stored
 from snrmjax.study.workers import AbstractWorkers, WorkerDied
 
 _DEATHS_BESIDE = 2  # of a chunk's worker, before the chunk is computed alone

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import platformdirs
 
-from snrmjax.study.worker import ENVIRONMENT, settle
+from snrmjax.study.tasks import ENVIRONMENT, settle
 
 INSTALL_CLUSTER = "a Dask cluster needs the package distributed: pip install 'snrmjax[cluster]'."
 

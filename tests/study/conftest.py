@@ -48,7 +48,7 @@ def peak_velocity(force, damping):
 
 @pytest.fixture(scope="session")
 def linear_model():
-    modes = sj.model.linear_modes([OMEGA], [0.02], [[SHAPE]], [PARTICIPATION], sensors=("tip",))
+    modes = sj.model.linear_modes([OMEGA], [0.02], [[SHAPE]], [PARTICIPATION])
     return sj.model.structure(modes, name="linear")
 
 

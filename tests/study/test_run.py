@@ -9,7 +9,7 @@ from filelock import FileLock
 
 import snrmjax as sj
 from snrmjax.study.run import RunSettings, Shard
-from snrmjax.study.worker import LOST
+from snrmjax.study.tasks import LOST
 from snrmjax.study.workers import WorkerDied
 
 from .conftest import InThisProcess, peak_velocity
