@@ -26,6 +26,7 @@ import numpy as np
 import snrmjax as sj
 from snrmjax.study.uncertainty.moments import STATISTICS
 from snrmjax.study.uncertainty.propagation import METHODS
+from snrmjax.study.uncertainty.quantities import MemberStatus
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
@@ -112,8 +113,9 @@ def propagated(name: str, case: Case, members: int) -> dict[str, sj.study.Propag
                 **rows,
                 first_order_error=result.first_order_error[:, q].tolist(),
                 members=int(counts.sum()),
-                ceased=int(counts[1]),
-                impossible=int(counts[2]),
+                replaced=int(counts[MemberStatus.REPLACED]),
+                ceased=int(counts[MemberStatus.CEASED]),
+                impossible=int(counts[MemberStatus.IMPOSSIBLE]),
                 traced_differ=f"{result.traced.differ[q]} of {result.traced.members}",
             )
         tell(case=name, scatter=scatter, seconds=seconds, notes=list(result.notes))

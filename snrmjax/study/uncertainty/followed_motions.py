@@ -1,7 +1,7 @@
 """Peaks, folds and phase resonances of a forced response as functions of uncertain inputs."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -32,8 +32,9 @@ EventKind = Literal["peak", "fold", "phase_resonance"]
 _BLOCK = 32  # members that one call works on
 _SMALLEST = 1 / 512  # share of the way to a member below which a motion counts as ceased
 _STEPS = 60  # on the way to a member, at most
-_LATE = 0.3  # correction over step, beyond which the step was too long
-_NEAR = 0.01  # of the motion: a correction that is never too large
+_ITERATIONS = 12  # of Newton's method, which starts from a prediction
+_LATE = 0.1  # correction over step, beyond which the step was too long
+_NEAR = 0.002  # of the motion: a correction that is never too large
 
 
 class NominalMotion(NamedTuple):
@@ -79,8 +80,18 @@ class ResponseQuantities(AbstractQuantities):
         return Expansion(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
-        """See `AbstractQuantities`."""
-        return self._followed(z, slopes=False)[0]
+        """See `AbstractQuantities`; what cannot be followed is looked for on the whole curve."""
+        followed = self._followed(z, slopes=False)[0]
+        ceased = followed.status == int(MemberStatus.CEASED)
+        rows = np.flatnonzero(ceased.any(axis=1))
+        if not rows.size:
+            return followed
+        values, status = followed.values.copy(), followed.status.copy()
+        whole, _ = self.traced(np.asarray(z)[rows])
+        instead = ceased[rows] & np.isfinite(whole)
+        values[rows] = np.where(instead, whole, values[rows])
+        status[rows] = np.where(instead, int(MemberStatus.REPLACED), status[rows])
+        return SolvedMembers(values, status)
 
     def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
         """See `AbstractQuantities`."""
@@ -163,6 +174,8 @@ def response_quantities(
     Returns `ResponseQuantities`; kinds of which the nominal curve has none are in its `notes`.
     Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
     where the nominal curve has none of the events.
+    Members whose motion ceases on the way are looked for on their whole response curves, and have
+    a status that says which.
     Validity: a motion is followed by its own branch; that another peak becomes the highest is seen
     by `ResponseQuantities.traced` only, which `propagate_uncertainty` uses on some members.
 
@@ -255,7 +268,7 @@ def _motion(
     base: Base, inputs: UncertainInputs, kind: EventKind, start: tuple, z: Array
 ) -> PeriodicMotion:
     model, force = _at(base, inputs, z)
-    return periodic_motion(model, force, start, condition=kind)
+    return periodic_motion(model, force, start, condition=kind, iterations=_ITERATIONS)
 
 
 def _pair(motion: PeriodicMotion) -> Float[Array, " 2"]:
@@ -295,8 +308,11 @@ class _Way(NamedTuple):
     share: Array
     step: Array
     n_steps: Array
-    coefficients: Array
-    frequency: Array
+    point: tuple[Array, Array]  # coefficients and frequency
+    slope: tuple[Array, Array]  # of them by the share, where it is known
+    known: Array
+    share_before: Array  # at the last point
+    slope_before: tuple[Array, Array]
 
 
 @compiled
@@ -316,44 +332,61 @@ def _follow(
             return jnp.maximum(moved, jnp.abs(one[1] - other[1]) / speed)
 
         def slope(way: _Way) -> tuple[Array, Array]:
-            start = (way.coefficients, way.frequency)
-
             def along(share: Array) -> tuple[Array, Array]:
-                motion = _motion(base, inputs, kind, start, share * row)
+                motion = _motion(base, inputs, kind, way.point, share * row)
                 return motion.coefficients, motion.frequency
 
-            def first() -> tuple[Array, Array]:
-                return near.coefficients_by_z @ row, near.frequency_by_z @ row
+            def computed() -> tuple[Array, Array]:
+                return jax.jvp(along, (way.share,), (jnp.ones(()),))[1]
 
-            later = lambda: jax.jvp(along, (way.share,), (jnp.ones(()),))[1]  # noqa: E731
-            return jax.lax.cond(way.share == 0, first, later)
+            return jax.lax.cond(way.known, lambda: way.slope, computed)
 
         def body(way: _Way) -> _Way:
-            here = (way.coefficients, way.frequency)
+            here, ahead = way.point, slope(way)
             step = jnp.minimum(way.step, 1 - way.share)
-            guess = tuple(a + step * b for a, b in zip(here, slope(way), strict=True))
+            width = way.share - way.share_before
+            bend = jnp.where(width > 0, 0.5 * step**2 / jnp.where(width > 0, width, 1.0), 0.0)
+            guess = jax.tree.map(
+                lambda x, s, last: x + step * s + bend * (s - last), here, ahead, way.slope_before
+            )
             to = way.share + step
             motion = _motion(base, inputs, kind, guess, to * row)
             there = (motion.coefficients, motion.frequency)
             turn = turning(*_at(base, inputs, to * row), motion, kind)
             close = apart(there, guess) <= _LATE * apart(guess, here) + _NEAR
             good = motion.converged & close & (turn * near.turning > 0)
+
+            def chosen(yes: Any, no: Any) -> Any:
+                return jax.tree.map(lambda a, b: jnp.where(good, a, b), yes, no)
+
             return _Way(
                 share=jnp.where(good, to, way.share),
                 step=jnp.where(good, 2 * step, step / 4),
                 n_steps=way.n_steps + 1,
-                coefficients=jnp.where(good, there[0], here[0]),
-                frequency=jnp.where(good, there[1], here[1]),
+                point=chosen(there, here),
+                slope=ahead,
+                known=~good,
+                share_before=jnp.where(good, way.share, way.share_before),
+                slope_before=chosen(ahead, way.slope_before),
             )
 
         def going(way: _Way) -> Array:
             return (way.share < 1) & (way.step > _SMALLEST) & (way.n_steps < _STEPS)
 
-        zero, one = jnp.zeros(()), jnp.ones(())
-        begin = _Way(zero, one, jnp.array(0), near.coefficients, near.frequency)
+        first = (near.coefficients_by_z @ row, near.frequency_by_z @ row)
+        begin = _Way(
+            share=jnp.zeros(()),
+            step=jnp.ones(()),
+            n_steps=jnp.array(0),
+            point=(near.coefficients, near.frequency),
+            slope=first,
+            known=jnp.array(True),
+            share_before=jnp.zeros(()),
+            slope_before=first,
+        )
         end = jax.lax.while_loop(going, body, begin)
         arrived = end.share >= 1
-        start = (jnp.where(arrived, end.coefficients, jnp.nan), end.frequency)
+        start = (jnp.where(arrived, end.point[0], jnp.nan), end.point[1])
         return _pair(_motion(base, inputs, kind, start, row)), *start
 
     return mapped(member, z)

@@ -105,8 +105,8 @@ class Propagation(AbstractResult):
                 lines.append(
                     f"  {method}: {mean:.6g} ± {std:.3g} (1σ), 95 % from {lower:.6g} to {upper:.6g}"
                 )
-        failed = n - self.status_counts[int(MemberStatus.FOUND)]
-        lines.append(f"members: {n}, found of each quantity at least {n - int(failed.max())}")
+        known = self.status_counts[[int(MemberStatus.FOUND), int(MemberStatus.REPLACED)]]
+        lines.append(f"members: {n}, found of each quantity at least {known.sum(axis=0).min()}")
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
@@ -292,15 +292,17 @@ def _accuracy_notes(
 
 def _member_notes(names: tuple[str, ...], counts: np.ndarray) -> list[str]:
     notes, n = [], int(counts[:, 0].sum())
-    for kind in (MemberStatus.CEASED, MemberStatus.IMPOSSIBLE, MemberStatus.NOT_FINITE):
+    for kind in tuple(MemberStatus)[1:]:
         groups: dict[int, list[str]] = {}
         for name, count in zip(names, counts[int(kind)].tolist(), strict=True):
             if count:
                 groups.setdefault(count, []).append(name)
+        replaced = kind == MemberStatus.REPLACED
+        rest = "" if replaced else "; the statistics are those of the others"
         for count, own in groups.items():
             notes.append(
                 f"{count} of {n} members ({100 * count / n:.2g} %) have {MEMBER_MESSAGE[kind]}:"
-                f" {', '.join(own)}; the statistics are those of the others"
+                f" {', '.join(own)}{rest}"
             )
     return notes
 

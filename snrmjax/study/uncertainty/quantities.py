@@ -22,14 +22,17 @@ class MemberStatus(IntEnum):
     """What became of one quantity of one member."""
 
     FOUND = 0
-    CEASED = 1  # the motion could not be followed from the nominal one to the member's inputs
-    IMPOSSIBLE = 2  # inputs that no structure has, such as a negative damping ratio
-    NOT_FINITE = 3  # a function's value is NaN or infinite
+    REPLACED = 1  # the motion could not be followed; the whole response curve has one in its place
+    CEASED = 2  # neither followed nor on the whole response curve
+    IMPOSSIBLE = 3  # inputs that no structure has, such as a negative damping ratio
+    NOT_FINITE = 4  # a function's value is NaN or infinite
 
 
 MEMBER_MESSAGE: dict[MemberStatus, str] = {
     MemberStatus.FOUND: "found",
-    MemberStatus.CEASED: "no such motion (two folds or peaks merge on the way to these inputs)",
+    MemberStatus.REPLACED: "another motion in place of the nominal one, which two folds or peaks"
+    " that merge, or an internal resonance, end on the way to these inputs",
+    MemberStatus.CEASED: "no such motion: two folds or peaks merge on the way to these inputs",
     MemberStatus.IMPOSSIBLE: "impossible inputs (a natural frequency, damping ratio or force that"
     " is not positive)",
     MemberStatus.NOT_FINITE: "a value that is not finite",
@@ -45,7 +48,7 @@ class Expansion(NamedTuple):
 
 
 class SolvedMembers(NamedTuple):
-    """Quantities of members; NaN where the status is not `FOUND`."""
+    """Quantities of members; NaN where the status is neither `FOUND` nor `REPLACED`."""
 
     values: Float[np.ndarray, "member quantity"]
     status: Int[np.ndarray, "member quantity"]  # a `MemberStatus` each

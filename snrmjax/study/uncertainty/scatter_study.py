@@ -21,7 +21,7 @@ from snrmjax.study.uncertainty.propagation import (
     PropagationSettings,
     members_per_scrambling,
 )
-from snrmjax.study.uncertainty.quantities import AbstractQuantities, MemberStatus
+from snrmjax.study.uncertainty.quantities import AbstractQuantities
 
 
 class ScatterStudy(AbstractResult):
@@ -92,7 +92,7 @@ def scatter_study(
         linear, quadratic = map(members_statistics, expanded_members(expansion, scale * z))
         errors.append(first_order_error(linear, reference))
         second_errors.append(first_order_error(quadratic, reference))
-        shares.append(np.mean(found.status == int(MemberStatus.FOUND), axis=0))
+        shares.append(np.mean(np.isfinite(found.values), axis=0))
     return ScatterStudy(
         scale=factors,
         first_order_error=np.stack(errors),
