@@ -46,6 +46,7 @@ SUB_ROOMS = {
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
+    "report.study": {"report.style", "report.html"},
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),

@@ -1,4 +1,4 @@
-"""The commands `study run` and `study discard-chunks`."""
+"""The commands `study run`, `study report` and `study discard-chunks`."""
 
 import sys
 import time
@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from snrmjax.cli.console import console, say, warn
-from snrmjax.cli.options import FILES
+from snrmjax.cli.console import console, say, staged, warn
+from snrmjax.cli.options import FILES, Out
 
 if TYPE_CHECKING:
+    from snrmjax.report.study.digest import StudyDigest
     from snrmjax.study.engine import Progress, ProgressReport
     from snrmjax.study.run import Expected, Shard, StudyRun
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
 _INTERRUPTED = 130
+_ROWS_SAID = 12  # of the summary on the screen
 
 study_app = typer.Typer(
     name="study",
@@ -108,6 +110,30 @@ def run(
         _say_done(done, out)
 
 
+@study_app.command(epilog="Example: snrmjax study report study.zarr --out report")
+def report(
+    store: Annotated[
+        Path,
+        typer.Argument(
+            help="The data set of a complete study.", metavar="STORE", show_default=False
+        ),
+    ],
+    out: Out,
+) -> None:
+    """Draw a study: distributions, main effects, response bands, where members failed.
+
+    Writes summary.csv, main_effects.csv, figures (PNG) and report.html.
+    """
+    from snrmjax.report.study.study_report import write_study_report
+    from snrmjax.study.run import open_study
+
+    data = open_study(store)
+    with staged(out) as folder:
+        found = write_study_report(folder, data)
+    _say_summary(found)
+    say(f"written to {out}")
+
+
 @study_app.command("discard-chunks")
 def discard(
     store: Annotated[
@@ -159,6 +185,26 @@ def _say_done(done: "StudyRun", out: Path) -> None:
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
     else:
         say(f"nothing was left to compute; {done.members} members are in {out}")
+
+
+def _say_summary(found: "StudyDigest") -> None:
+    """The outputs that vary, as a table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from snrmjax.report.study.summary import summary_table
+
+    rows = [row for row in found.summaries if row.varies and not row.scalar.is_count]
+    shown = summary_table(rows[:_ROWS_SAID], "")
+    table = Table(title=found.headline, title_justify="left", title_style="", box=None)
+    said = [shown.header.index(name) for name in ("output", "unit", "median", "95 % range")]
+    for k in said:
+        table.add_column(shown.header[k], no_wrap=k > 0)
+    for row in shown.rows:
+        table.add_row(*(Text(row[k]) for k in said))
+    console.print(table)
+    if len(rows) > _ROWS_SAID:
+        say(f"and {len(rows) - _ROWS_SAID} more outputs: see summary.csv")
 
 
 @contextmanager

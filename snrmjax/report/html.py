@@ -106,7 +106,7 @@ def with_error(value: float, spread: float) -> str:
     value, spread = value / 10.0**ten, spread / 10.0**ten
     digits = max(0, int(1 - np.floor(np.log10(spread))))
     text = minus(f"{value:.{digits}f} ± {spread:.{digits}f}")
-    return f"({text}) × {_ten_to(ten)}" if ten else text
+    return f"({text}) × {ten_to(ten)}" if ten else text
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -120,10 +120,11 @@ def number(value: float, digits: int = 4) -> str:
     power = int(np.floor(np.log10(abs(value))))
     if _PLAIN[0] <= power <= _PLAIN[1]:
         return minus(f"{float(f'{value:.{digits}g}'):.{max(digits, power + 1)}g}")
-    return f"{minus(f'{value / 10.0**power:.{digits}g}')} × {_ten_to(power)}"
+    return f"{minus(f'{value / 10.0**power:.{digits}g}')} × {ten_to(power)}"
 
 
-def _ten_to(power: int) -> str:
+def ten_to(power: int) -> str:
+    """A power of ten as text."""
     return "10" + str(power).translate(_SUPERSCRIPT)
 
 

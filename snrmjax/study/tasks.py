@@ -10,9 +10,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from snrmjax.study.chunks import StudyFolder, write_chunk
+from snrmjax.study.computations.base import COMPLETE
 from snrmjax.study.study import PlannedStudy
 
-_GOOD = ("upper_end", "lower_end", "closed", "solved", "answered")
 LOST = "lost: the process that computed it died"
 
 ENVIRONMENT = {
@@ -79,7 +79,7 @@ def stored(
     """Write the rows of a chunk and count them."""
     path = write_chunk(folder, number, identity, rows)
     status = np.asarray(rows["status"]).reshape(len(planned.rows_of(number)), -1)
-    failed = int(np.sum(~np.all(np.isin(status, _GOOD), axis=1)))
+    failed = int(np.sum(~np.all(np.isin(status, COMPLETE), axis=1)))
     size = path.stat().st_size
     return Receipt(number, len(status), failed, time.perf_counter() - begin, size, _memory())
 

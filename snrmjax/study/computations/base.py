@@ -13,6 +13,8 @@ from snrmjax.model.structures import Structure
 MEMBER = "member"
 FORCE = "force_n"
 TEXT = "text"
+COMPLETE = ("upper_end", "lower_end", "closed", "solved", "answered")
+"""Statuses of members that have their whole result."""
 
 
 class Output(NamedTuple):

@@ -1,0 +1,1 @@
+"""Reports of studies: distributions, main effects, response bands, where members failed."""

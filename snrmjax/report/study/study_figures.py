@@ -1,0 +1,262 @@
+"""Figures of a study: distributions, main effects, bands of its curves, where members failed."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from snrmjax.report.study.bands import Band, BandPanel
+from snrmjax.report.study.failures import Failures, failure_share
+from snrmjax.report.study.main_effects import MainEffect
+from snrmjax.report.study.scalars import Display, Scalar, display_on_axis
+from snrmjax.report.style import (
+    COLUMN,
+    IDENTIFIED,
+    LINE,
+    MEASURED,
+    PAGE,
+    SERIES,
+    SMALL,
+    Style,
+    legend,
+    name_axes,
+    panels,
+    plain,
+)
+
+_BINS = 40
+_ROW = 2.3  # inches: the height of a row of panels
+_ACROSS = 3  # panels beside one another
+_DOTS = 400  # of a scatter: more hide one another
+_PALE, _CLOUD = 0.13, 0.35
+_LONGEST = 28  # letters of a legend's name
+
+
+class EffectPanels(NamedTuple):
+    """One output, for every force, and what it does over some varied quantities."""
+
+    outputs: Sequence[Scalar]  # the same output, one for each force
+    effects: Sequence[dict[str, MainEffect | None]]  # of each of these, by quantity
+
+
+def distributions_figure(outputs: Sequence[Sequence[Scalar]]) -> Figure:
+    """Histograms of outputs, one panel each, with median and 95 % range; a colour for each force.
+
+    Arguments: each of `outputs` is one output, for every force.
+    """
+    columns = min(_ACROSS, len(outputs))
+    rows = -(-len(outputs) // columns)
+    figure, grid = panels(PAGE if columns > 1 else COLUMN, _ROW * rows + 0.3, rows, columns)
+    for axes, output in zip(grid.flat, outputs, strict=False):
+        _histogram(axes, output)
+    for axes in grid.flat[len(outputs) :]:
+        axes.set_visible(False)
+    legend(figure)
+    return figure
+
+
+def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
+    every = np.concatenate([one.values for one in output])
+    found = every[np.isfinite(every)]
+    shown = display_on_axis(found, output[0].unit)
+    if output[0].is_count:
+        edges = np.arange(found.min() - 0.5, found.max() + 1.0)
+    else:
+        # Far outliers are not drawn apart: they would leave the rest one bar.
+        low, high = np.quantile(found, [0.001, 0.999])
+        edges = np.linspace(low, high, _bins(found.size)) / shown.size
+    for one, colour in zip(output, _colours(len(output)), strict=True):
+        values = one.values[np.isfinite(one.values)] / shown.size
+        if not values.size:
+            continue
+        name = one.at_force or "members"
+        low, median, high = np.percentile(values, [2.5, 50.0, 97.5])
+        drawn: Style = {"color": colour, "alpha": 0.45, "label": name}
+        axes.hist(np.clip(values, edges[0], edges[-1]), edges.tolist(), **drawn)
+        if not one.is_count:
+            axes.axvline(median, color=colour, linewidth=LINE)
+            for end in (low, high):
+                axes.axvline(end, color=colour, linewidth=0.9, linestyle=":")
+    if not output[0].is_count:
+        axes.plot([], [], color="0.3", linewidth=LINE, label="median")
+        axes.plot([], [], ":", color="0.3", linewidth=0.9, label="95 % range")
+    name_axes(axes, plain(output[0].label), plain(shown.unit), "Members")
+
+
+def main_effects_figure(
+    shown: Sequence[EffectPanels],
+    quantities: dict[str, Float[np.ndarray, " member"]],
+    units: dict[str, str],
+) -> Figure:
+    """Each output (rows) over each quantity (columns): members, conditional mean and its band."""
+    names = list(quantities)
+    width = PAGE if len(names) > 1 else COLUMN
+    figure, grid = panels(width, _ROW * len(shown) + 0.4, len(shown), len(names))
+    for k, (line, one) in enumerate(zip(grid, shown, strict=True)):
+        every = np.concatenate([output.values for output in one.outputs])
+        y = display_on_axis(every, one.outputs[0].unit)
+        for j, (axes, name) in enumerate(zip(line, names, strict=True)):
+            x = display_on_axis(quantities[name], units[name])
+            _scatter(axes, one, name, quantities[name], (x, y))
+            broken = name.replace(".", ".\n", 1) if len(names) > _ACROSS else name
+            below = plain(x.labelled(broken)) if k == len(shown) - 1 else ""
+            beside = plain(y.labelled(one.outputs[0].label)) if j == 0 else ""
+            name_axes(axes, "", below, beside)
+            _share(axes, one, name)
+            if j:
+                axes.sharey(line[0])
+                axes.tick_params(labelleft=False)
+            if k < len(shown) - 1:
+                axes.tick_params(labelbottom=False)
+    legend(figure)
+    return figure
+
+
+def _scatter(
+    axes: Axes, shown: EffectPanels, name: str, quantity: np.ndarray, units: tuple[Display, Display]
+) -> None:
+    x, y = units
+    chosen = _thinned(len(quantity))
+    colours = _colours(len(shown.outputs))
+    for output, effects, colour in zip(shown.outputs, shown.effects, colours, strict=True):
+        dots: Style = {"linestyle": "none", "marker": ".", "markersize": 2.5, "alpha": _CLOUD}
+        values = output.values[chosen] / y.size
+        axes.plot(quantity[chosen] / x.size, values, **dots, color=colour, markeredgewidth=0.0)
+        effect = effects[name]
+        if effect is None:
+            continue
+        at, mean, error = effect.at / x.size, effect.mean / y.size, effect.error / y.size
+        band: Style = {"color": colour, "alpha": 0.35, "linewidth": 0}
+        axes.fill_between(at, mean - error, mean + error, **band)
+        named = f"mean {output.at_force}".rstrip()
+        axes.plot(at, mean, color=colour, linewidth=1.6, label=named)
+    axes.plot([], [], ".", color="0.4", markersize=4.0, label="members")
+
+
+def _share(axes: Axes, shown: EffectPanels, name: str) -> None:
+    """The share of variance above a panel, of the smallest and the largest force."""
+    found = [effects[name] for effects in shown.effects]
+    shares = [100 * max(one.share, 0.0) for one in found if one is not None]
+    if not shares:
+        return
+    low, high = (f"{value:.0f}" for value in (min(shares), max(shares)))
+    text = f"{low} %" if low == high else f"{low} to {high} %"
+    axes.set_title(text, loc="left", fontsize=SMALL, color="0.25")
+
+
+def bands_figure(shown: Sequence[BandPanel]) -> Figure:
+    """Bands of curves over all members, a panel for each force or curve."""
+    columns = min(_ACROSS, len(shown))
+    rows = -(-len(shown) // columns)
+    figure, grid = panels(PAGE if columns > 1 else COLUMN, 2.8 * rows + 0.4, rows, columns)
+    several = any(panel.lower is not None for panel in shown)
+    for panel, axes in zip(shown, grid.flat, strict=False):
+        alike = [one.upper.most for one in shown if one.y == panel.y]
+        y = display_on_axis(np.concatenate(alike), panel.y_unit)
+        x = display_on_axis(panel.upper.at, panel.x_unit)
+        _band(axes, panel.upper, (x, y), MEASURED, "highest value" if several else "")
+        if panel.lower is not None:
+            _band(axes, panel.lower, (x, y), IDENTIFIED, "lowest value")
+        name_axes(axes, plain(panel.title), x.labelled(panel.x), y.labelled(panel.y))
+    for axes in grid.flat[len(shown) :]:
+        axes.set_visible(False)
+    legend(figure)
+    return figure
+
+
+def _band(axes: Axes, band: Band, units: tuple[Display, Display], colour: str, which: str) -> None:
+    x, y = units
+    at, end = band.at / x.size, f", {which}" if which else ""
+    low, high = band.low / y.size, band.high / y.size
+    none: Style = {"linewidth": 0, "color": colour}
+    least, most = band.least / y.size, band.most / y.size
+    axes.fill_between(at, least, most, alpha=_PALE, label=f"all members{end}", **none)
+    axes.fill_between(at, low, high, alpha=0.3, label=f"95 %{end}", **none)
+    axes.plot(at, band.median / y.size, color=colour, linewidth=LINE, label=f"median{end}")
+
+
+def failures_figure(
+    failures: Failures,
+    quantities: dict[str, Float[np.ndarray, " member"]],
+    units: dict[str, str],
+) -> Figure:
+    """Where members failed: over the two most telling quantities, and the share along each.
+
+    Arguments: `quantities` in the order in which they tell failed members from whole ones.
+    """
+    names = list(quantities)
+    n = len(names) + 1
+    columns = min(_ACROSS, n)
+    rows = -(-n // columns)
+    figure, grid = panels(PAGE, 2.6 * rows + 0.5, rows, columns)
+    _map(grid.flat[0], failures, [quantities[name] for name in names[:2]])
+    second = plain(_named(names[1], units)) if len(names) > 1 else "Number of the member"
+    name_axes(grid.flat[0], "Failed members", plain(_named(names[0], units)), second)
+    for axes, name in zip(grid.flat[1:], names, strict=False):
+        found = failure_share(quantities[name], failures.failed)
+        middle = 0.5 * (found.edges[1:] + found.edges[:-1])
+        shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
+        axes.bar(middle, 100 * found.share, np.diff(found.edges), **shown, label="share failed")
+        bars = 100 * np.abs(np.array([found.share - found.low, found.high - found.share]))
+        style: Style = {"fmt": "none", "ecolor": "0.3", "elinewidth": 0.8}
+        axes.errorbar(middle, 100 * found.share, bars, **style, label="95 % interval")
+        name_axes(axes, "", plain(_named(name, units)), "Failed (%)")
+    for axes in grid.flat[n:]:
+        axes.set_visible(False)
+    legend(figure)
+    return figure
+
+
+def _map(axes: Axes, failures: Failures, places: Sequence[np.ndarray]) -> None:
+    x = places[0]
+    y = places[1] if len(places) > 1 else np.arange(len(x))
+    whole = np.flatnonzero(~failures.failed)
+    whole = whole[_thinned(len(whole))]
+    dots: Style = {"linestyle": "none", "marker": ".", "markersize": 3.0, "markeredgewidth": 0.0}
+    axes.plot(x[whole], y[whole], **dots, color="0.7", label="complete")
+    kinds = failures.kinds
+    groups = [(kind, [kind]) for kind in kinds[: len(SERIES) - 1]]
+    if len(kinds) >= len(SERIES):
+        groups.append(("other statuses", kinds[len(SERIES) - 1 :]))
+    for (name, those), colour in zip(groups, SERIES, strict=False):
+        mine = np.flatnonzero(failures.failed & np.isin(failures.status, those))
+        mine = mine[_thinned(len(mine))]
+        label = name if len(name) <= _LONGEST else f"{name[:_LONGEST]} …"
+        cross: Style = {"linestyle": "none", "marker": "x", "markersize": 4.0}
+        axes.plot(x[mine], y[mine], **cross, color=colour, label=plain(label))
+
+
+def counts_figure(counts: Sequence[tuple[str, dict[str, int]]]) -> Figure:
+    """How often each answer was given: one panel a question, such as the verdict."""
+    figure, (line,) = panels(PAGE if len(counts) > 1 else COLUMN, 2.8, 1, len(counts))
+    for axes, (title, found) in zip(line, counts, strict=True):
+        names = [name if len(name) <= _LONGEST else f"{name[:_LONGEST]} …" for name in found]
+        axes.barh(np.arange(len(found)), list(found.values()), color=MEASURED, alpha=0.6)
+        axes.set_yticks(np.arange(len(found)), [plain(name or "none") for name in names])
+        axes.invert_yaxis()
+        name_axes(axes, title, "Members", "")
+    return figure
+
+
+def _named(name: str, units: dict[str, str]) -> str:
+    return f"{name} ({units[name]})" if units[name] else name
+
+
+def _colours(n: int) -> Iterable[str]:
+    if n == 1:
+        return (MEASURED,)
+    return [SERIES[k % len(SERIES)] for k in range(n)]
+
+
+def _bins(n: int) -> int:
+    return int(np.clip(np.sqrt(n), 8, _BINS)) + 1
+
+
+def _thinned(n: int) -> np.ndarray:
+    """Places of at most `_DOTS` of n members, drawn at random: every k-th may be a pattern."""
+    if n <= _DOTS:
+        return np.arange(n)
+    return np.sort(np.random.default_rng(0).choice(n, _DOTS, replace=False))
