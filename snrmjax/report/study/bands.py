@@ -18,7 +18,7 @@ SAMPLED = 4096
 _BLOCK = 512  # members that are read together
 _PLACES = 121  # of a grid that the data set does not have
 _GRID, _SHARE = "frequency_hz", "relative_amplitude"
-_LEAST = 0.5  # share of the members that must have a curve at a place for its band
+_LEAST = 0.9  # share of the members that must have a curve at a place for its band
 _RANGE = (2.5, 50.0, 97.5)
 
 
@@ -215,13 +215,14 @@ def _pair(pair: tuple[_Collected, _Collected], at: np.ndarray) -> tuple[Band, Ba
         apart |= np.abs(one - other) > 1e-3 * scale
     if not apart.any():
         return upper, None
-    apart = np.convolve(apart, np.ones(3), mode="same") > 0  # up to where they meet
-    own = [np.where(apart, one, np.nan) for one in lower[1:]]
+    first, last = np.flatnonzero(apart)[[0, -1]]
+    drawn = (np.arange(len(at)) >= first - 1) & (np.arange(len(at)) <= last + 1)
+    own = [np.where(drawn, one, np.nan) for one in lower[1:]]
     return upper, Band(at, *own)
 
 
 def _ends(data: "xarray.Dataset", name: str, count: np.ndarray) -> tuple[float, float]:
-    """Between which values half of the curves have points, read in blocks of curves."""
+    """Between which values `_LEAST` of the curves have points, read in blocks of curves."""
     low, high, row = [], [], 0
     own = count[count > 0]
     for begin, end in _blocks(len(own)):
@@ -231,4 +232,5 @@ def _ends(data: "xarray.Dataset", name: str, count: np.ndarray) -> tuple[float, 
         low.append(np.minimum.reduceat(values, first))
         high.append(np.maximum.reduceat(values, first))
         row = int(ends[-1])
-    return float(np.median(np.concatenate(low))), float(np.median(np.concatenate(high)))
+    begin, end = np.concatenate(low), np.concatenate(high)
+    return float(np.quantile(begin, _LEAST)), float(np.quantile(end, 1 - _LEAST))

@@ -13,7 +13,7 @@ from snrmjax.model.structures import Structure
 MEMBER = "member"
 FORCE = "force_n"
 TEXT = "text"
-COMPLETE = ("upper_end", "lower_end", "closed", "solved", "answered")
+COMPLETE = ("upper_end", "lower_end", "closed", "largest_velocity", "solved", "answered")
 """Statuses of members that have their whole result."""
 
 

@@ -75,6 +75,8 @@ class DampedModes(AbstractComputation):
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         found = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
         rows = _rows(found.status, found.frequency, np.abs(found.velocity[:, 1, 0]))
+        if found.status == CurveStatus.AMPLITUDE_LIMIT:  # which was asked for: a whole mode
+            rows["status"] = np.array(["largest_velocity"])
         return {**rows, "point_damping_ratio": found.damping_ratio}
 
 
