@@ -53,7 +53,7 @@ EFFECTS = (
 BANDS = (
     "Curves of all members: median, 95 % and all of them at each place. Where a response folds, it "
     "has several values at a frequency; the highest and the lowest are drawn apart. Bands end "
-    "where fewer than nine tenths of the members have a curve: those left would tell of themselves only."
+    "where fewer than nine tenths of the members have a curve: the rest would tell of itself only."
 )
 FAILED = (
     "Where members have no whole result: over the two quantities in which they differ most from "
