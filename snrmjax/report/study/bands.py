@@ -232,5 +232,5 @@ def _ends(data: "xarray.Dataset", name: str, count: np.ndarray) -> tuple[float, 
         low.append(np.minimum.reduceat(values, first))
         high.append(np.maximum.reduceat(values, first))
         row = int(ends[-1])
-    begin, end = np.concatenate(low), np.concatenate(high)
-    return float(np.quantile(begin, _LEAST)), float(np.quantile(end, 1 - _LEAST))
+    begins, stops = np.concatenate(low), np.concatenate(high)
+    return float(np.quantile(begins, _LEAST)), float(np.quantile(stops, 1 - _LEAST))
