@@ -35,7 +35,7 @@ SUB_ROOMS = {
         *("simulate.balance", "simulate.continuation", "simulate.solutions"),
     },
     "identify.curves": set(),
-    "identify.pointwise": {"identify.curves"},
+    "identify.pointwise": {"identify.checks", "identify.curves"},
     "identify.checks": set(),
     "identify.joint": {"identify.checks", "identify.curves", "identify.pointwise"},
     "identify.inference": {"identify.curves", "identify.pointwise", "identify.joint"},

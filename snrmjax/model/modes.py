@@ -58,6 +58,12 @@ class LinearModes(eqx.Module):
         return self.natural_frequency.shape[-1]
 
     @property
+    def own_modal_mass_std(self) -> Float[Array, ""] | None:
+        """1σ, relative, of the modal mass of the mode of interest; None where nobody stated it."""
+        stated = self.modal_mass_std
+        return None if stated is None else stated[..., self.mode_of_interest]
+
+    @property
     def residual_modes(self) -> tuple[int, ...]:
         """Indices of the flexible modes other than the mode of interest, which respond linearly."""
         return tuple(k for k in range(self.n_modes) if k != self.mode_of_interest)

@@ -57,7 +57,12 @@ def identification_of_fit(data: SteadyStates, fit: JointFit) -> Identification:
         gain, phase = map(float, fit.noise.level_std[:2])
         wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
         points = errors_from_scatter(
-            points, curves, level_gain=gain, level_phase=phase, frequency_std=wandering
+            points,
+            curves,
+            level_gain=gain,
+            level_phase=phase,
+            frequency_std=wandering,
+            modal_mass_std=fit.modes_found.own_modal_mass_std,
         )
     freed = "instrument_phase" in fit.free
     consequence = "have no point of their own (the joint fit uses them)"

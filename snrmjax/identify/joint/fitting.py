@@ -12,6 +12,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
+from snrmjax.identify.checks.residual_autocorrelation import (
+    added_covariance,
+    along_resonance,
+    residual_autocorrelation,
+)
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     PriorStd,
@@ -20,11 +25,6 @@ from snrmjax.identify.joint.force_balance import (
     nearest_errors,
 )
 from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
-from snrmjax.identify.joint.residual_autocorrelation import (
-    added_covariance,
-    along_resonance,
-    residual_autocorrelation,
-)
 from snrmjax.identify.joint.residuals import (
     LevelPattern,
     all_residuals,

@@ -177,10 +177,19 @@ class JointFit(AbstractResult):
 
     @property
     def modes_found(self) -> LinearModes:
-        """The linear modes with the modal mass that the fit found for the mode of interest."""
+        """The linear modes with the modal mass that the fit found for the mode of interest.
+
+        Its 1σ, where one was stated, is then the fit's.
+        """
         share = jnp.exp(-self.problem.log_modal_mass(self.unknowns))
-        found = self.modes.participation.at[self.modes.mode_of_interest].multiply(share)
-        return eqx.tree_at(lambda m: m.participation, self.modes, found)
+        j, modes = self.modes.mode_of_interest, self.modes
+        found = eqx.tree_at(
+            lambda m: m.participation, modes, modes.participation.at[j].multiply(share)
+        )
+        if modes.modal_mass_std is None:
+            return found
+        left = self.prior.linear[-1] * jnp.sqrt(jnp.asarray(self.covariance)[-1, -1])
+        return eqx.tree_at(lambda m: m.modal_mass_std, found, modes.modal_mass_std.at[j].set(left))
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""

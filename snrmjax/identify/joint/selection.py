@@ -10,6 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
+from snrmjax.identify.checks.residual_autocorrelation import (
+    along_resonance,
+    independent_share,
+    residual_autocorrelation,
+)
 from snrmjax.identify.curves.families import (
     ARGUMENTS,
     BACKBONE_FAMILIES,
@@ -22,11 +27,6 @@ from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.force_balance import LEVEL_ERRORS, BalanceData, BalanceProblem, Unknowns
 from snrmjax.identify.joint.initial_guess import levels_apart, most_parameters
 from snrmjax.identify.joint.ranking import Compared, FamilyCandidate, RivalCurve, Trial, ranked
-from snrmjax.identify.joint.residual_autocorrelation import (
-    along_resonance,
-    independent_share,
-    residual_autocorrelation,
-)
 from snrmjax.identify.joint.residuals import BalanceSlopes, balance_slopes
 from snrmjax.identify.joint.smoothness import (
     curve_columns,

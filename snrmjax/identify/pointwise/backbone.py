@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from snrmjax.identify.pointwise.backbone_points import (
     AmplitudeArgument,
     BackbonePoints,
-    off_resonance_error_factor,
+    own_errors,
 )
 from snrmjax.identify.pointwise.curve_fit import (
     AbstractPointwiseCurve,
@@ -263,7 +263,8 @@ def fit_backbone(
     by how well left-out levels are predicted; `anchor` pins both curves at the linear mode at
     zero amplitude and reports how far this moves them; `level_stds` are the 1σ that the states of
     a level share, as `Structure.level_stds` has them: relative gain, phase (rad), natural frequency
-    (rad/s) and damping ratio.
+    (rad/s) and damping ratio. A stated error of the modal mass, which all points share, widens
+    the bands: that of the damping by the same share, that of the frequency off resonance only.
     Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
     Not differentiable: knots and smoothing are chosen on the host.
@@ -277,15 +278,17 @@ def fit_backbone(
         )
     if family not in ("spline", "piecewise_linear"):
         raise ValueError(f'`family` must be "spline" or "piecewise_linear", not {family!r}.')
-    relative = np.asarray(points.relative_std)[use]
-    stated = bool(np.all(np.isfinite(relative)))
-    settings = (relative, stated, level_stds, family, n_knots)
-    free = _fit_pair(points, use, *settings, None)
+    stated = bool(np.all(np.isfinite(points.relative_std[use])))
+    kept = jax.tree.map(lambda values: values[use], points)
+    mass_std = modes.own_modal_mass_std
+    shared = (level_stds, 0.0 if mass_std is None else float(mass_std))
+    settings = (stated, shared, family, n_knots)
+    free = _fit_pair(kept, *settings, None)
     pair, report = free, None
     j, r = modes.mode_of_interest, reference_sensor(modes)
     omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     if anchor:
-        pair = _fit_pair(points, use, *settings, (omega**2, 2 * zeta * omega))
+        pair = _fit_pair(kept, *settings, (omega**2, 2 * zeta * omega))
         report = _anchor_report(
             (free[0][0], free[1][0]),
             (pair[0][0], pair[1][0]),
@@ -319,28 +322,26 @@ def fit_backbone(
 
 def _fit_pair(
     points: BackbonePoints,
-    use: np.ndarray,
-    relative: np.ndarray,
     stated: bool,
-    level_stds: tuple[float, float, float, float],
+    shared_stds: tuple[tuple[float, float, float, float], float],
     family: CurveFamily,
     n_knots: int | None,
     anchor: tuple[float, float] | None,
 ) -> tuple[tuple[CurveFit, ErrorSizes], tuple[CurveFit, ErrorSizes]]:
-    amplitude = np.asarray(points.amplitude)[use]
-    level = np.asarray(points.level)[use]
-    values = (
-        np.asarray(points.natural_frequency)[use] ** 2,
-        np.asarray(points.modal_damping)[use],
+    amplitude, level, natural, damping, frequency = map(
+        np.asarray,
+        (
+            points.amplitude,
+            points.level,
+            points.natural_frequency,
+            points.modal_damping,
+            points.frequency,
+        ),
     )
-    sensitivity = np.asarray(points.sensitivity)[use]
-    linear = np.asarray(points.linear_variance)[use]
-    # Nothing stated: one relative error for amplitude and phase alike, none for the force.
-    errors = relative if stated else np.broadcast_to([0.0, 1.0, 1.0], relative.shape)
-    far = 1.0 if stated else off_resonance_error_factor(np.asarray(points.mode_velocity))[use]
-
-    gain, phase, *own_stds = level_stds
-    natural = np.asarray(points.natural_frequency)[use]
+    values = (natural**2, damping)
+    (gain, phase, *own_stds), mass = shared_stds
+    # In proportion to the force over the modal mass: the same relative error of all points.
+    by_mass = (values[0] - frequency**2, damping)
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
@@ -351,12 +352,12 @@ def _fit_pair(
         # The error of the amplitude matters along the slope, which a first fit tells. It is as
         # smooth as the second: weights by the slopes of a rough curve follow the noise.
         for _ in range(2):
-            moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
-            std = np.sqrt(np.sum((moved * errors) ** 2, axis=1) + linear[:, component] * stated)
-            std = np.maximum(std * far, 1e-12 * np.max(np.abs(values[component])))
+            moved, std = own_errors(points, component, slope, stated=stated)
+            std = np.maximum(std, 1e-12 * np.max(np.abs(values[component])))
             own = 2 * natural * own_stds[component]
             shared = np.column_stack([gain * moved[:, 1], phase * moved[:, 2], own])
-            sample = PointSample(amplitude, values[component], std, level, shared)
+            common = mass * by_mass[component] if mass > 0 else None
+            sample = PointSample(amplitude, values[component], std, level, shared, common)
             weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
             smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
             used = sizes._replace(noise_scale=1.0) if stated else sizes

@@ -1,7 +1,7 @@
 """From measured steady states to points of the backbone and of the damping, with errors."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -121,6 +121,12 @@ def _identify(
     natural_std, damping_std = _ratios_std(
         natural, damping, sensitivity, filtered_std, linear_variance
     )
+    if modes.own_modal_mass_std is not None:
+        moved = moved_by_modal_mass(natural, damping, data.frequency)
+        natural_std, damping_std = (
+            _hypotenuse(std, by_mass * modes.own_modal_mass_std)
+            for std, by_mass in zip((natural_std, damping_std), moved, strict=True)
+        )
     on_backbone = jnp.abs(mode_velocity)
     if amplitude == "displacement":
         on_backbone = on_backbone * jnp.where(found, natural, 1.0) / data.frequency
@@ -158,6 +164,51 @@ def _identify(
         sensor=modes.sensors[r],
         argument=amplitude,
     )
+
+
+def _hypotenuse(std: Array, other: Array) -> Array:
+    """√(std² + other²), NaN where `std` is, with finite derivatives there."""
+    known = jnp.isfinite(std)
+    both = jnp.where(known, std, 1.0) ** 2 + jnp.where(known, other, 0.0) ** 2
+    return jnp.where(known, safe_root(both), jnp.nan)
+
+
+def moved_by_modal_mass(
+    natural: Float[Array, " state"] | Float[np.ndarray, " state"],
+    damping: Float[Array, " state"] | Float[np.ndarray, " state"],
+    frequency: Float[Array, " state"] | Float[np.ndarray, " state"],
+) -> tuple[Any, Any]:
+    """Derivatives of ω̃ and ζ̃ with respect to the logarithm of the model's modal mass.
+
+    ω̃² − Ω² and 2ζ̃ω̃ are in proportion to the force over the modal mass: at resonance an error of
+    it is one of the damping alone, of the same relative size.
+    """
+    by_squares = -(natural**2 - frequency**2) / (2 * natural)
+    return by_squares, -damping * (1 + by_squares / natural)
+
+
+def own_errors(
+    points: BackbonePoints,
+    component: int,
+    slope: Float[np.ndarray, " state"],
+    *,
+    stated: bool,
+) -> tuple[Float[np.ndarray, "state input"], Float[np.ndarray, " state"]]:
+    """How errors of `INPUTS` move points away from a curve, and the points' own 1σ about it.
+
+    Where no noise is stated: one relative error for amplitude and phase alike, none of the force,
+    and the standard deviations are relative.
+    Arguments: `points` in NumPy; `component` 0 for ω̃² and 1 for 2ζ̃ω̃; `slope` dg/d log a of the
+    curve at the points, along which an error of the amplitude moves them.
+    """
+    sensitivity = np.asarray(points.sensitivity)
+    moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
+    if stated:
+        linear = np.asarray(points.linear_variance)[:, component]
+        own = np.sum((moved * np.asarray(points.relative_std)) ** 2, axis=1)
+        return moved, np.sqrt(own + linear)
+    far = off_resonance_error_factor(np.asarray(points.mode_velocity))
+    return moved, np.sqrt(np.sum((moved * [0.0, 1.0, 1.0]) ** 2, axis=1)) * far
 
 
 def _ratios_std(

@@ -130,6 +130,8 @@ class PointSample(NamedTuple):
     level: np.ndarray  # (point,): points of one level share a part of their errors
     # 1σ of the errors that are known to be shared by the points of a level.
     shared: Float[np.ndarray, "point kind"] | None = None
+    # 1σ of an error that all points share, each to its own extent.
+    common: Float[np.ndarray, " point"] | None = None
 
 
 def place_knots(
@@ -183,12 +185,16 @@ def fit_curve(
     _, level = np.unique(points.level, return_inverse=True)
     together = [np.full(len(level), sizes.level_std)]
     together += [] if points.shared is None else list(points.shared.T)
+    groups = [(one, level) for one in together]
+    if points.common is not None:
+        groups.append((points.common, np.zeros_like(level)))
     result = penalised_least_squares(
         design[:, free],
         np.zeros(len(design)),
         np.ones(len(design)),
         np.concatenate(
-            [problem.condensed.of_groups(one / points.std, level) for one in together], axis=1
+            [problem.condensed.of_groups(one / points.std, group) for one, group in groups],
+            axis=1,
         ),
         problem.rough[:, free],
         np.zeros(len(problem.rough)),
@@ -301,7 +307,7 @@ def predict_left_out(
     Points outside the amplitudes of the other levels are left aside: they would be continued,
     not interpolated.
     """
-    amplitude, values, std, level, shared = points
+    amplitude, values, std, level, shared, _ = points
     problem = _problem(kind, knots, smoothing, points, fixed_first)
     at_knots, slopes, by_values = _settle(problem)
     n = len(knots)

@@ -5,16 +5,20 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
+from snrmjax.identify.checks.modal_mass import ScatteredFrequencies, mass_of_states
 from snrmjax.identify.pointwise.backbone import BackboneFit, CurveFamily, fit_backbone
 from snrmjax.identify.pointwise.backbone_points import (
     AmplitudeArgument,
     AmplitudeMeasure,
     BackbonePoints,
     identify_points,
+    moved_by_modal_mass,
     off_resonance_error_factor,
+    own_errors,
 )
-from snrmjax.identify.pointwise.curve_fit import values_on_host
+from snrmjax.identify.pointwise.curve_fit import linearised_on_host, log_slope, values_on_host
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -87,9 +91,15 @@ def identify_backbone(
     )
     if not fit.noise_stated:
         points = errors_from_scatter(
-            points, fit, level_gain=stds[0], level_phase=stds[1], frequency_std=stds[2]
+            points,
+            fit,
+            level_gain=stds[0],
+            level_phase=stds[1],
+            frequency_std=stds[2],
+            modal_mass_std=modes.own_modal_mass_std,
         )
-    return Identification(points, fit, (*data.notes, *_notes(points, fit, modes)))
+    notes = (*_notes(points, fit, modes), *_notes_on_modal_mass(points, fit, stds))
+    return Identification(points, fit, (*data.notes, *notes))
 
 
 def errors_from_scatter(
@@ -99,12 +109,14 @@ def errors_from_scatter(
     level_gain: float = 0.0,
     level_phase: float = 0.0,
     frequency_std: float = 0.0,
+    modal_mass_std: float | Float[Array, ""] | None = None,
 ) -> BackbonePoints:
     """Points whose standard deviations come from the scatter, shared by level or not.
 
     Arguments: `level_gain` (relative) and `level_phase` (rad), where known, are 1σ of the errors of
     velocity and phase that all states of a level share; `frequency_std` (rad/s) is how far the
-    natural frequency wanders from state to state.
+    natural frequency wanders from state to state; `modal_mass_std` (relative) is 1σ of the modal
+    mass, an error that all points share.
     """
     sensitivity = np.asarray(points.sensitivity)
     scale = off_resonance_error_factor(np.asarray(points.mode_velocity))[:, None] * np.array(
@@ -118,6 +130,10 @@ def errors_from_scatter(
     natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), moving)
     damping_std = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), fit.level_damping_std)
     damping_std = np.hypot(damping_std, damping * natural_std / natural)
+    if modal_mass_std is not None:
+        of_mass = moved_by_modal_mass(natural, damping, np.asarray(points.frequency))
+        natural_std = np.hypot(natural_std, of_mass[0] * float(modal_mass_std))
+        damping_std = np.hypot(damping_std, of_mass[1] * float(modal_mass_std))
     return eqx.tree_at(
         lambda p: (p.natural_frequency_std, p.damping_ratio_std),
         points,
@@ -184,6 +200,42 @@ def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str
             "the mode's shape changes with amplitude."
         )
     return notes
+
+
+def _notes_on_modal_mass(
+    points: BackbonePoints, fit: BackboneFit, level_stds: tuple[float, float, float, float]
+) -> tuple[str, ...]:
+    """Another modal mass than the model's, where states away from resonance ask for it."""
+    points = jax.tree.map(np.asarray, points)
+    use = np.asarray(points.usable & np.isfinite(points.amplitude))
+    points = jax.tree.map(lambda values: values[use], points)
+    curve = fit.backbone.squared_frequency
+    amplitude, natural = np.asarray(points.amplitude), np.asarray(points.natural_frequency)
+    slope = log_slope(curve, amplitude)
+    moved, std = own_errors(points, 0, slope, stated=fit.noise_stated)
+    gain, phase, frequency, _ = level_stds
+    own = 2 * natural * np.hypot(frequency, fit.level_frequency_std)
+    states = ScatteredFrequencies(
+        level=np.asarray(points.level),
+        frequency=np.asarray(points.frequency),
+        squared=natural**2,
+        std=np.maximum(std, 1e-12 * np.max(natural**2)),
+        shared=np.column_stack([gain * moved[:, 1], phase * moved[:, 2], own]),
+    )
+    start = linearised_on_host(curve, amplitude)
+    found = mass_of_states(states, *start, stated=fit.noise_stated)
+    if found is None or not found.contradicts:
+        return ()
+    model = 1 / abs(float(fit.backbone.modal_constant))
+    ratio = np.exp(found.log_ratio)
+    change = 100 * (1 / ratio - 1)
+    return (
+        f"the states away from resonance ask for a modal mass of {model * ratio:.4g} ± "
+        f"{model * ratio * found.std:.2g} kg; the model has {model:.4g} kg. Damping in per cent is "
+        f"relative to the model's: relative to {model * ratio:.4g} kg it is {abs(change):.2g} % "
+        f"{'larger' if change > 0 else 'smaller'}. A gain of the force or of the sensor does the "
+        "same: check both and the linear test; a joint fit (`--fit auto`) takes what it finds.",
+    )
 
 
 FREE_PHASE = (

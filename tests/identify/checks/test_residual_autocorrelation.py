@@ -7,12 +7,12 @@ from truths.exact_states import LEVELS, NOISE, TRUE, exact, modes, stated, truth
 from truths.sizes import repeats
 
 import snrmjax as sj
-from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.joint.residual_autocorrelation import (
+from snrmjax.identify.checks.residual_autocorrelation import (
     added_covariance,
     along_resonance,
     residual_autocorrelation,
 )
+from snrmjax.identify.joint.joint_fit import fit_jointly
 
 
 def drawn(rng, rho, *shape):
