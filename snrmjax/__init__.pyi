@@ -7,6 +7,7 @@ from .identify.joint.joint_fit import fit_jointly
 from .identify.pointwise.identification import identify_backbone
 from .io.models import read_model
 from .io.tables import read_steady_states
+from .numerics.compiled import use_compilation_cache
 from .simulate.solutions.forced_response import forced_response
 from .simulate.solutions.normal_modes import nonlinear_normal_mode
 from .simulate.virtual_test.phase_resonance_test import phase_resonance_test
@@ -30,4 +31,5 @@ __all__ = [
     "read_steady_states",
     "simulate",
     "study",
+    "use_compilation_cache",
 ]

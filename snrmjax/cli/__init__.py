@@ -4,12 +4,9 @@ Each imports what it needs by itself: none waits for the imports of another.
 """
 
 import inspect
-import os
 import sys
 from collections.abc import Callable
 
-import jax
-import platformdirs
 import typer
 
 from snrmjax.cli.console import refuse
@@ -18,6 +15,7 @@ from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
+from snrmjax.numerics.compiled import use_compilation_cache
 
 app = typer.Typer(
     name="snrmjax",
@@ -55,9 +53,7 @@ app.add_typer(study_app)
 
 def main() -> None:
     """Run the commands; wrong input ends with exit code 2 and one sentence."""
-    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("snrmjax")
-    jax.config.update("jax_compilation_cache_dir", cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    use_compilation_cache()
     try:
         app()
     except ValueError as error:

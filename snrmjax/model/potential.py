@@ -51,19 +51,23 @@ class PolynomialPotential(eqx.Module):
         flat = _products(displacement, basis) @ coefficients
         return flat.reshape(*displacement.shape[:-1], n, n)
 
-    def stiffness_of_rows(
-        self, displacement: Float[Array, "mode time point"]
-    ) -> Float[Array, "time mode mode point"]:
-        """Tangent stiffness ∂²V/∂q∂q of many motions at many times, in 1/s².
+    def force_of_rows(
+        self, displacement: Float[Array, "mode sample"]
+    ) -> Float[Array, "mode sample"]:
+        """As `force`, with the samples along the last axis, where long loops are fast."""
+        basis, to_coefficient = _derivative_map(self.monomials, self.n_modes)
+        coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), self.n_modes)
+        return coefficients.T @ _products_of_rows(displacement, basis)
 
-        As `stiffness`, with the points along the last axis, where long loops are fast.
-        """
+    def stiffness_of_rows(
+        self, displacement: Float[Array, "mode sample"]
+    ) -> Float[Array, "mode mode sample"]:
+        """As `stiffness`, with the samples along the last axis."""
         basis, to_coefficient = _second_derivative_map(self.monomials, self.n_modes)
         n = self.n_modes
         coefficients = (self.coefficient @ to_coefficient).reshape(len(basis), n * n)
-        _, times, points = displacement.shape
-        products = _products_of_rows(displacement.reshape(n, -1), basis)
-        return jnp.moveaxis((coefficients.T @ products).reshape(n, n, times, points), 2, 0)
+        flat = coefficients.T @ _products_of_rows(displacement, basis)
+        return flat.reshape(n, n, displacement.shape[1])
 
 
 def polynomial_potential(

@@ -200,30 +200,37 @@ def samples_for(model: Structure, harmonic_order: int, n_samples: int | None) ->
 
 def truncation_error(
     balance: HarmonicBalance,
-    coefficients: Float[Array, "coefficient mode"],
-    frequency: Float[Array, ""],
-) -> Float[Array, ""]:
+    coefficients: Float[Array, "point coefficient mode"],
+    frequency: Float[Array, " point"],
+) -> Float[Array, " point"]:
     """Estimated share of the velocity that the harmonics left out, H + 1 to 2H, would have.
 
     The forces that the motion exerts at those harmonics, over the linear dynamic stiffness there:
     the first step of a Newton iteration with twice the harmonics. Root mean square over the
     period and the modes, relative; frequency in rad/s.
     """
-    model, order = balance.model, balance.harmonic_order
+    model, order, n = balance.model, balance.harmonic_order, balance.model.n_modes
     basis = harmonic_basis(2 * order, samples_for(model, 2 * order, None))
-    x = jnp.pad(coefficients, ((0, 2 * order), (0, 0)))
-    samples = jnp.asarray(basis.synthesis) @ x
-    rate = frequency * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
-    force = (jnp.asarray(basis.analysis) @ model.nonlinear_force(samples, rate))[2 * order + 1 :]
-    terms, h = model.linear_terms(), np.arange(order + 1, 2 * order + 1)[:, None]
-    stiffness = terms.stiffness - terms.mass * (h * frequency) ** 2
+    x = jnp.moveaxis(coefficients, 0, 2)
+    synthesis = basis.synthesis[:, : 2 * order + 1]
+    samples = jnp.tensordot(synthesis, x, axes=1)  # (time, mode, point)
+    if any(isinstance(effect, AbstractForce) for effect in model.effects):
+        slopes = (basis.synthesis @ basis.derivative)[:, : 2 * order + 1]
+        rate = frequency * jnp.tensordot(slopes, x, axes=1)
+        values = jax.vmap(model.nonlinear_force, in_axes=2, out_axes=2)(samples, rate)
+    else:
+        rows = jnp.moveaxis(samples, 1, 0)
+        values = model.potential.force_of_rows(rows.reshape(n, -1)).reshape(rows.shape)
+        values = jnp.moveaxis(values, 0, 1)
+    force = jnp.tensordot(basis.analysis[2 * order + 1 :], values, axes=1)
+    terms, h = model.linear_terms(), np.arange(order + 1, 2 * order + 1)[:, None, None]
+    stiffness = terms.stiffness[:, None] - terms.mass[:, None] * (h * frequency) ** 2
     square = (force[0::2] ** 2 + force[1::2] ** 2) / (
-        stiffness**2 + (terms.damping * h * frequency) ** 2
+        stiffness**2 + (terms.damping[:, None] * h * frequency) ** 2
     )
-    left_out = jnp.sum(h**2 * square)
-    repeated = np.repeat(np.arange(1, order + 1), 2)[:, None]
-    kept = jnp.sum((repeated * coefficients[1:]) ** 2)
-    return jnp.sqrt(left_out / kept)
+    left_out = jnp.sum(h**2 * square, axis=(0, 1))
+    repeated = np.repeat(np.arange(1, order + 1), 2)[:, None, None]
+    return jnp.sqrt(left_out / jnp.sum((repeated * x[1:]) ** 2, axis=(0, 1)))
 
 
 def linear_coefficients(

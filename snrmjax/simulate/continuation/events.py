@@ -1,6 +1,5 @@
-"""Folds, peaks, phase resonances and bifurcations along curves of periodic motions."""
+"""Folds, peaks and phase resonances along curves of periodic motions."""
 
-import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,14 +13,10 @@ from snrmjax.numerics.compiled import compiled
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance
 from snrmjax.simulate.continuation.continuation import StepControl, correct
 from snrmjax.simulate.continuation.event_location import LocatedEvent, locate_event
-from snrmjax.simulate.continuation.stability import MARGIN, floquet_multipliers
 
 EVENT_KINDS = ("fold", "peak", "phase_resonance")
-BIFURCATIONS = ("branch_point", "period_doubling", "neimark_sacker")
 _BLOCK = 8  # intervals that one call works on
-_FOLDS_OWN = 12  # points from a fold at which its multiplier may cross
 _INSIDE = 7  # points inside an interval that is looked at more closely
-_CROSSING = 2.5e-7  # of a step, to which the crossing of the circle is located
 
 
 class CurvePoints(NamedTuple):
@@ -83,22 +78,29 @@ def _between(
     here: Array,
     tangent: Array,
     there: Array,
+    arriving: Array,
     share: Array,
     wanted: Array,
     steps: StepControl,
 ) -> tuple:
-    """Points of the curve at shares of the way between neighbours, with their tangents."""
+    """Points of the curve at shares of the way between neighbours, with their tangents.
+
+    Guessed by the cubic through both neighbours with their tangents.
+    """
 
     def one(balance: HarmonicBalance, *row: Array) -> tuple:
-        here, tangent, there, share, wanted = row
+        here, tangent, there, arriving, share, wanted = row
         length = tangent @ (there - here)
-        guess = here + share * (there - here)
+        chord = there - here
+        early, late = (jnp.linalg.norm(chord) * t - chord for t in (tangent, arriving))
+        bend = share * (1 - share) * ((1 - share) * early - share * late)
+        guess = here + share * chord + bend
         guess = guess + (share * length - tangent @ (guess - here)) * tangent
         patience = jnp.where(wanted, 2 * steps.iterations, 0)
         found = correct(balance.linearised, guess, tangent, steps.tolerance, patience)
         return found.point, found.tangent, found.converged
 
-    return mapped(one, balances, here, tangent, there, share, wanted)
+    return mapped(one, balances, here, tangent, there, arriving, share, wanted)
 
 
 def _in_blocks(
@@ -158,12 +160,12 @@ def with_events(
     rows = (np.array(kind), here, ahead, there)
     found, tangents, resolved, missed = _in_blocks(_locate, balances, np.array(owner), rows, steps)
     for e in np.flatnonzero(missed).tolist():
-        divided[owner[e]] = _with_missed(divided[owner[e]], EVENT_KINDS[kind[e]])
+        divided[owner[e]] = with_missed(divided[owner[e]], EVENT_KINDS[kind[e]])
     new = [
-        _New(owner[e], position[e], found[e], tangents[e], EVENT_KINDS[kind[e]])
+        NewPoint(owner[e], position[e], found[e], tangents[e], EVENT_KINDS[kind[e]])
         for e in np.flatnonzero(resolved).tolist()
     ]
-    return _inserted(divided, new)
+    return inserted(divided, new)
 
 
 def _heights(
@@ -214,12 +216,14 @@ def _divided(
             share += [(i + 1) / (_INSIDE + 1) for i in range(_INSIDE)]
     if not owner:
         return list(curves)
-    found, tangents, ok = _points_between(balances, curves, owner, position, share, steps)
+    found, tangents, ok = points_between(balances, curves, owner, position, share, steps)
     keep = np.flatnonzero(ok).tolist()
-    return _inserted(curves, [_New(owner[k], position[k], found[k], tangents[k], "") for k in keep])
+    return inserted(
+        curves, [NewPoint(owner[k], position[k], found[k], tangents[k], "") for k in keep]
+    )
 
 
-def _points_between(
+def points_between(
     balances: HarmonicBalance,
     curves: list[CurvePoints],
     owner: list,
@@ -227,11 +231,13 @@ def _points_between(
     share: list,
     steps: StepControl,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points at shares of the way to the next one, their tangents, and whether they were found."""
     pairs = list(zip(owner, position, strict=True))
     here = np.stack([curves[o].points[k] for o, k in pairs])
     ahead = np.stack([curves[o].tangents[k] for o, k in pairs])
     there = np.stack([curves[o].points[k + 1] for o, k in pairs])
-    rows = (here, ahead, there, np.array(share))
+    arriving = np.stack([curves[o].tangents[k + 1] for o, k in pairs])
+    rows = (here, ahead, there, arriving, np.array(share))
     found, tangents, ok = _in_blocks(_between, balances, np.array(owner), rows, steps)
     turned = np.einsum("ku,ku->k", tangents, ahead) < 0
     return found, np.where(turned[:, None], -tangents, tangents), ok
@@ -269,7 +275,7 @@ def _may_vanish_twice(
     return same & towards & (bound < 0)
 
 
-class _New(NamedTuple):
+class NewPoint(NamedTuple):
     """A point to be put between two neighbours of a curve."""
 
     owner: int  # which curve
@@ -280,7 +286,7 @@ class _New(NamedTuple):
     multipliers: np.ndarray | None = None
 
 
-def _inserted(curves: list[CurvePoints], new: list[_New]) -> list[CurvePoints]:
+def inserted(curves: list[CurvePoints], new: list[NewPoint]) -> list[CurvePoints]:
     """The curves with new points put in their places, in order along each step."""
     result = list(curves)
     for number in sorted({e.owner for e in new}):
@@ -306,141 +312,6 @@ def _inserted(curves: list[CurvePoints], new: list[_New]) -> list[CurvePoints]:
     return result
 
 
-def _with_missed(curve: CurvePoints, kind: str) -> CurvePoints:
+def with_missed(curve: CurvePoints, kind: str) -> CurvePoints:
+    """The curve with one more event that was not located."""
     return curve._replace(not_located=(*curve.not_located, kind))
-
-
-def with_bifurcations(
-    balance: HarmonicBalance,
-    curve: CurvePoints,
-    multipliers: Complex[np.ndarray, "point multiplier"],
-    steps: StepControl,
-) -> CurvePoints:
-    """The curve with the points inserted where a multiplier crosses the unit circle.
-
-    A real multiplier through −1 is a period doubling, a complex pair a Neimark-Sacker
-    bifurcation, and +1 away from a fold a branch point; "bifurcation" in `not_located` stands for
-    one that could not be located. Returns the curve with the multipliers of all its points.
-    `balance` is stacked, of one member.
-    """
-    curve = curve._replace(multipliers=multipliers)
-    regular = np.array([k for k, label in enumerate(curve.labels) if "fold" not in label], int)
-    outside, beyond_one = _outside(multipliers), _beyond_one(multipliers)
-    rest = outside - beyond_one
-    crossings, beside_fold, quiet_folds = [], [], []
-    for k, following in itertools.pairwise(regular.tolist()):
-        if not np.all(np.isfinite(multipliers[[k, following]])):
-            continue
-        if following == k + 1:
-            crossings += [k] if outside[k] != outside[following] else []
-            continue
-        # At a fold one multiplier crosses +1 anyway; others may cross elsewhere beside it.
-        own = abs(int(beyond_one[following]) - int(beyond_one[k]))
-        if own == 0:
-            quiet_folds.append(k + 1)
-        beside = [m for m in range(k, following) if rest[m] != rest[m + 1]]
-        beside_fold += beside
-        crossings += beside or ([following - 1] if own > 1 else [])
-    # Truncated harmonics turn the curve a little beside the place where the motion loses its
-    # stability: a crossing of +1 next to a fold without one is the fold's own.
-    for fold in quiet_folds:
-        near = [k for k in crossings if abs(k - fold) <= _FOLDS_OWN and _real_plus(multipliers, k)]
-        if near:
-            crossings.remove(min(near, key=lambda k: abs(k - fold)))
-    if not crossings:
-        return curve
-    without_one = np.isin(crossings, beside_fold)
-    return _located_bifurcations(balance, curve, crossings, without_one, steps)
-
-
-def _real_plus(multipliers: np.ndarray, k: int) -> bool:
-    """Whether the multiplier that crosses between a point and the next does so near +1."""
-    count = max(_outside(multipliers[k : k + 2]))
-    row = multipliers[k + 1] if _outside(multipliers[k + 1]) == count else multipliers[k]
-    last = row[np.argsort(-np.abs(row))[count - 1]]
-    return bool(abs(last.imag) < 1e-9 * abs(last) and last.real > 0)
-
-
-def _located_bifurcations(
-    balance: HarmonicBalance,
-    curve: CurvePoints,
-    crossings: list[int],
-    without_one: Bool[np.ndarray, " crossing"],
-    steps: StepControl,
-) -> CurvePoints:
-    """Where the last multiplier that crosses is on the circle, to a millionth of a step.
-
-    Chandrupatla's method in the share of the step, with that multiplier's modulus. Where it is to
-    be found `without_one`, crossings of +1 do not count.
-    """
-    from scipy.optimize import elementwise  # not for curves without bifurcations
-
-    member, known = taken(balance, 0), np.asarray(curve.multipliers)
-    ends = np.stack([known[crossings], known[np.array(crossings) + 1]])
-    counts = _outside(ends) - np.where(without_one, _beyond_one(ends), 0)
-    last = np.max(counts, axis=0)
-
-    def height(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Modulus beyond the circle, of the multiplier that is outside at one end only."""
-        free = without_one[which][:, None] & _is_beyond_one(rows)
-        radius = np.sort(np.where(free, 0.0, np.abs(rows)), axis=1)
-        return radius[np.arange(len(rows)), -last[which]] - (1.0 + MARGIN)
-
-    every = np.arange(len(crossings))
-    first, second = (height(rows, every) for rows in ends)
-
-    def at(share: np.ndarray, which: np.ndarray) -> np.ndarray:
-        if np.all(share == 0.0) or np.all(share == 1.0):
-            return np.where(share == 0.0, first[which], second[which])
-        position = [crossings[e] for e in which.tolist()]
-        found, _, ok = _points_between(
-            balance, [curve], [0] * len(which), position, share.tolist(), steps
-        )
-        values = height(_multipliers_of(member, found), which)
-        return np.where(ok & np.isfinite(values), values, first[which])
-
-    tolerances = {"xatol": _CROSSING, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0}
-    bracket = np.zeros(len(every)), np.ones(len(every))
-    located = elementwise.find_root(at, bracket, args=(every,), tolerances=tolerances)
-    owner, share = [0] * len(crossings), located.x.tolist()
-    found, tangents, ok = _points_between(balance, [curve], owner, list(crossings), share, steps)
-    ok = ok & located.success
-    rows = _multipliers_of(member, found)
-    for _ in np.flatnonzero(~ok):
-        curve = _with_missed(curve, "bifurcation")
-    new = [
-        _New(0, crossings[k], found[k], tangents[k], _crossing_kind(rows[k]), rows[k])
-        for k in np.flatnonzero(ok).tolist()
-    ]
-    return _inserted([curve], new)[0]
-
-
-def _outside(multipliers: np.ndarray) -> np.ndarray:
-    return np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1)
-
-
-def _beyond_one(multipliers: np.ndarray) -> np.ndarray:
-    """How many multipliers are real and beyond +1, where a fold sends one of them."""
-    return np.sum(_is_beyond_one(multipliers), axis=-1)
-
-
-def _is_beyond_one(multipliers: np.ndarray) -> np.ndarray:
-    real = np.abs(multipliers.imag) < 1e-9 * np.abs(multipliers)
-    return real & (multipliers.real > 1.0 + MARGIN)
-
-
-def _multipliers_of(balance: HarmonicBalance, points: np.ndarray) -> np.ndarray:
-    size = (balance.n_coefficients, balance.model.n_modes)
-    x = points[:, :-1].reshape(-1, *size) * np.asarray(balance.displacement_scale)
-    return floquet_multipliers(
-        balance.model, x, points[:, -1] * np.asarray(balance.frequency_scale)
-    )
-
-
-def _crossing_kind(multipliers: Complex[np.ndarray, " multiplier"]) -> str:
-    """What kind of bifurcation the multiplier nearest to the unit circle makes."""
-    nearest = multipliers[np.argmin(np.abs(np.abs(multipliers) - 1.0))]
-    # At a crossing of +1 or −1 two multipliers of a light damped mode may be close by.
-    if abs(nearest.imag) > 1e-4:
-        return "neimark_sacker"
-    return "period_doubling" if nearest.real < 0 else "branch_point"

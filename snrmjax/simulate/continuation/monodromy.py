@@ -1,5 +1,6 @@
 """Monodromy matrices: what small disturbances of a periodic motion become over one period."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -26,7 +27,7 @@ class _Memory(NamedTuple):
     dragged: Bool[Array, "step point slider"]
 
 
-@compiled
+@partial(compiled, long_loops=True)
 def monodromy(
     model: Structure,
     coefficients: Float[Array, "point coefficient mode"],
@@ -67,7 +68,8 @@ def _by_kicks(
         angle = tau[:, None] * orders
         waves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=2).reshape(len(tau), -1)
         q = (rows[0] + waves @ rows[1:]).reshape(len(tau), n, n_points)
-        return model.potential.stiffness_of_rows(jnp.moveaxis(q, 1, 0)) / per_mass
+        tangent = model.potential.stiffness_of_rows(jnp.moveaxis(q, 1, 0).reshape(n, -1))
+        return jnp.moveaxis(tangent.reshape(n, n, len(tau), n_points), 2, 0) / per_mass
 
     varying = stiffness(2 * jnp.pi * jnp.arange(48) / 48)
     mean = jnp.mean(varying, axis=0)[own, own]

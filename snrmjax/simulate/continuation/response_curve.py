@@ -6,7 +6,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.numerics.blocks import by_blocks, over_cores, taken
 from snrmjax.numerics.compiled import compiled
@@ -14,12 +14,9 @@ from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, truncation_error
 from snrmjax.simulate.balance.harmonics import velocity_along
 from snrmjax.simulate.balance.labelled import HERTZ, counted, motion_variables, range_text
+from snrmjax.simulate.continuation.bifurcations import with_bifurcations
 from snrmjax.simulate.continuation.continuation import STATUS_MESSAGE, CurveStatus, StepControl
-from snrmjax.simulate.continuation.events import (
-    CurvePoints,
-    with_bifurcations,
-    with_events,
-)
+from snrmjax.simulate.continuation.events import CurvePoints, with_events
 from snrmjax.simulate.continuation.stability import (
     Stability,
     StabilityLoss,
@@ -197,7 +194,7 @@ def _response(
     truncation = None
     if curve.multipliers is not None:
         (truncation,) = by_blocks(
-            lambda x, w: (_truncation(balance, x, w),), 128, coefficients, frequency
+            lambda x, w: (_truncation(balance, x, w),), 32, coefficients, frequency
         )
     return ResponseCurve(
         force=float(balance.force),
@@ -215,6 +212,4 @@ def _response(
     )
 
 
-@compiled
-def _truncation(balance: HarmonicBalance, coefficients: Array, frequency: Array) -> Array:
-    return jax.vmap(lambda x, w: truncation_error(balance, x, w))(coefficients, frequency)
+_truncation = compiled(truncation_error)

@@ -10,14 +10,13 @@ from snrmjax.model.beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_bea
 from snrmjax.model.modes import linear_modes
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
-from snrmjax.simulate.continuation import events
+from snrmjax.simulate.continuation import bifurcations, events
+from snrmjax.simulate.continuation.bifurcations import BIFURCATIONS, with_bifurcations
 from snrmjax.simulate.continuation.continuation import StepControl
 from snrmjax.simulate.continuation.curve_tracing import response_balances
 from snrmjax.simulate.continuation.events import (
-    BIFURCATIONS,
     EVENT_KINDS,
     CurvePoints,
-    with_bifurcations,
 )
 from snrmjax.simulate.solutions.forced_response import forced_response
 
@@ -294,8 +293,8 @@ def line_with_a_crossing(monkeypatch, between):
         along = np.outer(np.ones(len(here)), [0, 0, 0, 1.0])
         return np.outer(found, [0, 0, 0, 1.0]), along, ok
 
-    monkeypatch.setattr(events, "floquet_multipliers", multipliers_at)
-    monkeypatch.setattr(events, "_points_between", points_between)
+    monkeypatch.setattr(bifurcations, "floquet_multipliers", multipliers_at)
+    monkeypatch.setattr(bifurcations, "points_between", points_between)
     curve = CurvePoints(points, np.outer(np.ones(6), [0, 0, 0, 1.0]), ("",) * 6)
     multipliers = multipliers_at(None, None, points[:, -1])
     return with_bifurcations(balance, curve, multipliers, StepControl()), multipliers_at
