@@ -5,9 +5,9 @@ from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.optimal_design import next_measurements
 from .identify.joint.joint_fit import fit_jointly
 from .identify.pointwise.identification import identify_backbone
+from .io.compilation_cache import use_compilation_cache
 from .io.models import read_model
 from .io.tables import read_steady_states
-from .numerics.compiled import use_compilation_cache
 from .simulate.solutions.forced_response import forced_response
 from .simulate.solutions.normal_modes import nonlinear_normal_mode
 from .simulate.virtual_test.phase_resonance_test import phase_resonance_test

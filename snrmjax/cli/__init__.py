@@ -15,7 +15,7 @@ from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
-from snrmjax.numerics.compiled import use_compilation_cache
+from snrmjax.io.compilation_cache import use_compilation_cache
 
 app = typer.Typer(
     name="snrmjax",

@@ -1,6 +1,5 @@
 """Programs of many small steps, compiled to run one step after the other."""
 
-import os
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
@@ -13,7 +12,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
 
-_WORTH_KEEPING = 0.05  # seconds of compilation: reading a program back takes a fifth of that
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"
 _OPTIONS: dict[str, str | bool | int] = {
@@ -86,26 +84,6 @@ def jitted(function: Callable[P, R]) -> Callable[P, R]:
 
 def _number(leaf: Any) -> Any:
     return np.asarray(leaf)[()] if isinstance(leaf, float | complex) else leaf
-
-
-def use_compilation_cache(folder: str | os.PathLike[str] | None = None) -> None:
-    """Keep compiled programs on disk, so that the next process starts without compiling them.
-
-    Arguments: `folder` to keep them in; None takes the one that JAX's own variable
-    JAX_COMPILATION_CACHE_DIR names, or else the user's cache folder for snrmjax, which the
-    commands use too. To be called before the first simulation. Machines with different processors
-    need folders of their own.
-
-    >>> import snrmjax as sj
-    >>> sj.use_compilation_cache()  # doctest: +SKIP
-    """
-    import platformdirs
-
-    where = folder or os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    jax.config.update(
-        "jax_compilation_cache_dir", str(where or platformdirs.user_cache_dir("snrmjax"))
-    )
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
 
 
 class _Array:

@@ -150,7 +150,7 @@ class _Bracket(NamedTuple):
     low: _Trial
     high: _Trial
     beside: _Trial | None = None
-    slow: bool = False  # whether the last points hardly narrowed it
+    slow: bool = False  # whether the last estimate hardly narrowed it
 
     @property
     def width(self) -> float:
@@ -193,7 +193,8 @@ class _Bracket(NamedTuple):
             others.append(self.beside)
         middle = 0.5 * (low.share + high.share)
         beside = min(others, key=lambda t: abs(t.share - middle))
-        return _Bracket(low, high, beside, high.share - low.share > 0.25 * self.width)
+        slow = not self.slow and high.share - low.share > 0.25 * self.width
+        return _Bracket(low, high, beside, slow)
 
 
 def _outside(multipliers: np.ndarray) -> np.ndarray:

@@ -1,0 +1,34 @@
+"""Programs that one process leaves on disk and the next one reads."""
+
+import os
+import subprocess
+import sys
+
+SCRIPT = """
+import sys, jax, snrmjax as sj
+counts = {}
+jax.monitoring.register_event_listener(lambda name, **_: counts.update({name: counts.get(name, 0) + 1}))
+sj.use_compilation_cache(sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.jit(lambda x: x * 3.0)(2.0)
+print(counts.get("/jax/compilation_cache/cache_hits", 0))
+"""
+
+
+def test_the_second_process_reads_what_the_first_compiled(tmp_path):
+    hidden = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    variables = {k: v for k, v in os.environ.items() if k not in hidden}
+    hits = [
+        int(
+            subprocess.run(
+                [sys.executable, "-c", SCRIPT, tmp_path / "programs"],
+                check=True,
+                capture_output=True,
+                text=True,
+                env=variables,
+            ).stdout
+        )
+        for _ in range(2)
+    ]
+    assert hits[0] == 0
+    assert hits[1] > 0
