@@ -3,9 +3,18 @@
 `jaxcont.continuation` makes a new function object at every call and so compiles at every call;
 the engine beneath it, `pseudo_arclength_scan`, takes the residual as a static argument and
 compiles once, so it is what is timed here. Stability and events are left out. The Jacobian is
-jaxcont's own (forward mode). Run by simulator_speed.py.
+jaxcont's own (forward mode). Run by simulator_speed.py, and by speed_per_core.py with `--cold`
+(import and first curve) or `--batch N` (forces from a tenth of the problem's, by `jax.vmap` of the
+engine as jaxcont's example of a sweep has it, and one by one).
 """
 
+import json
+import sys
+import time
+
+BEGIN = time.perf_counter()
+
+# ruff: noqa: E402
 from collections.abc import Callable
 from importlib.metadata import version
 
@@ -13,19 +22,27 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-# ruff: noqa: E402
 import jax.numpy as jnp
 import numpy as np
 from jaxcont.core.scan_continuation import pseudo_arclength_scan
-from peer_problem import Curve, Polynomial, Problem, basis, end_status, linear_start, serve
+from peer_problem import (
+    Curve,
+    Polynomial,
+    Problem,
+    basis,
+    end_status,
+    linear_start,
+    read_problem,
+    serve,
+)
 
 MAX_POINTS = 1000
 ITERATIONS = 8
 LARGEST_STEP = 0.5  # of the others': without control of the angle this gives as many points
 
 
-def solver(problem: Problem) -> Callable[[], Curve]:
-    """Build the residual; the returned function follows the curve."""
+def parts(problem: Problem) -> tuple[Callable, tuple]:
+    """The residual at a share of the force, and the engine's arguments."""
     n, size = problem.n_modes, 2 * problem.harmonic_order + 1
     matrices, polynomial = basis(problem.harmonic_order, problem.n_samples), Polynomial(problem)
     scale = problem.frequency_scale
@@ -38,7 +55,7 @@ def solver(problem: Problem) -> Callable[[], Curve]:
     load = np.zeros((size, n))
     load[1] = problem.force * problem.participation / (scale**2 * problem.displacement_scale)
 
-    def residual(u: jax.Array, frequency: jax.Array) -> jax.Array:
+    def residual(u: jax.Array, frequency: jax.Array, share: jax.Array | float) -> jax.Array:
         x = u.reshape(size, n)
         q = synthesis @ x
         padded = jnp.concatenate([q, jnp.ones((q.shape[0], 1))], axis=1)
@@ -49,7 +66,7 @@ def solver(problem: Problem) -> Callable[[], Curve]:
             (squared - h2 * frequency**2) * x
             + frequency * damping * (derivative @ x)
             + analysis @ (product @ coefficient)
-            - load
+            - share * load
         )
         return balance.reshape(-1)
 
@@ -68,7 +85,17 @@ def solver(problem: Problem) -> Callable[[], Curve]:
             )
         ),
     )
+    return residual, arguments
+
+
+def solver(problem: Problem) -> Callable[[], Curve]:
+    """Build the residual; the returned function follows the curve."""
+    at_share, arguments = parts(problem)
+    n, size = problem.n_modes, 2 * problem.harmonic_order + 1
     iterations = jnp.asarray(ITERATIONS)
+
+    def residual(u: jax.Array, frequency: jax.Array) -> jax.Array:
+        return at_share(u, frequency, 1.0)
 
     def run() -> Curve:
         result = pseudo_arclength_scan(residual, *arguments, MAX_POINTS, iterations)
@@ -82,10 +109,45 @@ def solver(problem: Problem) -> Callable[[], Curve]:
     return run
 
 
+def many(problem: Problem, count: int) -> dict[str, float]:
+    """Seconds of all curves for forces up to the problem's: side by side and one by one."""
+    at_share, (start, *settings) = parts(problem)
+    shares = jnp.geomspace(0.1, 1.0, count)
+
+    def one(share: jax.Array) -> jax.Array:
+        def residual(u: jax.Array, frequency: jax.Array) -> jax.Array:
+            return at_share(u, frequency, share)
+
+        iterations = jnp.asarray(ITERATIONS)
+        found = pseudo_arclength_scan(residual, share * start, *settings, MAX_POINTS, iterations)
+        return found.states, found.params, found.n_valid
+
+    together, alone = jax.jit(jax.vmap(one)), jax.jit(one)
+    ways = {
+        "vmap": lambda: jax.block_until_ready(together(shares)),
+        "one_by_one": lambda: [jax.block_until_ready(alone(share)) for share in shares],
+    }
+    seconds = {}
+    for name, way in ways.items():
+        times = []
+        for _ in range(4):
+            begin = time.perf_counter()
+            way()
+            times.append(time.perf_counter() - begin)
+        seconds[name] = float(np.median(times[1:]))
+    return seconds
+
+
 if __name__ == "__main__":
-    serve(
-        "jaxcont",
-        f"jaxcont {version('jaxcont')}, jax {version('jax')}",
-        "pseudo_arclength_scan, jacfwd, residual norm <= tolerance",
-        solver,
-    )
+    if sys.argv[2] == "--cold":
+        solver(read_problem(sys.argv[1]))()
+        print(time.perf_counter() - BEGIN)
+    elif sys.argv[2] == "--batch":
+        print(json.dumps(many(read_problem(sys.argv[1]), int(sys.argv[3]))))
+    else:
+        serve(
+            "jaxcont",
+            f"jaxcont {version('jaxcont')}, jax {version('jax')}",
+            "pseudo_arclength_scan, jacfwd, residual norm <= tolerance",
+            solver,
+        )

@@ -144,9 +144,9 @@ def linear_start(problem: Problem) -> np.ndarray:
     return start / problem.displacement_scale
 
 
-def read_problem(path: Path) -> Problem:
+def read_problem(path: Path | str) -> Problem:
     """The problem in a JSON file."""
-    data = json.loads(path.read_text())
+    data = json.loads(Path(path).read_text())
     for name in ("natural_frequency", "damping_ratio", "participation", "mode_shape"):
         data[name] = np.array(data[name], dtype=np.float64)
     data["monomials"] = tuple(tuple(m) for m in data["monomials"])
