@@ -195,6 +195,39 @@ def test_another_highest_peak_is_seen_by_whole_curves():
     assert any(f"{other} have another event in place of peak" in note for note in found.notes)
 
 
+def test_a_peak_that_merges_is_replaced_by_the_one_that_is_left():
+    # Two modes in opposite phase have no antiresonance between them: with much damping of the
+    # first one its peak becomes a shoulder of the second one's.
+    rates, gains, second = np.array([2.0, 2.25]), np.array([1.0, -0.6]), 0.03
+    modes = linear_modes(rates, [RATIO, second], [gains], [1.0, 1.0])
+    model = structure(modes, polynomial_potential({}, 2))
+    name = "mode_1.damping_ratio"
+    inputs = uncertain_inputs(model, {name: RATIO}, marginals={name: "lognormal"})
+    peak = response_quantities(
+        model, inputs, 1.0, 8.0, force=1.0, kinds=("peak",), harmonic_order=1
+    )
+    z = normal_members(48, 1, seed=0)
+    found = peak.members(z)
+    omega = np.linspace(1.8, 2.6, 80001)
+    replaced = 0
+    for (ratio,), values, status in zip(
+        np.asarray(jax.vmap(inputs.values)(z)), found.values, found.status, strict=True
+    ):
+        damping = np.array([ratio, second])[:, None]
+        apart = rates[:, None] ** 2 - omega**2 + 2j * damping * rates[:, None] * omega
+        height = np.abs(np.sum(gains[:, None] * 1j * omega / apart, axis=0))
+        inside = height[1:-1]
+        tops = np.flatnonzero((inside > height[:-2]) & (inside > height[2:])) + 1
+        alone = len(tops) == 1 and omega[tops[0]] > 2.15
+        replaced += alone
+        kind = MemberStatus.REPLACED if alone else MemberStatus.FOUND
+        assert set(status.tolist()) == {int(kind)}
+        # The grid's step is 1e-5 rad/s; a top of half width 2e-3 is lower beside by (1e-5/2e-3)²/2.
+        assert values[0] * HERTZ == pytest.approx(omega[tops[0]], abs=2e-5)
+        assert values[1] == pytest.approx(height[tops[0]], rel=2e-5)
+    assert 3 < replaced < 45
+
+
 def test_second_order_is_exact_for_a_quadratic():
     # z + ½rz² = ½r((z + 1/r)² − 1/r²): a noncentral χ² of one degree of freedom.
     r = 0.6
