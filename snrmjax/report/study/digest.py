@@ -105,7 +105,7 @@ def effects_table(shown: Sequence[EffectPanels]) -> ReportTable:
         if not order:
             continue
         cells = [f"{name}: {_per_cent(one)}" for name, one in order[:_RANKS]]
-        rest = 1.0 - sum(one.share for _, one in order)
+        rest = 1.0 - sum(max(one.share, 0.0) for _, one in order)
         filled = cells + [""] * (_RANKS - len(cells))
         rows.append((output.title, *filled, f"{100 * max(rest, 0.0):.0f} %"))
     return ReportTable(

@@ -139,7 +139,11 @@ def _distributions(folder: Path, found: StudyDigest) -> Section:
         figure = distributions_figure(shown[k : k + _PANELS])
         figures.append(_saved(folder, name, figure, DISTRIBUTIONS))
     caption = "All outputs over the members; further quantiles are in summary.csv."
-    rows = [row for row in found.summaries if row.varies or not row.scalar.is_count]
+    rows = [
+        row
+        for row in found.summaries
+        if not row.scalar.is_count or (row.varies and row.scalar.name in _SPREAD)
+    ]
     return Section("Distributions", (), figures, [summary_table(rows, caption)])
 
 
