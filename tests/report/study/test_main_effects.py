@@ -39,7 +39,7 @@ def test_intervals_hold_the_true_share_about_as_often_as_they_say():
         x = random.standard_normal((3, 300))
         found = main_effect(x[1], coefficients @ x)
         inside += abs(found.share - truth[1]) < found.half_width
-    # 95 of 100, with three standard deviations of a binomial and a jackknife that is a little short.
+    # 95 of 100 with three standard deviations of a binomial; a jackknife is a little short.
     assert 87 <= inside <= 99
 
 
