@@ -146,13 +146,6 @@ def of_the_others(relative, data):
     return numbers(*(value[OTHERS] for value in each))
 
 
-def of_all_states(relative, data):
-    """What all states say, by what they share."""
-    points = sj.identify.identify_points(data, moved_modes(MODES[2], relative))
-    each = (points.natural_frequency, points.damping_ratio, points.natural_frequency_std)
-    return numbers(*each, points.damping_ratio_std, points.backbone_velocity)
-
-
 class TestIdentifyPoints:
     @pytest.mark.parametrize("stated", STATED)
     def test_by_what_was_measured(self, stated):
@@ -179,7 +172,7 @@ class TestIdentifyPoints:
 
     @pytest.mark.parametrize("failure", FAILURES)
     def test_all_states_of_a_batch_with_a_failed_one(self, failure):
-        check_derivatives(of_all_states, 9, table(failure, **STATED["all stated"]))
+        check_derivatives(by_two_sensors, 9, table(failure, **STATED["all stated"]))
 
 
 CONSTANT = 3.0 * FORCE

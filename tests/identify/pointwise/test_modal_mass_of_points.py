@@ -79,7 +79,7 @@ def test_bands_of_curves_include_the_mass_undiminished_by_the_number_of_points(p
 
 
 def test_one_side_of_resonance_leaves_the_mass_in_the_frequency():
-    level, omega, force, velocity = exact(per_level=9, widest=60)
+    level, omega, force, velocity = exact(per_level=27, widest=60)
     use = np.angle(velocity) > np.radians(20)
     states = stated(level[use], omega[use], force[use], velocity[use])
     # Three knots: nothing is chosen anew for another mass.
@@ -113,7 +113,7 @@ def test_exact_states_tell_the_mass_itself():
 
 
 def test_states_near_resonance_say_nothing_of_the_mass():
-    level, omega, force, velocity = exact(per_level=5, widest=8)
+    level, omega, force, velocity = exact(per_level=9, widest=8)
     rng = np.random.default_rng(1)
     noise = NOISE["velocity"] * rng.normal(size=len(level))
     found = sj.identify_backbone(
