@@ -81,7 +81,10 @@ class Cluster:
         self.scheduler = started(
             "distributed.cli.dask_scheduler", "--port", port, *host, "--no-dashboard"
         )
-        self.workers = [started(*work) for _ in range(2)]
+        work = ("--nthreads", "1", *host, "--no-dashboard")
+        self.workers = [
+            started("distributed.cli.dask_worker", self.address, *work) for _ in range(2)
+        ]
 
     def close(self) -> None:
         """Stop all of them."""

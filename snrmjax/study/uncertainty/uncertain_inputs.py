@@ -13,6 +13,7 @@ from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.model.parameters import checked_names, parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.study.variations import AbstractVariation, standard_normal
 
 FORCE = "force_n"
 Marginal = Literal["normal", "lognormal", "uniform"]
@@ -57,6 +58,10 @@ class UncertainInputs(AbstractResult):
         spread = self.mean + half_width * (2 * jax.scipy.stats.norm.cdf(own) - 1)
         return jnp.where(kind == "lognormal", grown, jnp.where(kind == "uniform", spread, own))
 
+    def variation(self) -> "InputVariation":
+        """The same numbers as what varies between the members of a `Study`."""
+        return InputVariation(self.names, self)
+
     def possible(self, z: Float[np.ndarray, "member input"]) -> np.ndarray:
         """Whether every number of a member that must be positive is so, one truth a member.
 
@@ -85,6 +90,17 @@ class UncertainInputs(AbstractResult):
             "marginal": Variable(at, np.array(self.marginals), "", "kind of distribution"),
             "covariance": Variable(across, self.covariance, "SI", "covariance"),
         }
+
+
+class InputVariation(AbstractVariation):
+    """Uncertain numbers, such as a calibration's posterior, as what varies in a study."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    inputs: UncertainInputs
+
+    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
+        """See `AbstractVariation.quantiles`."""
+        return np.asarray(jax.vmap(self.inputs.values)(jnp.asarray(standard_normal(unit))))
 
 
 def uncertain_inputs(
