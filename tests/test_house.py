@@ -50,7 +50,7 @@ SUB_ROOMS = {
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
-    "study.uncertainty": set(),
+    "study.uncertainty": {"study.variations"},
 }
 NUMERICAL = set(ROOMS) - {"io", "study", "report"}
 MOST_MODULES = 12
