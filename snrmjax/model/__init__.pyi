@@ -1,3 +1,4 @@
+from .arches import ArchSettings, shallow_arch
 from .averaging import averaged_effect, averaged_force, averaged_response
 from .beams import CURVED_BEAM_FORCES, FLAT_BEAM_FORCES, curved_beam, flat_beam
 from .effect_base import (
@@ -45,6 +46,7 @@ __all__ = [
     "AbstractLinearChange",
     "AbstractMeasurementEffect",
     "AbstractMemoryless",
+    "ArchSettings",
     "Argument",
     "Confusion",
     "Imitation",
@@ -75,6 +77,7 @@ __all__ = [
     "potential_from_force_table",
     "register_effect",
     "residual_velocity",
+    "shallow_arch",
     "shape_of",
     "structure",
     "with_parameters",

@@ -1,3 +1,4 @@
+from .computations.base import OfForces
 from .computations.modes import DampedModes, NormalModes
 from .computations.responses import Curves, Peaks, ResponseRange
 from .computations.tests import Diagnoses, Identifications, VirtualTests
@@ -36,6 +37,7 @@ __all__ = [
     "Identifications",
     "MemberStatus",
     "NormalModes",
+    "OfForces",
     "Peaks",
     "Propagation",
     "PropagationSettings",

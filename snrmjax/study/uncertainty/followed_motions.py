@@ -1,6 +1,6 @@
 """Peaks, folds and phase resonances of a forced response as functions of uncertain inputs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -52,6 +52,7 @@ class Base(NamedTuple):
 
     model: Structure
     force: Float[np.ndarray, ""]  # N, where it is not among the inputs
+    model_of: Callable[[dict[str, Array]], Structure] | None = None  # of the inputs by name
 
 
 class ResponseQuantities(AbstractQuantities):
@@ -159,6 +160,7 @@ def response_quantities(
     force: float | None = None,
     kinds: Sequence[EventKind] = ("peak", "fold", "phase_resonance"),
     harmonic_order: int = 9,
+    model_of: Callable[[dict[str, Array]], Structure] | None = None,
 ) -> ResponseQuantities:
     """Frequency (Hz) and velocity (m/s) of a response's events as functions of uncertain inputs.
 
@@ -170,7 +172,8 @@ def response_quantities(
     fold or on a minimum is refused.
 
     Arguments: frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
-    among `inputs`.
+    among `inputs`; `model_of`, a differentiable JAX function that makes the model of the inputs'
+    values by name, where inputs are no parameters of `model` (dimensions, say).
     Returns `ResponseQuantities`; kinds of which the nominal curve has none are in its `notes`.
     Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
     where the nominal curve has none of the events.
@@ -191,13 +194,13 @@ def response_quantities(
         if kind not in get_args(EventKind):
             raise ValueError(f"`kinds` must be out of {get_args(EventKind)}, but has {kind!r}.")
     checked = [name for name in inputs.names if name != FORCE]
-    if checked:
+    if checked and model_of is None:
         checked_names(model, checked)
     if (force is None) != (FORCE in inputs.names):
         verb = "are given none of" if force is None else "have"
         raise ValueError(f"`force` must be given once, but it is {force!r} and inputs {verb} it.")
     load = np.asarray(1.0 if force is None else force, dtype=np.float64)
-    base = Base(model, load)
+    base = Base(model, load, model_of)
     nominal, nominal_force = _at(base, inputs, jnp.zeros(len(inputs.names)))
     settings = ResponseSettings(harmonic_order=harmonic_order, stability=False)
     ends = np.array([from_frequency, to_frequency], dtype=np.float64)
@@ -258,7 +261,9 @@ def _at(base: Base, inputs: UncertainInputs, z: Float[Array, " input"]) -> tuple
     load, model = jnp.asarray(base.force), base.model
     if FORCE in inputs.names:
         load = values[inputs.names.index(FORCE)]
-    if own:
+    if base.model_of is not None:
+        model = base.model_of(dict(zip(inputs.names, values, strict=True)))
+    elif own:
         names = [inputs.names[k] for k in own]
         model = with_parameters(model, names, values[np.array(own)])
     return model, load

@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 from snrmjax.model.modes import linear_modes
-from snrmjax.model.parameters import parameter_values
+from snrmjax.model.parameters import parameter_values, with_parameters
 from snrmjax.model.potential import polynomial_potential
 from snrmjax.model.structures import structure
 from snrmjax.study.uncertainty.followed_motions import response_quantities
@@ -319,6 +319,27 @@ def test_members_that_make_no_sequence_are_refused(settings, complaint):
     inputs = correlated_inputs(["x"], [1.0], [[1.0]])
     with pytest.raises(ValueError, match=complaint):
         propagate_uncertainty(FunctionQuantities(jnp.sin, inputs, ("y",), ("",)), settings)
+
+
+def of_loss_factor(values):
+    """The oscillator with half the loss factor as its damping ratio."""
+    return with_parameters(oscillator(), ["mode_1.damping_ratio"], values["loss_factor"][None] / 2)
+
+
+def test_inputs_may_be_other_numbers_than_the_model_has():
+    # |V| is largest at Ω = ω, there F φ b/(2ζω) = F φ b/(ηω): by 1/η, whose derivatives are known.
+    inputs = correlated_inputs(["loss_factor"], [2 * RATIO], [[(0.1 * RATIO) ** 2]])
+    model, ends = oscillator(), (1.0, 4.0)
+    own = {"force": FORCE, "kinds": ("peak",), "harmonic_order": 1}
+    found = response_quantities(model, inputs, *ends, **own, model_of=of_loss_factor)
+    value, gradient, hessian = found.expansion()
+    relative = np.array([gradient[1, 0], hessian[1, 0, 0]]) / value[1]
+    # Relative 1σ of 0.05: −0.05 and 2 · 0.05². Rounding of a solved motion's second derivative.
+    np.testing.assert_allclose(relative, [-0.05, 2 * 0.05**2], rtol=1e-7)
+    np.testing.assert_allclose(gradient[0] / value[0], 0.0, atol=1e-9)
+    z = np.array([[-2.0], [2.0]])
+    peaks = found.members(z).values[:, 1]
+    np.testing.assert_allclose(peaks / value[1], 1 / (1 + 0.05 * z[:, 0]), rtol=1e-9)
 
 
 def test_what_cannot_be_followed_is_refused():
