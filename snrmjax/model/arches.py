@@ -146,7 +146,7 @@ def _gathered(tensor: Float[Array, "..."]) -> tuple[Float[Array, " monomial"], t
     sums = np.zeros((len(monomials), len(places)))
     for k, place in enumerate(places):
         sums[row[tuple(sorted(place))], k] = 1.0
-    return sums @ tensor.ravel(), monomials
+    return jnp.asarray(sums) @ tensor.ravel(), monomials
 
 
 class _BeamIntegrals(NamedTuple):
