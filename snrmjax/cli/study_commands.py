@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,7 @@ from snrmjax.cli.console import console, say, staged, warn
 from snrmjax.cli.options import FILES, Out
 
 if TYPE_CHECKING:
-    from snrmjax.report.study.digest import StudyDigest
+    from snrmjax.report.study.summary import ScalarSummary
     from snrmjax.study.engine import Progress, ProgressReport
     from snrmjax.study.run import Expected, Shard, StudyRun
     from snrmjax.study.study import Study
@@ -130,7 +130,7 @@ def report(
     data = open_study(store)
     with staged(out) as folder:
         found = write_study_report(folder, data)
-    _say_summary(found)
+    _say_summary(found.headline, found.summaries)
     say(f"written to {out}")
 
 
@@ -182,21 +182,25 @@ def _say_done(done: "StudyRun", out: Path) -> None:
     if not done.complete:
         say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
+        from snrmjax.report.study.digest import output_summaries
+
+        _say_summary(f"{done.members} members", output_summaries(done.open()))
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
+        say(f"figures and tables of it: snrmjax study report {out} --out report")
     else:
         say(f"nothing was left to compute; {done.members} members are in {out}")
 
 
-def _say_summary(found: "StudyDigest") -> None:
+def _say_summary(title: str, summaries: "Sequence[ScalarSummary]") -> None:
     """The outputs that vary, as a table."""
     from rich.table import Table
     from rich.text import Text
 
     from snrmjax.report.study.summary import summary_table
 
-    rows = [row for row in found.summaries if row.varies and not row.scalar.is_count]
+    rows = [row for row in summaries if row.varies and not row.scalar.is_count]
     shown = summary_table(rows[:_ROWS_SAID], "")
-    table = Table(title=found.headline, title_justify="left", title_style="", box=None)
+    table = Table(title=title, title_justify="left", title_style="", box=None)
     said = [shown.header.index(name) for name in ("output", "unit", "median", "95 % range")]
     for k in said:
         table.add_column(shown.header[k], no_wrap=k > 0)
@@ -204,7 +208,7 @@ def _say_summary(found: "StudyDigest") -> None:
         table.add_row(*(Text(row[k]) for k in said))
     console.print(table)
     if len(rows) > _ROWS_SAID:
-        say(f"and {len(rows) - _ROWS_SAID} more outputs: see summary.csv")
+        say(f"and {len(rows) - _ROWS_SAID} more outputs")
 
 
 @contextmanager

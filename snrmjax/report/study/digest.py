@@ -50,6 +50,11 @@ class StudyDigest(NamedTuple):
         return f"{n} members, " + (f"of which {failed} failed." if failed else "none failed.")
 
 
+def output_summaries(data: "xarray.Dataset") -> list[ScalarSummary]:
+    """The summaries of a data set's outputs alone."""
+    return [summarized(one) for one in scalars(data)]
+
+
 def digest(data: "xarray.Dataset") -> StudyDigest:
     """The numbers of a study's data set; outputs are read one after another."""
     quantities = {k: v for k, v in varied_quantities(data).items() if np.ptp(v) > 0}
