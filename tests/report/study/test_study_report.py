@@ -113,7 +113,8 @@ def test_failures_are_placed(written):
     assert found.failures.n_failed == n_failed
     assert found.failures.counts == {"upper_end": 2 * N - n_failed, "step_too_small": n_failed}
     assert found.failures.kinds == ["step_too_small"]
-    assert most_telling(found.quantities, found.failures.failed)[0] == NASTY
+    both = {"a": data_set()["a.b"].values, "b": b}
+    assert most_telling(both, found.failures.failed) == ["b", "a"]
     share = failure_share(b, found.failures.failed)
     assert share.edges[8] == pytest.approx(0.8, abs=0.05)
     np.testing.assert_array_equal(share.share[[0, 3, 6, 9]], [0.0, 0.0, 0.0, 1.0])
