@@ -103,13 +103,14 @@ class HarmonicBalance(eqx.Module):
         tangent = model.pointwise.tangent_stiffness(samples, rate).reshape(self.n_samples, n * n)
         blocks = tangent_blocks(basis, tangent / fs**2).reshape(size, size, n, n)
         blocks = blocks.transpose(0, 2, 1, 3)
-        eye, own = jnp.eye(size)[:, None, :], np.arange(n)
+        eye = jnp.eye(size)[:, None, :]
         linear = (
             eye * stiffness[:, None]
             - omega**2 * eye * inertia[:, :, None]
             + omega * jnp.asarray(basis.derivative)[:, None, :] * damping[:, None]
         )
-        blocks = blocks.at[:, own, :, own].add(linear.transpose(1, 0, 2))
+        # Adding zeros beside the diagonal is faster than writing to its entries one by one.
+        blocks = blocks + linear[..., None] * np.eye(n)[:, None]
         column = damping * slope - 2 * omega * inertia * x
         if model.effects:
             added, by_rate = self._effects(samples, rate, by_omega, omega)
