@@ -14,6 +14,7 @@ LONG = (
     "03_joint_fit_and_error_bars",
     "04_the_missing_effect",
     "05_the_papers_open_ends",
+    "06_uncertain_curved_beam",
 )  # a minute and more
 PATHS = [
     pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)
@@ -29,7 +30,7 @@ def test_it_runs_to_its_end(path, tmp_path):
         capture_output=True,
         text=True,
         timeout=600,
-        env={**os.environ, "MPLBACKEND": "agg"},
+        env={**os.environ, "MPLBACKEND": "agg", "STUDY_MEMBERS": "128"},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "\nyes  " in done.stdout, "the notebook checks nothing"
