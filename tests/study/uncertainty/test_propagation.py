@@ -100,6 +100,7 @@ def duffing_inputs(relative):
     return model, uncertain_inputs(model, std, force=FORCE)
 
 
+@pytest.mark.long
 def test_gradient_and_hessian_of_a_duffing_resonance_are_those_of_its_backbone():
     model, inputs = duffing_inputs(0.03)
     found = response_quantities(
@@ -171,6 +172,7 @@ def test_folds_are_followed_to_where_they_merge_and_no_further():
     assert ceased > 10
 
 
+@pytest.mark.long
 def test_another_highest_peak_is_seen_by_whole_curves():
     modes = linear_modes([2.0, 5.0], [0.02, 0.02], [[1.0, 1.0]], [1.0, 2.2])
     model = structure(modes, polynomial_potential({}, 2))
@@ -195,6 +197,7 @@ def test_another_highest_peak_is_seen_by_whole_curves():
     assert any(f"{other} have another event in place of peak" in note for note in found.notes)
 
 
+@pytest.mark.long
 def test_a_peak_that_merges_is_replaced_by_the_one_that_is_left():
     # Two modes in opposite phase have no antiresonance between them: with much damping of the
     # first one its peak becomes a shoulder of the second one's.
