@@ -1,26 +1,36 @@
 """Compiled programs kept on disk for later processes."""
 
+import hashlib
 import os
+import platform
+from pathlib import Path
 
 import jax
 import platformdirs
 
-_WORTH_KEEPING = 0.05  # seconds of compilation: reading a program back takes a fifth of that
+WORTH_KEEPING = 0.05  # seconds of compilation: reading a program back takes a fifth of that
 
 
 def use_compilation_cache(folder: str | os.PathLike[str] | None = None) -> None:
     """Keep compiled programs on disk, so that the next process starts without compiling them.
 
     Arguments: `folder` to keep them in; None takes the one that JAX's own variable
-    JAX_COMPILATION_CACHE_DIR names, or else the user's cache folder for snrmjax, which the
-    commands use too. To be called before the first simulation. Machines with different processors
-    need folders of their own.
+    JAX_COMPILATION_CACHE_DIR names, or else the user's cache folder for snrmjax and this kind of
+    processor, which the commands use too. To be called before the first simulation. Machines with
+    different processors need folders of their own.
 
     >>> import snrmjax as sj
     >>> sj.use_compilation_cache()  # doctest: +SKIP
     """
     where = folder or os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    jax.config.update(
-        "jax_compilation_cache_dir", str(where or platformdirs.user_cache_dir("snrmjax"))
-    )
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+    jax.config.update("jax_compilation_cache_dir", str(where or default_cache_folder()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+
+
+def default_cache_folder() -> Path:
+    """The user's folder for programs that were compiled for this kind of processor."""
+    listed = Path("/proc/cpuinfo")
+    text = listed.read_text(encoding="utf-8") if listed.exists() else platform.processor()
+    kind = sorted({line for line in text.splitlines() if line.startswith(("model name", "flags"))})
+    digest = hashlib.sha256("\n".join(kind or [text]).encode()).hexdigest()
+    return Path(platformdirs.user_cache_dir("snrmjax")) / digest[:12]

@@ -7,8 +7,8 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from typing import Any
 
 import jax
-import platformdirs
 
+from snrmjax.io.compilation_cache import WORTH_KEEPING, default_cache_folder
 from snrmjax.study.tasks import ENVIRONMENT, settle
 
 INSTALL_CLUSTER = "a Dask cluster needs the package distributed: pip install 'snrmjax[cluster]'."
@@ -167,6 +167,9 @@ def available_cores() -> list[int]:
 
 def _environment() -> dict[str, str]:
     """Of the workers: one thread, and compiled programs kept where all of them find them."""
-    cache = jax.config.values["jax_compilation_cache_dir"] or platformdirs.user_cache_dir("snrmjax")
-    kept = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
+    cache = jax.config.values["jax_compilation_cache_dir"] or default_cache_folder()
+    kept = {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(WORTH_KEEPING),
+    }
     return {**ENVIRONMENT, **kept}
