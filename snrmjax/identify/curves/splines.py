@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument, Coefficient, linear_start
 
-_NEAREST = 0.01  # distance of two knots, of their amplitude
-_SMALL = 0.05  # amplitude, of the largest, below which distances count as if they were there
+_NEAREST = 1.05  # ratio of two knots' amplitudes
 
 
 class Spline(AbstractFamily):
@@ -100,7 +99,7 @@ def _drawn_and_slope(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 class SmoothingSpline(Spline):
-    """A natural cubic spline with a knot at every level that is as smooth as the data ask for.
+    """A natural cubic spline with many knots that is as smooth as the data ask for.
 
     Its bends, the differences of a value from the straight line between those at the next knots,
     have a prior 1σ that restricted maximum likelihood estimates: one for all while families are
@@ -124,8 +123,8 @@ class SmoothingSpline(Spline):
 
     @classmethod
     def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
-        """See `AbstractFamily`: a knot at rest and one at every level, or more if these are few."""
-        return (int(np.clip(n_levels, min(8, n_states // 3), cls.largest_size - 1)) + 1,)
+        """See `AbstractFamily`: as many as states can tell: their bends' size makes it smooth."""
+        return (int(np.clip(n_states // 3, 2, cls.largest_size - 1)) + 1,)
 
     @classmethod
     def starts(
@@ -136,17 +135,18 @@ class SmoothingSpline(Spline):
         values: np.ndarray,
         weight: np.ndarray,
     ) -> list[AbstractFamily]:
-        """See `AbstractFamily`; knots at rest and in the middles of groups of equally many states.
+        """See `AbstractFamily`; knots at rest and at amplitudes of states.
 
-        Knots that would almost coincide are one.
+        Amplitudes that almost coincide count once: of a level that passes its resonance most
+        states are far below it, and the few at resonance need knots too.
         """
         scale = float(np.max(amplitude))
-        groups = np.array_split(np.sort(amplitude / scale), order - 1)
         apart = [1.0]
-        for knot in [float(np.median(group)) for group in groups][-2::-1]:
-            if knot < apart[-1] - _NEAREST * max(apart[-1], _SMALL):
-                apart.append(knot)
-        knots = np.array([0.0, *apart[::-1]]) ** 2
+        for one in np.sort(amplitude / scale)[::-1]:
+            if 0 < one * _NEAREST <= apart[-1]:
+                apart.append(float(one))
+        pick = np.linspace(0, len(apart) - 1, min(order - 1, len(apart)))
+        knots = np.array([0.0, *np.array(apart)[np.round(pick).astype(int)][::-1]]) ** 2
         unit = jnp.asarray(scale, dtype=jnp.float64)
         blank = cls.through(knots, np.zeros(len(knots)), unit, argument)
         start = linear_start(spline_columns(blank, amplitude), values, weight)

@@ -16,6 +16,7 @@ from snrmjax.identify.checks.residual_autocorrelation import (
     added_covariance,
     along_resonance,
     residual_autocorrelation,
+    sizes_off_resonance,
 )
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
@@ -33,6 +34,7 @@ from snrmjax.identify.joint.residuals import (
 )
 from snrmjax.identify.joint.selection import Selection
 from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
+from snrmjax.identify.pointwise.backbone_points import OFF_RESONANCE
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 
@@ -148,10 +150,14 @@ def fitted(
     # What is left of overstated noise shares no more than it has.
     size = components.noise**2 if stated and components.contradicts_downward else 1.0
     counted = 1.0 if trusted else components.independent
+    unequal = None
+    if not stated:
+        phase = np.angle(np.asarray(problem.data.velocity))
+        unequal = sizes_off_resonance(residuals, rows @ root, phase, OFF_RESONANCE)
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
-        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels, counted),
+        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels, counted, unequal),
         problem=problem,
         components=components,
         residuals=residuals,

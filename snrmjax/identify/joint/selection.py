@@ -132,6 +132,16 @@ def select_families(
     # What the initial guess misses looks like level-to-level variance: that serves to choose
     # families, and theirs to choose again, until both belong together.
     own, jitter, guess = prepared(guess)
+    if components_too and smooth:
+        # Noise is what the most flexible curves leave: what stiff ones miss would count as noise
+        # and speak for them. Reference: Mallows, Technometrics 15 (1973) 661,
+        # doi:10.1080/00401706.1973.10489103.
+        pair = [guess.squared_frequency, guess.modal_damping]
+        asked = (("backbone", request.backbone), ("damping", request.damping))
+        for k, (name, choice) in enumerate(asked):
+            if choice.kind == "auto":
+                pair[k] = own.compare(name, choice, (_SMOOTH,), pair[1 - k]).best
+        own, jitter, guess = prepared(_with_curves(guess, pair))
     status = SelectionStatus.NOT_SETTLED
     for _ in range(_ROUNDS):
         tried = own.compare("backbone", request.backbone, kinds[0], guess.modal_damping)

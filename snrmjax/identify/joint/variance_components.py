@@ -137,7 +137,9 @@ def estimated_components(
         _, kinds, others = forward(straight, np.zeros(len(stated), dtype=bool))
         other = likelihood.best(straight, kinds | is_bend, ends)
         cost, other_cost = (float(price[mask[:n_errors]].sum()) for mask in (chosen, kinds))
-        if other.value + other_cost < found.value + cost:
+        # Levels that differ by as much as no structure's do are a curve's, in steps.
+        sound = np.max(other.std[open_kinds], initial=0.0) <= _AT_THE_END * _LARGEST
+        if sound and other.value + other_cost < found.value + cost:
             found, unbounded = other, others
     return VarianceComponents(
         noise=found.noise,
