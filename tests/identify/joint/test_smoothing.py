@@ -80,6 +80,22 @@ def drawn(seed, bend_std, noise, shared=0.0):
     return problem, Bends(2 + np.arange(15), (1e-7, 10.0)), 17 + np.arange(16)[:, None]
 
 
+def test_knots_lie_where_few_states_are_at_resonance():
+    """Four levels that pass resonance: most states are far below it, where levels overlap."""
+    detuned = np.linspace(-4, 4, 25)
+    amplitude = np.concatenate([peak / np.hypot(1, detuned) for peak in (0.1, 0.2, 0.5, 1.0)])
+    (order,) = SmoothingSpline.sizes(len(amplitude), 4)
+    given = (amplitude, np.ones_like(amplitude), np.ones_like(amplitude))
+    (curve,) = SmoothingSpline.starts(order, "displacement", *given)
+    knots = np.sqrt(np.asarray(curve.knots))[1:]
+    np.testing.assert_allclose(knots[[0, -1]], [0.1 / np.hypot(1, 4), 1.0], rtol=0.05)
+    # A knot at every level's peak or close to it, and two at least between any of them.
+    for peak in (0.1, 0.2, 0.5, 1.0):
+        assert np.min(np.abs(np.log(knots / peak))) < 0.08
+    for low, high in ((0.1, 0.2), (0.2, 0.5), (0.5, 1.0)):
+        assert np.sum((knots > 1.02 * low) & (knots < 0.98 * high)) >= 2
+
+
 def test_the_size_of_bends_is_found_without_bias():
     found = [likeliest_std(*drawn(seed, 0.2, 0.02)[:2]) for seed in range(20)]
     # Fifteen bends tell their size to 1/sqrt(30).
