@@ -120,8 +120,9 @@ def added_covariance(
     Arguments: `root` K with (JᵀJ)⁻¹ = KKᵀ; `jacobian` of the states' whitened residuals; the share
     of the states that the fit `counted`, which is in these residuals already; `size` of the
     states' errors, in units of what the fit took for their 1σ (`sizes_off_resonance`).
-    References: White, Econometrica 48 (1980) 817, doi:10.2307/1912934; Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610, with an
-    autoregressive process of first order in place of their weights.
+    References: White, Econometrica 48 (1980) 817, doi:10.2307/1912934; Newey & West, Econometrica
+    55 (1987) 703, doi:10.2307/1913610, with an autoregressive process of first order in place of
+    their weights.
     """
     excess = np.zeros((root.shape[1], root.shape[1]))
     for part, rho in enumerate(correlation):

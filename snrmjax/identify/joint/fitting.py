@@ -157,7 +157,8 @@ def fitted(
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
-        covariance=root @ root.T + size * added_covariance(root, rows, alike, levels, counted, unequal),
+        covariance=root @ root.T
+        + size * added_covariance(root, rows, alike, levels, counted, unequal),
         problem=problem,
         components=components,
         residuals=residuals,
