@@ -104,10 +104,9 @@ class SmoothingSpline(Spline):
     Its bends, the differences of a value from the straight line between those at the next knots,
     have a prior 1σ that restricted maximum likelihood estimates: one for all while families are
     compared, then 1.5 times one that changes along the curve (`sizes_along`), with adjacent bends
-    correlated (`likeness`). A band then covers what the curve may do between levels; with few free
-    knots it does not cover what they cannot follow. Levels lie
-    denser where a curve is rougher, so that bends from level to level are more alike than
-    curvature is.
+    correlated (`likeness`). A band then covers what the curve may do between knots; with few free
+    knots it does not cover what they cannot follow. Knots are many, about evenly spaced in the
+    logarithm of amplitude: steps of damping as joints begin to slip lie between levels too.
     Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.
     """
 
@@ -123,7 +122,7 @@ class SmoothingSpline(Spline):
 
     @classmethod
     def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
-        """See `AbstractFamily`: as many as states can tell: their bends' size makes it smooth."""
+        """See `AbstractFamily`: as many states can tell; the size of bends makes it smooth."""
         return (int(np.clip(n_states // 3, 2, cls.largest_size - 1)) + 1,)
 
     @classmethod

@@ -106,7 +106,8 @@ def select_families(
     worse, the one with the fewest parameters is taken. The guess's deviations of levels are in
     their own units; states are taken as the problem corrects them. The level-to-level variance
     beyond what is stated is estimated if `components_too`, and so is how the size of bends changes
-    along a smooth curve: the initial guess does not determine them. Without `smooth`, splines with
+    along a smooth curve: the initial guess does not determine them. Noise is then what smooth
+    curves leave, by which all families are scored. Without `smooth`, splines with
     few free knots stand in for smoothing splines.
     """
     kinds = [
