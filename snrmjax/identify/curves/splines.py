@@ -122,7 +122,7 @@ class SmoothingSpline(Spline):
 
     @classmethod
     def sizes(cls, n_states: int, n_levels: int) -> tuple[int, ...]:
-        """See `AbstractFamily`: as many states can tell; the size of bends makes it smooth."""
+        """See `AbstractFamily`: one for three states at most; bends of a size make it smooth."""
         return (int(np.clip(n_states // 3, 2, cls.largest_size - 1)) + 1,)
 
     @classmethod
