@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -125,12 +125,13 @@ def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings =
     begin = time.perf_counter()
     if is_collected(folder, described):
         return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
-    with _locked(folder, settings.shard):
+    workers = _workers(settings, study.n_chunks)  # a cluster that is not there leaves nothing
+    with closing(workers), _locked(folder, settings.shard):
         _claim(folder, described)
         job = Job(plan, folder, fingerprint(described))
         found = found_chunks(folder, job.fingerprint, study.n_chunks)
         remove_leftovers(folder, found)
-        done = _computed(job, found, settings)
+        done = _computed(job, found, settings, workers)
         every = found_chunks(folder, job.fingerprint, study.n_chunks)
         missing = study.n_chunks - len(every.whole)
         if not missing:
@@ -155,7 +156,9 @@ def discard_chunks(out: str | os.PathLike[str]) -> None:
     shutil.rmtree(folder.work)
 
 
-def _computed(job: Job, found: FoundChunks, settings: RunSettings) -> Progress:
+def _computed(
+    job: Job, found: FoundChunks, settings: RunSettings, workers: AbstractWorkers
+) -> Progress:
     study, n = job.planned.study, len(job.planned.table)
     before = sum(len(job.planned.rows_of(k)) for k in found.whole)
     missing = [k for k in range(study.n_chunks) if k not in found.whole]
@@ -165,17 +168,13 @@ def _computed(job: Job, found: FoundChunks, settings: RunSettings) -> Progress:
     if not missing:
         return state
     begin = time.perf_counter()
-    workers = _workers(settings, len(missing))
-    try:
-        with _words_for_disk(job.folder):
-            for number, receipt in enumerate(receipts(job, workers, missing)):
-                state = state.with_receipt(receipt, time.perf_counter() - begin)
-                if number == 0:
-                    _announce(job, settings, state, receipt.seconds, workers.width)
-                if settings.progress is not None:
-                    settings.progress(state)
-    finally:
-        workers.close()
+    with _words_for_disk(job.folder):
+        for number, receipt in enumerate(receipts(job, workers, missing)):
+            state = state.with_receipt(receipt, time.perf_counter() - begin)
+            if number == 0:
+                _announce(job, settings, state, receipt.seconds, workers.width)
+            if settings.progress is not None:
+                settings.progress(state)
     return state
 
 

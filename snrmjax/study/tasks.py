@@ -35,21 +35,22 @@ class Receipt(NamedTuple):
     memory: int  # bytes, most that the worker has held
 
 
-def settle(cores: Any = None) -> None:
-    """Before the first chunk: stay on one core, and end with the process that started this one.
+def settle(parent: int, cores: Any) -> None:
+    """Before the first chunk: end with the process that started this one, and stay on one core.
 
-    Arguments: `cores` is a queue with the number of a core for every worker.
+    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker.
     """
-    if cores is not None and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {cores.get()})
-    parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(0.2)
         os._exit(1)
 
+    # First of all: a parent that is killed now leaves nobody who would fill the queue.
     threading.Thread(target=watch, daemon=True).start()
+    core = cores.get()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core})
 
 
 def computed_rows(planned: PlannedStudy, numbers: range) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ import abc
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 
@@ -97,7 +97,7 @@ class LocalProcesses(AbstractWorkers):
             self.processes,
             context=context,
             initializer=settle,
-            initargs=(cores,),
+            initargs=(os.getpid(), cores),
             timeout=None,
             env=_environment(),
         )
@@ -105,6 +105,8 @@ class LocalProcesses(AbstractWorkers):
 
 class DaskCluster(AbstractWorkers):
     """The workers of a running Dask scheduler."""
+
+    patience: ClassVar[str] = "10s"  # with a scheduler that does not answer
 
     def __init__(self, address: str) -> None:
         """Arguments: the scheduler's address, such as tcp://node1:8786.
@@ -119,7 +121,7 @@ class DaskCluster(AbstractWorkers):
         self._gone = (distributed.comm.CommClosedError, distributed.client.FutureCancelledError)
         self.address = address
         try:
-            self._client = distributed.Client(address, timeout="10s", set_as_default=False)
+            self._client = distributed.Client(address, timeout=self.patience, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"no Dask scheduler answers at {address}.") from error
 

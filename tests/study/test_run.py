@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -228,6 +229,21 @@ def test_a_disk_that_is_full_costs_nothing_that_is_done(study_of_module, finishe
     sj.study.run_study(study_of_module, out, here(workers=workers))
     assert workers.done == ["compute_chunk"]
     assert identical(finished, out)
+
+
+def test_a_worker_ends_with_the_process_that_started_it():
+    # Without anybody who would tell it its core: the queue is empty for ever.
+    code = "import queue; from snrmjax.study.tasks import settle; settle(2**30, queue.Queue())"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 1
+
+
+def test_a_scheduler_that_is_not_there_leaves_nothing(study_of_module, tmp_path, monkeypatch):
+    monkeypatch.setattr("snrmjax.study.workers.DaskCluster.patience", "1s")
+    with pytest.raises(ValueError, match="no Dask scheduler answers at 127"):
+        sj.study.run_study(
+            study_of_module, tmp_path / "s.zarr", RunSettings(scheduler="127.0.0.1:9")
+        )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_no_study_is_left_alone(study_of_module, tmp_path):
