@@ -43,7 +43,7 @@ def test_few_states_of_one_level_are_fitted_too():
     data = driven(8)
     data = data.select(np.asarray(data.level) == 4)
     fit = sj.fit_jointly(data, modes())
-    assert "within 8° of resonance" in on_the_gain(fit)[0]
+    assert "these data hardly determine the force gain" in on_the_gain(fit)[0]
 
 
 def test_the_velocity_axis_ends_where_it_was_measured():
