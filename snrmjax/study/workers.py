@@ -2,8 +2,9 @@
 
 import abc
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import jax
@@ -128,19 +129,18 @@ class DaskCluster(AbstractWorkers):
     @property
     def width(self) -> int:
         """See `AbstractWorkers.width`; two tasks a thread, so that none waits."""
-        return max(2 * sum(self._client.nthreads().values()), 2)
+        with self._reached():
+            return max(2 * sum(self._client.nthreads().values()), 2)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """See `AbstractWorkers.submit`."""
-        return self._client.submit(function, *arguments, pure=False)
+        with self._reached():
+            return self._client.submit(function, *arguments, pure=False)
 
     def wait_for_one(self, futures: Iterable[Any]) -> list[Any]:
         """See `AbstractWorkers.wait_for_one`."""
-        try:
-            with self._client.as_current():
-                ended = self._distributed.wait(list(futures), return_when="FIRST_COMPLETED")
-        except (*self._gone, OSError) as error:
-            raise self._left() from error
+        with self._reached(), self._client.as_current():
+            ended = self._distributed.wait(list(futures), return_when="FIRST_COMPLETED")
         return list(ended.done)
 
     def result(self, future: Any) -> Any:
@@ -150,14 +150,23 @@ class DaskCluster(AbstractWorkers):
         except self._distributed.KilledWorker as error:
             raise WorkerDied(str(error)) from error
         except self._gone as error:
-            raise self._left() from error
+            raise ClusterGone(self._left) from error
 
     def close(self) -> None:
         """See `AbstractWorkers.close`."""
         self._client.close(timeout=2)
 
-    def _left(self) -> ClusterGone:
-        return ClusterGone(f"the Dask scheduler at {self.address} is gone")
+    @property
+    def _left(self) -> str:
+        return f"the Dask scheduler at {self.address} is gone"
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """What has to do with the scheduler alone: any error of the network is its end."""
+        try:
+            yield
+        except (*self._gone, OSError) as error:
+            raise ClusterGone(self._left) from error
 
 
 def available_cores() -> list[int]:
