@@ -1,5 +1,5 @@
 # The ten verbs to start with, and the namespaces that hold the rest.
-from . import diagnose, identify, io, measure, model, plot, simulate, study
+from . import condense, diagnose, identify, io, measure, model, plot, simulate, study
 from .diagnose.diagnosis import diagnose_model
 from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.optimal_design import next_measurements
@@ -14,6 +14,7 @@ from .simulate.virtual_test.phase_resonance_test import phase_resonance_test
 
 __all__ = [
     "calibrate_model",
+    "condense",
     "diagnose",
     "diagnose_model",
     "fit_jointly",

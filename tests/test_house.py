@@ -15,12 +15,19 @@ ROOMS = {
     "model": {"numerics"},
     "measure": {"numerics", "model"},
     "simulate": {"numerics", "model", "measure"},
+    # Finite elements to reduced models: the linear and polynomial structures of `model`.
+    "condense": {"numerics", "model", "simulate"},
     "identify": {"numerics", "model", "measure", "simulate"},
     "diagnose": {"numerics", "model", "measure", "simulate", "identify"},
     # Files are on the roof: they hold what the numerical rooms find.
-    "io": {"numerics", "model", "measure", "simulate", "identify", "diagnose"},
-    "study": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io"},
-    "report": {"numerics", "model", "measure", "simulate", "identify", "diagnose", "io", "study"},
+    "io": {"numerics", "model", "measure", "simulate", "condense", "identify", "diagnose"},
+    "study": {
+        *("numerics", "model", "measure", "simulate", "condense", "identify", "diagnose", "io"),
+    },
+    "report": {
+        *("numerics", "model", "measure", "simulate", "condense", "identify", "diagnose"),
+        *("io", "study"),
+    },
 }
 # Within a room: what each sub-room may import beside itself. A module beside the sub-rooms may
 # import all of them; none of them imports it, unless it is named here.

@@ -1,0 +1,16 @@
+"""Reduced-order models from finite elements, by implicit condensation.
+
+Static load cases of a geometrically nonlinear finite-element model, each a combination of mode
+shapes as forces, give modal displacements; one potential V(q) is fitted to all of them. Motions
+that follow the modes statically (membrane stretching above all) are in it without a coordinate of
+their own.
+
+References: J. J. Hollkamp & R. W. Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035;
+R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen, AIAA J. 53 (2015) 3273,
+doi:10.2514/1.J053838.
+"""
+
+import lazy_loader
+
+# The public names are in `__init__.pyi`; each module is imported with its first name.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,3 @@
+from .load_cases import ReductionBasis, StaticCases
+
+__all__ = ["ReductionBasis", "StaticCases"]
