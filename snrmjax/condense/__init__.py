@@ -5,8 +5,8 @@ shapes as forces, give modal displacements; one potential V(q) is fitted to all 
 that follow the modes statically (membrane stretching above all) are in it without a coordinate of
 their own.
 
-References: J. J. Hollkamp & R. W. Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035;
-R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen, AIAA J. 53 (2015) 3273,
+References: J. J. Hollkamp & R. W. Gordon, J. Sound Vib. 318 (2008) 1139,
+doi:10.1016/j.jsv.2008.04.035; R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen, AIAA J. 53 (2015) 3273,
 doi:10.2514/1.J053838.
 """
 

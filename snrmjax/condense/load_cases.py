@@ -1,4 +1,4 @@
-"""What a condensation starts from: the kept linear modes and the static load cases run with them."""
+"""What a condensation starts from: linear modes to keep, and static load cases run with them."""
 
 import equinox as eqx
 import numpy as np
