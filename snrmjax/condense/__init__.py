@@ -6,8 +6,8 @@ that follow the modes statically (membrane stretching above all) are in it witho
 their own.
 
 References: J. J. Hollkamp & R. W. Gordon, J. Sound Vib. 318 (2008) 1139,
-doi:10.1016/j.jsv.2008.04.035; R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen, AIAA J. 53 (2015) 3273,
-doi:10.2514/1.J053838.
+doi:10.1016/j.jsv.2008.04.035; R. J. Kuether, B. J. Deaner, J. J. Hollkamp & M. S. Allen,
+AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838.
 """
 
 import lazy_loader
