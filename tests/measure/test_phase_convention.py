@@ -169,12 +169,12 @@ def test_the_joint_fit_says_it():
     check_named([str(error.value)], "opposite")
 
 
-def test_the_diagnosis_says_it():
+@pytest.mark.parametrize("how", [pytest.param("conjugated", marks=pytest.mark.long), "opposite"])
+def test_the_diagnosis_says_it(how):
     """Of opposite signs it ended in a minimum of nothing."""
-    for how in ("conjugated", "opposite"):
-        found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
-        assert found.verdict == "unknown"
-        check_named(found.notes, how)
+    found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))
+    assert found.verdict == "unknown"
+    check_named(found.notes, how)
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1000.0, True), (0.001, True), (1.1, False)])

@@ -135,6 +135,7 @@ def test_no_band_becomes_narrower():
     assert more.max() > 1
 
 
+@pytest.mark.long
 def test_bands_cover_curves_whose_neighbouring_residuals_are_correlated():
     level, omega, force, velocity = exact(per_level=25)
     speeds = np.linspace(0.3, 0.9, 4)

@@ -99,6 +99,7 @@ def test_contributions_sum_to_one_and_name_the_level_errors(fit):
     assert far < 0.5 * gains
 
 
+@pytest.mark.long
 def test_contributions_near_resonance_of_a_linear_mode_are_known():
     rng, n, constant = np.random.default_rng(3), 60, 12.0
     omega = OMEGA + 0.5 * constant * np.tan(np.radians(np.linspace(-4, 4, n)))

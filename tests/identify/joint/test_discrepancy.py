@@ -58,7 +58,7 @@ def modes() -> sj.model.LinearModes:
     return sj.model.linear_modes([OWN], [0.002], [[MASS**-0.5]], [MASS**-0.5])
 
 
-@pytest.mark.parametrize("beside", [0.0, 0.4])
+@pytest.mark.parametrize("beside", [pytest.param(0.0, marks=pytest.mark.long), 0.4])
 def test_bands_hold_what_was_measured_at_resonance(beside):
     level, frequency, force, velocity = rows_of(beside, seed=5)
     fit = sj.fit_jointly(sj.measure.steady_states(level, frequency, force, velocity), modes())

@@ -83,7 +83,10 @@ def test_it_comes_back_from_its_file(fit, tmp_path):
     assert summarise_fit(again, ())["modal_mass"] == summarise_fit(fit, ())["modal_mass"]
 
 
-@pytest.mark.parametrize("case", ["stated to be exact", "near resonance", "gain free"])
+@pytest.mark.parametrize(
+    "case",
+    ["stated to be exact", "near resonance", pytest.param("gain free", marks=pytest.mark.long)],
+)
 def test_where_nothing_tells_it_the_models_is_taken(case):
     data = noisy(3, gain=0.003)
     std = 0.0 if case == "stated to be exact" else None
@@ -119,7 +122,9 @@ def test_a_model_file_states_it(tmp_path):
 
 
 @pytest.mark.skipif(not MEASURED.exists(), reason="measured data are not there: ../shared/data")
-@pytest.mark.parametrize("free", [(), ("force_gain", "instrument_phase")])
+@pytest.mark.parametrize(
+    "free", [(), pytest.param(("force_gain", "instrument_phase"), marks=pytest.mark.long)]
+)
 def test_no_gain_moves_the_measured_velocities_of_a_bolted_beam(free):
     """Four levels of constant force, whose own phase resonances are read off without a method."""
     model = sj.read_model(MEASURED / "model.toml")

@@ -158,6 +158,7 @@ def fits():
     ]
 
 
+@pytest.mark.long
 def test_bands_hold_a_curve_that_few_knots_cannot_follow(fits):
     at = np.linspace(3.2e-4, 1.95e-3, 40)
     inside = []

@@ -82,7 +82,10 @@ def start_and_value(curve, condition):
     return (1.001 * coefficients, 1.0001 * frequency), value
 
 
-@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize(
+    "condition",
+    [pytest.param(c, marks=pytest.mark.long if c == "peak" else ()) for c in CONDITIONS],
+)
 def test_conditions_are_met_and_differentiated(condition, curve):
     model = with_slider() if condition == "fold" else oscillator()
     start, value = start_and_value(curve, condition)
