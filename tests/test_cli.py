@@ -574,6 +574,7 @@ def test_without_a_joint_fit_a_drive_voltage_is_refused_with_the_remedy(beam, tm
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path):
     model, _, driven = beam
     options = ["--fit", FAMILIES, "--next", "2", "--predict-drive", "4", "--predict-force", "2"]

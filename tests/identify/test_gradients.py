@@ -151,7 +151,8 @@ class TestIdentifyPoints:
     def test_by_what_was_measured(self, stated):
         check_derivatives(by_measurements, 4 * N, table(**STATED[stated]))
 
-    @pytest.mark.parametrize("sensors", [pytest.param(1, marks=pytest.mark.long), 2])
+    @pytest.mark.long
+    @pytest.mark.parametrize("sensors", [1, 2])
     def test_by_the_linear_modes(self, sensors):
         function = by_one_sensor if sensors == 1 else by_two_sensors
         check_derivatives(

@@ -88,6 +88,7 @@ def test_a_law_draws_what_a_formula_of_the_library_does_but_the_formula_costs_le
         assert np.mean(inside) > 0.9
 
 
+@pytest.mark.long
 def test_no_law_is_drawn_where_the_misfit_is_no_function_of_the_motion():
     """A natural frequency that differs from level to level, which nobody stated."""
     found = sj.diagnose_model(linear_model(), balanced(lambda v: 0.0 * v, shift=2e-3, levels=6))

@@ -191,6 +191,7 @@ class TestBands:
         np.testing.assert_allclose(np.sqrt(np.mean(sizes[:, :2] ** 2, axis=0)), 1.0, atol=0.1)
         assert np.median(sizes[:, 3]) < 0.002 * RATE / (2 * W0)
 
+    @pytest.mark.long
     def test_errors_that_levels_share_are_found(self):
         # A gain error g of a level moves its damping by −g.
         _, sizes = study(40, amplitude=0.003, phase=0.003, level=0.03)

@@ -329,6 +329,7 @@ def of_loss_factor(values):
     return with_parameters(oscillator(), ["mode_1.damping_ratio"], values["loss_factor"][None] / 2)
 
 
+@pytest.mark.long
 def test_inputs_may_be_other_numbers_than_the_model_has():
     # |V| is largest at Ω = ω, there F φ b/(2ζω) = F φ b/(ηω): by 1/η, whose derivatives are known.
     inputs = correlated_inputs(["loss_factor"], [2 * RATIO], [[(0.1 * RATIO) ** 2]])
