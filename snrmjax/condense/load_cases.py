@@ -1,6 +1,7 @@
 """What a condensation starts from: linear modes to keep, and static load cases run with them."""
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -11,13 +12,24 @@ class ReductionBasis(eqx.Module):
     `shapes` are mass-normalised (ΦᵀMΦ = I, kg^-1/2). `filter` turns displacements into modal
     coordinates, q = filter @ u: it is ΦᵀM where the mass matrix is known, else the pseudo-inverse
     of the shapes at the degrees of freedom that were written. `numbers` are the modes' numbers in
-    the finite-element model, counted from one, for texts and tables.
+    the finite-element model, counted from one, for texts and tables. `translations` marks the
+    rows that are translations (m), where others are rotations (rad): a wanted displacement is one
+    of those. None: all are.
     """
 
     frequency: Float[Array, " mode"]  # rad/s
     shapes: Float[Array, "dof mode"]
     filter: Float[Array, "mode dof"]
     numbers: tuple[int, ...] = eqx.field(static=True)
+    translations: Bool[Array, " dof"] | None = None
+
+    @property
+    def largest(self) -> Float[Array, " mode"]:
+        """Largest translation of each shape, kg^-1/2: metres per unit of modal displacement."""
+        size = jnp.abs(self.shapes)
+        if self.translations is not None:
+            size = jnp.where(jnp.asarray(self.translations)[:, None], size, 0.0)
+        return jnp.max(size, axis=0)
 
 
 class StaticCases(eqx.Module):

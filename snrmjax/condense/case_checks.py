@@ -1,0 +1,258 @@
+"""What is wrong with static load cases: which of them, or all, and how a reader mends it."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.potential_fit import (
+    FitSystem,
+    LeftOut,
+    fit_system,
+    monomials_of,
+    solve_scaled,
+)
+from snrmjax.model.potential import PolynomialPotential
+
+_GOOD = 0.01  # residual over nonlinear force that needs no word
+_EXPLAINED = 0.3  # of the residual, left by two more degrees: then the polynomial was too short
+_ROUND_OFF = 1e-9  # residual over linear force below which nothing can be told
+_SMALL = 1e-3  # nonlinear over linear force that a table of six digits cannot show
+_ONE_CASE = 0.01  # of the squared residual, left without the inconsistent cases
+_LINEAR = 0.02  # of the linear stiffness, that the load cases may say otherwise
+_ENERGY = 0.01
+_UNIT = 5.0  # times the linear displacement beyond which a unit is wrong
+_SHOWN = 4
+
+
+class CaseWarning(NamedTuple):
+    """Something about the load cases that a reader should know before the model is used.
+
+    Kinds: `not_converged`, `repeated_case`, `inconsistent_case`, `linear_part`, `too_small`,
+    `too_large`, `other_regime`, `not_checked`, `energy`.
+    """
+
+    kind: str
+    message: str
+    cases: tuple[int, ...] = ()  # rows
+
+
+class FitView(NamedTuple):
+    """A fit as the checks look at it; its rows are those of the usable cases."""
+
+    basis: ReductionBasis
+    cases: StaticCases  # the usable ones
+    potential: PolynomialPotential
+    system: FitSystem
+    left_out: LeftOut
+    degree: int
+
+    @property
+    def misfit(self) -> float:
+        """Residual over nonlinear force, rms of all scaled equations."""
+        return rms(self.left_out.residual) / rms(self.system.target)
+
+
+def rms(values: np.ndarray | Array) -> float:
+    """Root mean square of all numbers."""
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
+
+
+def case_names(cases: StaticCases, rows: np.ndarray | tuple[int, ...]) -> str:
+    """Load cases as texts name them: their names, or their rows counted from one."""
+    listed = [cases.names[k] if cases.names else f"row {k + 1}" for k in rows]
+    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    return ", ".join(listed[:_SHOWN]) + more
+
+
+def case_warnings(every: StaticCases, fit: FitView) -> tuple[CaseWarning, ...]:
+    """All that the load cases show against themselves.
+
+    Arguments: `every` the load cases as they came, those without a solution included.
+    """
+    used = np.flatnonzero(every.usable)
+    failed = np.flatnonzero(~every.usable)
+    found = []
+    if failed.size:
+        text = f"{failed.size} of {len(every.force)} load cases have no solution and are left out: "
+        found.append(_warning("not_converged", text + case_names(every, failed), failed))
+    found += _repeated(every, used)
+    strange = _inconsistent(fit)
+    if strange.size:
+        rows = used[strange]
+        text = f"the other load cases contradict {case_names(every, rows)}{_reason(fit, strange)}"
+        found.append(_warning("inconsistent_case", text, rows))
+    else:
+        found += _linear_part(fit)
+        found += _sizes(fit)
+    turned = _softened(fit)
+    if turned.size:
+        rows = used[turned]
+        text = (
+            f"the tangent stiffness is no longer positive at {case_names(every, rows)}: beyond a "
+            "snap-through the potential mixes two regimes; take a smaller load scale"
+        )
+        found.append(_warning("other_regime", text, rows))
+    if not np.all(np.isfinite(fit.left_out.held_out)):
+        text = (
+            "some coefficients rest on a single load case each: their standard deviation and the "
+            "cross-validated error are not known; add load levels"
+        )
+        found.append(_warning("not_checked", text))
+    if fit.cases.energy is not None and not strange.size:
+        error = energy_error(fit.basis, fit.cases, fit.potential)
+        off = np.flatnonzero(~(np.abs(error) < _ENERGY))
+        if off.size:
+            rows = used[off]
+            text = (
+                f"the strain energy of the reduced model is off by up to "
+                f"{100 * np.max(np.abs(error[off])):.2g} % from the finite elements' at "
+                f"{case_names(every, rows)}"
+            )
+            found.append(_warning("energy", text, rows))
+    return tuple(found)
+
+
+def _warning(kind: str, message: str, rows: np.ndarray | tuple[int, ...] = ()) -> CaseWarning:
+    return CaseWarning(kind, message, tuple(int(row) for row in rows))
+
+
+def linear_stiffness_ratio(fit: FitView) -> Float[np.ndarray, " mode"]:
+    """Linear stiffness that the load cases show, over ω²; NaN where they are too few to tell.
+
+    One where shapes are mass-normalised, units agree and the loads are those that are stated.
+    """
+    n_cases, n = fit.cases.force.shape
+    monomials = monomials_of(n, fit.degree, 1)
+    if n_cases * n < len(monomials) + n:
+        return np.full(n, np.nan)
+    system = fit_system(fit.basis, fit.cases, monomials)
+    values = np.asarray(solve_scaled(system) * system.column_scale)
+    own = np.array([values[monomials.index((m, m))] for m in range(n)])
+    return 1.0 + 2.0 * own / np.asarray(fit.basis.frequency) ** 2
+
+
+def energy_error(
+    basis: ReductionBasis, cases: StaticCases, potential: PolynomialPotential
+) -> Float[np.ndarray, " case"]:
+    """Energy of the reduced model less the finite elements', over the latter, for each case."""
+    q = np.asarray(cases.modal_displacement)
+    energy = np.asarray(cases.energy, dtype=float)
+    linear = 0.5 * (q**2 @ np.asarray(basis.frequency) ** 2)
+    return (linear + np.asarray(potential.energy(jnp.asarray(q))) - energy) / energy
+
+
+def _repeated(every: StaticCases, used: np.ndarray) -> list[CaseWarning]:
+    force = np.asarray(every.force)[used]
+    size = np.max(np.abs(force), initial=0.0)
+    for k in range(1, len(used)):
+        same = np.flatnonzero(np.all(np.abs(force[:k] - force[k]) <= 1e-9 * size, axis=1))
+        if same.size:
+            rows = (int(used[same[0]]), int(used[k]))
+            text = f"the same load twice: {case_names(every, rows)}"
+            return [_warning("repeated_case", text, rows)]
+    return []
+
+
+def _inconsistent(fit: FitView) -> np.ndarray:
+    """The few cases without which the others fit ten times as well; none where there are none.
+
+    Those come first whose displacement is of another size than the others' for their load. Else
+    the worst is removed, the rest fitted again, and so on for up to a fifth of the cases.
+    """
+    size = _linear_size(fit.basis, fit.cases.force, fit.cases.modal_displacement)
+    other = np.abs(np.log(size / np.median(size))) > np.log(_UNIT)
+    if other.any():
+        return np.flatnonzero(other)
+    design, target = np.asarray(fit.system.design), np.asarray(fit.system.target)
+    n_cases, n_modes, n_unknowns = design.shape
+    start = float(np.sum(fit.left_out.residual**2))
+    keep, nobody = np.arange(n_cases), np.zeros(0, dtype=int)
+    if not fit.misfit > _GOOD or not rms(fit.left_out.residual) > _ROUND_OFF:
+        return nobody
+    for _ in range(max(1, n_cases // 5)):
+        if (len(keep) - 1) * n_modes <= n_unknowns:
+            return nobody
+        q, _ = np.linalg.qr(design[keep].reshape(-1, n_unknowns))
+        y = target[keep]
+        residual = y - (q @ (q.T @ y.reshape(-1))).reshape(y.shape)
+        blocks = q.reshape(len(keep), n_modes, n_unknowns)
+        rest = (1 + 1e-9) * np.eye(n_modes) - blocks @ blocks.transpose(0, 2, 1)
+        held_out = np.linalg.solve(rest, residual[..., None])[..., 0]
+        gain = np.sum(residual * held_out, axis=1)
+        worst = int(np.argmax(gain))
+        keep = np.delete(keep, worst)
+        if np.sum(residual**2) - gain[worst] < _ONE_CASE * start:
+            return np.setdiff1d(np.arange(n_cases), keep)
+    return nobody
+
+
+def _reason(fit: FitView, rows: np.ndarray) -> str:
+    """A guess at what is wrong with contradicting cases, ready to end a message, or nothing."""
+    force = np.asarray(fit.cases.force)[rows]
+    linear = np.asarray(fit.cases.modal_displacement)[rows] * np.asarray(fit.basis.frequency) ** 2
+    if np.all(np.sum(force * linear, axis=1) < 0):
+        return " (against their force: is the sign wrong?)"
+    ratio = _linear_size(fit.basis, force, fit.cases.modal_displacement[rows])
+    if np.all(ratio > _UNIT) or np.all(ratio < 1 / _UNIT):
+        return f" (displacements {np.median(ratio):.3g} times the linear ones: snapped through, or another unit?)"
+    return ""
+
+
+def _linear_size(basis: ReductionBasis, force: Array, moved: Array) -> np.ndarray:
+    """Size of a displacement over that of the linear structure under the same load, each case."""
+    squared = np.asarray(basis.frequency) ** 2
+    return np.linalg.norm(np.asarray(moved), axis=1) / np.linalg.norm(force / squared, axis=1)
+
+
+def _linear_part(fit: FitView) -> list[CaseWarning]:
+    ratio = linear_stiffness_ratio(fit)
+    off = np.flatnonzero(np.abs(ratio - 1) > _LINEAR)
+    if not off.size:
+        return []
+    said = ", ".join(f"{ratio[m]:.4g} (mode {fit.basis.numbers[m]})" for m in off)
+    text = (
+        f"the load cases show a linear stiffness of {said} times the squared natural frequency: "
+        "shapes, units, loads and frequencies do not belong together, or the loads are too large "
+        "for a polynomial of this degree"
+    )
+    return [_warning("linear_part", text)]
+
+
+def _sizes(fit: FitView) -> list[CaseWarning]:
+    """Whether the cases are too small, or too large for the degree."""
+    if fit.misfit < _GOOD or rms(fit.left_out.residual) < _ROUND_OFF:
+        return []
+    n_cases, n_modes = fit.system.target.shape
+    share = rms(fit.system.target)
+    higher = fit_system(fit.basis, fit.cases, monomials_of(n_modes, fit.degree + 2))
+    design = np.asarray(higher.design).reshape(n_cases * n_modes, -1)
+    spare = design.shape[0] - design.shape[1]
+    said = f"the potential leaves {100 * fit.misfit:.2g} % of the nonlinear force"
+    if spare > n_modes:
+        values = np.linalg.lstsq(design, np.asarray(higher.target).reshape(-1), rcond=1e-12)[0]
+        left = rms(design @ values - np.asarray(higher.target).reshape(-1))
+        left *= np.sqrt(design.shape[0] / spare)
+        longer = left < _EXPLAINED * rms(fit.left_out.residual)
+    else:
+        longer = share > _SMALL
+    if longer:
+        text = f"{said}: the loads are too large for degree {fit.degree}"
+        return [_warning("too_large", f"{text}; take a smaller load scale or a higher degree")]
+    if share < _SMALL:
+        text = (
+            f"{said}, which is only {share:.2g} of the linear force: round-off of the displacements"
+            " dominates; take a larger load scale or write more digits"
+        )
+        return [_warning("too_small", text)]
+    return [_warning("too_large", f"{said}: no polynomial of this degree fits the load cases")]
+
+
+def _softened(fit: FitView) -> np.ndarray:
+    """Cases where the tangent stiffness of the reduced model has a negative eigenvalue."""
+    tangent = np.asarray(fit.potential.stiffness(fit.cases.modal_displacement))
+    scale = np.asarray(fit.basis.frequency)
+    scaled = tangent / (scale[:, None] * scale) + np.eye(len(scale))
+    return np.flatnonzero(np.linalg.eigvalsh(scaled)[:, 0] <= 0)

@@ -1,0 +1,253 @@
+"""Implicit condensation: static load cases to a reduced-order model, with its checks."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.case_checks import (
+    CaseWarning,
+    FitView,
+    case_warnings,
+    energy_error,
+    linear_stiffness_ratio,
+    rms,
+)
+from snrmjax.condense.expansion import Expansion, fit_expansion
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import check_degree
+from snrmjax.condense.potential_fit import (
+    fit_potential,
+    fit_system,
+    leave_out,
+    monomials_of,
+    require_determined,
+)
+from snrmjax.model.modes import linear_modes
+from snrmjax.model.potential import PolynomialPotential, monomial_key
+from snrmjax.model.structures import Structure, structure
+from snrmjax.numerics.result import AbstractResult, Variable
+
+
+class FitQuality(eqx.Module):
+    """How well one potential fits the load cases; errors are rms over them.
+
+    `misfit` and `cross_validated` are of all equations together, over the nonlinear force; those
+    of `equation_…` are of each modal equation, over the force on that mode. Cross-validated:
+    every case as the fit to all others has it.
+    """
+
+    misfit: float
+    cross_validated: float
+    equation_residual: Float[np.ndarray, " mode"]
+    equation_cross_validated: Float[np.ndarray, " mode"]
+    case_error: Float[np.ndarray, " case"]  # cross-validated, over the nonlinear force; NaN: unused
+    nonlinear_ratio: Float[np.ndarray, " case"]  # nonlinear over linear force
+    linear_stiffness_ratio: Float[np.ndarray, " mode"]  # that the cases show, over ω²
+    condition: float  # of the least-squares problem, columns scaled
+    energy_error: Float[np.ndarray, " case"] | None  # relative
+
+
+class Condensation(AbstractResult):
+    """A reduced-order model out of static load cases: ω²q + ∂V/∂q = f, and how good it is.
+
+    `potential.coefficient_std` is the jackknife over load cases: how far a coefficient moves with
+    the choice of cases. `warnings` say what a reader should know before the model is used.
+    """
+
+    basis: ReductionBasis
+    cases: StaticCases
+    potential: PolynomialPotential
+    quality: FitQuality
+    expansion: Expansion | None  # None where the cases have no displacements
+    warnings: tuple[CaseWarning, ...] = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+
+    coordinates: ClassVar[tuple[str, ...]] = ("monomial",)
+
+    def summary(self) -> tuple[str, ...]:
+        """What was condensed, how well it fits, and the warnings."""
+        numbers = ", ".join(str(number) for number in self.basis.numbers)
+        count, used = len(self.cases.force), int(self.cases.usable.sum())
+        q = self.quality
+        return (
+            f"Condensation: modes {numbers}, force of degree {self.degree}, "
+            f"{len(self.potential.monomials)} coefficients of one potential",
+            f"{used} of {count} load cases, nonlinear up to {np.nanmax(q.nonlinear_ratio):.3g} of "
+            "the linear force",
+            f"misfit {q.misfit:.2g} of the nonlinear force, cross-validated "
+            f"{q.cross_validated:.2g}; condition {q.condition:.2g}",
+            *(f"{one.kind}: {one.message}" for one in self.warnings),
+        )
+
+    def variables(self) -> Mapping[str, Variable]:
+        """The coefficients, one a monomial."""
+        keys = np.array([monomial_key(m) for m in self.potential.monomials])
+        unit = "kg, m, s"
+        return {
+            "monomial": Variable(("monomial",), keys, "", "modes of the monomial of V"),
+            "coefficient": Variable(
+                ("monomial",), self.potential.coefficient, unit, "coefficient of the potential"
+            ),
+            "coefficient_std": Variable(
+                ("monomial",), self.potential.coefficient_std, unit, "1σ over load cases"
+            ),
+        }
+
+    def attributes(self) -> Mapping[str, str | float | int]:
+        """Quality of the whole fit."""
+        return {
+            "misfit": self.quality.misfit,
+            "cross_validated": self.quality.cross_validated,
+            "condition": self.quality.condition,
+            "degree": self.degree,
+        }
+
+    def force(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch mode"]:
+        """Static modal force at modal displacements, linear part included, kg^1/2 m/s²."""
+        q = jnp.asarray(displacement)
+        return q * jnp.asarray(self.basis.frequency) ** 2 + self.potential.force(q)
+
+    def expand(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch dof"]:
+        """Displacement of all degrees of freedom at modal displacements, membrane included.
+
+        Raises `ValueError` where the load cases had no displacements.
+        """
+        if self.expansion is None:
+            raise ValueError("the load cases had no displacements: there is no expansion.")
+        return self.expansion.expand(displacement)
+
+    def structure(
+        self,
+        damping_ratio: float | Float[np.ndarray, " mode"] | list[float],
+        *,
+        sensors: Mapping[str, Any],
+        participation: Float[np.ndarray, " mode"] | list[float],
+        mode_of_interest: int = 0,
+        name: str = "reduced model",
+    ) -> Structure:
+        """The reduced model as a `Structure`, for simulation and for tests of it.
+
+        Arguments: `damping_ratio` of each mode, or one for all; `sensors` maps a name to the mode
+        shapes there (kg^-1/2, one a mode: rows of `basis.shapes`, or averages of them);
+        `participation` Φᵀb per newton of the recorded force; `mode_of_interest` from zero.
+        Raises `ValueError` as `linear_modes` does.
+        """
+        n = len(self.basis.numbers)
+        modes = linear_modes(
+            np.asarray(self.basis.frequency),
+            np.broadcast_to(np.asarray(damping_ratio, dtype=float), (n,))
+            if np.ndim(damping_ratio) == 0
+            else np.asarray(damping_ratio, dtype=float),
+            np.array([np.asarray(row, dtype=float) for row in sensors.values()]).reshape(-1, n),
+            np.asarray(participation, dtype=float),
+            sensors=tuple(sensors),
+            mode_of_interest=mode_of_interest,
+        )
+        return structure(modes, self.potential, name=name)
+
+
+def condense(
+    basis: ReductionBasis, cases: StaticCases, *, degree: int = 3, expand: bool = True
+) -> Condensation:
+    """Fit one potential V to static load cases, f = ω²q + ∂V/∂q, and check both.
+
+    Arguments: `degree` of the nonlinear force (3: quadratic and cubic), up to 7; `expand` False
+    leaves the displacements beyond the modes out. For gradients, and under `jit`, `fit_potential`
+    is the same fit without checks.
+    Returns the model with residuals, condition, cross-validated error and warnings. Raises
+    `ValueError` where the cases are too few or do not determine every coefficient, naming some.
+    Validity: amplitudes up to those of the load cases; motions outside the modes kept must follow
+    them statically (their frequencies lie well above the response's harmonics).
+    Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035.
+
+    >>> basis = ReductionBasis(np.array([2.0]), np.eye(1), np.eye(1), (1,))
+    >>> q = np.array([[-1.0], [-0.5], [0.5], [1.0]])
+    >>> cases = StaticCases(4 * q + 3 * q**2 + q**3, q, np.ones(4, dtype=bool))
+    >>> condense(basis, cases).potential.coefficient.round(9)
+    Array([1.  , 0.25], dtype=float64)
+    """
+    check_degree(degree)
+    n_modes = len(basis.numbers)
+    if cases.force.shape[1] != n_modes:
+        raise ValueError(
+            f"the load cases have {cases.force.shape[1]} modes, but the basis has {n_modes}."
+        )
+    used = np.flatnonzero(cases.usable)
+    if not used.size:
+        raise ValueError(f"none of the {len(cases.force)} load cases has a solution.")
+    solved = _subset(cases, used)
+    monomials = monomials_of(n_modes, degree)
+    require_loaded(basis, solved)
+    system = fit_system(basis, solved, monomials)
+    require_determined(system, monomials, used.size)
+    left_out = leave_out(system)
+    spread = jnp.asarray(left_out.std * np.asarray(system.column_scale))
+    # A standard deviation that is not known is written as none.
+    spread = jnp.where(jnp.isfinite(spread), spread, 0.0)
+    potential = dataclasses.replace(
+        fit_potential(basis, solved, degree=degree), coefficient_std=spread
+    )
+    view = FitView(basis, solved, potential, system, left_out, degree)
+    has_shapes = expand and cases.displacement is not None
+    return Condensation(
+        basis=basis,
+        cases=cases,
+        potential=potential,
+        quality=_quality(view, used, len(cases.force)),
+        expansion=fit_expansion(basis, cases) if has_shapes else None,
+        warnings=case_warnings(cases, view),
+        degree=degree,
+    )
+
+
+def require_loaded(basis: ReductionBasis, cases: StaticCases) -> None:
+    """Raises `ValueError` where a mode is never loaded, or never moves."""
+    for what, rows in (("force", cases.force), ("modal displacement", cases.modal_displacement)):
+        still = np.flatnonzero(~np.any(np.asarray(rows) != 0, axis=0))
+        if still.size:
+            raise ValueError(
+                f"the {what} of mode {basis.numbers[still[0]]} is zero in every load case."
+            )
+
+
+def _subset(cases: StaticCases, rows: np.ndarray) -> StaticCases:
+    names = tuple(cases.names[k] for k in rows) if cases.names else ()
+    arrays = dataclasses.replace(cases, names=())
+    subset: StaticCases = jax.tree.map(lambda values: jnp.asarray(values)[rows], arrays)
+    return dataclasses.replace(subset, names=names)
+
+
+def _quality(fit: FitView, used: np.ndarray, n_cases: int) -> FitQuality:
+    target, left_out = np.asarray(fit.system.target), fit.left_out
+    force = np.asarray(fit.cases.force) / np.asarray(fit.system.row_scale)
+    linear = np.linalg.norm(force - target, axis=1)
+    size = np.sqrt(np.mean(force**2, axis=0))
+
+    def every(values: np.ndarray) -> np.ndarray:
+        rows = np.full(n_cases, np.nan)
+        rows[used] = values
+        return rows
+
+    known = np.all(np.isfinite(left_out.held_out))
+    held_out = left_out.held_out if known else np.full(target.shape, np.nan)
+    own = np.linalg.norm(target, axis=1)
+    energy = None
+    if fit.cases.energy is not None:
+        energy = every(energy_error(fit.basis, fit.cases, fit.potential))
+    return FitQuality(
+        misfit=fit.misfit,
+        cross_validated=rms(held_out) / rms(target),
+        equation_residual=np.sqrt(np.mean(left_out.residual**2, axis=0)) / size,
+        equation_cross_validated=np.sqrt(np.mean(held_out**2, axis=0)) / size,
+        case_error=every(np.linalg.norm(left_out.held_out, axis=1) / own),
+        nonlinear_ratio=every(own / linear),
+        linear_stiffness_ratio=linear_stiffness_ratio(fit),
+        condition=left_out.condition,
+        energy_error=energy,
+    )

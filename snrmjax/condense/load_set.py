@@ -1,0 +1,194 @@
+"""Sets of static load cases: forces along combinations of modes, and how large they are."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+
+NONLINEAR_RATIO = 0.1
+"""Default size of a load: there, the nonlinear part of the force is a tenth of the linear one.
+
+It is then far above the round-off of any code (a table of six digits still gives coefficients to
+1e-4), and the terms that the polynomial leaves out, of the order of the ratio's square, stay small
+against those that it has.
+"""
+
+StaticSolver = Callable[[Float[np.ndarray, "case mode"]], StaticCases]
+"""Runs static load cases, given their modal forces (kg^1/2 m/s²), one row a case."""
+
+_ROUNDS, _CLOSE = 12, 0.15  # of the search for a ratio, and how near it ends
+_FURTHEST = 30.0  # times by which one step of the search changes a displacement at most
+
+
+class LoadSet(NamedTuple):
+    """Modal forces of static load cases, and their names, such as "+1 -3"."""
+
+    force: Float[Array, "case mode"]  # f, kg^1/2 m/s²: the external force is F = M Φ f
+    names: tuple[str, ...]
+
+
+def modal_loads(
+    basis: ReductionBasis,
+    displacement: float | Sequence[float] | Float[Array, " mode"],
+    *,
+    degree: int = 3,
+    most_modes: int | None = None,
+    levels: Sequence[float] | None = None,
+) -> LoadSet:
+    """Forces along single modes, pairs, triples, … of them, with all combinations of signs.
+
+    A mode loaded alone gets the force that moves the linear structure by the wanted displacement d
+    where the mode shape is largest: f_r = ω_r² d_r / max|φ_r|. In a combination of k modes each
+    gets a k-th of that, so that all cases move the structure about as far.
+
+    Arguments: `displacement` in m, one for all modes or one for each; `degree` of the force that
+    is to be fitted, which sets how many modes are combined (as many, since q₁q₂q₃ is only seen
+    where three modes move) and how many load levels there are; `most_modes` and `levels`
+    (fractions of the displacement) say it otherwise.
+    Raises `ValueError` for a displacement, number of modes or level that makes no load.
+    Reference: Kuether, Deaner, Hollkamp & Allen, AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838
+    (constant modal displacement); R. W. Gordon & J. J. Hollkamp, AFRL-RB-WP-TR-2011-3040 (2011).
+
+    >>> basis = ReductionBasis(np.array([2.0]), np.array([[0.5]]), np.array([[2.0]]), (1,))
+    >>> modal_loads(basis, 1e-3, levels=(1.0,))
+    LoadSet(force=Array([[ 0.008],
+           [-0.008]], dtype=float64), names=('+1', '-1'))
+    """
+    check_degree(degree)
+    n = len(basis.numbers)
+    wanted = np.asarray(displacement, dtype=float)
+    if wanted.shape not in ((), (n,)) or not np.all(np.isfinite(wanted) & (wanted > 0)):
+        raise ValueError(
+            f"`displacement` must be positive (m), one number or one for each of the {n} modes, "
+            f"but is {displacement}."
+        )
+    if most_modes is not None and most_modes < 1:
+        raise ValueError(f"`most_modes` must be at least 1, but is {most_modes}.")
+    fractions = default_levels(n, degree) if levels is None else tuple(levels)
+    if not fractions or not all(np.isfinite(level) and level > 0 for level in fractions):
+        raise ValueError(f"`levels` must be positive fractions, at least one, but is {levels}.")
+    signs = _combinations(n, min(n, most_modes or degree))
+    alone = basis.frequency**2 * jnp.asarray(wanted) / basis.largest
+    rows = signs / np.sum(np.abs(signs), axis=1, keepdims=True)
+    names = [_name(row, basis.numbers) for row in signs]
+    return LoadSet(
+        jnp.concatenate([level * rows * alone for level in fractions]),
+        tuple(
+            name if len(fractions) == 1 else f"{name} at {level:.3g}"
+            for level in fractions
+            for name in names
+        ),
+    )
+
+
+def default_levels(n_modes: int, degree: int) -> tuple[float, ...]:
+    """Fractions of the full load at which each combination is run.
+
+    One level for every two degrees of the force, since cases of both signs tell even from odd
+    terms; one more where one or two modes leave nothing over to check the fit with.
+
+    >>> default_levels(4, 3), default_levels(1, 3)
+    ((1.0,), (0.5, 1.0))
+    """
+    count = max(degree // 2, 1) + (n_modes <= 2)
+    return tuple(float(level) for level in np.arange(1, count + 1) / count)
+
+
+def check_degree(degree: int) -> None:
+    """Raises `ValueError` for a degree of the force that is not from 2 to 7."""
+    if isinstance(degree, bool) or not isinstance(degree, int) or not 2 <= degree <= 7:
+        raise ValueError(f"`degree` of the force must be a whole number from 2 to 7, not {degree}.")
+
+
+def displacement_for_ratio(
+    basis: ReductionBasis,
+    solve: StaticSolver,
+    *,
+    ratio: float = NONLINEAR_RATIO,
+    start: float | Float[Array, " mode"],
+) -> Float[np.ndarray, " mode"]:
+    """The displacement of each mode alone at which nonlinear over linear force reaches a ratio.
+
+    The ratio is |f − ω²q|/|ω²q| of the loaded mode, the larger one of both signs. The search goes
+    by powers of the displacement: each round runs two load cases for every mode.
+
+    Arguments: `start` a displacement in m where to begin, such as the thickness.
+    Returns displacements in m for `modal_loads`. Raises `ValueError` where a mode does not reach
+    the ratio, such as in a linear structure, or where its load cases do not converge.
+    """
+    n = len(basis.numbers)
+    if not 0 < ratio < 1:
+        raise ValueError(f"`ratio` must lie between 0 and 1, but is {ratio}.")
+    size = np.broadcast_to(np.asarray(start, dtype=float), (n,)).copy()
+    before = (size, np.full(n, np.nan))
+    low, high = np.zeros(n), np.full(n, np.inf)  # displacements known to be too small, too large
+    for _ in range(_ROUNDS):
+        found = _nonlinear_ratio(basis, solve, size)
+        close = np.abs(np.log(found / ratio)) < _CLOSE
+        if np.all(close):
+            return size
+        low = np.where(found < ratio, np.fmax(low, size), low)
+        high = np.where(found >= ratio, np.fmin(high, size), high)
+        power = _power(before, (size, found))
+        before = (size, found)
+        step = np.where(np.isfinite(found), (ratio / np.fmin(found, 1e300)) ** (1 / power), 0.2)
+        new = size * np.clip(step, 1 / _FURTHEST, _FURTHEST)
+        outside = (low > 0) & np.isfinite(high) & ((new <= low) | (new >= high))
+        new = np.where(outside, np.sqrt(low * np.where(outside, high, 1.0)), new)
+        size = np.where(close, size, new)
+    worst = int(np.argmax(np.abs(np.log(found / ratio))))
+    raise ValueError(
+        f"no load along mode {basis.numbers[worst]} has a nonlinear force of {ratio:g} times the "
+        f"linear one (it is {found[worst]:.3g} where {before[0][worst]:.3g} m are wanted): state "
+        "the load scale."
+    )
+
+
+def _nonlinear_ratio(
+    basis: ReductionBasis, solve: StaticSolver, size: Float[np.ndarray, " mode"]
+) -> Float[np.ndarray, " mode"]:
+    """|f − ω²q|/|ω²q| of each mode alone, the larger of both signs; infinite if not solved."""
+    n = size.size
+    own = np.arange(n)
+    stiffness = np.asarray(basis.frequency) ** 2
+    alone = np.diag(stiffness * size / np.asarray(basis.largest))
+    cases = solve(np.concatenate([alone, -alone]))
+    force = np.asarray(cases.force).reshape(2, n, n)[:, own, own]
+    linear = stiffness * np.asarray(cases.modal_displacement).reshape(2, n, n)[:, own, own]
+    good = cases.usable.reshape(2, n) & (linear != 0)
+    ratio = np.abs(force - linear) / np.abs(np.where(good, linear, 1.0))
+    # A structure without any nonlinear force has the ratio of one rounding.
+    return np.fmax(np.where(good, ratio, np.inf).max(axis=0), np.finfo(float).eps)
+
+
+def _power(before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The power of displacement with which the ratio grows: 1 for an arch, 2 for a flat beam."""
+    known = np.isfinite(before[1]) & np.isfinite(now[1]) & (before[0] != now[0])
+    rise = np.log(np.where(known, now[1], 1.0) / np.where(known, before[1], 1.0))
+    run = np.log(np.where(known, now[0] / before[0], np.e))
+    return np.where(known, np.clip(rise / run, 0.7, 4.0), 1.5)
+
+
+def _combinations(n_modes: int, most: int) -> np.ndarray:
+    """Rows of signs (or zero) of all combinations of one to `most` modes."""
+    rows = []
+    for count in range(1, most + 1):
+        for modes in itertools.combinations(range(n_modes), count):
+            for signs in itertools.product((1.0, -1.0), repeat=count):
+                row = np.zeros(n_modes)
+                row[list(modes)] = signs
+                rows.append(row)
+    return np.array(rows)
+
+
+def _name(signs: np.ndarray, numbers: Sequence[int]) -> str:
+    return " ".join(
+        f"{'+' if sign > 0 else '-'}{number}"
+        for sign, number in zip(signs, numbers, strict=True)
+        if sign
+    )

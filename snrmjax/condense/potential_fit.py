@@ -1,0 +1,185 @@
+"""One potential fitted to static load cases: linear least squares over all modal equations."""
+
+import itertools
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import check_degree
+from snrmjax.model.potential import Monomial, PolynomialPotential, monomial_key
+
+_NOT_SEEN = 1e-7  # of a unit column: a monomial that no load case moves
+_SINGULAR = 1e11  # condition of the scaled columns from which on coefficients are arbitrary
+
+
+class FitSystem(NamedTuple):
+    """The equations f − ω²q = ∂V/∂q of all cases, scaled: design @ scaled ≈ target.
+
+    Row (c, m) is divided by the typical linear force of mode m, column k multiplied by
+    `column_scale`, so that coefficient = scaled × column_scale.
+    """
+
+    design: Float[Array, "case mode monomial"]
+    target: Float[Array, "case mode"]
+    column_scale: Float[Array, " monomial"]
+    row_scale: Float[Array, " mode"]  # kg^1/2 m/s²
+
+
+@lru_cache(maxsize=64)
+def monomials_of(n_modes: int, degree: int, lowest: int = 2) -> tuple[Monomial, ...]:
+    """Monomials of a potential whose force has degrees from `lowest` to `degree`.
+
+    >>> monomials_of(1, 3), len(monomials_of(4, 3))
+    (((0, 0, 0), (0, 0, 0, 0)), 55)
+    """
+    return tuple(
+        modes
+        for size in range(lowest + 1, degree + 2)
+        for modes in itertools.combinations_with_replacement(range(n_modes), size)
+    )
+
+
+def fit_system(
+    basis: ReductionBasis, cases: StaticCases, monomials: tuple[Monomial, ...]
+) -> FitSystem:
+    """The scaled equations of the fit; rows of cases that are not usable are zero."""
+    xp = _namespace(basis, cases)
+    force, moved = xp.asarray(cases.force), xp.asarray(cases.modal_displacement)
+    finite = xp.isfinite(xp.concatenate([force, moved], axis=1)).all(axis=1)
+    used = (xp.asarray(cases.converged) & finite)[:, None]
+    q, force = xp.where(used, moved, 0.0), xp.where(used, force, 0.0)
+    stiffness = xp.asarray(basis.frequency) ** 2
+    typical = xp.sqrt(xp.sum(q**2, axis=0) / xp.sum(used))
+    row_scale = stiffness * typical
+    n_modes = q.shape[1]
+    place = np.array([[m.count(i) for i in range(n_modes)] for m in monomials])
+    column_scale = xp.mean(row_scale * typical) / xp.prod(typical**place, axis=1)
+    # ∂/∂q_m of monomial k is n_km times the product of the others: powers of scaled q.
+    scaled = q / xp.where(typical > 0, typical, 1.0)
+    powers = [xp.ones_like(scaled)]
+    for _ in range(int(place.max())):
+        powers.append(powers[-1] * scaled)
+    of_power = xp.stack(powers, axis=-1)  # case, mode, power
+    columns = []
+    for m in range(n_modes):
+        left = np.maximum(place - (np.arange(n_modes) == m), 0)
+        product = xp.prod(of_power[:, np.arange(n_modes), left], axis=-1)  # case, monomial
+        columns.append(product * place[:, m])
+    # Scaled so that each modal equation is divided by its `row_scale`.
+    per_mode = xp.mean(row_scale * typical) / (row_scale * typical)
+    design = xp.stack(columns, axis=1) * per_mode[:, None]
+    return FitSystem(design, (force - stiffness * q) / row_scale, column_scale, row_scale)
+
+
+def fit_potential(
+    basis: ReductionBasis, cases: StaticCases, *, degree: int = 3
+) -> PolynomialPotential:
+    """The potential V whose gradient fits f = ω²q + ∂V/∂q best, in all equations at once.
+
+    Each coefficient of V enters several equations; fitted at once they cannot contradict each
+    other, as coefficients fitted equation by equation do. Equations are weighted by one over the
+    typical linear force ω²q of their mode. Solved by a QR decomposition; `jit`, `vmap` and
+    gradients by everything in `basis` and `cases` are exact, and without checks: see `condense`.
+
+    Arguments: `degree` of the force, from 2 to 7.
+    Returns the potential, without standard deviations. Cases that did not converge are left out;
+    NaN where the cases determine no potential.
+    Reference: Hollkamp & Gordon, J. Sound Vib. 318 (2008) 1139, doi:10.1016/j.jsv.2008.04.035.
+    """
+    check_degree(degree)
+    n_modes = cases.force.shape[1]
+    monomials = monomials_of(n_modes, degree)
+    system = fit_system(basis, cases, monomials)
+    coefficient = solve_scaled(system) * system.column_scale
+    return PolynomialPotential(coefficient, jnp.zeros(len(monomials)), monomials, n_modes)
+
+
+def solve_scaled(system: FitSystem) -> Float[Array, " monomial"]:
+    """The scaled coefficients of a fit system; NaN where it determines none."""
+    rows, target = system.design.reshape(-1, system.design.shape[-1]), system.target.reshape(-1)
+    if rows.shape[0] < rows.shape[1]:
+        return jnp.full(rows.shape[1], jnp.nan)
+    if isinstance(rows, np.ndarray):
+        basis, triangle = np.linalg.qr(rows)
+        return jnp.asarray(np.linalg.solve(triangle, basis.T @ target))
+    found = lx.linear_solve(lx.MatrixLinearOperator(rows), target, lx.QR(), throw=False)
+    return jnp.where(found.result == lx.RESULTS.successful, found.value, jnp.nan)
+
+
+def _namespace(*trees: object) -> Any:
+    """NumPy where everything has values: nothing is compiled then. JAX within `jit`, `grad`."""
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return jnp if traced else np
+
+
+class LeftOut(NamedTuple):
+    """What leaving out one load case after the other says, without fitting again."""
+
+    residual: Float[np.ndarray, "case mode"]  # of the fit to all, scaled rows
+    held_out: Float[np.ndarray, "case mode"]  # of each case, of the fit to the others
+    std: Float[np.ndarray, " monomial"]  # jackknife 1σ of the scaled coefficients
+    squares_without: Float[np.ndarray, " case"]  # Σ residual² of the fit to the others
+    condition: float
+
+
+def leave_out(system: FitSystem) -> LeftOut:
+    """Leave out each case in turn, in closed form from one decomposition.
+
+    With H = QQᵀ of the design the held-out residual of case c is (I − H_cc)⁻¹ r_c. A case without
+    which the others determine no potential has an infinite held-out residual. Coefficients'
+    standard deviations are those of the jackknife over cases.
+    Reference: B. Efron & R. J. Tibshirani, An Introduction to the Bootstrap (1993), ch. 11,
+    doi:10.1201/9780429246593.
+    """
+    design, target = np.asarray(system.design), np.asarray(system.target)
+    n_cases, n_modes, n_unknowns = design.shape
+    rows = design.reshape(-1, n_unknowns)
+    basis, triangle = np.linalg.qr(rows)
+    values = np.linalg.solve(triangle, basis.T @ target.reshape(-1))
+    residual = target - design @ values
+    blocks = basis.reshape(n_cases, n_modes, n_unknowns)
+    rest = np.eye(n_modes) - blocks @ blocks.transpose(0, 2, 1)
+    alone = np.linalg.eigvalsh(rest)[:, 0] < 1e-9
+    rest[alone] = np.eye(n_modes)
+    held_out = np.linalg.solve(rest, residual[..., None])[..., 0]
+    shift = np.linalg.solve(triangle, np.einsum("cmk,cm->kc", blocks, held_out)).T
+    std = np.sqrt((n_cases - 1) / n_cases * np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
+    squares = np.sum(residual**2) - np.sum(residual * held_out, axis=1)
+    held_out[alone] = np.inf
+    return LeftOut(
+        residual,
+        held_out,
+        np.full(n_unknowns, np.nan) if alone.any() else std,
+        np.where(alone, np.inf, np.maximum(squares, 0.0)),
+        float(np.linalg.cond(triangle)),
+    )
+
+
+def require_determined(system: FitSystem, monomials: tuple[Monomial, ...], n_used: int) -> None:
+    """Raises `ValueError` where the cases cannot determine every coefficient, naming some."""
+    rows = np.asarray(system.design).reshape(-1, len(monomials))
+    equations = n_used * system.design.shape[1]
+    if equations < len(monomials):
+        raise ValueError(
+            f"{n_used} usable load cases give {equations} equations for {len(monomials)} "
+            "coefficients: more load cases, or a lower degree, are needed."
+        )
+    size = np.linalg.norm(rows, axis=0) / np.sqrt(max(n_used, 1))
+    unseen = [monomial_key(m) for m, s in zip(monomials, size, strict=True) if not s > _NOT_SEEN]
+    if not unseen:
+        values, directions = np.linalg.svd(rows / np.linalg.norm(rows, axis=0))[1:]
+        if values[0] < _SINGULAR * values[-1]:
+            return
+        share = np.abs(directions[-1])
+        unseen = [monomial_key(monomials[k]) for k in np.flatnonzero(share > 0.3 * share.max())]
+    names = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
+    raise ValueError(
+        f"the load cases do not tell these coefficients apart: {names} (mode numbers of the "
+        "reduced model); combine more modes, add load levels, or lower the degree."
+    )
