@@ -197,7 +197,8 @@ def _reason(fit: FitView, rows: np.ndarray) -> str:
         return " (against their force: is the sign wrong?)"
     ratio = _linear_size(fit.basis, force, fit.cases.modal_displacement[rows])
     if np.all(ratio > _UNIT) or np.all(ratio < 1 / _UNIT):
-        return f" (displacements {np.median(ratio):.3g} times the linear ones: snapped through, or another unit?)"
+        times = f"{np.median(ratio):.3g} times the linear ones"
+        return f" (displacements {times}: another unit, or a snap-through?)"
     return ""
 
 
