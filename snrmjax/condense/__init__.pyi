@@ -1,6 +1,6 @@
 from .case_checks import CaseWarning
 from .condensation import Condensation, FitQuality, condense
-from .expansion import Expansion, fit_expansion
+from .expansion import MembraneExpansion, fit_expansion
 from .load_cases import ReductionBasis, StaticCases
 from .load_set import LoadSet, displacement_for_ratio, modal_loads
 from .potential_fit import fit_potential
@@ -8,9 +8,9 @@ from .potential_fit import fit_potential
 __all__ = [
     "CaseWarning",
     "Condensation",
-    "Expansion",
     "FitQuality",
     "LoadSet",
+    "MembraneExpansion",
     "ReductionBasis",
     "StaticCases",
     "condense",

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.potential_fit import (
     FitSystem,
-    LeftOut,
+    LeftOutCases,
     fit_system,
     monomials_of,
     solve_scaled,
@@ -46,7 +46,7 @@ class FitView(NamedTuple):
     cases: StaticCases  # the usable ones
     potential: PolynomialPotential
     system: FitSystem
-    left_out: LeftOut
+    left_out: LeftOutCases
     degree: int
 
     @property

@@ -18,7 +18,7 @@ from snrmjax.condense.case_checks import (
     linear_stiffness_ratio,
     rms,
 )
-from snrmjax.condense.expansion import Expansion, fit_expansion
+from snrmjax.condense.expansion import MembraneExpansion, fit_expansion
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import check_degree
 from snrmjax.condense.potential_fit import (
@@ -64,7 +64,7 @@ class Condensation(AbstractResult):
     cases: StaticCases
     potential: PolynomialPotential
     quality: FitQuality
-    expansion: Expansion | None  # None where the cases have no displacements
+    expansion: MembraneExpansion | None  # None where the cases have no displacements
     warnings: tuple[CaseWarning, ...] = eqx.field(static=True)
     degree: int = eqx.field(static=True)
 

@@ -10,7 +10,7 @@ from snrmjax.condense.potential_fit import monomials_of
 from snrmjax.model.potential import Monomial
 
 
-class Expansion(eqx.Module):
+class MembraneExpansion(eqx.Module):
     """u(q) = Φq + Σ_k s_k p_k(q), with products p_k of modal displacements as coordinates.
 
     The shapes s_k are fitted to what static load cases left of u − Φq: the quadratic ones are the
@@ -39,7 +39,9 @@ def products_of(
     return jnp.stack([jnp.prod(displacement[..., list(m)], axis=-1) for m in products], axis=-1)
 
 
-def fit_expansion(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3) -> Expansion:
+def fit_expansion(
+    basis: ReductionBasis, cases: StaticCases, *, degree: int = 3
+) -> MembraneExpansion:
     """Fit the static part of the displacement to load cases that have displacements.
 
     Arguments: `degree` of the products, 2 for the membrane alone. Fewer products are taken where
@@ -63,6 +65,6 @@ def fit_expansion(basis: ReductionBasis, cases: StaticCases, *, degree: int = 3)
     unit = np.array([np.prod(scale[list(m)]) for m in products])
     size = float(np.sum(left**2))
     misfit = float(np.sqrt(np.sum((left - columns @ found) ** 2) / size)) if size else 0.0
-    return Expansion(
+    return MembraneExpansion(
         jnp.asarray(basis.shapes), jnp.asarray((found / unit[:, None]).T), misfit, products
     )

@@ -118,7 +118,7 @@ def _namespace(*trees: object) -> Any:
     return jnp if traced else np
 
 
-class LeftOut(NamedTuple):
+class LeftOutCases(NamedTuple):
     """What leaving out one load case after the other says, without fitting again."""
 
     residual: Float[np.ndarray, "case mode"]  # of the fit to all, scaled rows
@@ -128,7 +128,7 @@ class LeftOut(NamedTuple):
     condition: float
 
 
-def leave_out(system: FitSystem) -> LeftOut:
+def leave_out(system: FitSystem) -> LeftOutCases:
     """Leave out each case in turn, in closed form from one decomposition.
 
     With H = QQᵀ of the design the held-out residual of case c is (I − H_cc)⁻¹ r_c. A case without
@@ -152,7 +152,7 @@ def leave_out(system: FitSystem) -> LeftOut:
     std = np.sqrt((n_cases - 1) / n_cases * np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
     squares = np.sum(residual**2) - np.sum(residual * held_out, axis=1)
     held_out[alone] = np.inf
-    return LeftOut(
+    return LeftOutCases(
         residual,
         held_out,
         np.full(n_unknowns, np.nan) if alone.any() else std,
