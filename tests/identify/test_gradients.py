@@ -308,6 +308,7 @@ def test_curves_of_a_joint_fit(kind):
     check_derivatives(of, n + len(at))
 
 
+@pytest.mark.long
 def test_inverse_force_with_a_state_that_was_not_measured():
     beam = sj.model.structure(
         sj.model.linear_modes([500.0], [0.01], [[2.0]], [3.0]),

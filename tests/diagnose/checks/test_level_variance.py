@@ -59,6 +59,7 @@ def test_the_differences_are_those_that_were_put_in(found):
     assert f"{100 * size:.2g} % in natural frequency" in note
 
 
+@pytest.mark.long
 def test_levels_that_agree_are_not_said_to_differ():
     model = linear_model()
     same, note = with_level_variance(model, silent(balanced(quadratic, seed=SEED)))

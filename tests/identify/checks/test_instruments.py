@@ -21,7 +21,12 @@ def test_a_gain_that_the_inertia_determines_is_taken_without_a_word():
 
 
 @pytest.mark.parametrize(
-    ("widest", "said"), [(6, "within 6° of resonance"), (0.5, "its 1σ is"), (1e-3, None)]
+    ("widest", "said"),
+    [
+        (6, "within 6° of resonance"),
+        (0.5, "its 1σ is"),
+        pytest.param(1e-3, None, marks=pytest.mark.long),
+    ],
 )
 def test_states_near_resonance_hardly_determine_the_gain(widest, said):
     """At resonance the force is the damping's, and half of both does the same."""

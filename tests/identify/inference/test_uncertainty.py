@@ -120,6 +120,7 @@ def test_contributions_near_resonance_of_a_linear_mode_are_known():
         assert shares[other].frequency_share < 0.01 * shares["phase"].frequency_share
 
 
+@pytest.mark.long
 def test_a_profile_of_a_quadratic_unknown_is_its_standard_deviation(fit):
     found = profile(fit, "damping.viscous")
     std = np.sqrt(fit.covariance[2, 2])

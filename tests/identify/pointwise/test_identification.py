@@ -128,6 +128,7 @@ class TestLinearMode:
         np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-8)  # steps of a fit
         np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-8)
 
+    @pytest.mark.long
     def test_point_errors_that_were_not_stated_come_from_the_scatter(self):
         scores = []
         for seed in range(20):

@@ -149,6 +149,7 @@ def duffing_folds(values):
     return np.sqrt(sorted(found, reverse=True))
 
 
+@pytest.mark.long
 def test_folds_are_followed_to_where_they_merge_and_no_further():
     model, inputs = duffing_inputs(0.25)
     found = response_quantities(model, inputs, 1.0, 8.0, kinds=("fold",), harmonic_order=1)
