@@ -1,3 +1,4 @@
+from . import calculix
 from .joint_results import read_joint_fit, write_fitted_backbone, write_joint_fit, write_next
 from .models import read_model, write_model
 from .results import (
@@ -10,6 +11,7 @@ from .results import (
 from .tables import read_steady_states, write_steady_states, write_table
 
 __all__ = [
+    "calculix",
     "read_joint_fit",
     "read_model",
     "read_steady_states",

@@ -1,0 +1,13 @@
+"""Reduced models through CalculiX: its decks, its jobs and its results.
+
+A user's deck with its own mesh, sections, materials and supports gives linear modes
+(`linear_modes`) and geometrically nonlinear static load cases (`static_cases`), from which
+`snrmjax.condense` fits a reduced model. Beams and shells are CalculiX's own, which are solids
+inside: reference G. Dhondt, "The Finite Element Method for Three-Dimensional Thermomechanical
+Applications", Wiley 2004, doi:10.1002/0470021217.
+"""
+
+import lazy_loader
+
+# The public names are in `__init__.pyi`; each module is imported with its first name.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

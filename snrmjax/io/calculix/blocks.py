@@ -1,0 +1,113 @@
+"""The text of an input deck as keyword blocks: included files in their place, comments left out."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from snrmjax.io.files import FilePath, file_name, read_text, shown
+
+_DEEPEST_INCLUDE = 20
+
+
+class Line(NamedTuple):
+    """A line of a deck and where it stands."""
+
+    text: str
+    file: str
+    number: int  # in its file, from one
+
+    @property
+    def place(self) -> str:
+        """Where it stands, as messages say it."""
+        return f"{self.file}, line {self.number}"
+
+    @property
+    def entries(self) -> list[str]:
+        """What stands between its commas; a comma at the end adds nothing."""
+        parts = [part.strip() for part in self.text.split(",")]
+        return parts[:-1] if len(parts) > 1 and not parts[-1] else parts
+
+
+class Block(NamedTuple):
+    """A keyword with its parameters and the data lines below it."""
+
+    keyword: str  # in capitals, without the star
+    parameters: dict[str, str]  # names in capitals; a flag has an empty value
+    head: Line
+    data: tuple[Line, ...]
+
+    def named(self, parameter: str) -> str:
+        """The value of a parameter in capitals, as CalculiX compares names, or an empty text."""
+        return self.parameters.get(parameter, "").upper()
+
+    @property
+    def text(self) -> str:
+        """The block as it stands in a deck."""
+        values = [f"{name}={value}" if value else name for name, value in self.parameters.items()]
+        rows = [line.text for line in self.data]
+        return "\n".join(["*" + ", ".join([self.keyword, *values]), *rows])
+
+    def with_parameters(self, **changed: str | None) -> "Block":
+        """With other values of parameters; None takes one away."""
+        kept = {**self.parameters, **{name: value or "" for name, value in changed.items()}}
+        gone = [name for name, value in changed.items() if value is None]
+        return self._replace(parameters={n: v for n, v in kept.items() if n not in gone})
+
+
+def read_blocks(path: FilePath) -> list[Block]:
+    """The keyword blocks of a deck, those of its *INCLUDE files in their place.
+
+    Returns blocks in the deck's order. Raises `ValueError` where a file is missing, includes
+    itself, or data stand before the first keyword.
+    """
+    lines = list(_lines(Path(path), ()))
+    blocks: list[Block] = []
+    position = 0
+    while position < len(lines):
+        head = lines[position]
+        if not head.text.startswith("*"):
+            raise ValueError(
+                f"{head.place}: {shown(head.text)} stands before the first keyword (*NODE, ...)."
+            )
+        text = head.text
+        while text.endswith(",") and position + 1 < len(lines):  # a keyword on several lines
+            position += 1
+            text += lines[position].text
+        begin = position = position + 1
+        while position < len(lines) and not lines[position].text.startswith("*"):
+            position += 1
+        keyword, *parameters = [part.strip() for part in text[1:].split(",")]
+        named = [part.partition("=") for part in parameters if part]
+        values = {name.strip().upper(): value.strip() for name, _, value in named}
+        keyword = " ".join(keyword.upper().split())
+        blocks.append(Block(keyword, values, head, tuple(lines[begin:position])))
+    return blocks
+
+
+def _lines(path: Path, above: tuple[Path, ...]) -> Iterator[Line]:
+    """Lines that say something, those of included files in their place."""
+    name = file_name(path)
+    for number, raw in enumerate(read_text(path).splitlines(), start=1):
+        text = raw.strip()
+        if not text or text.startswith("**"):
+            continue
+        line = Line(text, name, number)
+        if text[1:].replace(" ", "").upper().startswith("INCLUDE") and text[0] == "*":
+            yield from _included(line, path, (*above, path))
+        else:
+            yield line
+
+
+def _included(line: Line, path: Path, above: tuple[Path, ...]) -> Iterator[Line]:
+    values = dict(part.split("=", 1) for part in line.text.split(",") if "=" in part)
+    given = [
+        value.strip().strip('"') for key, value in values.items() if key.strip().upper() == "INPUT"
+    ]
+    if not given:
+        raise ValueError(f"{line.place}: *INCLUDE needs INPUT=file.")
+    target = path.parent / given[0]
+    if target in above or len(above) > _DEEPEST_INCLUDE:
+        raise ValueError(f"{line.place}: {given[0]} includes itself.")
+    if not target.is_file():
+        raise ValueError(f"{line.place}: the included file {given[0]} does not exist.")
+    yield from _lines(target, above)

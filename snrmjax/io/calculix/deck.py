@@ -1,0 +1,236 @@
+"""A user's CalculiX deck: its mesh, what is checked of it, and the text that jobs start from."""
+
+import re
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.io.calculix.blocks import Block, Line, read_blocks
+from snrmjax.io.calculix.flatten import flattened
+from snrmjax.io.files import FilePath, file_name, shown
+
+# CalculiX reads a coordinate from this many characters and drops the rest without a word.
+_COORDINATE_WIDTH = 20
+_ELASTIC = ("ELASTIC", "HYPERELASTIC", "HYPERFOAM")
+_LOSSY = (
+    *("PLASTIC", "CREEP", "CYCLIC HARDENING", "DEFORMATION PLASTICITY", "USER MATERIAL", "VISCO"),
+    *("DAMAGE INITIATION", "MOHR COULOMB", "COULOMB PLASTICITY"),
+)
+_REFUSED = {
+    "CONTACT PAIR": "contact has no smooth potential",
+    "TIE": "tied surfaces move nodes by constraints that a load case does not see; "
+    "join the meshes or use *EQUATION",
+    "TRANSFORM": "displacements in local systems cannot be read back; write the supports in "
+    "global directions or with *EQUATION",
+    "USER ELEMENT": "user elements are linear",
+}
+_RIGID_ZERO = 1e-9  # prescribed displacements up to here count as none
+
+
+class Deck(eqx.Module):
+    """The model part of a CalculiX deck: everything before its first step, as text and mesh.
+
+    Supports inside the first step belong to it; loads and outputs of the steps are left out
+    (`left_out` names their keywords). Lengths, moduli and densities are in the deck's units: a
+    deck in metres, pascals and kilograms gives a model in SI units.
+    """
+
+    name: str = eqx.field(static=True)
+    text: str = eqx.field(static=True)
+    nodes: Int[np.ndarray, " node"] = eqx.field(converter=np.asarray)  # of elements, ascending
+    coordinates: Float[np.ndarray, "node 3"] = eqx.field(converter=np.asarray)  # m
+    elements: Int[np.ndarray, " element"] = eqx.field(converter=np.asarray)  # numbers, ascending
+    element_types: tuple[str, ...] = eqx.field(static=True)
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def node_index(self, number: int) -> int:
+        """Row of a node in `nodes`. Raises `ValueError` where no element has it."""
+        found = np.flatnonzero(self.nodes == number)
+        if not len(found):
+            raise ValueError(
+                f"{self.name} has no element with node {number} (nodes {self.nodes[0]} to "
+                f"{self.nodes[-1]})."
+            )
+        return int(found[0])
+
+    def nearest_node(self, point: tuple[float, float, float]) -> int:
+        """The number of the node next to a point (m)."""
+        away = np.linalg.norm(self.coordinates - np.asarray(point), axis=1)
+        return int(self.nodes[int(np.argmin(away))])
+
+
+def read_deck(path: FilePath) -> Deck:
+    """Read a CalculiX (or Abaqus) input deck with beam, shell or solid elements.
+
+    Keywords that are not known here are kept as they stand. *INCLUDE files are read in their
+    place; one part with one instance is written flat.
+
+    Arguments: `path` of the deck. Returns the `Deck`. Raises `ValueError`, with file and line, for
+    what a condensation cannot use: no mesh, an element or a support with a missing node, a
+    prescribed displacement, a material without density or elastic law, plasticity and other
+    materials with losses, contact, local coordinate systems.
+    """
+    blocks = flattened(read_blocks(path))
+    name = file_name(path)
+    model, supports, left_out = _split(blocks)
+    nodes = _nodes(model, name)
+    elements, used, types = _elements(model, nodes, name)
+    kept = [*model, *supports]
+    _check_supports(kept, set(nodes), _node_sets(model))
+    _check_materials(model, name)
+    labels = np.array(sorted(used))
+    return Deck(
+        name=name,
+        text="\n".join(block.text for block in kept) + "\n",
+        nodes=labels,
+        coordinates=np.array([nodes[label] for label in labels]),
+        elements=np.array(sorted(elements)),
+        element_types=types,
+        left_out=left_out,
+    )
+
+
+def _split(blocks: list[Block]) -> tuple[list[Block], list[Block], tuple[str, ...]]:
+    """The model part, supports of the first step, and keywords of steps that are left out."""
+    first = next((i for i, b in enumerate(blocks) if b.keyword == "STEP"), len(blocks))
+    supports, left_out, step = [], [], 0
+    for block in blocks[first:]:
+        step += block.keyword == "STEP"
+        if block.keyword == "BOUNDARY" and step == 1:
+            supports.append(block.with_parameters(OP=None))
+        elif block.keyword not in ("STEP", "END STEP", "BOUNDARY"):
+            left_out.append(block.keyword)
+    unwanted = {"NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "OUTPUT"}
+    model = [block for block in blocks[:first] if block.keyword not in unwanted]
+    return model, supports, tuple(dict.fromkeys(left_out))
+
+
+def _number(line: Line, entry: str, wanted: str) -> float:
+    try:
+        return float(re.sub("[dD]", "e", entry))
+    except ValueError as error:
+        raise ValueError(f"{line.place}: {shown(entry)} where {wanted} is expected.") from error
+
+
+def _label(line: Line, entry: str, wanted: str) -> int:
+    value = _number(line, entry, wanted)
+    if not value.is_integer() or value < 1:
+        raise ValueError(f"{line.place}: {shown(entry)} where {wanted} is expected.")
+    return int(value)
+
+
+def _nodes(blocks: list[Block], name: str) -> dict[int, tuple[float, ...]]:
+    nodes: dict[int, tuple[float, ...]] = {}
+    for block in blocks:
+        if block.keyword != "NODE":
+            continue
+        for line in block.data:
+            label, *places = line.entries
+            for entry in places[:3]:
+                if len(entry) > _COORDINATE_WIDTH:
+                    raise ValueError(
+                        f"{line.place}: the coordinate {entry} has {len(entry)} characters; "
+                        f"CalculiX reads {_COORDINATE_WIDTH} and would drop the rest."
+                    )
+            values = [_number(line, entry, "a coordinate") for entry in places[:3] if entry]
+            number = _label(line, label, "a node number")
+            nodes[number] = tuple((*values, 0.0, 0.0, 0.0)[:3])
+    if not nodes:
+        raise ValueError(f"{name} has no *NODE block with nodes before its first *STEP.")
+    return nodes
+
+
+def _elements(
+    blocks: list[Block], nodes: dict[int, tuple[float, ...]], name: str
+) -> tuple[set[int], set[int], tuple[str, ...]]:
+    """Numbers of elements and of their nodes, and the elements' types."""
+    elements: set[int] = set()
+    used: set[int] = set()
+    types: list[str] = []
+    for block in blocks:
+        if block.keyword in _REFUSED:
+            raise ValueError(f"{block.head.place}: *{block.keyword}: {_REFUSED[block.keyword]}.")
+        if block.keyword != "ELEMENT":
+            continue
+        types.append(block.named("TYPE"))
+        if types[-1].startswith("U"):
+            raise ValueError(f"{block.head.place}: {types[-1]}: {_REFUSED['USER ELEMENT']}.")
+        continued, size = 0, _nodes_of_type(types[-1])
+        for line in block.data:
+            numbers = [_label(line, e, "a node or element number") for e in line.entries if e]
+            members = numbers if continued else numbers[1:]
+            if not continued:
+                elements.add(numbers[0])
+            missing = [number for number in members if number not in nodes]
+            if missing:
+                raise ValueError(
+                    f"{line.place}: the element has node {missing[0]}, which no *NODE block has."
+                )
+            used.update(members)
+            continued += len(members)
+            if continued >= size or (size == 0 and not line.text.endswith(",")):
+                continued = 0
+    if not used:
+        raise ValueError(f"{name} has no *ELEMENT block with elements before its first *STEP.")
+    return elements, used, tuple(dict.fromkeys(types))
+
+
+def _nodes_of_type(kind: str) -> int:
+    """How many nodes an element has, by its name, or zero where its lines have to tell."""
+    solids = re.match(r"(?:C3D|S|CPS|CPE|CAX|M3D|DC3D)(\d+)", kind)
+    if solids:
+        return int(solids[1])
+    beams = re.match(r"(?:B|T)(?:2|3)D?(\d)", kind)
+    if beams:
+        return int(beams[1]) + (0 if kind.startswith("T") else 1)
+    return {"MASS": 1, "SPRING1": 1, "SPRING2": 2, "SPRINGA": 2, "DASHPOTA": 2}.get(kind, 0)
+
+
+def _node_sets(blocks: list[Block]) -> set[str]:
+    """Names, in capitals, that stand for nodes."""
+    names = {block.named("NSET") for block in blocks if block.keyword in ("NODE", "NSET")}
+    return names - {""}
+
+
+def _check_supports(blocks: list[Block], nodes: set[int], sets: set[str]) -> None:
+    for block in blocks:
+        if block.keyword != "BOUNDARY":
+            continue
+        for line in block.data:
+            who, *rest = line.entries
+            if who.isdigit() and int(who) not in nodes:
+                raise ValueError(
+                    f"{line.place}: the support is at node {who}, which no *NODE block has."
+                )
+            if not who.isdigit() and who.upper() not in sets:
+                raise ValueError(f"{line.place}: no node set is called {shown(who)}.")
+            value = rest[2] if len(rest) > 2 else ""
+            if value and abs(_number(line, value, "a displacement")) > _RIGID_ZERO:
+                raise ValueError(
+                    f"{line.place}: the displacement {value} is prescribed; supports of a "
+                    "condensation do not move."
+                )
+
+
+def _check_materials(blocks: list[Block], name: str) -> None:
+    keywords = {block.keyword: block for block in reversed(blocks)}
+    for lossy in _LOSSY:
+        if lossy in keywords:
+            raise ValueError(
+                f"{keywords[lossy].head.place}: *{lossy}: a reduced stiffness has a potential, so "
+                "that the material must be elastic (*ELASTIC, *HYPERELASTIC)."
+            )
+    if not any(keyword in keywords for keyword in _ELASTIC):
+        raise ValueError(f"{name} has no *ELASTIC or *HYPERELASTIC material.")
+    for keyword in ("DENSITY", "ELASTIC"):
+        for block in blocks:
+            if block.keyword == keyword and block.data:
+                line = block.data[0]
+                value = _number(line, line.entries[0], "a number")
+                if not value > 0:
+                    raise ValueError(
+                        f"{line.place}: *{keyword} must be positive, but is {value:g}."
+                    )
+    if "DENSITY" not in keywords and "MASS" not in keywords:
+        raise ValueError(f"{name} has no *DENSITY: modes need a mass.")

@@ -1,0 +1,111 @@
+"""Running CalculiX: one job in a folder of its own, on one thread, with what became of it."""
+
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from snrmjax.io.calculix.results import first_error
+from snrmjax.io.files import FilePath, write_atomically
+
+INSTALL = (
+    "CalculiX is needed and its program {program} is not on the search path: install it (Debian, "
+    "Ubuntu: apt install calculix-ccx; conda-forge: calculix) or name its program."
+)
+# What CalculiX may be told to spread over threads by; a job here has one.
+_THREADS = (
+    *("OMP_NUM_THREADS", "CCX_NPROC_STIFFNESS", "CCX_NPROC_EQUATION_SOLVER", "CCX_NPROC_RESULTS"),
+    *("OPENBLAS_NUM_THREADS", "CCX_NPROC_CFD", "CCX_NPROC_VIEWFACTOR"),
+)
+
+
+class JobOutcome(NamedTuple):
+    """What became of a job."""
+
+    finished: bool  # the program came to its end, with an error or not
+    dat: str  # what it printed of results
+    error: str  # its first error, or how it ended
+    seconds: float
+
+
+class Calculix(NamedTuple):
+    """The program and how long a job of it may run."""
+
+    program: str
+    time_limit: float  # s
+
+
+def found_calculix(program: str, time_limit: float) -> Calculix:
+    """The program on this machine. Raises `ValueError` where it is not there or not a program."""
+    path = shutil.which(program)
+    if path is None:
+        raise ValueError(INSTALL.format(program=program))
+    if not time_limit > 0:
+        raise ValueError(f"`time_limit` must be positive seconds, but is {time_limit}.")
+    return Calculix(path, float(time_limit))
+
+
+def model_file(text: str, folder: FilePath) -> Path:
+    """Write a deck's model into a folder, made where it is missing, for jobs to include.
+
+    Returns its path; the name has a digest of the text, so that two models never share a file.
+    """
+    place = Path(folder)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"the folder {place} cannot be made: {error.strerror}.") from error
+    path = place / f"model-{digest(text)}.inp"
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        write_atomically(path, text)
+    return path
+
+
+def digest(text: str) -> str:
+    """What a deck is known by: sixteen hexadecimal digits of its SHA-256."""
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
+
+
+def run_job(calculix: Calculix, model: Path, step: str) -> JobOutcome:
+    """Run one job: a model file, included, and the steps below it.
+
+    The job's files live in a temporary folder beside the model and go with it.
+    """
+    with tempfile.TemporaryDirectory(dir=model.parent, prefix="job-") as folder:
+        Path(folder, "job.inp").write_text(
+            f"*INCLUDE, INPUT=../{model.name}\n{step}", encoding="utf-8"
+        )
+        begin = time.perf_counter()
+        with open(Path(folder, "job.log"), "wb") as log:
+            process = subprocess.Popen(
+                [calculix.program, "job"],
+                cwd=folder,
+                env={**os.environ, **dict.fromkeys(_THREADS, "1")},
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+            try:
+                process.wait(calculix.time_limit)
+                stopped = ""
+            except subprocess.TimeoutExpired:
+                stopped = f"stopped after the time limit of {calculix.time_limit:g} s"
+            finally:
+                if process.poll() is None:  # the time limit, or the user's Ctrl-C
+                    process.kill()
+                    process.wait()
+        seconds = time.perf_counter() - begin
+        dat = Path(folder, "job.dat")
+        printed = dat.read_text(encoding="utf-8", errors="replace") if dat.is_file() else ""
+        said = Path(folder, "job.log").read_text(encoding="utf-8", errors="replace")
+    if not stopped and process.returncode < 0:
+        stopped = f"killed by {signal.Signals(-process.returncode).name}"
+    error = stopped or first_error(said)
+    if not error and process.returncode:
+        error = f"it ended with code {process.returncode}"
+    return JobOutcome(not stopped, printed, error, seconds)

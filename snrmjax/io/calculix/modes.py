@@ -1,0 +1,162 @@
+"""Linear modes of a CalculiX deck, and the nodal forces and filter that belong to them."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.condense.load_cases import ReductionBasis
+from snrmjax.io.calculix.deck import Deck
+from snrmjax.io.calculix.jobs import found_calculix, model_file, run_job
+from snrmjax.io.calculix.results import eigenvalues, printed_tables
+from snrmjax.io.files import FilePath
+
+ALL_NODES = "SNRMJAX_NODES"
+# Extra modes: of a structure that floats, with six rigid motions, an elastic one is among them.
+_MORE_MODES = 6
+# Eigenvalues of rigid motions are round-off of the stiffness: this far below the last one asked.
+_RIGID_RATIO = 1e-7
+# How much of a mode's inertia nodal translations must carry (1: all of it).
+_LEAST_CARRIED = 0.9
+
+
+class LinearModes(eqx.Module):
+    """Modes of a deck: the basis of a reduced model, in degrees of freedom x, y, z of each node.
+
+    Degree of freedom 3 i + d is the translation in direction d of `deck.nodes[i]`. `carried` is
+    how much of each mode's inertia the translations of nodes carry: one but for rotary inertia and
+    the distortion of a section.
+    """
+
+    basis: ReductionBasis
+    deck: Deck
+    carried: Float[np.ndarray, " mode"] = eqx.field(converter=np.asarray)
+    seconds: float = 0.0  # that CalculiX took
+
+    def shape_at(self, node: int, direction: int | str) -> Float[np.ndarray, " mode"]:
+        """Mass-normalised shapes (kg^-1/2) at a node in direction 0, 1, 2 or "x", "y", "z"."""
+        axis = "xyz".index(direction) if isinstance(direction, str) else direction
+        return np.asarray(self.basis.shapes)[3 * self.deck.node_index(node) + axis]
+
+    def participation(self, direction: int | str) -> Float[np.ndarray, " mode"]:
+        """ΦᵀF (kg^-1/2) of a unit force on every node in one direction."""
+        axis = "xyz".index(direction) if isinstance(direction, str) else direction
+        return np.asarray(self.basis.shapes)[axis::3].sum(axis=0)
+
+
+def linear_modes(
+    deck: Deck,
+    numbers: Sequence[int],
+    folder: FilePath,
+    *,
+    program: str = "ccx",
+    time_limit: float = 3600.0,
+) -> LinearModes:
+    """Modes of a deck by CalculiX, with M Φ from its nodal forces.
+
+    CalculiX prints the internal forces of a mode, KΦ = ω²MΦ, at the nodes of the deck, for beams
+    and shells as resultants over the solids that they are inside. R = KΦ/ω² is M Φ without a mass
+    matrix, for any element, point masses and consistent masses included. Load cases and filter
+    share G = R (ΦᵀR)⁻¹: ΦᵀG = I holds to round-off, so that loads and modal coordinates stay
+    conjugate. For solids ΦᵀR = I already; for beams and shells it lacks the rotary inertia of the
+    section, some 1e-5 to 1e-2 (`carried`).
+
+    Arguments: `deck`; `numbers` of the modes to keep, from one; `folder` for its files; `program`
+    and its `time_limit` (s). Returns `LinearModes`, largest translation of each mode positive.
+    Raises `ValueError` where CalculiX is missing, killed or refuses the deck, where a mode is rigid
+    (a mechanism) or does not exist, and for a mode that nodal translations do not carry, as the
+    torsion of a beam.
+    """
+    wanted = _checked(numbers)
+    calculix = found_calculix(program, time_limit)
+    model = model_file(deck.text + all_nodes(deck), folder)
+    outcome = run_job(calculix, model, _step(max(wanted) + _MORE_MODES))
+    squares = eigenvalues(outcome.dat)
+    tables = list(printed_tables(outcome.dat, deck.nodes)) if outcome.finished else []
+    shapes = [t.values.ravel() for t in tables if t.quantity == "displacements"]
+    forces = [t.values.ravel() for t in tables if t.quantity == "forces"]
+    if outcome.error or not shapes or len(shapes) != len(forces):
+        said = outcome.error or "it printed no modes"
+        raise ValueError(f"CalculiX gave no modes of {deck.name}: {said}.")
+    if len(shapes) < max(wanted):
+        raise ValueError(
+            f"mode {max(wanted)} of {deck.name} was asked for, but CalculiX found {len(shapes)}."
+        )
+    _check_rigid(deck, squares, wanted)
+    kept = [number - 1 for number in wanted]
+    basis, carried = _basis(np.array(shapes).T[:, kept], np.array(forces).T[:, kept], squares[kept])
+    _check_carried(deck, wanted, carried)
+    return LinearModes(
+        ReductionBasis(
+            jnp.asarray(np.sqrt(squares[kept])),
+            jnp.asarray(basis[0]),
+            jnp.asarray(basis[1]),
+            wanted,
+        ),
+        deck,
+        carried,
+        outcome.seconds,
+    )
+
+
+def all_nodes(deck: Deck) -> str:
+    """A set of all nodes of elements, for what is printed."""
+    rows = [deck.nodes[i : i + 8] for i in range(0, len(deck.nodes), 8)]
+    return "\n".join(
+        [f"*NSET, NSET={ALL_NODES}", *(", ".join(map(str, row)) + "," for row in rows), ""]
+    )
+
+
+def _step(count: int) -> str:
+    return "\n".join(
+        ["*STEP", "*FREQUENCY", str(count), f"*NODE PRINT, NSET={ALL_NODES}", "U, RF", "*END STEP"]
+    )
+
+
+def _checked(numbers: Sequence[int]) -> tuple[int, ...]:
+    wanted = tuple(int(number) for number in numbers)
+    if not wanted or min(wanted) < 1 or len(set(wanted)) != len(wanted):
+        raise ValueError(
+            f"modes are different numbers from one, as 1, 3, 5, but {list(numbers)} are asked for."
+        )
+    return wanted
+
+
+def _basis(
+    shapes: Float[np.ndarray, "dof mode"],
+    forces: Float[np.ndarray, "dof mode"],
+    squares: Float[np.ndarray, " mode"],
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """(Shapes, filter) with filter @ shapes = I, and what nodal translations carry."""
+    momenta = np.where(np.any(shapes != 0, axis=1, keepdims=True), forces, 0.0) / squares
+    heights = np.abs(shapes).max(axis=0)
+    # Of two peaks that are equal but for round-off the first decides the sign.
+    peaks = np.argmax(np.abs(shapes) > 0.999 * heights, axis=0)
+    signs = np.sign(shapes[peaks, np.arange(shapes.shape[1])])
+    shapes, momenta = shapes * signs, momenta * signs
+    carried = np.diag(shapes.T @ momenta)
+    if np.any(np.abs(carried) < 1e-6):
+        return (shapes, momenta.T), carried
+    return (shapes, np.linalg.solve(momenta.T @ shapes, momenta.T)), carried
+
+
+def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"], wanted: tuple[int, ...]) -> None:
+    rigid = int(np.sum(squares <= _RIGID_RATIO * np.max(np.abs(squares))))
+    if rigid:
+        raise ValueError(
+            f"{deck.name} has {rigid} mode{'s' if rigid > 1 else ''} without stiffness among its "
+            f"first {max(wanted) + _MORE_MODES}: the structure is a mechanism or not held; add "
+            "supports (*BOUNDARY)."
+        )
+
+
+def _check_carried(deck: Deck, wanted: tuple[int, ...], carried: np.ndarray) -> None:
+    for number, part in zip(wanted, carried, strict=True):
+        if not part >= _LEAST_CARRIED:
+            raise ValueError(
+                f"mode {number} of {deck.name} moves its nodes too little: their translations "
+                f"carry {100 * part:.0f} % of its inertia (torsion of a beam?); leave it out or "
+                "model it with shells or solids."
+            )

@@ -1,0 +1,228 @@
+"""Geometrically nonlinear static load cases by CalculiX, in parallel, resumed where cut off."""
+
+import io
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.condense.load_cases import StaticCases
+from snrmjax.io.calculix.deck import Deck
+from snrmjax.io.calculix.jobs import (
+    Calculix,
+    JobOutcome,
+    digest,
+    found_calculix,
+    model_file,
+    run_job,
+)
+from snrmjax.io.calculix.modes import ALL_NODES, LinearModes, all_nodes
+from snrmjax.io.calculix.results import last_energy, printed_tables
+from snrmjax.io.files import FilePath, write_atomically
+
+CONVERGED, DIVERGED, KILLED = "converged", "diverged", "killed"
+_ALL_ELEMENTS = "SNRMJAX_ELEMENTS"
+# First and longest increment a quarter of the load; CalculiX cuts back where it has to.
+_INCREMENTS = "0.25, 1., 1.e-5, 1."
+# CalculiX stops iterating at a residual of 0.5 %, which a cubic coefficient of small loads feels:
+# tightened to 1e-8 of the mean force and of the largest correction.
+_CONTROLS = "1.e-8, 1.e-8, 0.01, , 1.e-6, 1.e-8, 1.e-8, 1.e-10"
+_END_OF_STEP = 1.0 - 1e-6
+
+Progress = Callable[[int, int], None]
+"""Called with the numbers of cases done and of all cases."""
+
+
+class StaticRun(eqx.Module):
+    """Load cases that CalculiX has run, or had run before.
+
+    `status` of a case: "converged"; "diverged", the load was not reached; "killed", the program was
+    stopped from outside or by its time limit, or did not start (the next run tries it again).
+    `seconds` is what CalculiX took, whether in this run or in an earlier one.
+    """
+
+    cases: StaticCases
+    status: tuple[str, ...] = eqx.field(static=True)
+    seconds: Float[np.ndarray, " case"] = eqx.field(converter=np.asarray)
+    errors: tuple[str, ...] = eqx.field(static=True, default=())  # CalculiX's own words, or empty
+    found: int = eqx.field(static=True, default=0)  # cases whose result was there before
+
+
+class _Result(NamedTuple):
+    status: str
+    displacement: Float[np.ndarray, " dof"]
+    energy: float
+    seconds: float
+    error: str
+
+
+def static_cases(
+    modes: LinearModes,
+    forces: Float[np.ndarray, "case mode"],
+    folder: FilePath,
+    *,
+    names: Sequence[str] = (),
+    workers: int | None = None,
+    time_limit: float = 3600.0,
+    program: str = "ccx",
+    progress: Progress | None = None,
+) -> StaticRun:
+    """Run static load cases F = M Φ f with large displacements (NLGEOM), one job a case.
+
+    Each job is known by a digest of its deck: results in `folder` are taken over, damaged ones are
+    run again, cases that were killed too. A case that did not converge is kept with its status.
+
+    Arguments: `modes` by `linear_modes`; `forces` f, one row a case (kg^1/2 m/s²); `folder` for
+    decks and results; `names` of the cases; `workers`, jobs at a time (one for each core, each on
+    one thread); `time_limit` of a case (s); `program`; `progress` is called after each case.
+    Returns a `StaticRun`. Raises `ValueError` where CalculiX is missing, forces have another
+    number of modes, or every case failed, with CalculiX's own words.
+    """
+    forces = np.atleast_2d(np.asarray(forces, dtype=float))
+    kept = len(modes.basis.numbers)
+    if forces.shape[1] != kept or not np.all(np.isfinite(forces)):
+        raise ValueError(
+            f"`forces` must be finite with {kept} columns, one for each mode, but has the shape "
+            f"{forces.shape}."
+        )
+    calculix = found_calculix(program, time_limit)
+    deck = modes.deck
+    model = model_file(deck.text + all_nodes(deck) + _all_elements(deck), folder)
+    steps = [_step(modes, row) for row in forces]
+    places = [model.parent / f"case-{digest(model.name + step)}.npz" for step in steps]
+    results = {place: result for place in places if (result := _stored(place, deck)) is not None}
+    todo = {place: step for place, step in zip(places, steps, strict=True) if place not in results}
+    found = sum(place in results for place in places)
+    with ThreadPoolExecutor(max_workers=workers or os.cpu_count() or 1) as pool:
+        running = {
+            pool.submit(_compute, calculix, model, step, place, modes): place
+            for place, step in todo.items()
+        }
+        try:
+            for done, future in enumerate(as_completed(running), start=1):
+                results[running[future]] = future.result()
+                if progress is not None:
+                    progress(found + done, len(places))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    rows = [results[place] for place in places]
+    if rows and all(row.status != CONVERGED for row in rows):
+        said = next((row.error for row in rows if row.error), "nothing was said")
+        raise ValueError(f"no load case of {deck.name} converged in CalculiX: {said}.")
+    displacement = np.array([row.displacement for row in rows]).reshape(len(rows), -1)
+    energy = np.array([row.energy for row in rows])
+    return StaticRun(
+        StaticCases(
+            force=jnp.asarray(forces),
+            modal_displacement=jnp.asarray(displacement @ np.asarray(modes.basis.filter).T),
+            converged=jnp.asarray([row.status == CONVERGED for row in rows], dtype=bool),
+            energy=jnp.asarray(energy) if np.any(np.isfinite(energy)) else None,
+            displacement=jnp.asarray(displacement),
+            names=tuple(names),
+        ),
+        tuple(row.status for row in rows),
+        np.array([row.seconds for row in rows]),
+        tuple(row.error for row in rows),
+        found,
+    )
+
+
+def _step(modes: LinearModes, force: Float[np.ndarray, " mode"]) -> str:
+    """The step of one case: loads ramped up, displacements and energy printed at its end."""
+    loads = (np.asarray(modes.basis.filter).T @ force).reshape(-1, 3)
+    rows = [
+        f"{label}, {direction + 1}, {loads[node, direction]:.12e}"
+        for node, label in enumerate(modes.deck.nodes)
+        for direction in range(3)
+        if loads[node, direction]
+    ]
+    energy = [f"*EL PRINT, ELSET={_ALL_ELEMENTS}, TOTALS=ONLY", "ELSE"]
+    return "\n".join(
+        [
+            *("*STEP, NLGEOM, INC=1000", "*STATIC", _INCREMENTS),
+            *("*CONTROLS, PARAMETERS=FIELD", _CONTROLS),
+            *(["*CLOAD", *rows] if rows else []),
+            *(f"*NODE PRINT, NSET={ALL_NODES}", "U"),
+            *(energy if _has_energy(modes.deck) else []),
+            *("*END STEP", ""),
+        ]
+    )
+
+
+def _has_energy(deck: Deck) -> bool:
+    """Whether the energies of elements that CalculiX prints are all of the energy."""
+    return not any(kind.startswith("SPRING") for kind in deck.element_types)
+
+
+def _all_elements(deck: Deck) -> str:
+    labels = deck.elements
+    rows = [labels[i : i + 8] for i in range(0, len(labels), 8)]
+    return "\n".join(
+        [f"*ELSET, ELSET={_ALL_ELEMENTS}", *(", ".join(map(str, row)) + "," for row in rows), ""]
+    )
+
+
+def _compute(
+    calculix: Calculix, model: Path, step: str, place: Path, modes: LinearModes
+) -> _Result:
+    """Run one case and store it, but for one that was killed."""
+    result = _judged(run_job(calculix, model, step), modes.deck)
+    if result.status != KILLED:
+        content = io.BytesIO()
+        np.savez(
+            content,
+            status=result.status,
+            displacement=result.displacement,
+            energy=result.energy,
+            seconds=result.seconds,
+            error=result.error,
+        )
+        write_atomically(place, content.getvalue())
+    return result
+
+
+def _judged(outcome: JobOutcome, deck: Deck) -> _Result:
+    """What a job's end means: the displacement only where the whole load was reached."""
+    nothing = np.full(3 * len(deck.nodes), np.nan)
+    if not outcome.finished:
+        return _Result(KILLED, nothing, np.nan, outcome.seconds, outcome.error)
+    try:
+        tables = list(printed_tables(outcome.dat, deck.nodes))
+    except ValueError as error:
+        return _Result(DIVERGED, nothing, np.nan, outcome.seconds, str(error))
+    if outcome.error or not tables or tables[-1].time < _END_OF_STEP:
+        said = outcome.error or "the whole load was not reached"
+        return _Result(DIVERGED, nothing, np.nan, outcome.seconds, said)
+    energy = last_energy(outcome.dat)
+    return _Result(
+        CONVERGED,
+        tables[-1].values.ravel(),
+        np.nan if energy is None else energy,
+        outcome.seconds,
+        "",
+    )
+
+
+def _stored(place: Path, deck: Deck) -> _Result | None:
+    """The result of an earlier run, or nothing where there is none or it is damaged."""
+    if not place.is_file():
+        return None
+    try:
+        with np.load(place, allow_pickle=False) as file:
+            result = _Result(
+                str(file["status"]),
+                file["displacement"],
+                float(file["energy"]),
+                float(file["seconds"]),
+                str(file["error"]),
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    return result if result.displacement.shape == (3 * len(deck.nodes),) else None

@@ -1,0 +1,150 @@
+"""Modes by CalculiX against beam theory, and each way in which there are none."""
+
+import numpy as np
+import pytest
+
+from snrmjax.io.calculix.deck import read_deck
+from snrmjax.io.calculix.modes import linear_modes
+
+from .conftest import DENSITY, LENGTH, POISSON, THICKNESS, WIDTH, YOUNG, beam_deck, needs_calculix
+
+# (βL) of a cantilever: roots of cos x cosh x = -1.
+ROOTS = np.array([1.8751040687, 4.6940911330])
+
+
+def bending_frequency(root, thickness):
+    """Natural frequency (rad/s) of an Euler-Bernoulli beam."""
+    return (root / LENGTH) ** 2 * thickness * np.sqrt(YOUNG / (12 * DENSITY))
+
+
+@needs_calculix
+def test_a_cantilever_of_beams_has_its_frequencies_and_shapes(write, tmp_path):
+    modes = linear_modes(read_deck(write(beam_deck(elements=12))), (1, 3), tmp_path / "jobs")
+    # Without Poisson's effect only the mesh of 12 elements and shear are left: below 0.3 %.
+    frequency = np.asarray(modes.basis.frequency)
+    np.testing.assert_allclose(frequency, bending_frequency(ROOTS, THICKNESS), rtol=3e-3)
+    # A cantilever's mass-normalised tip is 2 / sqrt(its mass) in every bending mode.
+    mass = DENSITY * LENGTH * WIDTH * THICKNESS
+    tip = modes.deck.nearest_node((LENGTH, 0.0, 0.0))
+    np.testing.assert_allclose(np.abs(modes.shape_at(tip, "z")), 2 / np.sqrt(mass), rtol=3e-3)
+    np.testing.assert_allclose(modes.shape_at(tip, 1), 0.0, atol=1e-6)
+    # Translations of nodes carry all of the inertia but the rotary one of the section.
+    np.testing.assert_allclose(modes.carried, 1.0, atol=5e-3)
+    basis = modes.basis
+    np.testing.assert_allclose(basis.filter @ basis.shapes, np.eye(2), atol=1e-12)
+    assert basis.numbers == (1, 3)  # mode 2 bends the other way
+
+
+def solid_deck():
+    """A clamped block of two quadratic bricks along x."""
+    places = {}
+    for i in range(5):
+        for j in range(3):
+            for k in range(3):
+                if (i % 2) + (j % 2) + (k % 2) <= 1:
+                    places[i, j, k] = len(places) + 1
+    nodes = [f"{n}, {0.01 * i:g}, {0.005 * j:g}, {0.005 * k:g}" for (i, j, k), n in places.items()]
+    corners = [
+        (0, 0, 0),
+        (2, 0, 0),
+        (2, 2, 0),
+        (0, 2, 0),
+        (0, 0, 2),
+        (2, 0, 2),
+        (2, 2, 2),
+        (0, 2, 2),
+    ]
+    middles = [*((0, 1), (1, 2), (2, 3), (3, 0)), *((4, 5), (5, 6), (6, 7), (7, 4))]
+    middles += [(0, 4), (1, 5), (2, 6), (3, 7)]
+    local = corners + [
+        tuple((a + b) // 2 for a, b in zip(corners[p], corners[q], strict=True)) for p, q in middles
+    ]
+    rows = [
+        f"{e + 1}, " + ", ".join(str(places[i + 2 * e, j, k]) for i, j, k in local)
+        for e in range(2)
+    ]
+    # CalculiX takes at most 16 numbers a line.
+    rows = [
+        ", ".join(row.split(", ")[:11]) + ",\n" + ", ".join(row.split(", ")[11:]) for row in rows
+    ]
+    fixed = [f"{n}, 1, 3" for (i, _, _), n in places.items() if i == 0]
+    return "\n".join(
+        [
+            *("*NODE, NSET=ALL", *nodes, "*ELEMENT, TYPE=C3D20, ELSET=E", *rows),
+            f"*MATERIAL, NAME=M\n*ELASTIC\n{YOUNG}, {POISSON}\n*DENSITY\n{DENSITY}",
+            *("*SOLID SECTION, ELSET=E, MATERIAL=M\n*BOUNDARY", *fixed, ""),
+        ]
+    )
+
+
+@needs_calculix
+def test_nodal_forces_of_solids_are_mass_times_shape(write, tmp_path):
+    modes = linear_modes(read_deck(write(solid_deck())), (1, 2, 3), tmp_path / "jobs")
+    # ΦᵀMΦ = 1 to the seven digits that CalculiX prints.
+    np.testing.assert_allclose(modes.carried, 1.0, atol=1e-5)
+    # M times a unit translation, summed over the modes, misses what the clamped nodes carry only:
+    # the participation of unit acceleration stays below the block's mass.
+    sum_of_masses = np.sum(np.asarray(modes.basis.filter)[:, 1::3], axis=1)
+    assert 0.5 < np.sum(sum_of_masses**2) / (DENSITY * 0.04 * 0.01 * 0.01) < 1.0
+
+
+@needs_calculix
+@pytest.mark.parametrize(
+    ("text", "numbers", "said"),
+    [
+        (beam_deck(supports=()), (1,), "deck.inp has 6 modes without stiffness"),
+        (beam_deck(supports=("1, 1, 3",)), (1,), "mechanism or not held"),
+        (beam_deck(elements=2).replace("MATERIAL=STEEL,", "MATERIAL=WOOD,"), (1,), r"\*ERROR"),
+    ],
+    ids=["free", "hinged", "material missing"],
+)
+def test_decks_without_modes(write, tmp_path, text, numbers, said):
+    with pytest.raises(ValueError, match=said) as raised:
+        linear_modes(read_deck(write(text)), numbers, tmp_path / "jobs")
+    assert "\n" not in str(raised.value)
+
+
+@needs_calculix
+def test_torsion_of_a_beam_is_refused(write, tmp_path):
+    square = beam_deck().replace(f"{THICKNESS}, {WIDTH}", "0.02, 0.02")
+    deck = read_deck(write(square))
+    with pytest.raises(ValueError, match=r"mode 5 .* translations carry 0 % of its inertia"):
+        linear_modes(deck, (5,), tmp_path / "jobs")
+
+
+@pytest.mark.parametrize("numbers", [(), (0,), (1, 1)])
+def test_numbers_that_name_no_modes(write, tmp_path, numbers):
+    with pytest.raises(ValueError, match="modes are different numbers from one"):
+        linear_modes(read_deck(write(beam_deck())), numbers, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("kill -9 $$", "CalculiX gave no modes of deck.inp: killed by SIGKILL"),
+        ("sleep 60", "stopped after the time limit of 0.2 s"),
+        ("exit 3", "it ended with code 3"),
+        ("echo ' *ERROR reading *STEP: no memory'; exit 201", r"\*ERROR reading \*STEP: no memory"),
+        ("exit 0", "it printed no modes"),
+    ],
+    ids=["killed", "time limit", "code", "error", "silent"],
+)
+def test_a_program_that_fails(write, tmp_path, program, script, said):
+    with pytest.raises(ValueError, match=said):
+        linear_modes(
+            read_deck(write(beam_deck())),
+            (1,),
+            tmp_path / "jobs",
+            program=program(f"{'exec ' if 'sleep' in script else ''}{script}"),
+            time_limit=0.2 if "sleep" in script else 60.0,
+        )
+    assert [path.name[:6] for path in (tmp_path / "jobs").iterdir()] == ["model-"]
+
+
+def test_without_calculix(write, tmp_path):
+    deck = read_deck(write(beam_deck()))
+    with pytest.raises(ValueError, match=r"no-ccx is not on the search path: install it .*apt"):
+        linear_modes(deck, (1,), tmp_path / "jobs", program="no-ccx")
+    assert not (tmp_path / "jobs").exists()
+    with pytest.raises(ValueError, match="`time_limit` must be positive"):
+        linear_modes(deck, (1,), tmp_path / "jobs", program="sh", time_limit=0.0)
