@@ -1,12 +1,12 @@
 from .deck import Deck, read_deck
-from .modes import LinearModes, linear_modes
-from .static import StaticRun, static_cases
+from .modes import DeckModes, modes_of_deck
+from .static import StaticRun, run_static_cases
 
 __all__ = [
     "Deck",
-    "LinearModes",
+    "DeckModes",
     "StaticRun",
-    "linear_modes",
+    "modes_of_deck",
     "read_deck",
-    "static_cases",
+    "run_static_cases",
 ]

@@ -60,13 +60,13 @@ def model_file(text: str, folder: FilePath) -> Path:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"the folder {place} cannot be made: {error.strerror}.") from error
-    path = place / f"model-{digest(text)}.inp"
+    path = place / f"model-{deck_digest(text)}.inp"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_atomically(path, text)
     return path
 
 
-def digest(text: str) -> str:
+def deck_digest(text: str) -> str:
     """What a deck is known by: sixteen hexadecimal digits of its SHA-256."""
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
 

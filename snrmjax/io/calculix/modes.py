@@ -22,7 +22,7 @@ _RIGID_RATIO = 1e-7
 _LEAST_CARRIED = 0.9
 
 
-class LinearModes(eqx.Module):
+class DeckModes(eqx.Module):
     """Modes of a deck: the basis of a reduced model, in degrees of freedom x, y, z of each node.
 
     Degree of freedom 3 i + d is the translation in direction d of `deck.nodes[i]`. `carried` is
@@ -46,14 +46,14 @@ class LinearModes(eqx.Module):
         return np.asarray(self.basis.shapes)[axis::3].sum(axis=0)
 
 
-def linear_modes(
+def modes_of_deck(
     deck: Deck,
     numbers: Sequence[int],
     folder: FilePath,
     *,
     program: str = "ccx",
     time_limit: float = 3600.0,
-) -> LinearModes:
+) -> DeckModes:
     """Modes of a deck by CalculiX, with M Φ from its nodal forces.
 
     CalculiX prints the internal forces of a mode, KΦ = ω²MΦ, at the nodes of the deck, for beams
@@ -64,7 +64,7 @@ def linear_modes(
     section, some 1e-5 to 1e-2 (`carried`).
 
     Arguments: `deck`; `numbers` of the modes to keep, from one; `folder` for its files; `program`
-    and its `time_limit` (s). Returns `LinearModes`, largest translation of each mode positive.
+    and its `time_limit` (s). Returns `DeckModes`, largest translation of each mode positive.
     Raises `ValueError` where CalculiX is missing, killed or refuses the deck, where a mode is rigid
     (a mechanism) or does not exist, and for a mode that nodal translations do not carry, as the
     torsion of a beam.
@@ -88,7 +88,7 @@ def linear_modes(
     kept = [number - 1 for number in wanted]
     basis, carried = _basis(np.array(shapes).T[:, kept], np.array(forces).T[:, kept], squares[kept])
     _check_carried(deck, wanted, carried)
-    return LinearModes(
+    return DeckModes(
         ReductionBasis(
             jnp.asarray(np.sqrt(squares[kept])),
             jnp.asarray(basis[0]),

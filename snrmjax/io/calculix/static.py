@@ -18,12 +18,12 @@ from snrmjax.io.calculix.deck import Deck
 from snrmjax.io.calculix.jobs import (
     Calculix,
     JobOutcome,
-    digest,
+    deck_digest,
     found_calculix,
     model_file,
     run_job,
 )
-from snrmjax.io.calculix.modes import ALL_NODES, LinearModes, all_nodes
+from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes
 from snrmjax.io.calculix.results import last_energy, printed_tables
 from snrmjax.io.files import FilePath, write_atomically
 
@@ -63,8 +63,8 @@ class _Result(NamedTuple):
     error: str
 
 
-def static_cases(
-    modes: LinearModes,
+def run_static_cases(
+    modes: DeckModes,
     forces: Float[np.ndarray, "case mode"],
     folder: FilePath,
     *,
@@ -79,7 +79,7 @@ def static_cases(
     Each job is known by a digest of its deck: results in `folder` are taken over, damaged ones are
     run again, cases that were killed too. A case that did not converge is kept with its status.
 
-    Arguments: `modes` by `linear_modes`; `forces` f, one row a case (kg^1/2 m/s²); `folder` for
+    Arguments: `modes` by `modes_of_deck`; `forces` f, one row a case (kg^1/2 m/s²); `folder` for
     decks and results; `names` of the cases; `workers`, jobs at a time (one for each core, each on
     one thread); `time_limit` of a case (s); `program`; `progress` is called after each case.
     Returns a `StaticRun`. Raises `ValueError` where CalculiX is missing, forces have another
@@ -96,7 +96,7 @@ def static_cases(
     deck = modes.deck
     model = model_file(deck.text + all_nodes(deck) + _all_elements(deck), folder)
     steps = [_step(modes, row) for row in forces]
-    places = [model.parent / f"case-{digest(model.name + step)}.npz" for step in steps]
+    places = [model.parent / f"case-{deck_digest(model.name + step)}.npz" for step in steps]
     results = {place: result for place in places if (result := _stored(place, deck)) is not None}
     todo = {place: step for place, step in zip(places, steps, strict=True) if place not in results}
     found = sum(place in results for place in places)
@@ -134,7 +134,7 @@ def static_cases(
     )
 
 
-def _step(modes: LinearModes, force: Float[np.ndarray, " mode"]) -> str:
+def _step(modes: DeckModes, force: Float[np.ndarray, " mode"]) -> str:
     """The step of one case: loads ramped up, displacements and energy printed at its end."""
     loads = (np.asarray(modes.basis.filter).T @ force).reshape(-1, 3)
     rows = [
@@ -169,9 +169,7 @@ def _all_elements(deck: Deck) -> str:
     )
 
 
-def _compute(
-    calculix: Calculix, model: Path, step: str, place: Path, modes: LinearModes
-) -> _Result:
+def _compute(calculix: Calculix, model: Path, step: str, place: Path, modes: DeckModes) -> _Result:
     """Run one case and store it, but for one that was killed."""
     result = _judged(run_job(calculix, model, step), modes.deck)
     if result.status != KILLED:

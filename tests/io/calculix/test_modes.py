@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snrmjax.io.calculix.deck import read_deck
-from snrmjax.io.calculix.modes import linear_modes
+from snrmjax.io.calculix.modes import modes_of_deck
 
 from .conftest import DENSITY, LENGTH, POISSON, THICKNESS, WIDTH, YOUNG, beam_deck, needs_calculix
 
@@ -19,7 +19,7 @@ def bending_frequency(root, thickness):
 
 @needs_calculix
 def test_a_cantilever_of_beams_has_its_frequencies_and_shapes(write, tmp_path):
-    modes = linear_modes(read_deck(write(beam_deck(elements=12))), (1, 3), tmp_path / "jobs")
+    modes = modes_of_deck(read_deck(write(beam_deck(elements=12))), (1, 3), tmp_path / "jobs")
     # Without Poisson's effect only the mesh of 12 elements and shear are left: below 0.3 %.
     frequency = np.asarray(modes.basis.frequency)
     np.testing.assert_allclose(frequency, bending_frequency(ROOTS, THICKNESS), rtol=3e-3)
@@ -79,7 +79,7 @@ def solid_deck():
 
 @needs_calculix
 def test_nodal_forces_of_solids_are_mass_times_shape(write, tmp_path):
-    modes = linear_modes(read_deck(write(solid_deck())), (1, 2, 3), tmp_path / "jobs")
+    modes = modes_of_deck(read_deck(write(solid_deck())), (1, 2, 3), tmp_path / "jobs")
     # ΦᵀMΦ = 1 to the seven digits that CalculiX prints.
     np.testing.assert_allclose(modes.carried, 1.0, atol=1e-5)
     # M times a unit translation, summed over the modes, misses what the clamped nodes carry only:
@@ -100,7 +100,7 @@ def test_nodal_forces_of_solids_are_mass_times_shape(write, tmp_path):
 )
 def test_decks_without_modes(write, tmp_path, text, numbers, said):
     with pytest.raises(ValueError, match=said) as raised:
-        linear_modes(read_deck(write(text)), numbers, tmp_path / "jobs")
+        modes_of_deck(read_deck(write(text)), numbers, tmp_path / "jobs")
     assert "\n" not in str(raised.value)
 
 
@@ -109,13 +109,13 @@ def test_torsion_of_a_beam_is_refused(write, tmp_path):
     square = beam_deck().replace(f"{THICKNESS}, {WIDTH}", "0.02, 0.02")
     deck = read_deck(write(square))
     with pytest.raises(ValueError, match=r"mode 5 .* translations carry 0 % of its inertia"):
-        linear_modes(deck, (5,), tmp_path / "jobs")
+        modes_of_deck(deck, (5,), tmp_path / "jobs")
 
 
 @pytest.mark.parametrize("numbers", [(), (0,), (1, 1)])
 def test_numbers_that_name_no_modes(write, tmp_path, numbers):
     with pytest.raises(ValueError, match="modes are different numbers from one"):
-        linear_modes(read_deck(write(beam_deck())), numbers, tmp_path)
+        modes_of_deck(read_deck(write(beam_deck())), numbers, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_numbers_that_name_no_modes(write, tmp_path, numbers):
 )
 def test_a_program_that_fails(write, tmp_path, program, script, said):
     with pytest.raises(ValueError, match=said):
-        linear_modes(
+        modes_of_deck(
             read_deck(write(beam_deck())),
             (1,),
             tmp_path / "jobs",
@@ -144,7 +144,7 @@ def test_a_program_that_fails(write, tmp_path, program, script, said):
 def test_without_calculix(write, tmp_path):
     deck = read_deck(write(beam_deck()))
     with pytest.raises(ValueError, match=r"no-ccx is not on the search path: install it .*apt"):
-        linear_modes(deck, (1,), tmp_path / "jobs", program="no-ccx")
+        modes_of_deck(deck, (1,), tmp_path / "jobs", program="no-ccx")
     assert not (tmp_path / "jobs").exists()
     with pytest.raises(ValueError, match="`time_limit` must be positive"):
-        linear_modes(deck, (1,), tmp_path / "jobs", program="sh", time_limit=0.0)
+        modes_of_deck(deck, (1,), tmp_path / "jobs", program="sh", time_limit=0.0)

@@ -6,8 +6,8 @@ import pytest
 
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.io.calculix.deck import read_deck
-from snrmjax.io.calculix.modes import LinearModes, linear_modes
-from snrmjax.io.calculix.static import static_cases
+from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
+from snrmjax.io.calculix.static import run_static_cases
 
 from .conftest import LENGTH, THICKNESS, WIDTH, YOUNG, beam_deck, needs_calculix
 
@@ -21,13 +21,13 @@ def test_tip_deflection_and_energy_of_a_cantilever(write, tmp_path):
     tip = np.zeros((3 * len(deck.nodes), 1))
     tip[3 * deck.node_index(deck.nearest_node((LENGTH, 0.0, 0.0))) + 2] = 1.0
     basis = ReductionBasis(jnp.ones(1), jnp.asarray(tip), jnp.asarray(tip.T), (1,))
-    modes = LinearModes(basis, deck, np.ones(1))
+    modes = DeckModes(basis, deck, np.ones(1))
     stiffness = 3 * YOUNG * INERTIA / LENGTH**3
     # P L² / (E I) = 1 deflects by 0.30172 L (elastica: Bisshopp & Drucker 1945).
     forces = np.array(
         [[1e-4 * LENGTH * stiffness], [-1e-4 * LENGTH * stiffness], [stiffness / 3 * LENGTH]]
     )
-    run = static_cases(modes, forces, tmp_path / "jobs", names=("up", "down", "large"))
+    run = run_static_cases(modes, forces, tmp_path / "jobs", names=("up", "down", "large"))
     assert run.status == ("converged",) * 3
     deflection = np.asarray(run.cases.modal_displacement)[:, 0]
     np.testing.assert_allclose(deflection[:2], [1e-4 * LENGTH, -1e-4 * LENGTH], rtol=2e-3)
@@ -41,10 +41,10 @@ def test_tip_deflection_and_energy_of_a_cantilever(write, tmp_path):
 @needs_calculix
 def test_small_loads_move_one_mode_by_its_stiffness(write, tmp_path):
     deck = read_deck(write(beam_deck(elements=6)))
-    modes = linear_modes(deck, (1, 3), tmp_path / "jobs")
+    modes = modes_of_deck(deck, (1, 3), tmp_path / "jobs")
     squares = np.asarray(modes.basis.frequency) ** 2
     wanted = 1e-3 * THICKNESS / np.abs(np.asarray(modes.basis.shapes)).max(axis=0)
-    run = static_cases(modes, np.diag(squares * wanted), tmp_path / "jobs")
+    run = run_static_cases(modes, np.diag(squares * wanted), tmp_path / "jobs")
     # q = f/ω² of each mode and nothing of the other, to what the printed digits resolve.
     np.testing.assert_allclose(run.cases.modal_displacement / wanted, np.eye(2), atol=3e-4)
 
@@ -52,16 +52,16 @@ def test_small_loads_move_one_mode_by_its_stiffness(write, tmp_path):
 @needs_calculix
 def test_a_load_beyond_the_structure_diverges_and_the_others_stay(write, tmp_path):
     deck = read_deck(write(beam_deck(elements=2)))
-    modes = linear_modes(deck, (1,), tmp_path / "jobs")
+    modes = modes_of_deck(deck, (1,), tmp_path / "jobs")
     force = np.array([[1e-2], [1e12]])
-    run = static_cases(modes, force, tmp_path / "jobs")
+    run = run_static_cases(modes, force, tmp_path / "jobs")
     assert run.status == ("converged", "diverged")
     assert run.errors[0] == ""
     assert run.errors[1]
     assert run.cases.usable.tolist() == [True, False]
     assert np.all(np.isnan(np.asarray(run.cases.displacement)[1]))
     with pytest.raises(ValueError, match=r"no load case of deck.inp converged in CalculiX: "):
-        static_cases(modes, force[1:], tmp_path / "jobs")
+        run_static_cases(modes, force[1:], tmp_path / "jobs")
 
 
 # The results of a job as CalculiX prints them, for a deck of five nodes in a row.
@@ -79,7 +79,7 @@ def small(write):
     """A deck of five nodes with a basis of one shape."""
     deck = read_deck(write(beam_deck(elements=2)))
     shape = np.tile([0.0, 0.0, 1.0], 5)[:, None]
-    return LinearModes(
+    return DeckModes(
         ReductionBasis(jnp.ones(1), jnp.asarray(shape), jnp.asarray(shape.T / 5), (1,)),
         deck,
         np.ones(1),
@@ -93,7 +93,7 @@ def test_results_of_an_earlier_run_are_taken_over(small, tmp_path, program):
     done = []
 
     def run(forces):
-        return static_cases(
+        return run_static_cases(
             small,
             forces,
             tmp_path / "jobs",
@@ -118,8 +118,8 @@ def test_results_of_an_earlier_run_are_taken_over(small, tmp_path, program):
     assert run([[1.0], [2.0], [5.0]]).found == 2
     assert run([[1.0], [2.0], [5.0]]).found == 3
     # Another model in the same folder shares nothing with this one.
-    other = LinearModes(small.basis, read_deck(_thicker(tmp_path)), small.carried)
-    assert static_cases(other, [[1.0]], tmp_path / "jobs", program=stand_in).found == 0
+    other = DeckModes(small.basis, read_deck(_thicker(tmp_path)), small.carried)
+    assert run_static_cases(other, [[1.0]], tmp_path / "jobs", program=stand_in).found == 0
     assert not list((tmp_path / "jobs").glob("job-*"))
 
 
@@ -146,7 +146,7 @@ esac"""
     )
     forces = np.array([[1.0], [2.0], [3.0], [4.0], [5.0]])
     for _ in range(2):
-        run = static_cases(small, forces, tmp_path / "jobs", program=stand_in)
+        run = run_static_cases(small, forces, tmp_path / "jobs", program=stand_in)
         assert run.status == ("killed", "diverged", "diverged", "diverged", "converged")
         assert run.errors[0] == "killed by SIGKILL"
         assert run.errors[1] == "*ERROR: too many cutbacks"
@@ -158,9 +158,9 @@ esac"""
 
 def test_forces_of_other_modes_and_no_program(small, tmp_path):
     with pytest.raises(ValueError, match=r"`forces` must be finite with 1 columns.*\(1, 2\)"):
-        static_cases(small, [[1.0, 2.0]], tmp_path / "jobs", program="sh")
+        run_static_cases(small, [[1.0, 2.0]], tmp_path / "jobs", program="sh")
     with pytest.raises(ValueError, match="`forces` must be finite"):
-        static_cases(small, [[np.nan]], tmp_path / "jobs", program="sh")
+        run_static_cases(small, [[np.nan]], tmp_path / "jobs", program="sh")
     with pytest.raises(ValueError, match="no-ccx is not on the search path"):
-        static_cases(small, [[1.0]], tmp_path / "jobs", program="no-ccx")
+        run_static_cases(small, [[1.0]], tmp_path / "jobs", program="no-ccx")
     assert not (tmp_path / "jobs").exists()
