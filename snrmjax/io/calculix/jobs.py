@@ -22,11 +22,13 @@ _THREADS = (
     *("OMP_NUM_THREADS", "CCX_NPROC_STIFFNESS", "CCX_NPROC_EQUATION_SOLVER", "CCX_NPROC_RESULTS"),
     *("OPENBLAS_NUM_THREADS", "CCX_NPROC_CFD", "CCX_NPROC_VIEWFACTOR"),
 )
+_BEGUN = "increment 1 attempt 1"  # in the log, once the deck is read and a static step begins
 
 
 class JobOutcome(NamedTuple):
     """What became of a job."""
 
+    started: bool  # a static step began, or the program printed results
     finished: bool  # the program came to its end, with an error or not
     dat: str  # what it printed of results
     error: str  # its first error, or how it ended
@@ -108,4 +110,4 @@ def run_job(calculix: Calculix, model: Path, step: str) -> JobOutcome:
     error = stopped or first_error(said)
     if not error and process.returncode:
         error = f"it ended with code {process.returncode}"
-    return JobOutcome(not stopped, printed, error, seconds)
+    return JobOutcome(bool(printed) or _BEGUN in said, not stopped, printed, error, seconds)

@@ -27,7 +27,8 @@ from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes
 from snrmjax.io.calculix.results import last_energy, printed_tables
 from snrmjax.io.files import FilePath, write_atomically
 
-CONVERGED, DIVERGED, KILLED = "converged", "diverged", "killed"
+CONVERGED, DIVERGED = "converged", "diverged"
+KILLED, REFUSED = "killed", "refused"
 _ALL_ELEMENTS = "SNRMJAX_ELEMENTS"
 # First and longest increment a quarter of the load; CalculiX cuts back where it has to.
 _INCREMENTS = "0.25, 1., 1.e-5, 1."
@@ -44,7 +45,8 @@ class StaticRun(eqx.Module):
     """Load cases that CalculiX has run, or had run before.
 
     `status` of a case: "converged"; "diverged", the load was not reached; "killed", the program was
-    stopped from outside or by its time limit, or did not start (the next run tries it again).
+    stopped from outside or by its time limit; "refused", the deck was not read. The next run tries
+    those killed or refused again.
     `seconds` is what CalculiX took, whether in this run or in an earlier one.
     """
 
@@ -83,7 +85,8 @@ def run_static_cases(
     decks and results; `names` of the cases; `workers`, jobs at a time (one for each core, each on
     one thread); `time_limit` of a case (s); `program`; `progress` is called after each case.
     Returns a `StaticRun`. Raises `ValueError` where CalculiX is missing, forces have another
-    number of modes, or every case failed, with CalculiX's own words.
+    number of modes, or not one case could be run, with CalculiX's own words. Cases that all diverge
+    are returned as such.
     """
     forces = np.atleast_2d(np.asarray(forces, dtype=float))
     kept = len(modes.basis.numbers)
@@ -113,9 +116,8 @@ def run_static_cases(
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     rows = [results[place] for place in places]
-    if rows and all(row.status != CONVERGED for row in rows):
-        said = next((row.error for row in rows if row.error), "nothing was said")
-        raise ValueError(f"no load case of {deck.name} converged in CalculiX: {said}.")
+    if rows and all(row.status in (KILLED, REFUSED) for row in rows):
+        raise ValueError(f"CalculiX ran no load case of {deck.name}: {rows[0].error}.")
     displacement = np.array([row.displacement for row in rows]).reshape(len(rows), -1)
     energy = np.array([row.energy for row in rows])
     return StaticRun(
@@ -170,9 +172,9 @@ def _all_elements(deck: Deck) -> str:
 
 
 def _compute(calculix: Calculix, model: Path, step: str, place: Path, modes: DeckModes) -> _Result:
-    """Run one case and store it, but for one that was killed."""
+    """Run one case and store it, but for one that was killed or refused."""
     result = _judged(run_job(calculix, model, step), modes.deck)
-    if result.status != KILLED:
+    if result.status not in (KILLED, REFUSED):
         content = io.BytesIO()
         np.savez(
             content,
@@ -191,6 +193,10 @@ def _judged(outcome: JobOutcome, deck: Deck) -> _Result:
     nothing = np.full(3 * len(deck.nodes), np.nan)
     if not outcome.finished:
         return _Result(KILLED, nothing, np.nan, outcome.seconds, outcome.error)
+    if not outcome.started:
+        return _Result(
+            REFUSED, nothing, np.nan, outcome.seconds, outcome.error or "it said nothing"
+        )
     try:
         tables = list(printed_tables(outcome.dat, deck.nodes))
     except ValueError as error:

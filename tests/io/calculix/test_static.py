@@ -60,8 +60,7 @@ def test_a_load_beyond_the_structure_diverges_and_the_others_stay(write, tmp_pat
     assert run.errors[1]
     assert run.cases.usable.tolist() == [True, False]
     assert np.all(np.isnan(np.asarray(run.cases.displacement)[1]))
-    with pytest.raises(ValueError, match=r"no load case of deck.inp converged in CalculiX: "):
-        run_static_cases(modes, force[1:], tmp_path / "jobs")
+    assert run_static_cases(modes, force[1:], tmp_path / "jobs").status == ("diverged",)
 
 
 # The results of a job as CalculiX prints them, for a deck of five nodes in a row.
@@ -154,6 +153,17 @@ esac"""
         assert "it is cut off" in run.errors[3]
         assert run.cases.usable.tolist() == [False] * 4 + [True]
     assert run.found == 4  # all but the killed one, which was tried again
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [("kill -9 $$", "killed by SIGKILL"), ("echo ' *ERROR: no such set'", r"\*ERROR: no such set")],
+    ids=["killed", "refused"],
+)
+def test_not_one_case_could_be_run(small, tmp_path, program, script, said):
+    with pytest.raises(ValueError, match=f"CalculiX ran no load case of deck.inp: {said}"):
+        run_static_cases(small, [[1.0], [2.0]], tmp_path / "jobs", program=program(script))
+    assert not list((tmp_path / "jobs").glob("case-*"))
 
 
 def test_forces_of_other_modes_and_no_program(small, tmp_path):
