@@ -54,7 +54,11 @@ SUB_ROOMS = {
     "io.calculix": {"io.files"},
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
+    "report.condense": {"report.style", "report.html"},
     "report.study": {"report.style", "report.html"},
+    "io.reduction": {
+        *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
+    },
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),

@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify, diagnose, study.
+"""The commands: demo, simulate, nnm, identify, diagnose, study, rom.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -13,6 +13,7 @@ from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
+from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
 from snrmjax.io.compilation_cache import use_compilation_cache
@@ -37,6 +38,9 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     "--next 5 --out result",
     diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
     "snrmjax diagnose sets/*.csv --model model.toml --out results",
+    rom: "Examples: snrmjax rom beam.toml --out reduced\n\n"
+    "snrmjax rom --tables load_cases --out reduced\n\n"
+    "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
 }
 
 

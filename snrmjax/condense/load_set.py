@@ -34,7 +34,7 @@ class LoadSet(NamedTuple):
 
 def modal_loads(
     basis: ReductionBasis,
-    displacement: float | Sequence[float] | Float[Array, " mode"],
+    displacement: float | Sequence[float] | Float[Array | np.ndarray, " mode"],
     *,
     degree: int = 3,
     most_modes: int | None = None,

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.condense.condensation import Condensation
+from snrmjax.condense.scale_study import LoadScaleStudy
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.inverse_force import InverseForce
@@ -25,6 +27,7 @@ from snrmjax.measure.force_calibration import ForceCalibration
 from snrmjax.measure.harmonic_fit import HarmonicFit
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
+from snrmjax.report.condense.reduction_figures import scale_figure, static_figure
 from snrmjax.report.sampling import span_of
 from snrmjax.report.uncertainty import uncertainty_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -234,3 +237,13 @@ def _(result: ScatterStudy) -> Figure:
 @plot_result.register
 def _(result: SobolIndices) -> Figure:
     return uncertainty_figures.sensitivity_figure(result)
+
+
+@plot_result.register
+def _(result: Condensation) -> Figure:
+    return static_figure(result, [f"mode {number}" for number in result.basis.numbers])
+
+
+@plot_result.register
+def _(result: LoadScaleStudy) -> Figure:
+    return scale_figure(result)

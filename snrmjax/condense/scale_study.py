@@ -1,0 +1,183 @@
+"""How the coefficients of a reduced-order model depend on the size of its load cases."""
+
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.case_checks import rms
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import StaticSolver, modal_loads
+from snrmjax.condense.potential_fit import fit_system, monomials_of, solve_scaled
+from snrmjax.model.potential import Monomial, monomial_key
+from snrmjax.numerics.result import AbstractResult, Variable
+
+SCALES = tuple(float(scale) for scale in np.logspace(-2.0, 0.75, 12))
+"""Default multiples of the displacement: two decades below and three quarters of one above."""
+
+TOLERANCE = 0.02
+"""By this share the leading coefficients may differ within a plateau."""
+
+_LEADING = 0.1  # of the largest term's force: a coefficient that the plateau is judged by
+
+
+class LoadScaleStudy(AbstractResult):
+    """Coefficients against the size of the load cases, and where they do not depend on it.
+
+    Too small loads leave round-off, too large ones the terms that the polynomial does not have.
+    `plateau` is the longest range of scales over which every leading coefficient stays within
+    `TOLERANCE`; leading are those whose term has at least a tenth of the force of the largest term
+    of its degree at scale 1. None: there is no plateau of two scales.
+    """
+
+    scale: Float[np.ndarray, " scale"]  # times the displacement that was asked for
+    coefficient: Float[np.ndarray, "scale monomial"]  # NaN where load cases failed
+    misfit: Float[np.ndarray, " scale"]  # residual over nonlinear force
+    nonlinear_ratio: Float[np.ndarray, " scale"]  # nonlinear over linear force, the largest
+    leading: tuple[bool, ...] = eqx.field(static=True)
+    plateau: tuple[float, float] | None = eqx.field(static=True)
+    monomials: tuple[Monomial, ...] = eqx.field(static=True)
+
+    coordinates: ClassVar[tuple[str, ...]] = ("load_scale", "monomial")
+
+    @property
+    def decades(self) -> float:
+        """Width of the plateau in powers of ten; 0 where there is none."""
+        return 0.0 if self.plateau is None else float(np.log10(self.plateau[1] / self.plateau[0]))
+
+    @property
+    def holds_default(self) -> bool:
+        """Whether scale 1 lies inside the plateau."""
+        return self.plateau is not None and self.plateau[0] < 1.0 < self.plateau[1]
+
+    def summary(self) -> tuple[str, ...]:
+        """Range of scales and plateau."""
+        solved = int(np.isfinite(self.misfit).sum())
+        first = f"LoadScaleStudy: {len(self.scale)} load scales, {solved} with a whole fit"
+        if self.plateau is None:
+            return first, "no plateau"
+        low, high = self.plateau
+        where = "inside it" if self.holds_default else "not inside it"
+        return (
+            first,
+            f"plateau from {low:.3g} to {high:.3g} ({self.decades:.2g} decades); scale 1 {where}",
+        )
+
+    def variables(self) -> Mapping[str, Variable]:
+        """Coefficients and quality over scale."""
+        keys = np.array([monomial_key(m) for m in self.monomials])
+        over = ("load_scale",)
+        return {
+            "load_scale": Variable(over, self.scale, "1", "times the default displacement"),
+            "monomial": Variable(("monomial",), keys, "", "modes of the monomial of V"),
+            "coefficient": Variable(
+                ("load_scale", "monomial"), self.coefficient, "kg, m, s", "coefficient of V"
+            ),
+            "misfit": Variable(over, self.misfit, "1", "residual over nonlinear force"),
+            "nonlinear_ratio": Variable(
+                over, self.nonlinear_ratio, "1", "nonlinear over linear force"
+            ),
+        }
+
+
+def load_scale_study(
+    basis: ReductionBasis,
+    solve: StaticSolver,
+    displacement: float | Float[Array | np.ndarray, " mode"],
+    *,
+    degree: int = 3,
+    scales: tuple[float, ...] = SCALES,
+    most_modes: int | None = None,
+    report: Callable[[int, int], None] | None = None,
+) -> LoadScaleStudy:
+    """Condense with loads of many sizes.
+
+    Arguments: `displacement` in m, as for `modal_loads`; `scales` rising multiples of it, 1 among
+    or between them; `report` is told how many scales of how many are done.
+    Returns coefficients over scale and the plateau. A scale whose load cases do not all converge
+    has NaN and ends a plateau. Raises `ValueError` for scales that do not rise.
+    """
+    scale = np.asarray(scales, dtype=float)
+    if scale.ndim != 1 or scale.size < 2 or not np.all(np.diff(scale) > 0) or not scale[0] > 0:
+        raise ValueError(f"`scales` must be positive and rise, at least two, but is {scales}.")
+    monomials = monomials_of(len(basis.numbers), degree)
+    coefficient = np.full((scale.size, len(monomials)), np.nan)
+    misfit, ratio = np.full(scale.size, np.nan), np.full(scale.size, np.nan)
+    typical = np.ones(len(basis.numbers))
+    nearest = int(np.argmin(np.abs(np.log(scale))))
+    for k, one in enumerate(scale):
+        loads = modal_loads(
+            basis, one * np.asarray(displacement), degree=degree, most_modes=most_modes
+        )
+        cases = solve(np.asarray(loads.force))
+        if k == nearest:
+            typical = _typical(cases) / one
+        if cases.usable.all():
+            coefficient[k], misfit[k], ratio[k] = _fitted(basis, cases, monomials)
+        if report is not None:
+            report(k + 1, scale.size)
+    leading = _leading(coefficient[nearest], typical, monomials)
+    return LoadScaleStudy(
+        scale=scale,
+        coefficient=coefficient,
+        misfit=misfit,
+        nonlinear_ratio=ratio,
+        leading=tuple(bool(one) for one in leading),
+        plateau=plateau_of(scale, coefficient[:, leading]),
+        monomials=monomials,
+    )
+
+
+def plateau_of(
+    scale: Float[np.ndarray, " scale"], coefficient: Float[np.ndarray, "scale monomial"]
+) -> tuple[float, float] | None:
+    """The longest range of scales (in ratio) over which all coefficients stay within `TOLERANCE`.
+
+    >>> plateau_of(np.array([1.0, 2.0, 4.0, 8.0]), np.array([[3.0], [1.0], [1.01], [1.5]]))
+    (2.0, 4.0)
+    """
+    best = None
+    for first in range(len(scale)):
+        for last in range(first + 1, len(scale)):
+            rows = coefficient[first : last + 1]
+            spread = rows.max(axis=0) - rows.min(axis=0)
+            middle = np.abs(np.median(rows, axis=0))
+            if not rows.size or not np.all(spread <= TOLERANCE * middle):
+                break
+            ends = (float(scale[first]), float(scale[last]))
+            if best is None or ends[1] / ends[0] > best[1] / best[0]:
+                best = ends
+    return best
+
+
+def _fitted(
+    basis: ReductionBasis, cases: StaticCases, monomials: tuple[Monomial, ...]
+) -> tuple[np.ndarray, float, float]:
+    """Coefficients, residual over nonlinear force, and the largest nonlinear over linear force."""
+    system = fit_system(basis, cases, monomials)
+    scaled = np.asarray(solve_scaled(system))
+    design, target = np.asarray(system.design), np.asarray(system.target)
+    linear = np.asarray(cases.force) / np.asarray(system.row_scale) - target
+    ratio = np.linalg.norm(target, axis=1) / np.linalg.norm(linear, axis=1)
+    misfit = rms(target - design @ scaled) / rms(target)
+    return scaled * np.asarray(system.column_scale), misfit, float(ratio.max())
+
+
+def _typical(cases: StaticCases) -> np.ndarray:
+    """Modal displacements, rms over the load cases that were solved."""
+    moved = np.asarray(cases.modal_displacement)[cases.usable]
+    return np.sqrt(np.mean(moved**2, axis=0)) if len(moved) else np.ones(moved.shape[1])
+
+
+def _leading(
+    coefficient: np.ndarray, typical: np.ndarray, monomials: tuple[Monomial, ...]
+) -> np.ndarray:
+    """The coefficients whose terms have a tenth of the energy of the largest of their degree."""
+    size = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
+    degree = np.array([len(m) for m in monomials])
+    every = np.nan_to_num(size)
+    largest = np.array([every[degree == d].max() for d in degree])
+    # An odd term of a flat structure is rounding: no term of a degree that hardly acts leads.
+    return (every >= _LEADING * largest) & (largest >= _LEADING**2 * every.max())

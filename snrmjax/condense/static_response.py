@@ -1,0 +1,52 @@
+"""Static displacement of a reduced-order model under modal forces."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from snrmjax.model.potential import PolynomialPotential
+
+_STEPS, _ITERATIONS = 40, 6
+_TOLERANCE = 1e-9  # of the force
+
+
+@eqx.filter_jit
+def static_displacement(
+    frequency: Float[Array, " mode"],
+    potential: PolynomialPotential,
+    force: Float[Array, "case mode"],
+) -> Float[Array, "case mode"]:
+    """Solve ω²q + ∂V/∂q = f, each case on the path that starts at rest.
+
+    The load grows in steps, each with Newton's method. NaN where the path ends before the load is
+    reached, such as at a snap-through.
+
+    Arguments: `frequency` in rad/s, `force` f in kg^1/2 m/s². Returns q in kg^1/2 m.
+
+    >>> hardening = PolynomialPotential(jnp.ones(1), jnp.zeros(1), ((0, 0, 0, 0),), 1)
+    >>> static_displacement(jnp.array([2.0]), hardening, jnp.array([[8.0]])).round(9)
+    Array([[1.]], dtype=float64)
+    """
+    squared = jnp.asarray(frequency) ** 2
+
+    def balance(q: Array, f: Array) -> Array:
+        return squared * q + potential.force(q) - f
+
+    def at_rest(full: Array) -> Array:
+        def step(carry: tuple[Array, Array], fraction: Array) -> tuple[tuple[Array, Array], None]:
+            q, stable = carry
+            for _ in range(_ITERATIONS):
+                tangent = jnp.diag(squared) + potential.stiffness(q)
+                q = q - jnp.linalg.solve(tangent, balance(q, fraction * full))
+            scaled = jnp.eye(q.size) + potential.stiffness(q) / jnp.sqrt(squared[:, None] * squared)
+            return (q, stable & (jnp.linalg.eigvalsh(scaled)[0] > 0)), None
+
+        fractions = jnp.arange(1, _STEPS + 1) / _STEPS
+        start = jnp.zeros_like(full), jnp.array(True)
+        (q, stable), _ = jax.lax.scan(step, start, fractions)
+        size = jnp.max(jnp.abs(full))
+        found = stable & (jnp.max(jnp.abs(balance(q, full))) <= _TOLERANCE * size)
+        return jnp.where(found, q, jnp.nan)
+
+    return jax.vmap(at_rest)(jnp.asarray(force))

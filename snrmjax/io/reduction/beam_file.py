@@ -1,0 +1,211 @@
+"""Beams and arches as TOML: what `snrmjax rom beam.toml` reads.
+
+name = "flat beam"
+[material]
+young_pa = 204.8e9
+density_kg_m3 = 7870.0
+poisson = 0.29
+[section]
+width_m = 0.0127
+thickness_m = 0.000508
+[geometry]
+length_m = 0.2286
+radius_m = 11.43                     # absent: straight
+elements = 40
+[supports]
+left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses:
+right = { axial_n_m = 1e6, transverse_n_m = 1e7, rotation_nm_rad = 50.0 }
+[condense]
+modes = [1, 3, 5]
+load_scale = 0.3                     # thicknesses, optional
+degree = 3
+damping_ratio = [0.05, 0.001, 0.001] # optional, one number or one a mode
+[sensors]
+midspan = 0.5                        # fraction of the length
+[force]
+distribution = "uniform"             # or: at = 0.5
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.io.files import FilePath, file_name, read_text
+from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
+from snrmjax.io.toml_table import TomlTable, parsed_toml
+from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, Rule
+
+MOST_ELEMENTS = 400
+SUPPORTS = ("clamped", "pinned", "free")
+STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
+
+_TABLES = ("material", "section", "geometry", "supports", "condense", "sensors", "force")
+_POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
+_MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
+
+
+class SupportStiffness(NamedTuple):
+    """Springs at an end; infinite is held, zero free."""
+
+    axial: float  # N/m, along the chord
+    transverse: float  # N/m, across it
+    rotation: float  # N m/rad
+
+
+class BeamDescription(NamedTuple):
+    """A beam or arch as its file says."""
+
+    name: str
+    young: float  # Pa
+    density: float  # kg/m³
+    poisson: float
+    width: float  # m
+    thickness: float  # m
+    length: float  # m, of the chord
+    radius: float | None  # m; None: straight
+    elements: int
+    supports: tuple[SupportStiffness, SupportStiffness]  # left, right
+    modes: tuple[int, ...]  # counted from one
+    load_scale: float | None  # thicknesses
+    degree: int
+    damping_ratio: tuple[float, ...] | None  # one a mode; None: not stated
+    sensors: dict[str, float]  # fractions of the length
+    force_at: float | None  # fraction of the length; None: uniform
+
+
+def read_beam_description(path: FilePath) -> BeamDescription:
+    """Read a beam from a TOML; its format is told at the top of this module.
+
+    Raises `ValueError` that names file, table, key, value and what was expected; a near miss is
+    suggested for an unknown key.
+    """
+    file = file_name(path)
+    top = parsed_toml(read_text(path), file)
+    top.check_keys(_TABLES[:5], ("name", *_TABLES[5:]))
+    material, section, geometry, supports, of_modes, sensors, force = (
+        top.table(name, f"[{name}] of {file}") for name in _TABLES
+    )
+    material.check_keys(("young_pa", "density_kg_m3"), ("poisson",))
+    section.check_keys(("width_m", "thickness_m"))
+    geometry.check_keys(("length_m", "elements"), ("radius_m",))
+    supports.check_keys(("left", "right"))
+    of_modes.check_keys(("modes",), ("load_scale", "degree", "damping_ratio"))
+    length = geometry.number("length_m", POSITIVE)
+    radius = geometry.number("radius_m", POSITIVE) if "radius_m" in geometry.entries else None
+    if radius is not None and not length < 2 * _MOST_RISE * radius:
+        raise geometry.refusal("radius_m", f"above {length / (2 * _MOST_RISE):.4g}", radius)
+    thickness = section.number("thickness_m", POSITIVE)
+    if not thickness < length:
+        raise section.refusal("thickness_m", f"below the length ({length:g})", thickness)
+    elements = geometry.whole("elements", 2)
+    if elements > MOST_ELEMENTS:
+        raise geometry.refusal("elements", f"at most {MOST_ELEMENTS}", elements)
+    modes = _modes(of_modes, elements)
+    degree = of_modes.whole("degree", 2, 3)
+    if degree > 7:
+        raise of_modes.refusal("degree", "from 2 to 7", degree)
+    scaled = "load_scale" in of_modes.entries
+    places = {name: sensors.number(name, FRACTION) for name in sensors.entries}
+    return BeamDescription(
+        name=top.text("name", file.removesuffix(".toml")),
+        young=material.number("young_pa", POSITIVE),
+        density=material.number("density_kg_m3", POSITIVE),
+        poisson=material.number("poisson", _POISSON, default=0.3),
+        width=section.number("width_m", POSITIVE),
+        thickness=thickness,
+        length=length,
+        radius=radius,
+        elements=elements,
+        supports=_held(_support(supports, "left"), _support(supports, "right"), supports),
+        modes=modes,
+        load_scale=of_modes.number("load_scale", POSITIVE) if scaled else None,
+        degree=degree,
+        damping_ratio=_damping(of_modes, len(modes)),
+        sensors=places or {"midspan": 0.5},
+        force_at=_force(force),
+    )
+
+
+def read_beam(path: FilePath) -> ReductionSource:
+    """Read a beam and prepare its finite elements, modes and load cases.
+
+    Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes.
+    """
+    read_beam_description(path)
+    raise ValueError("the built-in finite elements are not in this version.")
+
+
+def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
+    values = table.entries["modes"]
+    if not isinstance(values, list) or not values:
+        raise table.refusal("modes", "a list of mode numbers, at least one", values)
+    numbers = []
+    for k, one in enumerate(values):
+        entry = TomlTable({"modes": one}, f"{table.place}, entry {k + 1},")
+        numbers.append(entry.whole("modes", 1))
+    if len(set(numbers)) < len(numbers):
+        raise table.refusal("modes", "different mode numbers", values)
+    if len(numbers) > 8:
+        raise table.refusal("modes", "at most 8 modes", values)
+    if max(numbers) > elements:
+        expected = f"mode numbers that {elements} elements can show (at most {elements})"
+        raise table.refusal("modes", expected, max(numbers))
+    return tuple(numbers)
+
+
+def _support(table: TomlTable, side: str) -> SupportStiffness:
+    value = table.entries[side]
+    if isinstance(value, dict):
+        springs = TomlTable(value, f"{side} of {table.place}")
+        springs.check_keys((), STIFFNESSES)
+        if not value:
+            raise table.refusal(side, f"a support or stiffnesses ({', '.join(STIFFNESSES)})", value)
+        sizes = [springs.number(key, NOT_NEGATIVE, default=0.0) for key in STIFFNESSES]
+        return SupportStiffness(*sizes)
+    kind = table.choice(side, SUPPORTS)
+    held = np.inf if kind != "free" else 0.0
+    return SupportStiffness(held, held, np.inf if kind == "clamped" else 0.0)
+
+
+def _held(
+    left: SupportStiffness, right: SupportStiffness, table: TomlTable
+) -> tuple[SupportStiffness, SupportStiffness]:
+    """The supports, unless they leave a rigid-body motion: a mechanism has no static load cases."""
+    if not (left.axial or right.axial):
+        missing = "nothing holds the beam along its axis"
+    elif not (left.transverse or right.transverse):
+        missing = "nothing holds the beam across its axis"
+    elif not ((left.transverse and right.transverse) or left.rotation or right.rotation):
+        missing = "nothing keeps the beam from turning"
+    else:
+        return left, right
+    raise ValueError(f"{table.place} leave a mechanism: {missing}.")
+
+
+def _damping(table: TomlTable, n: int) -> tuple[float, ...] | None:
+    if "damping_ratio" not in table.entries:
+        return None
+    if not isinstance(table.entries["damping_ratio"], list):
+        return (table.number("damping_ratio", BELOW_ONE),) * n
+    values = table.numbers("damping_ratio", BELOW_ONE, each="mode")
+    if len(values) != n:
+        raise table.refusal("damping_ratio", f"{n} numbers, one a mode", values)
+    return tuple(values)
+
+
+def _force(table: TomlTable) -> float | None:
+    table.check_keys((), ("distribution", "at"))
+    if "distribution" in table.entries and "at" in table.entries:
+        raise ValueError(f"{table.place} has both `distribution` and `at`: one of them is enough.")
+    if "at" in table.entries:
+        return table.number("at", FRACTION)
+    table.choice("distribution", ("uniform",), "uniform")
+    return None
+
+
+def damping_of(beam: BeamDescription) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Damping ratios of the modes, and a note where they are assumed."""
+    if beam.damping_ratio is not None:
+        return np.array(beam.damping_ratio), ()
+    note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
+    return np.full(len(beam.modes), ASSUMED_DAMPING), (note,)

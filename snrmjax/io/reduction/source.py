@@ -1,0 +1,78 @@
+"""What a reduced-order model is made from, wherever it comes from, and what is written of it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.condense.condensation import Condensation
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import StaticSolver
+from snrmjax.io.files import FilePath
+from snrmjax.io.tables import write_table
+from snrmjax.model.structures import Structure
+
+ASSUMED_DAMPING = 0.01
+"""Damping ratio of a mode of which nobody stated one: no finite-element model has it."""
+
+_TINY = 1e-12  # of the largest participation: what a model file needs instead of zero
+
+
+class ShapeLines(NamedTuple):
+    """Mode shapes along a structure, to be drawn."""
+
+    position: Float[np.ndarray, " point"]  # m along the structure
+    shape: Float[np.ndarray, "point mode"]  # transverse, kg^-1/2
+    axis: str = "Position along the structure (m)"
+
+
+class ReductionSource(NamedTuple):
+    """Modes to keep, load cases or what runs them, and what else a model needs.
+
+    `cases` are load cases that were run already; where they are None `solve` runs any.
+    """
+
+    name: str
+    basis: ReductionBasis
+    damping_ratio: Float[np.ndarray, " mode"]
+    sensors: Mapping[str, Float[np.ndarray, " mode"]]  # mode shapes there, kg^-1/2
+    participation: Float[np.ndarray, " mode"]  # Φᵀb per newton, kg^-1/2
+    cases: StaticCases | None = None
+    solve: StaticSolver | None = None
+    thickness: float | None = None  # m, the unit of `load_scale`
+    load_scale: float | None = None  # thicknesses that single modes move linearly
+    degree: int = 3
+    lines: ShapeLines | None = None
+    notes: tuple[str, ...] = ()
+
+    def structure(self, found: Condensation) -> Structure:
+        """The reduced model as a structure that a model file can hold."""
+        size = np.abs(self.participation)
+        # A file has no zeros here; a mode that the force does not drive gets next to nothing.
+        driven = np.where(size > 0, self.participation, _TINY * (size.max() or 1.0))
+        return found.structure(
+            self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
+        )
+
+
+def write_load_cases(path: FilePath, cases: StaticCases) -> None:
+    """Write load cases: `case, f_1…, q_1…[, energy]`, as `--tables` reads them.
+
+    The modes count from one in the order of the reduced model. Fields of a case without solution
+    are empty.
+    """
+    n_cases, n_modes = cases.force.shape
+    force = np.asarray(cases.force)
+    moved = np.where(cases.usable[:, None], cases.modal_displacement, np.nan)
+    columns = {"case": list(cases.names) or [str(k + 1) for k in range(n_cases)]}
+    columns |= {f"f_{m + 1}": _texts(force[:, m]) for m in range(n_modes)}
+    columns |= {f"q_{m + 1}": _texts(moved[:, m]) for m in range(n_modes)}
+    if cases.energy is not None:
+        columns["energy"] = _texts(np.where(cases.usable, cases.energy, np.nan))
+    write_table(path, columns)
+
+
+def _texts(values: np.ndarray) -> list[str]:
+    """Numbers in full, since small differences of them count; an empty field for NaN."""
+    return ["" if np.isnan(value) else repr(value) for value in values.tolist()]

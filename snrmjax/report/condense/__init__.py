@@ -1,0 +1,1 @@
+"""Reports of reduced-order models."""

@@ -1,0 +1,171 @@
+"""Figures of a reduced-order model: shapes, force and displacement, fit quality, load scale."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from snrmjax.condense.condensation import Condensation
+from snrmjax.condense.scale_study import LoadScaleStudy
+from snrmjax.condense.static_response import static_displacement
+from snrmjax.io.reduction.source import ShapeLines
+from snrmjax.model.potential import monomial_key
+from snrmjax.report.style import (
+    BACKGROUND,
+    COLUMN,
+    CROSS,
+    DOT,
+    EXCLUDED,
+    IDENTIFIED,
+    LINE,
+    PAGE,
+    SERIES,
+    STAR,
+    legend,
+    marks,
+    name_axes,
+    panels,
+    unit_for,
+)
+
+_ACROSS = 3  # panels beside one another
+_ROW = 2.4  # inches
+_POINTS = 60  # on each side of a static curve
+_MOST_LINES = 6  # coefficients that are drawn
+
+
+def shapes_figure(lines: ShapeLines, names: Sequence[str]) -> Figure:
+    """Mode shapes along the structure, each over its largest value."""
+    figure, grid = panels(COLUMN, _ROW + 0.4, 1, 1)
+    axes = grid[0, 0]
+    for k, name in enumerate(names):
+        shape = lines.shape[:, k] / np.max(np.abs(lines.shape[:, k]))
+        axes.plot(lines.position, shape, color=_colour(k), linewidth=LINE, label=name)
+    name_axes(axes, "Mode shapes", lines.axis, "Shape over its largest value")
+    legend(figure)
+    return figure
+
+
+def static_figure(found: Condensation, names: Sequence[str]) -> Figure:
+    """Load and displacement of every mode loaded alone: finite elements and the reduced model.
+
+    Loads are given as the displacement that they would cause in the linear structure.
+    """
+    n = len(names)
+    columns = min(_ACROSS, n)
+    rows = -(-n // columns)
+    figure, grid = panels(PAGE if n > 1 else COLUMN, _ROW * rows + 0.4, rows, columns)
+    largest, squared = np.asarray(found.basis.largest), np.asarray(found.basis.frequency) ** 2
+    to_length = largest / squared
+    force, moved = np.asarray(found.cases.force), np.asarray(found.cases.modal_displacement)
+    usable = found.cases.usable
+    for k, axes in enumerate(list(grid.flat)[:n]):
+        alone = usable & (np.abs(force[:, k]) > 0)
+        alone &= np.count_nonzero(force, axis=1) == 1
+        end = 1.3 * np.max(np.abs(force[usable, k]))
+        loads = np.zeros((2 * _POINTS + 1, n))
+        loads[:, k] = np.linspace(-end, end, 2 * _POINTS + 1)
+        loads[_POINTS, k] = 1e-9 * end  # at rest a path has no direction
+        static = np.asarray(
+            static_displacement(found.basis.frequency, found.potential, jnp.asarray(loads))
+        )
+        unit = unit_for(largest[k] * moved[usable, k], "m")
+        x, y = largest[k] * static[:, k] / unit.size, loads[:, k] * to_length[k] / unit.size
+        axes.plot(y, y, color=BACKGROUND, linewidth=LINE, label="linear")
+        axes.plot(x, y, color=IDENTIFIED, linewidth=LINE, label="reduced model")
+        points = (
+            largest[k] * moved[alone, k] / unit.size,
+            force[alone, k] * to_length[k] / unit.size,
+        )
+        marks(axes, *points, {**DOT, "zorder": 3}, "finite elements, this mode loaded alone")
+        beside = f"Load, as linear displacement ({unit.name})" if k % columns == 0 else ""
+        name_axes(axes, names[k], f"Largest displacement ({unit.name})", beside)
+        reach = 1.05 * max(np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(y)))
+        axes.set_xlim(-reach, reach)
+    for axes in list(grid.flat)[n:]:
+        axes.set_visible(False)
+    legend(figure)
+    return figure
+
+
+def quality_figure(found: Condensation) -> Figure:
+    """Cross-validated error of every load case over how nonlinear it is."""
+    figure, grid = panels(COLUMN, _ROW + 0.4, 1, 1)
+    axes: Axes = grid[0, 0]
+    quality = found.quality
+    ratio, error = quality.nonlinear_ratio, quality.case_error
+    named = np.zeros(len(ratio), dtype=bool)
+    for one in found.warnings:
+        if one.kind == "inconsistent_case":
+            named[list(one.cases)] = True
+    shown = np.isfinite(error) & (error > 0)
+    marks(axes, ratio[shown & ~named], error[shown & ~named], DOT, "load case")
+    cross = {**CROSS, "markeredgecolor": IDENTIFIED}
+    marks(axes, ratio[shown & named], error[shown & named], cross, "contradicts the others")
+    if shown.any():
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+    name_axes(
+        axes,
+        "Each load case as the fit to all others has it",
+        "Nonlinear over linear force",
+        "Error over nonlinear force",
+    )
+    legend(figure)
+    return figure
+
+
+def scale_figure(study: LoadScaleStudy) -> Figure:
+    """Leading coefficients and misfit over the size of the loads, with the plateau."""
+    figure, grid = panels(PAGE, _ROW + 0.5, 1, 2)
+    left, right = grid[0]
+    solved = np.isfinite(study.misfit)
+    nearest = int(np.argmin(np.abs(np.log(study.scale))))
+    listed = np.flatnonzero(study.leading)
+    for k, column in enumerate(listed[:_MOST_LINES]):
+        reference = study.coefficient[nearest, column]
+        left.plot(
+            study.scale[solved],
+            study.coefficient[solved, column] / reference,
+            ".-",
+            color=_colour(k),
+            linewidth=LINE,
+            label=f"coefficient {monomial_key(study.monomials[column])}",
+        )
+    left.set_ylim(0.5, 1.5)
+    right.plot(study.scale[solved], study.misfit[solved], ".-", color=SERIES[1], linewidth=LINE)
+    right.plot(
+        study.scale[solved],
+        study.nonlinear_ratio[solved],
+        "--",
+        color="0.3",
+        linewidth=LINE,
+        label="nonlinear over linear force (right)",
+    )
+    right.plot([], [], ".-", color=SERIES[1], label="residual over nonlinear force (right)")
+    right.set_yscale("log")
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.axvline(
+            1.0, color="0.2", linewidth=0.9, linestyle=":", label="load scale of the model"
+        )
+        if study.plateau is not None:
+            axes.axvspan(*study.plateau, color=EXCLUDED, alpha=0.15, linewidth=0, label="plateau")
+        lost = study.scale[~solved]
+        marks(
+            axes,
+            lost,
+            np.full(lost.size, 0.02),
+            {**STAR, "transform": axes.get_xaxis_transform()},
+            "load cases without solution",
+        )
+    name_axes(left, "Coefficients", "Load scale", "Over that at load scale 1")
+    name_axes(right, "Fit", "Load scale", "Ratio")
+    legend(figure)
+    return figure
+
+
+def _colour(k: int) -> str:
+    return SERIES[k % len(SERIES)]

@@ -1,0 +1,127 @@
+"""Beams as TOML: what they say, and what is refused."""
+
+import numpy as np
+import pytest
+
+from snrmjax.cli import main
+from snrmjax.io.reduction.beam_file import SupportStiffness, read_beam_description
+
+BEAM = """name = "flat beam"
+[material]
+young_pa = 204.8e9
+density_kg_m3 = 7870.0
+poisson = 0.29
+[section]
+width_m = 0.0127
+thickness_m = 0.000508
+[geometry]
+length_m = 0.2286
+elements = 12
+[supports]
+left = "clamped"
+right = "clamped"
+[condense]
+modes = [1, 3]
+[sensors]
+midspan = 0.5
+[force]
+distribution = "uniform"
+"""
+SPRINGS = "{ axial_n_m = 1e6, transverse_n_m = 1e7 }"
+
+
+def test_a_beam_file_says_what_the_description_has(tmp_path):
+    path = tmp_path / "beam.toml"
+    path.write_text(BEAM)
+    beam = read_beam_description(path)
+    clamped = SupportStiffness(np.inf, np.inf, np.inf)
+    assert beam.supports == (clamped, clamped)
+    assert (beam.name, beam.young, beam.thickness) == ("flat beam", 204.8e9, 0.000508)
+    assert (beam.radius, beam.load_scale, beam.force_at, beam.damping_ratio) == (None,) * 4
+    assert (beam.modes, beam.degree, beam.sensors) == ((1, 3), 3, {"midspan": 0.5})
+    text = BEAM.replace("elements", "radius_m = 11.43\nelements").replace(
+        'right = "clamped"', f"right = {SPRINGS}"
+    )
+    text = text.replace("3]", "3]\nload_scale = 0.3\ndegree = 5\ndamping_ratio = [0.05, 0.001]")
+    path.write_text(text.replace('distribution = "uniform"', "at = 0.25"))
+    beam = read_beam_description(path)
+    assert beam.supports[1] == SupportStiffness(1e6, 1e7, 0.0)
+    assert (beam.radius, beam.load_scale, beam.degree) == (11.43, 0.3, 5)
+    assert (beam.force_at, beam.damping_ratio) == (0.25, (0.05, 0.001))
+
+
+def edit(old, new):
+    return BEAM.replace(old, new)
+
+
+BAD_BEAMS = [
+    (edit("thickness_m = 0.000508", "thickness_m = 0"), "`thickness_m` must be positive"),
+    (edit("7870.0", "-7870.0"), "`density_kg_m3` must be positive, but [material]"),
+    (edit("204.8e9", "nan"), "`young_pa` must be a finite number"),
+    (edit("204.8e9", '"steel"'), "`young_pa` must be a number"),
+    (edit("young_pa", "youngs_pa"), "unknown key 'youngs_pa' (did you mean `young_pa`?)"),
+    (edit("0.29", "0.5"), "`poisson` must be above -1 and below 0.5"),
+    (edit("[section]", "[sections]"), "unknown key 'sections' (did you mean `section`?)"),
+    (edit("width_m = 0.0127\n", ""), "lacks the key `width_m`"),
+    (edit("thickness_m = 0.000508", "thickness_m = 0.5"), "below the length"),
+    (edit("0.2286", "-0.2286"), "`length_m` must be positive"),
+    (edit("elements = 12", "elements = 1"), "`elements` must be a whole number from 2"),
+    (edit("elements = 12", "elements = 12.5"), "`elements` must be a whole number"),
+    (edit("elements = 12", "elements = 5000"), "at most 400"),
+    (edit("elements", "radius_m = 0.1\nelements"), "`radius_m` must be above 0.1203"),
+    (edit('left = "clamped"', 'left = "clammped"'), "did you mean `clamped`"),
+    (edit('left = "clamped"\n', ""), "lacks the key `left`"),
+    (edit('left = "clamped"', "left = { axial_nm = 1 }"), "unknown key 'axial_nm'"),
+    (edit('left = "clamped"', "left = {}"), "a support or stiffnesses"),
+    (edit('left = "clamped"', "left = { axial_n_m = -1 }"), "zero or positive"),
+    (edit('"clamped"', '"free"'), "leave a mechanism: nothing holds the beam along"),
+    (
+        edit('left = "clamped"', 'left = "free"').replace('"clamped"', '"pinned"'),
+        "leave a mechanism: nothing keeps the beam from turning",
+    ),
+    (edit("[1, 3]", "[1, 1]"), "different mode numbers"),
+    (edit("[1, 3]", "[0]"), "`modes` must be a whole number from 1"),
+    (edit("[1, 3]", "[]"), "at least one"),
+    (edit("[1, 3]", "[1, 13]"), "12 elements can show"),
+    (edit("[1, 3]", "[1, 3]\ndegree = 9"), "`degree` must be from 2 to 7"),
+    (edit("[1, 3]", "[1, 3]\nload_scale = 0"), "`load_scale` must be positive"),
+    (edit("[1, 3]", "[1, 3]\ndamping_ratio = [0.1]"), "2 numbers, one a mode"),
+    (edit("midspan = 0.5", "midspan = 1.5"), "`midspan` must be from 0 to 1"),
+    (edit('"uniform"', '"unifrom"'), "did you mean `uniform`"),
+    (BEAM + "at = 0.5\n", "both `distribution` and `at`"),
+    ("material = [", "is not valid TOML"),
+]
+
+
+def refused(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr("sys.argv", ["snrmjax", "rom", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert said.count("\n") == 1
+    return said
+
+
+@pytest.mark.parametrize(("text", "words"), BAD_BEAMS, ids=[words for _, words in BAD_BEAMS])
+def test_a_bad_beam_is_refused_with_one_sentence(tmp_path, capsys, monkeypatch, text, words):
+    path = tmp_path / "beam.toml"
+    path.write_text(text)
+    assert words in refused(monkeypatch, capsys, path, "--out", tmp_path / "out")
+    assert {one.name for one in tmp_path.iterdir()} == {"beam.toml"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "needs one of BEAM, --tables and --calculix, but has none of them"),
+        (["beam.toml", "--tables", "tables"], "but has BEAM and --tables"),
+        (["beam.toml", "--modes", "1,3"], "`--modes` goes with --calculix"),
+        (["nowhere.toml"], "nowhere.toml does not exist"),
+        (["--tables", "nowhere"], "nowhere does not exist"),
+    ],
+)
+def test_one_source_is_needed(tmp_path, capsys, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(monkeypatch, capsys, *arguments, "--out", "out")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,95 @@
+"""What `snrmjax rom` writes: a model that reads back, load cases, a summary and a page."""
+
+import json
+
+import numpy as np
+import pytest
+from condense.conftest import basis_of, cases_of
+from truths.hidden_membrane import hidden_membrane
+
+import snrmjax as sj
+from snrmjax.cli import main
+from snrmjax.condense.load_set import LoadSet
+from snrmjax.io.reduction.load_tables import read_load_tables
+from snrmjax.io.reduction.source import ReductionSource, ShapeLines, write_load_cases
+from snrmjax.report.condense.reduction_report import reduce, write_reduction
+
+WRITTEN = {
+    *("model.toml", "load_cases.csv", "summary.json", "report.html"),
+    *("force_displacement.png", "fit_quality.png"),
+}
+
+
+@pytest.fixture(scope="module")
+def source():
+    """Two modes whose load cases are run on demand, as finite elements would."""
+    truth = hidden_membrane(2, 2, curved=3.0)
+    basis = basis_of(truth, (1, 3))
+    return truth, ReductionSource(
+        name="panel",
+        basis=basis,
+        damping_ratio=np.array([0.01, 0.02]),
+        sensors={"tip": np.asarray(basis.shapes)[0]},
+        participation=np.array([1.0, 0.0]),  # the force does not drive the second mode
+        solve=lambda force: cases_of(truth, LoadSet(force, ())),
+        thickness=2.0,
+        lines=ShapeLines(np.arange(4.0), np.asarray(basis.shapes)),
+    )
+
+
+def test_a_source_that_runs_its_cases_is_condensed_studied_and_written(source, tmp_path):
+    truth, of_truth = source
+    found = reduce(of_truth)
+    write_reduction(tmp_path, found)
+    assert {p.name for p in tmp_path.iterdir()} == WRITTEN | {"load_scale.png", "mode_shapes.png"}
+    model = sj.read_model(tmp_path / "model.toml")
+    known = truth.coefficients()
+    for monomial, value in zip(
+        model.potential.monomials, np.asarray(model.potential.coefficient), strict=True
+    ):
+        assert value == pytest.approx(known[monomial], rel=1e-6)
+    np.testing.assert_allclose(model.modes.natural_frequency, truth.frequency)
+    assert abs(model.modes.participation[1]) < 1e-9
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["modes"] == [1, 3]
+    assert summary["load_cases"]["load_scale"] == pytest.approx(found.displacement.max() / 2.0)
+    assert summary["load_scale_study"]["scale_of_the_model_inside"] is True
+    assert summary["load_scale_study"]["plateau_decades"] > 1
+    assert summary["fit"]["energy_error"] < 1e-9
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img") == 4
+    assert "mode 3" in page
+
+
+def test_a_stated_load_scale_is_in_thicknesses(source):
+    _, of_truth = source
+    found = reduce(of_truth._replace(load_scale=0.5), study=False)
+    np.testing.assert_array_equal(found.displacement, [1.0, 1.0])
+    alone = found.condensation.cases.force[found.condensation.cases.names.index("+1 at 1")]
+    basis = of_truth.basis
+    assert alone[0] / basis.frequency[0] ** 2 * basis.largest[0] == pytest.approx(1.0)
+    assert found.study is None
+
+
+def test_load_cases_that_were_written_condense_to_the_same_model(source, tmp_path, monkeypatch):
+    truth, of_truth = source
+    cases = cases_of(truth, sj.condense.modal_loads(of_truth.basis, 3.0))
+    write_load_cases(tmp_path / "cases.csv", cases)
+    hertz = [float(one) for one in truth.frequency / (2 * np.pi)]
+    (tmp_path / "modes.toml").write_text(
+        f"frequency_hz = {hertz}\ndamping_ratio = 0.01\nparticipation = 1.0\n"
+        "[sensors]\ntip = [1.0, 2.0]\n"
+    )
+    np.testing.assert_array_equal(read_load_tables(tmp_path).cases.force, cases.force)
+    out = tmp_path / "out"
+    command = ["snrmjax", "rom", "--tables", str(tmp_path), "--out", str(out)]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert {p.name for p in out.iterdir()} == WRITTEN
+    direct = sj.condense.condense(of_truth.basis, cases, expand=False)
+    model = sj.read_model(out / "model.toml")
+    np.testing.assert_allclose(
+        model.potential.coefficient, direct.potential.coefficient, rtol=1e-10
+    )
