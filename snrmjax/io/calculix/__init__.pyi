@@ -1,12 +1,14 @@
 from .deck import Deck, read_deck
-from .modes import DeckModes, modes_of_deck
+from .modes import DeckModes, ModeSurvey, modes_of_deck, survey_modes
 from .static import StaticRun, run_static_cases
 
 __all__ = [
     "Deck",
     "DeckModes",
+    "ModeSurvey",
     "StaticRun",
     "modes_of_deck",
     "read_deck",
     "run_static_cases",
+    "survey_modes",
 ]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.io.calculix.deck import Deck
-from snrmjax.io.calculix.jobs import found_calculix, model_file, run_job
+from snrmjax.io.calculix.jobs import Calculix, found_calculix, model_file, run_job
 from snrmjax.io.calculix.results import eigenvalues, printed_tables
 from snrmjax.io.files import FilePath
 
@@ -46,6 +46,49 @@ class DeckModes(eqx.Module):
         return np.asarray(self.basis.shapes)[axis::3].sum(axis=0)
 
 
+class ModeSurvey(eqx.Module):
+    """The first modes of a deck, to choose from: those that can be kept and those that cannot."""
+
+    frequency: Float[np.ndarray, " mode"] = eqx.field(converter=np.asarray)  # rad/s
+    shapes: Float[np.ndarray, "dof mode"] = eqx.field(converter=np.asarray)  # kg^-1/2
+    momenta: Float[np.ndarray, "dof mode"] = eqx.field(converter=np.asarray)  # M Φ, kg^1/2
+    seconds: float  # that CalculiX took
+
+    @property
+    def carried(self) -> Float[np.ndarray, " mode"]:
+        """How much of each mode's inertia the translations of nodes carry, from zero to one."""
+        return np.sum(self.shapes * self.momenta, axis=0)
+
+    @property
+    def effective_mass(self) -> Float[np.ndarray, "mode 3"]:
+        """Of rigid translations in x, y and z (kg): which way a mode moves."""
+        return self.momenta.reshape(-1, 3, len(self.frequency)).sum(axis=0).T ** 2
+
+    def only(self, kept: Sequence[int]) -> "ModeSurvey":
+        """Some of the modes, by place from zero."""
+        rows = list(kept)
+        return ModeSurvey(
+            self.frequency[rows], self.shapes[:, rows], self.momenta[:, rows], self.seconds
+        )
+
+
+def survey_modes(
+    deck: Deck,
+    count: int,
+    folder: FilePath,
+    *,
+    program: str = "ccx",
+    time_limit: float = 3600.0,
+) -> ModeSurvey:
+    """The first modes of a deck by CalculiX, whatever they are, to choose from.
+
+    Arguments and errors as `modes_of_deck`, but for modes that nodal translations do not carry.
+    Returns a `ModeSurvey` of `count` modes.
+    """
+    (count,) = _checked([count])
+    return _survey(deck, count, folder, found_calculix(program, time_limit))
+
+
 def modes_of_deck(
     deck: Deck,
     numbers: Sequence[int],
@@ -70,9 +113,26 @@ def modes_of_deck(
     torsion of a beam.
     """
     wanted = _checked(numbers)
-    calculix = found_calculix(program, time_limit)
+    survey = _survey(deck, max(wanted), folder, found_calculix(program, time_limit))
+    kept = [number - 1 for number in wanted]
+    survey = survey.only(kept)
+    _check_carried(deck, wanted, survey.carried)
+    return DeckModes(
+        ReductionBasis(
+            jnp.asarray(survey.frequency),
+            jnp.asarray(survey.shapes),
+            jnp.asarray(np.linalg.solve(survey.momenta.T @ survey.shapes, survey.momenta.T)),
+            wanted,
+        ),
+        deck,
+        survey.carried,
+        survey.seconds,
+    )
+
+
+def _survey(deck: Deck, count: int, folder: FilePath, calculix: Calculix) -> ModeSurvey:
     model = model_file(deck.text + all_nodes(deck), folder)
-    outcome = run_job(calculix, model, _step(max(wanted) + _MORE_MODES))
+    outcome = run_job(calculix, model, _step(count + _MORE_MODES))
     squares = eigenvalues(outcome.dat)
     tables = list(printed_tables(outcome.dat, deck.nodes)) if outcome.finished else []
     shapes = [t.values.ravel() for t in tables if t.quantity == "displacements"]
@@ -80,23 +140,15 @@ def modes_of_deck(
     if outcome.error or not shapes or len(shapes) != len(forces):
         said = outcome.error or "it printed no modes"
         raise ValueError(f"CalculiX gave no modes of {deck.name}: {said}.")
-    if len(shapes) < max(wanted):
+    if len(shapes) < count:
         raise ValueError(
-            f"mode {max(wanted)} of {deck.name} was asked for, but CalculiX found {len(shapes)}."
+            f"mode {count} of {deck.name} was asked for, but CalculiX found {len(shapes)}."
         )
-    _check_rigid(deck, squares, wanted)
-    kept = [number - 1 for number in wanted]
-    basis, carried = _basis(np.array(shapes).T[:, kept], np.array(forces).T[:, kept], squares[kept])
-    _check_carried(deck, wanted, carried)
-    return DeckModes(
-        ReductionBasis(
-            jnp.asarray(np.sqrt(squares[kept])),
-            jnp.asarray(basis[0]),
-            jnp.asarray(basis[1]),
-            wanted,
-        ),
-        deck,
-        carried,
+    _check_rigid(deck, squares)
+    return _signed(
+        np.sqrt(squares[:count]),
+        np.array(shapes[:count]).T,
+        np.array(forces[:count]).T / squares[:count],
         outcome.seconds,
     )
 
@@ -124,30 +176,27 @@ def _checked(numbers: Sequence[int]) -> tuple[int, ...]:
     return wanted
 
 
-def _basis(
+def _signed(
+    frequency: Float[np.ndarray, " mode"],
     shapes: Float[np.ndarray, "dof mode"],
-    forces: Float[np.ndarray, "dof mode"],
-    squares: Float[np.ndarray, " mode"],
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """(Shapes, filter) with filter @ shapes = I, and what nodal translations carry."""
-    momenta = np.where(np.any(shapes != 0, axis=1, keepdims=True), forces, 0.0) / squares
+    momenta: Float[np.ndarray, "dof mode"],
+    seconds: float,
+) -> ModeSurvey:
+    """Modes with their largest translation positive, without the reactions of held nodes."""
+    momenta = np.where(np.any(shapes != 0, axis=1, keepdims=True), momenta, 0.0)
     heights = np.abs(shapes).max(axis=0)
     # Of two peaks that are equal but for round-off the first decides the sign.
     peaks = np.argmax(np.abs(shapes) > 0.999 * heights, axis=0)
     signs = np.sign(shapes[peaks, np.arange(shapes.shape[1])])
-    shapes, momenta = shapes * signs, momenta * signs
-    carried = np.diag(shapes.T @ momenta)
-    if np.any(np.abs(carried) < 1e-6):
-        return (shapes, momenta.T), carried
-    return (shapes, np.linalg.solve(momenta.T @ shapes, momenta.T)), carried
+    return ModeSurvey(frequency, shapes * signs, momenta * signs, seconds)
 
 
-def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"], wanted: tuple[int, ...]) -> None:
+def _check_rigid(deck: Deck, squares: Float[np.ndarray, " mode"]) -> None:
     rigid = int(np.sum(squares <= _RIGID_RATIO * np.max(np.abs(squares))))
     if rigid:
         raise ValueError(
             f"{deck.name} has {rigid} mode{'s' if rigid > 1 else ''} without stiffness among its "
-            f"first {max(wanted) + _MORE_MODES}: the structure is a mechanism or not held; add "
+            f"first {len(squares)}: the structure is a mechanism or not held; add "
             "supports (*BOUNDARY)."
         )
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from snrmjax.io.calculix.deck import read_deck
-from snrmjax.io.calculix.modes import modes_of_deck
+from snrmjax.io.calculix.modes import modes_of_deck, survey_modes
 
 from .conftest import DENSITY, LENGTH, POISSON, THICKNESS, WIDTH, YOUNG, beam_deck, needs_calculix
 
@@ -108,6 +108,15 @@ def test_decks_without_modes(write, tmp_path, text, numbers, said):
 def test_torsion_of_a_beam_is_refused(write, tmp_path):
     square = beam_deck().replace(f"{THICKNESS}, {WIDTH}", "0.02, 0.02")
     deck = read_deck(write(square))
+    survey = survey_modes(deck, 5, tmp_path / "jobs")
+    assert (survey.carried > 0.9).tolist() == [True] * 4 + [False]
+    # Bending of a square section comes in pairs; in all, both ways are alike.
+    masses = survey.effective_mass[:4]
+    np.testing.assert_allclose(masses[:2].sum(axis=0)[1:], masses[:2].sum() / 2, rtol=1e-3)
+    # A cantilever's first bending mode has 61.3 % of the mass.
+    np.testing.assert_allclose(
+        masses[:2].sum() / 2 / (DENSITY * LENGTH * 0.02**2), 0.613, atol=0.006
+    )
     with pytest.raises(ValueError, match=r"mode 5 .* translations carry 0 % of its inertia"):
         modes_of_deck(deck, (5,), tmp_path / "jobs")
 
