@@ -51,7 +51,7 @@ SUB_ROOMS = {
     "diagnose.search": {"diagnose.misfit"},
     "diagnose.checks": {"diagnose.misfit", "diagnose.search"},
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
-    "io.calculix": {"io.files"},
+    "io.calculix": {"io.files", "io.reduction"},
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},

@@ -98,7 +98,9 @@ def _source(
         from snrmjax.io.reduction.beam_file import read_beam
 
         return read_beam(beam)
-    raise ValueError("`--calculix` is not available in this version.")
+    from snrmjax.io.calculix.reduction import read_deck_source
+
+    return read_deck_source(calculix or "", _mode_numbers(modes))
 
 
 def _mode_numbers(modes: str | None) -> tuple[int, ...]:

@@ -25,6 +25,12 @@ _REFUSED = {
     "global directions or with *EQUATION",
     "USER ELEMENT": "user elements are linear",
 }
+# What steps say that changes nothing about the structure, and need not be said to be left out.
+_QUIET = {
+    *("STEP", "END STEP", "BOUNDARY", "STATIC", "FREQUENCY", "BUCKLE", "CONTROLS", "HEADING"),
+    *("NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "ELEMENT OUTPUT", "OUTPUT"),
+    *("RESTART", "MONITOR", "PRINT"),
+}
 _RIGID_ZERO = 1e-9  # prescribed displacements up to here count as none
 
 
@@ -42,6 +48,7 @@ class Deck(eqx.Module):
     coordinates: Float[np.ndarray, "node 3"] = eqx.field(converter=np.asarray)  # m
     elements: Int[np.ndarray, " element"] = eqx.field(converter=np.asarray)  # numbers, ascending
     element_types: tuple[str, ...] = eqx.field(static=True)
+    thickness: float = eqx.field(static=True)  # m, the smallest of its sections
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
     def node_index(self, number: int) -> int:
@@ -87,6 +94,7 @@ def read_deck(path: FilePath) -> Deck:
         coordinates=np.array([nodes[label] for label in labels]),
         elements=np.array(sorted(elements)),
         element_types=types,
+        thickness=_thickness(model, np.array([nodes[label] for label in labels])),
         left_out=left_out,
     )
 
@@ -99,11 +107,31 @@ def _split(blocks: list[Block]) -> tuple[list[Block], list[Block], tuple[str, ..
         step += block.keyword == "STEP"
         if block.keyword == "BOUNDARY" and step == 1:
             supports.append(block.with_parameters(OP=None))
-        elif block.keyword not in ("STEP", "END STEP", "BOUNDARY"):
+        elif block.keyword not in _QUIET:
             left_out.append(block.keyword)
     unwanted = {"NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "OUTPUT"}
     model = [block for block in blocks[:first] if block.keyword not in unwanted]
     return model, supports, tuple(dict.fromkeys(left_out))
+
+
+def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) -> float:
+    """The smallest dimension of shell and beam sections, or of the mesh where it has neither."""
+    found = []
+    for block in blocks:
+        beam = block.keyword == "BEAM SECTION"
+        if (beam or block.keyword == "SHELL SECTION") and block.data:
+            line = block.data[0]
+            entries = line.entries[: 2 if beam else 1]
+            found += [_number(line, entry, "a dimension") for entry in entries if entry]
+            if found[-1:] and not min(found) > 0:
+                raise ValueError(
+                    f"{line.place}: dimensions of a section must be positive, but one is "
+                    f"{min(found):g}."
+                )
+    if found:
+        return min(found)
+    spans = np.ptp(coordinates, axis=0)
+    return float(np.min(spans[spans > 0], initial=np.inf)) if np.any(spans > 0) else 1.0
 
 
 def _number(line: Line, entry: str, wanted: str) -> float:

@@ -1,0 +1,111 @@
+"""A CalculiX deck as what a reduced-order model is made from."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.condense.load_cases import StaticCases
+from snrmjax.io.calculix.deck import Deck, read_deck
+from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
+from snrmjax.io.calculix.static import run_static_cases
+from snrmjax.io.files import FilePath
+from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
+
+Place = tuple[int, str]
+"""A node's number and a direction, "x", "y" or "z"."""
+
+
+def read_deck_source(
+    path: FilePath,
+    numbers: Sequence[int],
+    folder: FilePath | None = None,
+    *,
+    sensors: Mapping[str, Place] | None = None,
+    force: Place | None = None,
+    program: str = "ccx",
+    time_limit: float = 3600.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> ReductionSource:
+    """Read a deck, compute its modes and prepare its load cases, all by CalculiX.
+
+    Jobs and their results live in `folder` (`<deck>.jobs` beside the deck) and serve later runs of
+    the same deck, whatever its modes and loads.
+
+    Arguments: `path` of the deck; `numbers` of the modes to keep, from one; `sensors` by name and
+    `force` (one newton) as (node, direction): where nothing is said, both are where the first mode
+    is largest; `program`, `time_limit` (s) and `progress` as for `run_static_cases`.
+    Raises `ValueError` as `read_deck` and `modes_of_deck` do, and leaves no folder behind then.
+    """
+    deck = read_deck(path)
+    place = Path(path).with_suffix(".jobs") if folder is None else Path(folder)
+    try:
+        modes = modes_of_deck(deck, numbers, place, program=program, time_limit=time_limit)
+    except ValueError:
+        _remove_unused(place)
+        raise
+    largest = _largest(modes)
+    where = dict(sensors) if sensors else {f"node {largest[0]} {largest[1]}": largest}
+    drive = force or largest
+
+    def solve(forces: Float[np.ndarray, "case mode"]) -> StaticCases:
+        return run_static_cases(
+            modes, forces, place, time_limit=time_limit, program=program, progress=progress
+        ).cases
+
+    return ReductionSource(
+        name=Path(path).stem,
+        basis=modes.basis,
+        damping_ratio=np.full(len(modes.basis.numbers), ASSUMED_DAMPING),
+        sensors={name: modes.shape_at(*at) for name, at in where.items()},
+        participation=modes.shape_at(*drive),
+        solve=solve,
+        thickness=deck.thickness,
+        lines=_lines(modes),
+        notes=_notes(deck, drive, forced=force is not None),
+    )
+
+
+def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[str, ...]:
+    notes = [f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"]
+    if not forced:
+        notes.append(
+            f"the model is driven and observed at node {drive[0]} in {drive[1]}, where its first "
+            "mode is largest"
+        )
+    if deck.left_out:
+        notes.append(
+            "loads of the deck are left out ("
+            + ", ".join(f"*{word}" for word in deck.left_out)
+            + "): the model is that of the unloaded structure"
+        )
+    return tuple(notes)
+
+
+def _largest(modes: DeckModes) -> Place:
+    """Where the first mode that is kept moves most."""
+    first = np.asarray(modes.basis.shapes)[:, 0]
+    node, direction = divmod(int(np.argmax(np.abs(first))), 3)
+    return int(modes.deck.nodes[node]), "xyz"[direction]
+
+
+def _lines(modes: DeckModes) -> ShapeLines | None:
+    """Shapes along a structure of beam elements, which has a line to draw them over."""
+    if not all(kind.startswith("B") for kind in modes.deck.element_types):
+        return None
+    places = modes.deck.coordinates
+    along = int(np.argmax(np.ptp(places, axis=0)))
+    order = np.argsort(places[:, along])
+    across = "xyz".index(_largest(modes)[1])
+    shape = np.asarray(modes.basis.shapes)[across::3][order]
+    return ShapeLines(places[order, along], shape, f"Position along {'xyz'[along]} (m)")
+
+
+def _remove_unused(place: Path) -> None:
+    """Remove a folder of jobs in which there is no result yet."""
+    if place.is_dir() and not any(place.glob("case-*")):
+        for model in place.glob("model-*.inp"):
+            model.unlink()
+        if not any(place.iterdir()):
+            place.rmdir()
