@@ -18,6 +18,8 @@ ALL_NODES = "SNRMJAX_NODES"
 _MORE_MODES = 6
 # Eigenvalues of rigid motions are round-off of the stiffness: this far below the last one asked.
 _RIGID_RATIO = 1e-7
+# Held nodes of beams and shells move by the round-off of their constraints: this much of the mode.
+_HELD = 1e-10
 # How much of a mode's inertia nodal translations must carry (1: all of it).
 _LEAST_CARRIED = 0.9
 
@@ -183,8 +185,9 @@ def _signed(
     seconds: float,
 ) -> ModeSurvey:
     """Modes with their largest translation positive, without the reactions of held nodes."""
-    momenta = np.where(np.any(shapes != 0, axis=1, keepdims=True), momenta, 0.0)
     heights = np.abs(shapes).max(axis=0)
+    held = np.all(np.abs(shapes) <= _HELD * heights, axis=1, keepdims=True)
+    momenta = np.where(held, 0.0, momenta)
     # Of two peaks that are equal but for round-off the first decides the sign.
     peaks = np.argmax(np.abs(shapes) > 0.999 * heights, axis=0)
     signs = np.sign(shapes[peaks, np.arange(shapes.shape[1])])
