@@ -40,7 +40,7 @@ def test_reactions_of_supports_are_no_inertia(write, tmp_path):
     # At both clamps beams have reactions, whose sum is the whole inertia with its sign turned.
     deck = read_deck(write(beam_deck(elements=8, supports=("1, 1, 6", "17, 1, 6"))))
     masses = survey_modes(deck, 2, tmp_path / "jobs").effective_mass
-    # A clamped beam's first mode has 69.0 % of the mass, its second, antisymmetric one none; rows of
+    # A clamped beam's first mode has 69.0 % of the mass, its second, antisymmetric none; rows of
     # held nodes are left out, some 0.4 % with 8 elements.
     mass = DENSITY * LENGTH * WIDTH * THICKNESS
     wanted = [[0.0, 0.0, 0.690], [0.0, 0.0, 0.0]]
