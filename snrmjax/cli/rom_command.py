@@ -95,7 +95,7 @@ def _source(
 
         return read_load_tables(tables)
     if beam is not None:
-        from snrmjax.io.reduction.beam_file import read_beam
+        from snrmjax.io.reduction.beam_source import read_beam
 
         return read_beam(beam)
     from snrmjax.io.calculix.reduction import read_deck_source

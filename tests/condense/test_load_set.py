@@ -62,10 +62,11 @@ def test_the_wanted_nonlinear_ratio_is_reached(curved):
     size = sj.condense.displacement_for_ratio(basis, solve, ratio=0.1, start=1e-3)
     alone = sj.condense.modal_loads(basis, size, most_modes=1, levels=(1.0,))
     cases = cases_of(truth, alone)
-    linear = np.asarray(basis.frequency) ** 2 * cases.modal_displacement
-    ratio = np.abs(alone.force - linear)[np.asarray(alone.force) != 0]
-    ratio = (ratio / np.abs(linear[np.asarray(alone.force) != 0])).reshape(3, 2).max(axis=1)
-    np.testing.assert_allclose(ratio, 0.1, rtol=0.17)  # found to 15 % in the logarithm
+    linear = np.asarray(basis.frequency) * cases.modal_displacement  # energy: ½ |linear|²
+    rest = np.asarray(alone.force) / np.asarray(basis.frequency) - linear
+    ratio = np.linalg.norm(rest, axis=1) / np.linalg.norm(linear, axis=1)
+    # Rows are +1, -1, +3, …; found to 15 % in the logarithm.
+    np.testing.assert_allclose(ratio.reshape(3, 2).max(axis=1), 0.1, rtol=0.17)
 
 
 def test_a_linear_structure_and_one_that_never_converges_have_no_such_load():
@@ -75,7 +76,7 @@ def test_a_linear_structure_and_one_that_never_converges_have_no_such_load():
     def solve(force):
         return cases_of(truth, LoadSet(force, ()))
 
-    with pytest.raises(ValueError, match="no load along mode 1 has"):
+    with pytest.raises(ValueError, match="no load along mode"):
         sj.condense.displacement_for_ratio(basis, solve, start=1.0)
 
     def fail(force):

@@ -30,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.condense.corotational_beam import SupportStiffness
 from snrmjax.io.files import FilePath, file_name, read_text
-from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, Rule
 
@@ -42,14 +42,6 @@ STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
 _TABLES = ("material", "section", "geometry", "supports", "condense", "sensors", "force")
 _POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
 _MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
-
-
-class SupportStiffness(NamedTuple):
-    """Springs at an end; infinite is held, zero free."""
-
-    axial: float  # N/m, along the chord
-    transverse: float  # N/m, across it
-    rotation: float  # N m/rad
 
 
 class BeamDescription(NamedTuple):
@@ -126,15 +118,6 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     )
 
 
-def read_beam(path: FilePath) -> ReductionSource:
-    """Read a beam and prepare its finite elements, modes and load cases.
-
-    Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes.
-    """
-    read_beam_description(path)
-    raise ValueError("the built-in finite elements are not in this version.")
-
-
 def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
     values = table.entries["modes"]
     if not isinstance(values, list) or not values:
@@ -201,11 +184,3 @@ def _force(table: TomlTable) -> float | None:
         return table.number("at", FRACTION)
     table.choice("distribution", ("uniform",), "uniform")
     return None
-
-
-def damping_of(beam: BeamDescription) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Damping ratios of the modes, and a note where they are assumed."""
-    if beam.damping_ratio is not None:
-        return np.array(beam.damping_ratio), ()
-    note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
-    return np.full(len(beam.modes), ASSUMED_DAMPING), (note,)

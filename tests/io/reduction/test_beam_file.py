@@ -1,10 +1,10 @@
 """Beams as TOML: what they say, and what is refused."""
 
-import numpy as np
 import pytest
 
 from snrmjax.cli import main
-from snrmjax.io.reduction.beam_file import SupportStiffness, read_beam_description
+from snrmjax.condense.corotational_beam import CLAMPED, SupportStiffness
+from snrmjax.io.reduction.beam_file import read_beam_description
 
 BEAM = """name = "flat beam"
 [material]
@@ -34,8 +34,7 @@ def test_a_beam_file_says_what_the_description_has(tmp_path):
     path = tmp_path / "beam.toml"
     path.write_text(BEAM)
     beam = read_beam_description(path)
-    clamped = SupportStiffness(np.inf, np.inf, np.inf)
-    assert beam.supports == (clamped, clamped)
+    assert beam.supports == (CLAMPED, CLAMPED)
     assert (beam.name, beam.young, beam.thickness) == ("flat beam", 204.8e9, 0.000508)
     assert (beam.radius, beam.load_scale, beam.force_at, beam.damping_ratio) == (None,) * 4
     assert (beam.modes, beam.degree, beam.sensors) == ((1, 3), 3, {"midspan": 0.5})
