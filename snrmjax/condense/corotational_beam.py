@@ -22,11 +22,11 @@ from jaxtyping import Array, Bool, Float
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 
-_FEW_STEPS, _MANY_STEPS = 4, 40
-_ITERATIONS = 25
+_FEW_STEPS, _MANY_STEPS = 8, 64
+_ITERATIONS = 8  # of one step: more are a sign that it went astray
 _CONVERGED = 1e-9  # largest unbalanced force over the largest load
 _ROUNDING = 30 * float(np.finfo(float).eps)  # of a membrane strain over displacement and length
-_JUMP = 5.0  # times what the tangent predicts: a step that went to another equilibrium path
+_JUMP = 2.5  # times what the tangent predicts: a step that went to another equilibrium path
 _STRAIN = 0.05  # beyond which small-strain elements no longer hold
 
 

@@ -51,6 +51,7 @@ def test_stretching_comes_back_with_the_modes(curved):
     assert np.max(np.abs(missed)) > 1e-3 * size  # there was something to add
 
 
+@pytest.mark.long
 def test_degree_five_finds_no_terms_that_are_not_there(curved):
     truth, basis, _ = curved
     cases = cases_of(truth, sj.condense.modal_loads(basis, 4.0, degree=5))

@@ -33,6 +33,7 @@ def bending_wave(beam):
     return float(np.sqrt(beam.bending / beam.mass)) / LENGTH**2
 
 
+@pytest.mark.long
 def test_large_deflections_of_a_cantilever_are_those_of_the_elastica():
     # K. Mattiasson, Int. J. Numer. Methods Eng. 17 (1981) 145, doi:10.1002/nme.1620170113: tip of
     # a cantilever under P = EI/L² and 10 EI/L², over its length.
@@ -98,7 +99,5 @@ def test_loads_beyond_small_strain_and_beyond_a_limit_point_are_not_solved(clamp
     own = arch.modes((2,))  # the first is antisymmetric
     loads = sj.condense.modal_loads(own, 10 * 0.000508, levels=(0.01, 1.0))
     cases = beam_static_cases(arch, own, loads.force)
-    # Pushed down by ten thicknesses it snaps through; a Newton iteration finds the other side.
-    assert cases.usable.tolist() == [True, True, True, False] or cases.usable.tolist() == [
-        *(True, True, False, True)
-    ]
+    # Pushed down it snaps through, for which the linear ten thicknesses are far more than enough.
+    assert cases.usable.tolist() == [True, True, True, False]
