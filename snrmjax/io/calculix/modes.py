@@ -35,7 +35,21 @@ class DeckModes(eqx.Module):
     basis: ReductionBasis
     deck: Deck
     carried: Float[np.ndarray, " mode"] = eqx.field(converter=np.asarray)
+    residual_flexibility: Float[np.ndarray, "mode mode"] = eqx.field(converter=np.asarray)  # s²
     seconds: float = 0.0  # that CalculiX took
+
+    def modal_displacement(
+        self,
+        displacement: Float[np.ndarray, "case dof"],
+        force: Float[np.ndarray, "case mode"],
+    ) -> Float[np.ndarray, "case mode"]:
+        """Modal coordinates q of static displacements (m) under modal forces f.
+
+        q = G ᵀu − (GᵀK⁻¹G − ω⁻²) f: what nodal loads add to the inertia's (on the section of a
+        beam they act at its middle) gives way locally, which is no motion of the mode.
+        """
+        seen: Float[np.ndarray, "case mode"] = displacement @ np.asarray(self.basis.filter).T
+        return seen - force @ self.residual_flexibility
 
     def shape_at(self, node: int, direction: int | str) -> Float[np.ndarray, " mode"]:
         """Mass-normalised shapes (kg^-1/2) at a node in direction 0, 1, 2 or "x", "y", "z"."""
@@ -115,20 +129,30 @@ def modes_of_deck(
     torsion of a beam.
     """
     wanted = _checked(numbers)
-    survey = _survey(deck, max(wanted), folder, found_calculix(program, time_limit))
+    calculix = found_calculix(program, time_limit)
+    survey = _survey(deck, max(wanted), folder, calculix)
     kept = [number - 1 for number in wanted]
     survey = survey.only(kept)
     _check_carried(deck, wanted, survey.carried)
+    conjugate = np.linalg.solve(survey.momenta.T @ survey.shapes, survey.momenta.T)
+    model = model_file(deck.text + all_nodes(deck), folder)
+    outcome = run_job(calculix, model, _linear_steps(deck, conjugate))
+    tables = list(printed_tables(outcome.dat, deck.nodes)) if outcome.finished else []
+    if outcome.error or len(tables) != len(kept):
+        said = outcome.error or "a load case is missing"
+        raise ValueError(f"CalculiX gave no linear static load cases of {deck.name}: {said}.")
+    flexibility = conjugate @ np.array([table.values.ravel() for table in tables]).T
     return DeckModes(
         ReductionBasis(
             jnp.asarray(survey.frequency),
             jnp.asarray(survey.shapes),
-            jnp.asarray(np.linalg.solve(survey.momenta.T @ survey.shapes, survey.momenta.T)),
+            jnp.asarray(conjugate),
             wanted,
         ),
         deck,
         survey.carried,
-        survey.seconds,
+        (flexibility + flexibility.T) / 2 - np.diag(survey.frequency**-2.0),
+        survey.seconds + outcome.seconds,
     )
 
 
@@ -161,6 +185,25 @@ def all_nodes(deck: Deck) -> str:
     return "\n".join(
         [f"*NSET, NSET={ALL_NODES}", *(", ".join(map(str, row)) + "," for row in rows), ""]
     )
+
+
+def load_rows(deck: Deck, loads: Float[np.ndarray, " dof"]) -> list[str]:
+    """Nodal forces (N) as a deck has them."""
+    table = loads.reshape(-1, 3)
+    rows = [
+        f"{label}, {direction + 1}, {table[node, direction]:.12e}"
+        for node, label in enumerate(deck.nodes)
+        for direction in range(3)
+        if table[node, direction]
+    ]
+    return ["*CLOAD, OP=NEW", *rows] if rows else []
+
+
+def _linear_steps(deck: Deck, conjugate: Float[np.ndarray, "mode dof"]) -> str:
+    """A linear static step for the unit force of each mode."""
+    printed = [f"*NODE PRINT, NSET={ALL_NODES}", "U", "*END STEP"]
+    steps = [["*STEP", "*STATIC", *load_rows(deck, row), *printed] for row in conjugate]
+    return "\n".join([*(line for step in steps for line in step), ""])
 
 
 def _step(count: int) -> str:

@@ -23,7 +23,7 @@ from snrmjax.io.calculix.jobs import (
     model_file,
     run_job,
 )
-from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes
+from snrmjax.io.calculix.modes import ALL_NODES, DeckModes, all_nodes, load_rows
 from snrmjax.io.calculix.results import last_energy, printed_tables
 from snrmjax.io.files import FilePath, write_atomically
 
@@ -119,11 +119,13 @@ def run_static_cases(
     if rows and all(row.status in (KILLED, REFUSED) for row in rows):
         raise ValueError(f"CalculiX ran no load case of {deck.name}: {rows[0].error}.")
     displacement = np.array([row.displacement for row in rows]).reshape(len(rows), -1)
-    energy = np.array([row.energy for row in rows])
+    # As the displacement, the energy is without what gives way locally under the nodal loads.
+    local = 0.5 * np.einsum("ci,ij,cj->c", forces, modes.residual_flexibility, forces)
+    energy = np.array([row.energy for row in rows]) - local
     return StaticRun(
         StaticCases(
             force=jnp.asarray(forces),
-            modal_displacement=jnp.asarray(displacement @ np.asarray(modes.basis.filter).T),
+            modal_displacement=jnp.asarray(modes.modal_displacement(displacement, forces)),
             converged=jnp.asarray([row.status == CONVERGED for row in rows], dtype=bool),
             energy=jnp.asarray(energy) if np.any(np.isfinite(energy)) else None,
             displacement=jnp.asarray(displacement),
@@ -138,19 +140,13 @@ def run_static_cases(
 
 def _step(modes: DeckModes, force: Float[np.ndarray, " mode"]) -> str:
     """The step of one case: loads ramped up, displacements and energy printed at its end."""
-    loads = (np.asarray(modes.basis.filter).T @ force).reshape(-1, 3)
-    rows = [
-        f"{label}, {direction + 1}, {loads[node, direction]:.12e}"
-        for node, label in enumerate(modes.deck.nodes)
-        for direction in range(3)
-        if loads[node, direction]
-    ]
+    loads = np.asarray(modes.basis.filter).T @ force
     energy = [f"*EL PRINT, ELSET={_ALL_ELEMENTS}, TOTALS=ONLY", "ELSE"]
     return "\n".join(
         [
             *("*STEP, NLGEOM, INC=1000", "*STATIC", _INCREMENTS),
             *("*CONTROLS, PARAMETERS=FIELD", _CONTROLS),
-            *(["*CLOAD", *rows] if rows else []),
+            *load_rows(modes.deck, loads),
             *(f"*NODE PRINT, NSET={ALL_NODES}", "U"),
             *(energy if _has_energy(modes.deck) else []),
             *("*END STEP", ""),

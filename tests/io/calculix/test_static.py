@@ -21,7 +21,7 @@ def test_tip_deflection_and_energy_of_a_cantilever(write, tmp_path):
     tip = np.zeros((3 * len(deck.nodes), 1))
     tip[3 * deck.node_index(deck.nearest_node((LENGTH, 0.0, 0.0))) + 2] = 1.0
     basis = ReductionBasis(jnp.ones(1), jnp.asarray(tip), jnp.asarray(tip.T), (1,))
-    modes = DeckModes(basis, deck, np.ones(1))
+    modes = DeckModes(basis, deck, np.ones(1), np.zeros((1, 1)))
     stiffness = 3 * YOUNG * INERTIA / LENGTH**3
     # P L² / (E I) = 1 deflects by 0.30172 L (elastica: Bisshopp & Drucker 1945).
     forces = np.array(
@@ -41,12 +41,14 @@ def test_tip_deflection_and_energy_of_a_cantilever(write, tmp_path):
 @needs_calculix
 def test_small_loads_move_one_mode_by_its_stiffness(write, tmp_path):
     deck = read_deck(write(beam_deck(elements=6)))
-    modes = modes_of_deck(deck, (1, 3), tmp_path / "jobs")
+    modes = modes_of_deck(deck, (1, 6), tmp_path / "jobs")
     squares = np.asarray(modes.basis.frequency) ** 2
     wanted = 1e-3 * THICKNESS / np.abs(np.asarray(modes.basis.shapes)).max(axis=0)
     run = run_static_cases(modes, np.diag(squares * wanted), tmp_path / "jobs")
-    # q = f/ω² of each mode and nothing of the other, to what the printed digits resolve.
-    np.testing.assert_allclose(run.cases.modal_displacement / wanted, np.eye(2), atol=3e-4)
+    # q = f/ω² of each mode and nothing of the other, to what the printed digits resolve; what gives
+    # way under the nodal loads is 7e-4 of the sixth mode and is taken out, of the energy as well.
+    np.testing.assert_allclose(run.cases.modal_displacement / wanted, np.eye(2), atol=5e-5)
+    np.testing.assert_allclose(run.cases.energy, 0.5 * squares * wanted**2, rtol=1e-5)
 
 
 @needs_calculix
@@ -82,6 +84,7 @@ def small(write):
         ReductionBasis(jnp.ones(1), jnp.asarray(shape), jnp.asarray(shape.T / 5), (1,)),
         deck,
         np.ones(1),
+        np.zeros((1, 1)),
     )
 
 
@@ -117,7 +120,7 @@ def test_results_of_an_earlier_run_are_taken_over(small, tmp_path, program):
     assert run([[1.0], [2.0], [5.0]]).found == 2
     assert run([[1.0], [2.0], [5.0]]).found == 3
     # Another model in the same folder shares nothing with this one.
-    other = DeckModes(small.basis, read_deck(_thicker(tmp_path)), small.carried)
+    other = DeckModes(small.basis, read_deck(_thicker(tmp_path)), small.carried, np.zeros((1, 1)))
     assert run_static_cases(other, [[1.0]], tmp_path / "jobs", program=stand_in).found == 0
     assert not list((tmp_path / "jobs").glob("job-*"))
 
