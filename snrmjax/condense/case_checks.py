@@ -224,14 +224,20 @@ def _linear_part(fit: FitView) -> list[CaseWarning]:
 
 def _sizes(fit: FitView) -> list[CaseWarning]:
     """Whether the cases are too small, or too large for the degree."""
-    if fit.misfit < _GOOD or rms(fit.left_out.residual) < _ROUND_OFF:
+    if fit.misfit < _GOOD:
         return []
     n_cases, n_modes = fit.system.target.shape
     share = rms(fit.system.target)
+    said = f"the potential leaves {100 * fit.misfit:.2g} % of the nonlinear force"
+    small = (
+        f"{said}, which is only {share:.2g} of the linear force: round-off of the displacements "
+        "dominates; take a larger load scale or write more digits"
+    )
+    if rms(fit.left_out.residual) < _ROUND_OFF:
+        return [_warning("too_small", small)]
     higher = fit_system(fit.basis, fit.cases, monomials_of(n_modes, fit.degree + 2))
     design = np.asarray(higher.design).reshape(n_cases * n_modes, -1)
     spare = design.shape[0] - design.shape[1]
-    said = f"the potential leaves {100 * fit.misfit:.2g} % of the nonlinear force"
     if spare > n_modes:
         values = np.linalg.lstsq(design, np.asarray(higher.target).reshape(-1), rcond=1e-12)[0]
         left = rms(design @ values - np.asarray(higher.target).reshape(-1))
@@ -243,11 +249,7 @@ def _sizes(fit: FitView) -> list[CaseWarning]:
         text = f"{said}: the loads are too large for degree {fit.degree}"
         return [_warning("too_large", f"{text}; take a smaller load scale or a higher degree")]
     if share < _SMALL:
-        text = (
-            f"{said}, which is only {share:.2g} of the linear force: round-off of the displacements"
-            " dominates; take a larger load scale or write more digits"
-        )
-        return [_warning("too_small", text)]
+        return [_warning("too_small", small)]
     return [_warning("too_large", f"{said}: no polynomial of this degree fits the load cases")]
 
 

@@ -180,7 +180,9 @@ def condense(
         )
     used = np.flatnonzero(cases.usable)
     if not used.size:
-        raise ValueError(f"none of the {len(cases.force)} load cases has a solution.")
+        raise ValueError(
+            f"none of the {len(cases.force)} load cases has a solution: smaller loads are needed."
+        )
     solved = _subset(cases, used)
     monomials = monomials_of(n_modes, degree)
     require_loaded(basis, solved)

@@ -43,7 +43,7 @@ PINNED = SupportStiffness(np.inf, np.inf, 0.0)
 FREE = SupportStiffness(0.0, 0.0, 0.0)
 
 
-class BeamSection(NamedTuple):
+class RectangularSection(NamedTuple):
     """A rectangular section and its material."""
 
     width: float | Array  # m
@@ -158,7 +158,7 @@ def _deformation(ends: Array, span: Array) -> tuple[Array, Array, Array]:
 
 def corotational_beam(
     length: float | Array,
-    section: BeamSection,
+    section: RectangularSection,
     supports: tuple[SupportStiffness, SupportStiffness] = (CLAMPED, CLAMPED),
     *,
     elements: int = 40,
@@ -170,7 +170,7 @@ def corotational_beam(
     an arch below a half circle.
     Raises `ValueError` for fewer than two elements and for supports that hold nothing.
 
-    >>> section = BeamSection(0.01, 0.001, 2e11, 7800.0)
+    >>> section = RectangularSection(0.01, 0.001, 2e11, 7800.0)
     >>> basis = corotational_beam(0.3, section, elements=10).modes((1, 2))
     >>> [round(float(one) / (2 * np.pi), 2) for one in basis.frequency]
     [57.84, 159.46]
@@ -244,7 +244,7 @@ def transverse_row(beam: CorotationalBeam, fraction: float) -> Float[np.ndarray,
     return every[np.array(beam.free)]
 
 
-def uniform_load(beam: CorotationalBeam) -> Float[Array, " free"]:
+def line_load(beam: CorotationalBeam) -> Float[Array, " free"]:
     """One newton across the beam, spread evenly over its length, as nodal forces."""
     span = jnp.diff(beam.nodes, axis=0)
     whole = jnp.sum(jnp.sqrt(jnp.sum(span**2, axis=1)))

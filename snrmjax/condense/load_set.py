@@ -145,10 +145,14 @@ def displacement_for_ratio(
         new = np.where(outside, np.sqrt(low * np.where(outside, high, 1.0)), new)
         size = np.where(close, size, new)
     worst = int(np.argmax(np.abs(np.log(found / ratio))))
+    last = f"{before[0][worst]:.3g} m are wanted"
+    if np.isinf(found[worst]):
+        why = f"the load cases where {last} have no solution"
+    else:
+        why = f"it is {found[worst]:.3g} where {last}"
     raise ValueError(
         f"no load along mode {basis.numbers[worst]} has a nonlinear force of {ratio:g} times the "
-        f"linear one (it is {found[worst]:.3g} where {before[0][worst]:.3g} m are wanted): state "
-        "the load scale."
+        f"linear one ({why}): state the load scale."
     )
 
 

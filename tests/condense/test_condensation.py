@@ -141,6 +141,10 @@ def test_too_small_loads_too_short_a_polynomial_and_too_large_loads_are_told_apa
     loads = sj.condense.modal_loads(basis, 0.001)
     rounded = sj.condense.condense(basis, cases_of(truth, loads, digits=6), expand=False)
     assert kinds(rounded) == ["too_small"]
+    nothing = sj.condense.modal_loads(basis, 1e-13)
+    assert kinds(sj.condense.condense(basis, cases_of(truth, nothing), expand=False)) == [
+        "too_small"
+    ]
     short = sj.condense.condense(basis, cases, degree=2, expand=False)
     assert "too_large" in kinds(short)
     assert "degree 2" in next(w.message for w in short.warnings if w.kind == "too_large")

@@ -9,15 +9,15 @@ from snrmjax.condense.corotational_beam import (
     CLAMPED,
     FREE,
     PINNED,
-    BeamSection,
+    RectangularSection,
     SupportStiffness,
     beam_static_cases,
     corotational_beam,
+    line_load,
     transverse_row,
-    uniform_load,
 )
 
-SECTION = BeamSection(0.0127, 0.000508, 204.8e9, 7870.0)
+SECTION = RectangularSection(0.0127, 0.000508, 204.8e9, 7870.0)
 LENGTH = 0.2286
 FIRST = 4.730040744862704  # root of cos k cosh k = 1
 
@@ -37,7 +37,7 @@ def bending_wave(beam):
 def test_large_deflections_of_a_cantilever_are_those_of_the_elastica():
     # K. Mattiasson, Int. J. Numer. Methods Eng. 17 (1981) 145, doi:10.1002/nme.1620170113: tip of
     # a cantilever under P = EI/L² and 10 EI/L², over its length.
-    beam = corotational_beam(1.0, BeamSection(0.01, 0.001, 2e11, 7800.0), (CLAMPED, FREE))
+    beam = corotational_beam(1.0, RectangularSection(0.01, 0.001, 2e11, 7800.0), (CLAMPED, FREE))
     tip = transverse_row(beam, 1.0)
     basis = sj.condense.ReductionBasis(jnp.ones(1), tip[:, None], tip[None], (1,))
     cases = beam_static_cases(beam, basis, float(beam.bending) * np.array([[1.0], [10.0]]))
@@ -82,7 +82,7 @@ def test_springs_go_from_free_to_held_and_loads_are_those_of_one_newton(clamped)
     # A sine of mass one: φ = √(2/(mL)) sin, its mean 2/π of the largest.
     largest = np.sqrt(2 / (float(pinned.mass) * LENGTH))
     assert float(first.largest[0]) == pytest.approx(largest, rel=1e-5)
-    participation = np.asarray(uniform_load(pinned)) @ np.asarray(first.shapes)
+    participation = np.asarray(line_load(pinned)) @ np.asarray(first.shapes)
     np.testing.assert_allclose(participation, [2 / np.pi * largest, 0.0], atol=1e-6 * largest)
     assert transverse_row(pinned, 0.5) @ first.shapes[:, 0] == pytest.approx(largest, rel=1e-5)
     mechanism = corotational_beam(LENGTH, SECTION, (PINNED, FREE), elements=4)

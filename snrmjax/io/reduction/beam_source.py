@@ -4,12 +4,12 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.condense.corotational_beam import (
-    BeamSection,
     CorotationalBeam,
+    RectangularSection,
     beam_static_cases,
     corotational_beam,
+    line_load,
     transverse_row,
-    uniform_load,
 )
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.io.files import FilePath, file_name
@@ -40,7 +40,7 @@ def read_beam(path: FilePath) -> ReductionSource:
         if not np.max(np.abs(sensors[name])) > _NOWHERE * largest:
             raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
     if beam.force_at is None:
-        participation = np.asarray(uniform_load(elements)) @ shapes
+        participation = np.asarray(line_load(elements)) @ shapes
     else:
         participation = transverse_row(elements, beam.force_at) @ shapes
         if not np.max(np.abs(participation)) > _NOWHERE * largest:
@@ -69,7 +69,7 @@ def read_beam(path: FilePath) -> ReductionSource:
 def _elements(beam: BeamDescription) -> CorotationalBeam:
     return corotational_beam(
         beam.length,
-        BeamSection(beam.width, beam.thickness, beam.young, beam.density),
+        RectangularSection(beam.width, beam.thickness, beam.young, beam.density),
         beam.supports,
         elements=beam.elements,
         radius=beam.radius,

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from snrmjax.condense.condensation import Condensation
+from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.scale_study import LoadScaleStudy
 from snrmjax.condense.static_response import static_displacement
 from snrmjax.io.reduction.source import ShapeLines
@@ -18,6 +19,7 @@ from snrmjax.report.style import (
     CROSS,
     DOT,
     EXCLUDED,
+    HOLLOW,
     IDENTIFIED,
     LINE,
     PAGE,
@@ -34,6 +36,7 @@ _ACROSS = 3  # panels beside one another
 _ROW = 2.4  # inches
 _POINTS = 60  # on each side of a static curve
 _MOST_LINES = 6  # coefficients that are drawn
+FITTED, FURTHER = "finite elements, load cases of the fit", "finite elements, not fitted"
 
 
 def shapes_figure(lines: ShapeLines, names: Sequence[str]) -> Figure:
@@ -48,8 +51,12 @@ def shapes_figure(lines: ShapeLines, names: Sequence[str]) -> Figure:
     return figure
 
 
-def static_figure(found: Condensation, names: Sequence[str]) -> Figure:
+def static_figure(
+    found: Condensation, names: Sequence[str], sweep: StaticCases | None = None
+) -> Figure:
     """Load and displacement of every mode loaded alone: finite elements and the reduced model.
+
+    Arguments: `sweep` has further load cases, of single modes, that were not fitted.
 
     Loads are given as the displacement that they would cause in the linear structure.
     """
@@ -59,35 +66,44 @@ def static_figure(found: Condensation, names: Sequence[str]) -> Figure:
     figure, grid = panels(PAGE if n > 1 else COLUMN, _ROW * rows + 0.4, rows, columns)
     largest, squared = np.asarray(found.basis.largest), np.asarray(found.basis.frequency) ** 2
     to_length = largest / squared
-    force, moved = np.asarray(found.cases.force), np.asarray(found.cases.modal_displacement)
-    usable = found.cases.usable
     for k, axes in enumerate(list(grid.flat)[:n]):
-        alone = usable & (np.abs(force[:, k]) > 0)
-        alone &= np.count_nonzero(force, axis=1) == 1
-        end = 1.3 * np.max(np.abs(force[usable, k]))
+        own = _alone(found.cases, k)
+        further = np.zeros((0, 2)) if sweep is None else _alone(sweep, k)
+        every = np.concatenate([own, further])
+        if not len(every):
+            every = np.array([[np.max(np.abs(np.asarray(found.cases.force)[:, k])), 0.0]])
+        end = 1.1 * np.max(np.abs(every[:, 0]))
         loads = np.zeros((2 * _POINTS + 1, n))
         loads[:, k] = np.linspace(-end, end, 2 * _POINTS + 1)
         loads[_POINTS, k] = 1e-9 * end  # at rest a path has no direction
         static = np.asarray(
             static_displacement(found.basis.frequency, found.potential, jnp.asarray(loads))
         )
-        unit = unit_for(largest[k] * moved[usable, k], "m")
+        unit = unit_for(np.append(largest[k] * every[:, 1], to_length[k] * end), "m")
         x, y = largest[k] * static[:, k] / unit.size, loads[:, k] * to_length[k] / unit.size
         axes.plot(y, y, color=BACKGROUND, linewidth=LINE, label="linear")
         axes.plot(x, y, color=IDENTIFIED, linewidth=LINE, label="reduced model")
-        points = (
-            largest[k] * moved[alone, k] / unit.size,
-            force[alone, k] * to_length[k] / unit.size,
-        )
-        marks(axes, *points, {**DOT, "zorder": 3}, "finite elements, this mode loaded alone")
+        for dots, style, name in ((own, DOT, FITTED), (further, HOLLOW, FURTHER)):
+            at = largest[k] * dots[:, 1] / unit.size, to_length[k] * dots[:, 0] / unit.size
+            marks(axes, at[0], at[1], {**style, "zorder": 3}, name)
         beside = f"Load, as linear displacement ({unit.name})" if k % columns == 0 else ""
         name_axes(axes, names[k], f"Largest displacement ({unit.name})", beside)
-        reach = 1.05 * max(np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(y)))
+        reach = 1.15 * max(
+            np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(every[:, 1])) * largest[k] / unit.size
+        )
         axes.set_xlim(-reach, reach)
     for axes in list(grid.flat)[n:]:
         axes.set_visible(False)
     legend(figure)
     return figure
+
+
+def _alone(cases: StaticCases, mode: int) -> np.ndarray:
+    """(force, modal displacement) of the solved cases that load one mode only."""
+    force = np.asarray(cases.force)
+    rows = cases.usable & (np.count_nonzero(force, axis=1) == 1) & (force[:, mode] != 0)
+    moved = np.asarray(cases.modal_displacement)
+    return np.stack([force[rows, mode], moved[rows, mode]], axis=1)
 
 
 def quality_figure(found: Condensation) -> Figure:

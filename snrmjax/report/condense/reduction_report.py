@@ -39,9 +39,10 @@ from snrmjax.report.style import printed, with_unit
 SHAPES = "Shapes of the modes that the reduced model keeps."
 STATIC = (
     "Static load along one mode, given as the displacement that it would cause in the linear "
-    "structure, against the displacement at the place where that mode is largest. Dots: finite "
-    "elements. Lines: the reduced model with all its modes, from rest; a line ends where its path "
-    "turns unstable."
+    "structure, against the displacement at the place where that mode is largest, of the mode "
+    "alone. Dots: finite elements; filled ones are load cases of the fit, hollow ones larger loads "
+    "that the fit has not seen: they show how far the model holds. Lines: the reduced model with "
+    "all its modes, from rest; a line ends where its path turns unstable."
 )
 QUALITY = (
     "Each load case is left out of the fit and predicted by the others. Errors that grow with the "
@@ -54,6 +55,7 @@ SCALE = (
     "polynomial lacks; between them the coefficients do not depend on the loads, and the model's "
     f"own load scale should lie there. The plateau is where they stay within {100 * TOLERANCE:g} %."
 )
+_SWEEP = (1.0, 2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
 _REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
 
 
@@ -65,6 +67,7 @@ class Reduction(NamedTuple):
     structure: Structure
     displacement: np.ndarray | None  # m that single modes move linearly; None for tables
     study: LoadScaleStudy | None
+    sweep: StaticCases | None  # single modes, far beyond the load cases; None for tables
     notes: tuple[str, ...]
 
     @property
@@ -98,7 +101,10 @@ def reduce(
         displacement, cases = _run(source)
     found = condense(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
-    scales = None
+    scales = sweep = None
+    if displacement is not None and source.solve is not None:
+        far = modal_loads(source.basis, displacement, most_modes=1, levels=_SWEEP)
+        sweep = source.solve(np.asarray(far.force))
     if study and source.solve is not None and displacement is not None:
         scales = load_scale_study(
             source.basis, source.solve, displacement, degree=source.degree, report=report
@@ -113,7 +119,7 @@ def reduce(
             f"the reduced model has {len(states)} stable equilibria: responses may end in another "
             "one than rest"
         )
-    return Reduction(source, found, structure, displacement, scales, tuple(notes))
+    return Reduction(source, found, structure, displacement, scales, sweep, tuple(notes))
 
 
 def _run(source: ReductionSource) -> tuple[np.ndarray, StaticCases]:
@@ -283,7 +289,7 @@ def _shapes(folder: Path, reduction: Reduction) -> Section | None:
 
 
 def _static(folder: Path, reduction: Reduction) -> Section:
-    figure = static_figure(reduction.condensation, reduction.mode_names)
+    figure = static_figure(reduction.condensation, reduction.mode_names, reduction.sweep)
     saved = _saved(folder, "force_displacement", figure, STATIC)
     return Section("Force and displacement", (), [saved])
 
