@@ -53,7 +53,7 @@ def modal_loads(
     (fractions of the displacement) say it otherwise.
     Raises `ValueError` for a displacement, number of modes or level that makes no load.
     Reference: Kuether, Deaner, Hollkamp & Allen, AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838
-    (constant modal displacement); R. W. Gordon & J. J. Hollkamp, AFRL-RB-WP-TR-2011-3040 (2011).
+    (constant modal displacement).
 
     >>> basis = ReductionBasis(np.array([2.0]), np.array([[0.5]]), np.array([[2.0]]), (1,))
     >>> modal_loads(basis, 1e-3, levels=(1.0,))

@@ -86,7 +86,7 @@ def static_figure(
         for dots, style, name in ((own, DOT, FITTED), (further, HOLLOW, FURTHER)):
             at = largest[k] * dots[:, 1] / unit.size, to_length[k] * dots[:, 0] / unit.size
             marks(axes, at[0], at[1], {**style, "zorder": 3}, name)
-        beside = f"Load, as linear displacement ({unit.name})" if k % columns == 0 else ""
+        beside = f"Load, as displacement ({unit.name})" if k % columns == 0 else ""
         name_axes(axes, names[k], f"Largest displacement ({unit.name})", beside)
         reach = 1.15 * max(
             np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(every[:, 1])) * largest[k] / unit.size
@@ -121,8 +121,9 @@ def quality_figure(found: Condensation) -> Figure:
     cross = {**CROSS, "markeredgecolor": IDENTIFIED}
     marks(axes, ratio[shown & named], error[shown & named], cross, "contradicts the others")
     if shown.any():
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        axes.set(
+            xscale="log", yscale="log", xlim=_decades(ratio[shown]), ylim=_decades(error[shown])
+        )
     name_axes(
         axes,
         "Each load case as the fit to all others has it",
@@ -131,6 +132,12 @@ def quality_figure(found: Condensation) -> Figure:
     )
     legend(figure)
     return figure
+
+
+def _decades(values: np.ndarray) -> tuple[float, float]:
+    """Powers of ten around positive values."""
+    power = np.log10(values)
+    return float(10.0 ** np.floor(power.min())), float(10.0 ** (np.floor(power.max()) + 1))
 
 
 def scale_figure(study: LoadScaleStudy) -> Figure:
@@ -177,7 +184,7 @@ def scale_figure(study: LoadScaleStudy) -> Figure:
             {**STAR, "transform": axes.get_xaxis_transform()},
             "load cases without solution",
         )
-    name_axes(left, "Coefficients", "Load scale", "Over that at load scale 1")
+    name_axes(left, "Coefficients", "Load scale", "Over value at scale 1")
     name_axes(right, "Fit", "Load scale", "Ratio")
     legend(figure)
     return figure

@@ -55,7 +55,7 @@ SCALE = (
     "polynomial lacks; between them the coefficients do not depend on the loads, and the model's "
     f"own load scale should lie there. The plateau is where they stay within {100 * TOLERANCE:g} %."
 )
-_SWEEP = (1.0, 2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
+_SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
 _REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
 
 

@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from condense.conftest import basis_of, cases_of
 from truths.hidden_membrane import hidden_membrane
+from truths.printed_page import unreadable
 
 import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.condense.load_set import LoadSet
 from snrmjax.io.reduction.load_tables import read_load_tables
 from snrmjax.io.reduction.source import ReductionSource, ShapeLines, write_load_cases
+from snrmjax.report.condense.reduction_figures import (
+    FURTHER,
+    quality_figure,
+    scale_figure,
+    shapes_figure,
+    static_figure,
+)
 from snrmjax.report.condense.reduction_report import reduce, write_reduction
 
 WRITTEN = {
@@ -37,9 +45,13 @@ def source():
     )
 
 
-def test_a_source_that_runs_its_cases_is_condensed_studied_and_written(source, tmp_path):
-    truth, of_truth = source
-    found = reduce(of_truth)
+@pytest.fixture(scope="module")
+def found(source):
+    return reduce(source[1])
+
+
+def test_a_source_that_runs_its_cases_is_condensed_studied_and_written(source, found, tmp_path):
+    truth, _ = source
     write_reduction(tmp_path, found)
     assert {p.name for p in tmp_path.iterdir()} == WRITTEN | {"load_scale.png", "mode_shapes.png"}
     model = sj.read_model(tmp_path / "model.toml")
@@ -59,6 +71,30 @@ def test_a_source_that_runs_its_cases_is_condensed_studied_and_written(source, t
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == 4
     assert "mode 3" in page
+
+
+def test_figures_are_readable_on_paper(source, found):
+    _, of_truth = source
+    names = found.mode_names
+    sweep = found.sweep
+    for figure in (
+        shapes_figure(of_truth.lines, names),
+        static_figure(found.condensation, names, sweep),
+        quality_figure(found.condensation),
+        scale_figure(found.study),
+        found.condensation.plot(),
+        found.study.plot(),
+    ):
+        assert unreadable(figure) == []
+    # The reduced model of a polynomial truth holds as far as the sweep goes.
+    first = static_figure(found.condensation, names, sweep).axes[0]
+    lines = {line.get_label(): line for line in first.lines}
+    curve, dots = lines["reduced model"], lines[FURTHER]
+    x, y = curve.get_data()
+    solved = np.isfinite(x)
+    on_curve = np.interp(dots.get_xdata(), x[solved], y[solved])
+    inside = np.abs(dots.get_xdata()) <= np.nanmax(np.abs(x))
+    np.testing.assert_allclose(on_curve[inside], dots.get_ydata()[inside], rtol=0.01)
 
 
 def test_a_stated_load_scale_is_in_thicknesses(source):
