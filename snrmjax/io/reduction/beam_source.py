@@ -1,5 +1,7 @@
 """A beam file as what a reduced-order model is made from: its finite elements and their modes."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -12,10 +14,12 @@ from snrmjax.condense.corotational_beam import (
     transverse_row,
 )
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 
+_BLOCK = 8  # load cases at once
 _NOWHERE = 1e-9  # of the largest shape: a sensor that no mode moves
 
 
@@ -47,7 +51,7 @@ def read_beam(path: FilePath) -> ReductionSource:
             raise ValueError(f"[force] of {file} is at {beam.force_at:g}, where no mode moves.")
 
     def solve(force: Float[np.ndarray, "case mode"]) -> StaticCases:
-        return beam_static_cases(elements, basis, force)
+        return _in_blocks(lambda rows: beam_static_cases(elements, basis, rows), force)
 
     stated = beam.damping_ratio
     note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
@@ -64,6 +68,15 @@ def read_beam(path: FilePath) -> ReductionSource:
         lines=_lines(elements, basis),
         notes=() if stated is not None else (note,),
     )
+
+
+def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> StaticCases:
+    """Load cases by blocks of one size, so that one program serves any number of them."""
+    count = len(force)
+    rows = np.resize(np.arange(count), -(-count // _BLOCK) * _BLOCK)
+    blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]
+    found: StaticCases = jax.tree.map(lambda *parts: jnp.concatenate(parts)[:count], *blocks)
+    return found
 
 
 def _elements(beam: BeamDescription) -> CorotationalBeam:

@@ -1,10 +1,15 @@
-"""Beams as TOML: what they say, and what is refused."""
+"""Beams as TOML: what they say, what is refused, and the models that come out of them."""
 
+import json
+
+import numpy as np
 import pytest
 
+import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.condense.corotational_beam import CLAMPED, SupportStiffness
 from snrmjax.io.reduction.beam_file import read_beam_description
+from snrmjax.io.reduction.beam_source import read_beam
 
 BEAM = """name = "flat beam"
 [material]
@@ -87,6 +92,9 @@ BAD_BEAMS = [
     (edit("[1, 3]", "[1, 3]\ndamping_ratio = [0.1]"), "2 numbers, one a mode"),
     (edit("midspan = 0.5", "midspan = 1.5"), "`midspan` must be from 0 to 1"),
     (edit('"uniform"', '"unifrom"'), "did you mean `uniform`"),
+    (edit("midspan = 0.5", "clamp = 0"), "`clamp` at 0, where no mode moves"),
+    (edit('distribution = "uniform"', "at = 1.0"), "[force] of beam.toml is at 1, where no mode"),
+    (edit("[1, 3]", "[1]\nload_scale = 1e5"), "none of the 4 load cases has a solution"),
     (BEAM + "at = 0.5\n", "both `distribution` and `at`"),
     ("material = [", "is not valid TOML"),
 ]
@@ -124,3 +132,39 @@ def test_one_source_is_needed(tmp_path, capsys, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert words in refused(monkeypatch, capsys, *arguments, "--out", "out")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_beam_becomes_a_model_that_simulates(tmp_path, monkeypatch):
+    path, out = tmp_path / "beam.toml", tmp_path / "out"
+    path.write_text(BEAM.replace("[1, 3]", "[1]\ndamping_ratio = 0.05"))
+    monkeypatch.setattr("sys.argv", ["snrmjax", "rom", str(path), "--out", str(out)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    model = sj.read_model(out / "model.toml")
+    # Closed forms of the clamped beam: k = 4.73004, shape 1.58815 and mean 0.83086 of √(1/mass).
+    mass = 7870.0 * 0.0127 * 0.000508 * 0.2286
+    speed = np.sqrt(204.8e9 * 0.000508**2 / 12 / 7870.0)
+    natural = 4.730040745**2 * speed / 0.2286**2
+    assert float(model.modes.natural_frequency[0]) == pytest.approx(natural, rel=1e-4)
+    assert float(model.modes.mode_shape[0, 0]) == pytest.approx(1.58815 / mass**0.5, rel=1e-3)
+    assert float(model.modes.participation[0]) == pytest.approx(0.83086 / mass**0.5, rel=1e-3)
+    assert model.modes.sensors == ("midspan",)
+    # V = EA/(8L) (∫φ'² dx)² q⁴ with ∫φ'² = 12.3026/(mass L).
+    area = 0.0127 * 0.000508
+    quartic = 204.8e9 * area / (8 * 0.2286) * (12.3026 / (mass * 0.2286)) ** 2
+    assert float(model.potential.coefficient[1]) == pytest.approx(quartic, rel=2e-3)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["load_scale_study"]["scale_of_the_model_inside"] is True
+    assert summary["load_scale_study"]["plateau_decades"] >= 1.0
+    assert summary["notes"] == []
+
+
+def test_damping_is_assumed_aloud_and_a_force_may_be_at_a_point(tmp_path):
+    path = tmp_path / "beam.toml"
+    path.write_text(edit("[1, 3]", "[1]").replace('distribution = "uniform"', "at = 0.5"))
+    source = read_beam(path)
+    np.testing.assert_allclose(source.participation, source.sensors["midspan"])
+    np.testing.assert_array_equal(source.damping_ratio, [0.01])
+    assert "no damping is stated" in source.notes[0]
+    assert source.thickness == 0.000508
