@@ -60,6 +60,7 @@ SUB_ROOMS = {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },
     "diagnose.design": {"diagnose.misfit", "diagnose.search"},
+    "condense.elements": {"condense.load_cases"},
     # A study is made of computations, which know nothing of where and how often they run.
     "study.computations": set(),
     "study.uncertainty": {"study.variations"},

@@ -1,0 +1,1 @@
+"""Built-in finite elements: beams and arches in a plane, with large displacements and rotations."""

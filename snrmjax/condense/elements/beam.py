@@ -1,0 +1,217 @@
+"""A beam or arch by its dimensions, and the geometry of its elements."""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.model.modes import have_values
+
+Number = float | Float[Array, ""]
+SupportName = Literal["clamped", "pinned", "free"]
+
+
+def _number(value: Number) -> Float[Array, ""]:
+    # Arrays, not floats: a compiled program then serves all values.
+    return jnp.asarray(value, dtype=jnp.float64)
+
+
+def _stiffness(value: Number | None) -> Float[Array, ""] | None:
+    if value is None or (isinstance(value, (int, float)) and value == np.inf):
+        return None
+    return _number(value)
+
+
+class Support(eqx.Module):
+    """Springs between an end and the ground: None (or infinite) is held, zero is free.
+
+    `axial` acts along the chord of the beam and `transverse` across it, both in N/m; `rotation`
+    in N m/rad. Derivatives by a stiffness are those of a finite one.
+    """
+
+    axial: Number | None = eqx.field(converter=_stiffness, default=None)
+    transverse: Number | None = eqx.field(converter=_stiffness, default=None)
+    rotation: Number | None = eqx.field(converter=_stiffness, default=None)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError` for a stiffness that is negative or not a number."""
+        for name in ("axial", "transverse", "rotation"):
+            value = getattr(self, name)
+            if value is not None and have_values(value) and not np.all(value >= 0):
+                raise ValueError(
+                    f"`{name}` stiffness must be zero or positive, but is {float(value):g}."
+                )
+
+    @property
+    def springs(self) -> tuple[Number | None, ...]:
+        """Stiffnesses along the chord, across it and in rotation."""
+        return self.axial, self.transverse, self.rotation
+
+
+_NAMED = {
+    "clamped": Support(),
+    "pinned": Support(rotation=0.0),
+    "free": Support(0.0, 0.0, 0.0),
+}
+
+
+def _support(value: Support | SupportName) -> Support:
+    if isinstance(value, Support):
+        return value
+    if value not in _NAMED:
+        raise ValueError(f"a support must be one of {', '.join(_NAMED)}, but is {value!r}.")
+    return _NAMED[value]
+
+
+class PointMass(eqx.Module):
+    """A mass (kg) fixed to the beam at a fraction of its length, with its rotary inertia."""
+
+    at: float = eqx.field(static=True)
+    mass: Number = eqx.field(converter=_number)
+    inertia: Number = eqx.field(converter=_number, default=0.0)  # kg m²
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError` for a place off the beam or a negative mass."""
+        if not 0 <= self.at <= 1:
+            raise ValueError(f"`at` must be a fraction of the length, but is {self.at:g}.")
+        for name in ("mass", "inertia"):
+            value = getattr(self, name)
+            if have_values(value) and not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"`{name}` must be zero or positive, but is {float(value):g}.")
+
+
+class Beam(eqx.Module):
+    """A beam of rectangular section, straight or a circular arc, as a chain of finite elements.
+
+    `length` is that of the chord and `rise` the height of the arc over it (`rise_of_radius` gives
+    it from a radius); the arc is stress-free. x runs along the chord, y away from the centre of
+    curvature. `poisson` None: no shear deformation; else it is that of a rectangular section.
+    All numbers but `elements` may be differentiated by; SI units throughout.
+
+    >>> Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0).nodes.shape
+    (41, 2)
+    """
+
+    length: Number = eqx.field(converter=_number)  # m
+    width: Number = eqx.field(converter=_number)  # m
+    thickness: Number = eqx.field(converter=_number)  # m
+    rise: Number = eqx.field(converter=_number, default=0.0, kw_only=True)  # m
+    young: Number = eqx.field(converter=_number, kw_only=True)  # Pa
+    density: Number = eqx.field(converter=_number, kw_only=True)  # kg/m³
+    poisson: Number | None = eqx.field(
+        converter=lambda value: None if value is None else _number(value),
+        default=None,
+        kw_only=True,
+    )
+    elements: int = eqx.field(static=True, default=40, kw_only=True)
+    left: Support | SupportName = eqx.field(converter=_support, default="clamped", kw_only=True)
+    right: Support | SupportName = eqx.field(converter=_support, default="clamped", kw_only=True)
+    point_masses: tuple[PointMass, ...] = eqx.field(converter=tuple, default=(), kw_only=True)
+
+    def __check_init__(self) -> None:
+        """Raises `ValueError` for numbers that no beam has and for supports that hold nothing."""
+        if isinstance(self.elements, bool) or not isinstance(self.elements, int):
+            raise ValueError(f"`elements` must be a whole number, but is {self.elements!r}.")
+        if self.elements < 2:
+            raise ValueError(f"`elements` must be at least 2, but is {self.elements}.")
+        for name in ("length", "width", "thickness", "rise", "young", "density", "poisson"):
+            value = getattr(self, name)
+            if value is None or not have_values(value):
+                continue
+            if np.ndim(value):
+                raise ValueError(f"`{name}` must be one number, but has shape {np.shape(value)}.")
+            _check_number(name, float(value))
+
+    @property
+    def half_angle(self) -> Float[Array, ""]:
+        """Half of the angle that the arc spans, rad; zero for a straight beam."""
+        return 2 * jnp.arctan2(2 * self.rise, self.length)
+
+    @property
+    def arc_length(self) -> Float[Array, ""]:
+        """Length along the beam, m."""
+        return self.length / jnp.sinc(self.half_angle / jnp.pi)
+
+    @property
+    def nodes(self) -> Float[Array, "node 2"]:
+        """Coordinates (x, y) of the nodes, equally spaced along the beam, m."""
+        half = self.half_angle
+        t = jnp.linspace(-1.0, 1.0, self.elements + 1)
+
+        def sinc(angle: Array) -> Array:
+            return jnp.sinc(angle / jnp.pi)
+
+        # R sin and R (cos − cos) without a radius, which a straight beam has not.
+        x = 0.5 * self.length * (1 + t * sinc(t * half) / sinc(half))
+        bulge = sinc(0.5 * half * (1 + t)) * sinc(0.5 * half * (1 - t)) / sinc(half)
+        return jnp.stack([x, 0.25 * self.length * half * (1 - t**2) * bulge], axis=1)
+
+    @property
+    def ends(self) -> tuple[tuple[int, Support], ...]:
+        """Node and support of the left end, then of the right one."""
+        return (0, _support(self.left)), (self.elements, _support(self.right))
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which of the degrees of freedom (x, y, rotation of each node in turn) are not held."""
+        held = [
+            3 * node + k
+            for node, end in self.ends
+            for k, spring in enumerate(end.springs)
+            if spring is None
+        ]
+        return np.setdiff1d(np.arange(self.n_dof), held)
+
+    @property
+    def n_dof(self) -> int:
+        """Number of degrees of freedom, held ones included."""
+        return 3 * (self.elements + 1)
+
+
+class BeamSection(NamedTuple):
+    """Stiffness and mass of the section."""
+
+    axial: Number  # EA, N
+    bending: Number  # EI, N m²
+    shear: Number | None  # κGA, N
+    mass: Number  # ρA, kg/m
+    rotary: Number  # ρI, kg m
+
+
+def section_of(beam: Beam) -> BeamSection:
+    """The rectangular section; shear coefficient κ = 10(1+ν)/(12+11ν).
+
+    Reference: G. R. Cowper, J. Appl. Mech. 33 (1966) 335, doi:10.1115/1.3625046.
+    """
+    area = beam.width * beam.thickness
+    inertia = area * beam.thickness**2 / 12
+    shear = None
+    if beam.poisson is not None:
+        kappa = 10 * (1 + beam.poisson) / (12 + 11 * beam.poisson)
+        shear = kappa * beam.young / (2 * (1 + beam.poisson)) * area
+    return BeamSection(
+        beam.young * area, beam.young * inertia, shear, beam.density * area, beam.density * inertia
+    )
+
+
+def rise_of_radius(length: Number, radius: Number) -> Float[Array, ""]:
+    """Rise (m) of an arc below a half circle over a chord of `length`, both in m.
+
+    >>> round(float(rise_of_radius(0.3048, 11.43)), 9)
+    0.001016045
+    """
+    half = 0.5 * jnp.asarray(length)
+    return half**2 / (radius + jnp.sqrt(jnp.asarray(radius) ** 2 - half**2))
+
+
+def _check_number(name: str, value: float) -> None:
+    if name == "poisson":
+        good, wanted = -1 < value < 0.5, "above -1 and below 0.5"
+    elif name == "rise":
+        good, wanted = value >= 0, "zero or positive"
+    else:
+        good, wanted = value > 0, "positive"
+    if not (np.isfinite(value) and good):
+        raise ValueError(f"`{name}` must be {wanted}, but is {value:g}.")

@@ -1,0 +1,136 @@
+"""Linear modes of a beam, and what forces and sensors see of them."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.elements.beam import Beam
+from snrmjax.condense.elements.strain_energy import (
+    mass_matrix,
+    shape_rows,
+    tangent_stiffness,
+    uniform_load,
+)
+from snrmjax.condense.load_cases import ReductionBasis
+from snrmjax.model.modes import have_values
+
+_MIDSPAN_NODE = 0.05  # of the largest displacement: below it midspan does not choose the sign
+_MECHANISM = 1e-10  # of the largest squared frequency a beam of so many elements could have
+
+
+def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
+    """Mass-normalised modes of small vibration about the stress-free shape: K φ = ω² M φ.
+
+    Shapes have rows for all degrees of freedom (x, y, rotation of each node, zero where held).
+    Their sign is positive upwards at midspan; where that is a node, at the first place from the
+    left that moves almost as far as any. Frequencies and shapes are differentiable by everything
+    in `beam`, where their frequency differs from that of all other modes.
+
+    Arguments: `modes` numbers counted from one, in order of frequency (axial modes counted too).
+    Raises `ValueError` for modes that the elements do not have or that are too coarsely resolved
+    (above one for each element), and for supports that leave a mechanism.
+
+    >>> beam = Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0)
+    >>> (beam_modes(beam, (1, 3)).frequency / (2 * np.pi)).round(2)
+    Array([ 78.97, 426.73], dtype=float64)
+    """
+    numbers = tuple(modes)
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise ValueError(f"`modes` must be different numbers, at least one, but are {numbers}.")
+    if min(numbers) < 1 or max(numbers) > beam.elements:
+        raise ValueError(
+            f"`modes` must be numbers from 1 to {beam.elements}, which {beam.elements} elements "
+            f"can show, but are {numbers}."
+        )
+    basis = _linear_modes(beam, numbers)
+    if have_values(basis) and not np.all(np.isfinite(basis.frequency)):
+        raise ValueError("the supports leave a mechanism: the beam can move without deforming.")
+    return basis
+
+
+@eqx.filter_jit
+def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
+    free = beam.free
+    places = free[:, None], free
+    whole_mass = mass_matrix(beam)
+    stiffness = tangent_stiffness(beam, jnp.zeros(beam.n_dof))[places]
+    mass = whole_mass[places]
+    k, m = jax.lax.stop_gradient((stiffness, mass))
+    # Of K⁻¹M, whose largest eigenvalues are the lowest modes: they keep all their digits.
+    scale = 1 / jnp.sqrt(jnp.diagonal(k))
+    root = jnp.linalg.cholesky(k * scale[:, None] * scale)
+    half = jax.scipy.linalg.solve_triangular(root, m * scale[:, None] * scale, lower=True)
+    inverse = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
+    values, vectors = jnp.linalg.eigh(0.5 * (inverse + inverse.T))
+    chosen = values.size - np.asarray(numbers)
+    mechanism = values[-1] > values[0] / _MECHANISM**2
+    shapes = scale[:, None] * jax.scipy.linalg.solve_triangular(root.T, vectors[:, chosen])
+    shapes = shapes * _sign(beam, shapes) / jnp.sqrt(values[chosen])
+
+    def differentiable(value: Array, shape: Array) -> tuple[Array, Array]:
+        # One Newton step on K φ = λ M φ, φᵀMφ = 1: nothing but rounding in value, and the whole
+        # of the derivative (Nelson's, with the shape's own direction made regular).
+        weighted = m @ shape
+        regular = k - m / value + jnp.outer(weighted, weighted) / value
+        size = shape @ mass @ shape
+        squared = shape @ stiffness @ shape / size
+        residual = stiffness @ shape - squared * (mass @ shape)
+        return squared, shape - jnp.linalg.solve(regular, residual) - 0.5 * shape * (size - 1)
+
+    squared, shapes = jax.vmap(differentiable, (0, 1), (0, 1))(values[chosen], shapes)
+    whole = jnp.zeros((beam.n_dof, len(numbers))).at[free].set(shapes)
+    squared = jnp.where(mechanism, jnp.nan, squared)
+    return ReductionBasis(
+        frequency=jnp.sqrt(squared),
+        shapes=whole,
+        filter=whole.T @ whole_mass,
+        numbers=numbers,
+        translations=jnp.asarray(np.arange(beam.n_dof) % 3 != 2),
+    )
+
+
+def _sign(beam: Beam, shapes: Float[Array, "free mode"]) -> Float[Array, " mode"]:
+    whole = jnp.zeros((beam.n_dof, shapes.shape[1])).at[beam.free].set(shapes)
+    up = whole[1::3]
+    midspan = jax.lax.stop_gradient(shape_rows(beam, 0.5)[1]) @ whole
+    largest = jnp.max(jnp.abs(up), axis=0)
+    first = jnp.argmax(jnp.abs(up) >= 0.9 * largest, axis=0)
+    at_first = jnp.take_along_axis(up, first[None], axis=0)[0]
+    chosen = jnp.where(jnp.abs(midspan) > _MIDSPAN_NODE * largest, midspan, at_first)
+    return jnp.where(chosen < 0, -1.0, 1.0)
+
+
+def shape_at(beam: Beam, basis: ReductionBasis, fraction: float) -> Float[Array, " mode"]:
+    """Mode shapes across the chord at a fraction of the length, kg^-1/2: a sensor's row."""
+    _check_fraction(fraction)
+    return shape_rows(beam, fraction)[1] @ basis.shapes
+
+
+def participation(
+    beam: Beam, basis: ReductionBasis, at: float | None = None
+) -> Float[Array, " mode"]:
+    """Φᵀb of a force across the chord, per newton in total, kg^-1/2.
+
+    Arguments: `at` is the fraction of the length where the force acts; None: it is spread evenly
+    along the beam.
+    """
+    if at is None:
+        return uniform_load(beam) @ basis.shapes
+    return shape_at(beam, basis, at)
+
+
+def base_participation(beam: Beam, basis: ReductionBasis) -> Float[Array, " mode"]:
+    """ΦᵀM1 of a motion of the ground across the chord, kg^1/2.
+
+    An acceleration a of the ground forces mode r by −Γ_r a, and Γ_r² is its effective mass (kg).
+    """
+    return basis.filter @ jnp.asarray(np.arange(beam.n_dof) % 3 == 1, dtype=jnp.float64)
+
+
+def _check_fraction(fraction: float) -> None:
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"a place must be a fraction of the length, but is {fraction:g}.")

@@ -1,0 +1,180 @@
+"""Strain energy, forces, tangent stiffness and mass of a chain of plane beam elements.
+
+Each element keeps its deformation in a frame that turns with its chord (corotational), where it is
+a shallow arch: cubic deflection w with the end slopes a and b, and *one* membrane strain, the mean
+over the element,
+
+    e = (l − l₀)/s + mean of w'²/2 − mean of w₀'²/2,    mean of w'²/2 = (2a² − ab + 2b²)/30.
+
+With the linear strain of the chord alone an element of a strongly bent beam is too long by θ²/24;
+with w'²/2 point by point, which cubic and linear functions cannot balance, bending stretches
+(membrane locking). The mean does neither. Rotations of the whole are exact, strains are small.
+
+References: M. A. Crisfield, Non-linear Finite Element Analysis of Solids and Structures, vol. 1
+(Wiley 1991), ch. 7 (corotational and shallow-arch elements); shear as in J. S. Przemieniecki,
+Theory of Matrix Structural Analysis (McGraw-Hill 1968), ch. 5; mass as there, ch. 11.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.elements.beam import Beam, section_of
+
+
+def strain_energy(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, ""]:
+    """Energy (J) of elements and support springs, at displacements of all degrees of freedom.
+
+    The displacement of each node in turn: x, y (m), rotation (rad), from the stress-free shape.
+    """
+    rows = displacement[_connectivity(beam.elements)]
+    inside = jax.vmap(_element_energy, (None, 0, 0))(beam, _chords(beam), rows)
+    return jnp.sum(inside) + 0.5 * jnp.sum(_springs(beam) * displacement**2)
+
+
+def internal_force(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, " dof"]:
+    """Derivative of the strain energy: N and N m, in order of the degrees of freedom."""
+    rows = displacement[_connectivity(beam.elements)]
+    forces = jax.vmap(jax.grad(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), rows)
+    return _gathered(forces) + _springs(beam) * displacement
+
+
+def tangent_stiffness(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
+    """Second derivative of the strain energy."""
+    rows = displacement[_connectivity(beam.elements)]
+    blocks = jax.vmap(jax.hessian(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), rows)
+    return _assembled(blocks) + jnp.diag(_springs(beam))
+
+
+def mass_matrix(beam: Beam) -> Float[Array, "dof dof"]:
+    """Consistent mass with rotary inertia of the section, and point masses."""
+    n = beam.elements
+    s, section = beam.arc_length / n, section_of(beam)
+    along = jnp.array([[2.0, 1.0], [1.0, 2.0]]) * section.mass * s / 6
+    across = _CUBIC_MASS * section.mass * s + _CUBIC_SLOPE * section.rotary / s
+    size = jnp.array([1.0, s, 1.0, s])
+    across = across * size[:, None] * size
+    local = jnp.zeros((6, 6))
+    local = local.at[np.ix_([0, 3], [0, 3])].set(along)
+    local = local.at[np.ix_([1, 2, 4, 5], [1, 2, 4, 5])].set(across)
+    turned = _turned(beam)
+    mass = _assembled(jnp.einsum("eki,kl,elj->eij", turned, local, turned))
+    for point in beam.point_masses:
+        rows = shape_rows(beam, point.at)
+        weight = jnp.stack([point.mass, point.mass, point.inertia])
+        mass = mass + jnp.einsum("ki,k,kj->ij", rows, weight, rows)
+    return mass
+
+
+def shape_rows(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
+    """Rows that give x, y (m) and rotation (rad) at a fraction of the length from all freedoms."""
+    n = beam.elements
+    element = min(int(fraction * n), n - 1)
+    t, s = fraction * n - element, beam.arc_length / n
+    rows = jnp.zeros((3, 6))
+    rows = rows.at[0, jnp.array([0, 3])].set(jnp.array([1 - t, t]))
+    cubic = jnp.stack(
+        [
+            jnp.array([1 - 3 * t**2 + 2 * t**3, 3 * t**2 - 2 * t**3]),
+            jnp.array([t - 2 * t**2 + t**3, t**3 - t**2]) * s,
+        ]
+    )
+    slope = jnp.stack(
+        [
+            jnp.array([6 * t**2 - 6 * t, 6 * t - 6 * t**2]) / s,
+            jnp.array([1 - 4 * t + 3 * t**2, 3 * t**2 - 2 * t]),
+        ]
+    )
+    rows = rows.at[1, jnp.array([[1, 4], [2, 5]])].set(cubic)
+    rows = rows.at[2, jnp.array([[1, 4], [2, 5]])].set(slope)
+    turned = _turned(beam)[element]
+    rows = turned[:3, :3].T @ rows @ turned
+    return jnp.zeros((3, beam.n_dof)).at[:, _connectivity(n)[element]].set(rows)
+
+
+def uniform_load(beam: Beam) -> Float[Array, " dof"]:
+    """Consistent nodal forces of one newton across the chord, spread evenly along the beam."""
+    node, weight = np.polynomial.legendre.leggauss(2)  # exact for cubics
+    places = (np.arange(beam.elements)[:, None] + 0.5 * (node + 1)) / beam.elements
+    rows = [shape_rows(beam, float(place))[1] for place in places.ravel()]
+    weights = np.tile(0.5 * weight / beam.elements, beam.elements)
+    return jnp.asarray(weights) @ jnp.stack(rows)
+
+
+_CUBIC_MASS = (
+    np.array(
+        [[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]], dtype=float
+    )
+    / 420
+)
+_CUBIC_SLOPE = (
+    np.array([[36, 3, -36, 3], [3, 4, -3, -1], [-36, -3, 36, -3], [3, -1, -3, 4]], dtype=float) / 30
+)
+
+
+def _connectivity(elements: int) -> np.ndarray:
+    return 3 * np.arange(elements)[:, None] + np.arange(6)
+
+
+def _chords(beam: Beam) -> Float[Array, "element 2"]:
+    return jnp.diff(beam.nodes, axis=0)
+
+
+def _springs(beam: Beam) -> Float[Array, " dof"]:
+    """Stiffness to ground of every degree of freedom."""
+    springs = jnp.zeros(beam.n_dof)
+    for node, end in beam.ends:
+        for k, spring in enumerate(end.springs):
+            if spring is not None:
+                springs = springs.at[3 * node + k].set(spring)
+    return springs
+
+
+def _turned(beam: Beam) -> Float[Array, "element 6 6"]:
+    """Rotation from x and y to along and across each chord, for both ends."""
+    chord = _chords(beam)
+    c, s = (chord / jnp.linalg.norm(chord, axis=1, keepdims=True)).T
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    block = jnp.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+    turned = jnp.zeros((len(c), 6, 6))
+    return turned.at[:, :3, :3].set(block).at[:, 3:, 3:].set(block)
+
+
+def _element_energy(
+    beam: Beam, chord: Float[Array, " 2"], u: Float[Array, " 6"]
+) -> Float[Array, ""]:
+    section, s = section_of(beam), beam.arc_length / beam.elements
+    initial = beam.half_angle / beam.elements  # end slopes of the stress-free arc: +, −
+    moved = u[3:5] - u[:2]
+    squared = jnp.sum(chord**2)
+    ahead = jnp.sum(chord * moved)
+    aside = chord[0] * moved[1] - chord[1] * moved[0]
+    # Differences are formed before squares and roots: small motions keep all their digits.
+    before = jnp.sqrt(squared)
+    now = jnp.sqrt(jnp.sum((chord + moved) ** 2))
+    longer = (2 * ahead + jnp.sum(moved**2)) / (now + before)
+    # The chord against the mean rotation of the ends, an angle below a half turn however far the
+    # beam has turned.
+    turn, difference = 0.5 * (u[2] + u[5]), 0.5 * (u[2] - u[5])
+    c, d = jnp.cos(turn), jnp.sin(turn)
+    chord_turn = jnp.arctan2(c * aside - d * (squared + ahead), c * (squared + ahead) + d * aside)
+    a, b = difference - chord_turn, -difference - chord_turn
+    mean = 2 * a * (a + 2 * initial) + 2 * b * (b - 2 * initial) - (a * b + initial * (b - a))
+    strain = longer / s + mean / 30
+    phi = 0.0 if section.shear is None else 12 * section.bending / (section.shear * s**2)
+    # Bending by opposite end slopes (constant curvature) and by equal ones (shear force).
+    bent = (a - b) ** 2 + 3 * (a + b) ** 2 / (1 + phi)
+    return 0.5 * section.axial * s * strain**2 + 0.5 * section.bending / s * bent
+
+
+def _gathered(rows: Float[Array, "element 6"]) -> Float[Array, " dof"]:
+    elements = len(rows)
+    return jnp.zeros(3 * (elements + 1)).at[_connectivity(elements)].add(rows)
+
+
+def _assembled(blocks: Float[Array, "element 6 6"]) -> Float[Array, "dof dof"]:
+    elements = len(blocks)
+    dof = _connectivity(elements)
+    size = 3 * (elements + 1)
+    return jnp.zeros((size, size)).at[dof[:, :, None], dof[:, None, :]].add(blocks)
