@@ -69,24 +69,32 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     free = beam.free
     fixed_beam = jax.lax.stop_gradient(beam)
     loads = load[:, free]
-    found = mapped(lambda one: _followed(fixed_beam, one), jax.lax.stop_gradient(loads))
+    start, stiffness, status, fraction = mapped(
+        lambda one: _followed(fixed_beam, one), jax.lax.stop_gradient(loads)
+    )
 
-    def polished(u: Array, one: Array, status: Array) -> tuple[Array, Array]:
+    def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
         # One more Newton step: nothing but rounding in value, the whole of the derivative.
-        stiffness = jax.lax.stop_gradient(_tangent(fixed_beam, u))
-        u = u - jnp.linalg.solve(stiffness, _force(beam, u) - one)
-        u = jnp.where(status == StaticStatus.CONVERGED, u, jnp.nan)
-        whole = jnp.zeros(beam.n_dof).at[free].set(u)
+        u = u - jnp.linalg.solve(k, _force(beam, u) - one)
+        whole = jnp.zeros(beam.n_dof).at[free].set(jnp.where(good, u, jnp.nan))
         return whole, strain_energy(beam, whole)
 
-    displacement, energy = mapped(lambda row: polished(*row), (found.u, loads, found.status))
-    return StaticSolutions(displacement, energy, found.status, found.fraction)
+    rows = start, stiffness, loads, status == StaticStatus.CONVERGED
+    displacement, energy = mapped(polished, *rows)
+    return StaticSolutions(displacement, energy, status, fraction)
 
 
-class _Followed(NamedTuple):
-    u: Array
-    status: Array
-    fraction: Array
+class _Path(NamedTuple):
+    """Where the search for a solution is; the path is known up to `reached` of the load."""
+
+    u: Array  # the iterate
+    accepted: Array  # displacement at `reached`
+    stiffness: Array  # there
+    at_rest: Array  # stiffness without load
+    predicted: Array  # work of the load by the tangent, in this step
+    reached: Array
+    size: Array  # of this step, in loads
+    count: Array  # iterations in it
 
 
 def _force(beam: Beam, u: Array) -> Array:
@@ -99,57 +107,51 @@ def _tangent(beam: Beam, u: Array) -> Array:
     return whole[free[:, None], free]
 
 
-def _newton(beam: Beam, start: Array, load: Array) -> tuple[Array, Array]:
-    """The equilibrium near `start`, and whether it converged."""
+def _followed(beam: Beam, load: Array) -> tuple[Array, Array, Array, Array]:
+    """Displacement, stiffness, status and load fraction at the end of the stable path from rest.
 
-    def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        u, _, count = carry
-        residual = load - _force(beam, u)
-        change = jnp.linalg.solve(_tangent(beam, u), residual)
-        new = u + change
-        work = jnp.abs(change @ residual)
-        return new, work <= _TOLERANCE * jnp.abs(load @ new), count + 1
+    One loop for load steps and iterations in them, so that the tangent is compiled once.
+    """
 
-    def going(carry: tuple[Array, Array, Array]) -> Array:
-        u, done, count = carry
-        return ~done & (count < _ITERATIONS) & jnp.all(jnp.isfinite(u))
-
-    u, done, _ = jax.lax.while_loop(going, step, (start, jnp.array(False), jnp.array(0)))
-    return u, done
-
-
-def _followed(beam: Beam, load: Array) -> _Followed:
-    """The path from rest by load steps, as far as it is stable."""
-    at_rest = _tangent(beam, jnp.zeros_like(load))
-
-    def step(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        u, fraction, size = carry
-        target = jnp.minimum(fraction + size, 1.0)
-        predicted = jnp.linalg.solve(_tangent(beam, u), (target - fraction) * load)
-        new, good = _newton(beam, u, target * load)
-        stable = jnp.all(jnp.isfinite(jnp.linalg.cholesky(_tangent(beam, new))))
-        work = jnp.abs(load @ (new - u))
-        good &= stable & (work <= _JUMP * jnp.abs(load @ predicted))
-        return (
-            jnp.where(good, new, u),
-            jnp.where(good, target, fraction),
-            jnp.where(good, 2 * size, 0.5 * size),
+    def step(path: _Path) -> _Path:
+        target = jnp.minimum(path.reached + path.size, 1.0)
+        residual = target * load - _force(beam, path.u)
+        stiffness = _tangent(beam, path.u)
+        change = jnp.linalg.solve(stiffness, residual)
+        u, first = path.u + change, path.count == 0
+        predicted = jnp.where(first, jnp.abs(load @ change), path.predicted)
+        settled = jnp.abs(change @ residual) <= _TOLERANCE * jnp.abs(load @ u)
+        done = ~first & settled
+        stable = jnp.all(jnp.isfinite(jnp.linalg.cholesky(stiffness)))
+        near = jnp.abs(load @ (u - path.accepted)) <= _JUMP * predicted
+        good = done & stable & near
+        failed = ~good & (done | (path.count >= _ITERATIONS) | ~jnp.all(jnp.isfinite(u)))
+        return _Path(
+            u=jnp.where(failed, path.accepted, u),
+            accepted=jnp.where(good, u, path.accepted),
+            stiffness=jnp.where(good, stiffness, path.stiffness),
+            at_rest=jnp.where(first & (path.reached == 0), stiffness, path.at_rest),
+            predicted=predicted,
+            reached=jnp.where(good, target, path.reached),
+            size=path.size * jnp.where(good, 2.0, jnp.where(failed, 0.5, 1.0)),
+            count=jnp.where(good | failed, 0, path.count + 1),
         )
 
-    def going(carry: tuple[Array, Array, Array]) -> Array:
-        _, fraction, size = carry
-        return (fraction < 1) & (size >= _SMALLEST_STEP)
+    zero, flat = jnp.zeros_like(load), jnp.eye(load.size)
+    start = _Path(zero, zero, flat, flat, jnp.array(0.0), jnp.array(0.0), jnp.array(1.0), 0)
+    end = jax.lax.while_loop(
+        lambda path: (path.reached < 1) & (path.size >= _SMALLEST_STEP), step, start
+    )
+    complete = end.reached >= 1
+    failed = jax.lax.cond(complete, lambda _: jnp.array(0), _failure, end)
+    return end.accepted, end.stiffness, failed, end.reached
 
-    start = jnp.zeros_like(load), jnp.array(0.0), jnp.array(1.0)
-    u, fraction, _ = jax.lax.while_loop(going, step, start)
-    # Softest direction now against rest: zero at a limit point or a bifurcation.
-    root = jnp.linalg.cholesky(at_rest)
-    half = jax.scipy.linalg.solve_triangular(root, _tangent(beam, u), lower=True)
+
+def _failure(end: _Path) -> Array:
+    """SNAPPED_THROUGH where a direction has lost its stiffness, else DIVERGED."""
+    root = jnp.linalg.cholesky(end.at_rest)
+    half = jax.scipy.linalg.solve_triangular(root, end.stiffness, lower=True)
     whole = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
-    softest = jax.lax.cond(
-        fraction < 1, lambda one: jnp.linalg.eigvalsh(one)[0], lambda _: jnp.array(1.0), whole
-    )
-    failed = jnp.where(
-        softest < _LIMIT_STIFFNESS, StaticStatus.SNAPPED_THROUGH, StaticStatus.DIVERGED
-    )
-    return _Followed(u, jnp.where(fraction >= 1, StaticStatus.CONVERGED, failed), fraction)
+    softest = jnp.linalg.eigvalsh(whole)[0]
+    limit = (end.reached > 0) & (softest < _LIMIT_STIFFNESS)
+    return jnp.where(limit, int(StaticStatus.SNAPPED_THROUGH), int(StaticStatus.DIVERGED))

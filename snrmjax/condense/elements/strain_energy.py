@@ -28,23 +28,22 @@ def strain_energy(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array
 
     The displacement of each node in turn: x, y (m), rotation (rad), from the stress-free shape.
     """
-    rows = displacement[_connectivity(beam.elements)]
-    inside = jax.vmap(_element_energy, (None, 0, 0))(beam, _chords(beam), rows)
+    inside = jax.vmap(_element_energy, (None, 0, 0))(beam, _chords(beam), _relative(displacement))
     return jnp.sum(inside) + 0.5 * jnp.sum(_springs(beam) * displacement**2)
 
 
 def internal_force(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, " dof"]:
     """Derivative of the strain energy: N and N m, in order of the degrees of freedom."""
-    rows = displacement[_connectivity(beam.elements)]
-    forces = jax.vmap(jax.grad(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), rows)
-    return _gathered(forces) + _springs(beam) * displacement
+    moved = _relative(displacement)
+    forces = jax.vmap(jax.grad(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), moved)
+    return _gathered(forces @ _RELATIVE) + _springs(beam) * displacement
 
 
 def tangent_stiffness(beam: Beam, displacement: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
     """Second derivative of the strain energy."""
-    rows = displacement[_connectivity(beam.elements)]
-    blocks = jax.vmap(jax.hessian(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), rows)
-    return _assembled(blocks) + jnp.diag(_springs(beam))
+    moved = _relative(displacement)
+    blocks = jax.vmap(jax.hessian(_element_energy, 2), (None, 0, 0))(beam, _chords(beam), moved)
+    return _assembled(_RELATIVE.T @ blocks @ _RELATIVE) + jnp.diag(_springs(beam))
 
 
 def mass_matrix(beam: Beam) -> Float[Array, "dof dof"]:
@@ -102,6 +101,15 @@ def uniform_load(beam: Beam) -> Float[Array, " dof"]:
     return jnp.asarray(weights) @ jnp.stack(rows)
 
 
+# What deforms an element: difference of displacements, mean and half difference of rotations.
+_RELATIVE = np.array(
+    [
+        [-1.0, 0, 0, 1, 0, 0],
+        [0, -1, 0, 0, 1, 0],
+        [0, 0, 0.5, 0, 0, 0.5],
+        [0, 0, 0.5, 0, 0, -0.5],
+    ]
+)
 _CUBIC_MASS = (
     np.array(
         [[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]], dtype=float
@@ -141,12 +149,16 @@ def _turned(beam: Beam) -> Float[Array, "element 6 6"]:
     return turned.at[:, :3, :3].set(block).at[:, 3:, 3:].set(block)
 
 
+def _relative(displacement: Float[Array, " dof"]) -> Float[Array, "element 4"]:
+    return displacement[_connectivity(displacement.size // 3 - 1)] @ _RELATIVE.T
+
+
 def _element_energy(
-    beam: Beam, chord: Float[Array, " 2"], u: Float[Array, " 6"]
+    beam: Beam, chord: Float[Array, " 2"], relative: Float[Array, " 4"]
 ) -> Float[Array, ""]:
     section, s = section_of(beam), beam.arc_length / beam.elements
     initial = beam.half_angle / beam.elements  # end slopes of the stress-free arc: +, −
-    moved = u[3:5] - u[:2]
+    moved = relative[:2]
     squared = jnp.sum(chord**2)
     ahead = jnp.sum(chord * moved)
     aside = chord[0] * moved[1] - chord[1] * moved[0]
@@ -156,7 +168,7 @@ def _element_energy(
     longer = (2 * ahead + jnp.sum(moved**2)) / (now + before)
     # The chord against the mean rotation of the ends, an angle below a half turn however far the
     # beam has turned.
-    turn, difference = 0.5 * (u[2] + u[5]), 0.5 * (u[2] - u[5])
+    turn, difference = relative[2], relative[3]
     c, d = jnp.cos(turn), jnp.sin(turn)
     chord_turn = jnp.arctan2(c * aside - d * (squared + ahead), c * (squared + ahead) + d * aside)
     a, b = difference - chord_turn, -difference - chord_turn

@@ -1,0 +1,77 @@
+"""Load cases of the built-in beams, condensed, against closed forms and an independent model."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.condense.elements.beam import Beam, rise_of_radius
+from snrmjax.condense.elements.beam_cases import static_cases
+from snrmjax.condense.elements.beam_modes import beam_modes
+from snrmjax.condense.load_set import modal_loads
+from snrmjax.condense.potential_fit import fit_potential
+from snrmjax.model.arches import ArchSettings, shallow_arch
+
+_FLAT = {"young": 204.8e9, "density": 7870.0}
+
+
+def _condensed(beam, modes, displacement):
+    basis = beam_modes(beam, modes)
+    cases = static_cases(beam, basis, modal_loads(basis, displacement).force)
+    return basis, cases, fit_potential(basis, cases)
+
+
+def test_flat_beam_has_the_cubic_coefficient_of_von_karman():
+    # One clamped-clamped mode φ: V = EA/8L (∫φ'²)² q⁴, and ∫φ'² of the mass-normalised function is
+    # 12.3026/(m L²) (Blevins, Formulas for Natural Frequency and Mode Shape, 1979, tab. 8-1).
+    length, width, thickness = 0.2286, 0.0127, 0.787e-3
+    mass = 7870.0 * width * thickness
+    exact = 204.8e9 * width * thickness / (2 * length) * (12.3026 / (mass * length**2)) ** 2
+    beam = Beam(length, width, thickness, **_FLAT)
+    basis, cases, found = _condensed(beam, (1,), 0.1 * thickness)
+    by_monomial = dict(zip(found.monomials, found.coefficient, strict=True))
+    # Small loads: the other modes' bending follows with the third power, and adds −0.5 %.
+    assert abs(4 * by_monomial[(0, 0, 0, 0)] / exact - 1) < 2e-2
+    # The strain energy is that of the potential: an independent output of the elements.
+    q = np.asarray(cases.modal_displacement)
+    energy = 0.5 * (q**2 * basis.frequency**2).sum(axis=1) + found.energy(jnp.asarray(q))
+    np.testing.assert_allclose(energy, cases.energy, rtol=1e-6)
+
+
+def test_curved_beam_softens_then_hardens_as_galerkins_arch():
+    length, width, thickness = 0.3048, 0.0127, 0.508e-3
+    rise = rise_of_radius(length, 11.43)
+    beam = Beam(length, width, thickness, rise=rise, young=204e9, density=7860.0)
+    basis, _, found = _condensed(beam, (1,), 0.02 * thickness)
+    quadratic, cubic = found.coefficient[:2] * np.array([3.0, 4.0])
+    assert quadratic < 0 < cubic
+    settings = ArchSettings(beam_functions=(1, 3, 5, 7, 9))
+    arch = shallow_arch(
+        *(length, width, thickness, rise),
+        young=204e9,
+        density=7860.0,
+        damping_ratio=0.01,
+        settings=settings,
+    )
+    np.testing.assert_allclose(basis.frequency[0], arch.modes.natural_frequency[0], rtol=1e-3)
+    first = dict(zip(arch.potential.monomials, arch.potential.coefficient, strict=True))
+    np.testing.assert_allclose(quadratic, 3 * first[(0, 0, 0)], rtol=1e-2)
+
+
+def test_coefficients_have_right_derivatives_by_the_geometry():
+    def told(numbers):
+        thickness, rise, young = numbers
+        beam = Beam(*(0.3, 0.0127, thickness), rise=rise, young=young, density=7800.0, elements=8)
+        basis = beam_modes(beam, (1, 3))
+        force = jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+        cases = static_cases(beam, basis, force * jnp.array([4.0, 60.0]))
+        return fit_potential(basis, cases).coefficient
+
+    at = jnp.array([0.6e-3, 0.9e-3, 2e11])
+    exact = jax.jacrev(told)(at)
+    for k in range(3):
+        step = 2e-3 * at[k]
+        values = [told(at.at[k].add(n * step)) for n in (-2, -1, 1, 2)]
+        slope = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
+        np.testing.assert_allclose(
+            slope, exact[:, k], rtol=1e-6, atol=1e-7 * abs(exact[:, k]).max()
+        )
