@@ -76,7 +76,7 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
         # One more Newton step: nothing but rounding in value, the whole of the derivative.
         u = u - jnp.linalg.solve(k, _force(beam, u) - one)
-        whole = jnp.zeros(beam.n_dof).at[free].set(jnp.where(good, u, jnp.nan))
+        whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 
     rows = start, stiffness, loads, status == StaticStatus.CONVERGED
