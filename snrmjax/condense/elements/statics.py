@@ -94,7 +94,7 @@ class _Path(NamedTuple):
     predicted: Array  # work of the load by the tangent, in this step
     reached: Array
     size: Array  # of this step, in loads
-    count: Array  # iterations in it
+    iterations: Array  # in it
 
 
 def _force(beam: Beam, u: Array) -> Array:
@@ -118,14 +118,14 @@ def _followed(beam: Beam, load: Array) -> tuple[Array, Array, Array, Array]:
         residual = target * load - _force(beam, path.u)
         stiffness = _tangent(beam, path.u)
         change = jnp.linalg.solve(stiffness, residual)
-        u, first = path.u + change, path.count == 0
+        u, first = path.u + change, path.iterations == 0
         predicted = jnp.where(first, jnp.abs(load @ change), path.predicted)
         settled = jnp.abs(change @ residual) <= _TOLERANCE * jnp.abs(load @ u)
         done = ~first & settled
         stable = jnp.all(jnp.isfinite(jnp.linalg.cholesky(stiffness)))
         near = jnp.abs(load @ (u - path.accepted)) <= _JUMP * predicted
         good = done & stable & near
-        failed = ~good & (done | (path.count >= _ITERATIONS) | ~jnp.all(jnp.isfinite(u)))
+        failed = ~good & (done | (path.iterations >= _ITERATIONS) | ~jnp.all(jnp.isfinite(u)))
         return _Path(
             u=jnp.where(failed, path.accepted, u),
             accepted=jnp.where(good, u, path.accepted),
@@ -134,11 +134,13 @@ def _followed(beam: Beam, load: Array) -> tuple[Array, Array, Array, Array]:
             predicted=predicted,
             reached=jnp.where(good, target, path.reached),
             size=path.size * jnp.where(good, 2.0, jnp.where(failed, 0.5, 1.0)),
-            count=jnp.where(good | failed, 0, path.count + 1),
+            iterations=jnp.where(good | failed, 0, path.iterations + 1),
         )
 
     zero, flat = jnp.zeros_like(load), jnp.eye(load.size)
-    start = _Path(zero, zero, flat, flat, jnp.array(0.0), jnp.array(0.0), jnp.array(1.0), 0)
+    start = _Path(
+        zero, zero, flat, flat, jnp.array(0.0), jnp.array(0.0), jnp.array(1.0), jnp.array(0)
+    )
     end = jax.lax.while_loop(
         lambda path: (path.reached < 1) & (path.size >= _SMALLEST_STEP), step, start
     )
