@@ -15,6 +15,7 @@ LONG = (
     "04_the_missing_effect",
     "05_the_papers_open_ends",
     "06_uncertain_curved_beam",
+    "07_models_from_finite_elements",
 )  # a minute and more
 PATHS = [
     pytest.param(path, marks=[pytest.mark.long] if path.stem in LONG else [], id=path.stem)

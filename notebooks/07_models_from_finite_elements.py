@@ -1,0 +1,267 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     name: python3
+# ---
+
+# %% [markdown]
+# # The paper's two beams, made anew from finite elements
+#
+# Kwarta and Allen test their method on reduced models of two clamped beams: a flat one with four
+# modes (Tabs. 1, 2 and A.1) and a curved one with one mode (Tabs. 3 and 4). Both were condensed
+# from finite elements, and what is printed of them is a table of polynomial coefficients. Are these
+# the coefficients of the beams whose dimensions are printed beside them?
+#
+# 1. The flat beam: linear modes, static load cases, one potential fitted to them.
+# 2. Every printed coefficient against the new one.
+# 3. The curved beam: coefficients at small loads, and the path to its limit point.
+# 4. The same by CalculiX, where it is installed.
+#
+# Implicit condensation loads the nonlinear finite elements with combinations of mode shapes, F =
+# M Φ f, reads the modal displacements q and fits ω²q + ∂V/∂q = f by one potential V. Conventions:
+# mass-normalised shapes, q in kg^1/2 m; the force's coefficients of mode 1 are α of q² and β of q³.
+
+# %%
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+import snrmjax as sj
+from snrmjax import condense as fe
+from snrmjax import plot
+from snrmjax.plot import style as drawing
+
+HERTZ = 2 * np.pi
+FIGURES = Path(sys.argv[1]) if len(sys.argv) > 1 and sys.argv[0].endswith(".py") else None
+BLUE, ORANGE, GREEN = drawing.MEASURED, drawing.IDENTIFIED, drawing.SERIES[2]
+headline = {}
+
+
+def show(figure, name):
+    """Return the figure to the notebook; as a script, write it into the folder given."""
+    if FIGURES is not None:
+        FIGURES.mkdir(parents=True, exist_ok=True)
+        plot.save_figure(FIGURES / f"{name}.png", figure, dots_per_inch=150)
+    return figure
+
+
+# %% [markdown]
+# ## 1. The flat beam
+#
+# Forty elements, as the paper has. The frequencies come out within 0.6 % of the print, which were
+# computed with another beam element.
+
+# %%
+flat = fe.Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0, elements=40)
+basis = fe.beam_modes(flat, (1, 3, 5, 7))
+printed = sj.model.flat_beam()
+frequency = np.asarray(basis.frequency)
+for new, old in zip(frequency, np.asarray(printed.modes.natural_frequency), strict=True):
+    print(f"{new / HERTZ:8.2f} Hz, printed {old / HERTZ:8.2f} Hz, ratio {new / old:.4f}")
+worst = np.max(np.abs(frequency / np.asarray(printed.modes.natural_frequency) - 1))
+headline["linear frequencies are the printed ones within 0.7 %"] = bool(worst < 7e-3)
+
+# %% [markdown]
+# Load cases of single modes, pairs and triples with all signs, each moving the beam by a quarter of
+# its thickness. One potential serves all four equations, so that its coefficients cannot contradict
+# one another.
+
+# %%
+loads = fe.modal_loads(basis, 0.25 * 0.787e-3)
+condensed = fe.condense(basis, fe.static_cases(flat, basis, loads.force))
+print(condensed)
+
+# %% [markdown]
+# ## 2. Every printed coefficient
+#
+# The sign of a mode is arbitrary: it is turned to that of the printed midspan shape. The flat beam
+# is symmetric, so that its quadratic coefficients are zero; those printed are small leftovers of a
+# fit. All quartic coefficients of the potential:
+
+# %%
+turn = np.sign(np.asarray(fe.shape_at(flat, basis, 0.5)))
+turn *= np.sign(np.asarray(printed.modes.mode_shape)[0])
+new = dict(zip(condensed.potential.monomials, condensed.potential.coefficient, strict=True))
+quartic = [m for m in printed.potential.monomials if len(m) == 4]
+old_values = np.array(
+    [
+        float(c)
+        for m, c in zip(printed.potential.monomials, printed.potential.coefficient, strict=True)
+        if len(m) == 4
+    ]
+)
+new_values = np.array([float(new[m]) * np.prod(turn[list(m)]) for m in quartic])
+ratio = new_values / old_values
+for m, a, b in zip(quartic, old_values, new_values, strict=True):
+    print("".join(str(k + 1) for k in m), f"{a:11.4g} printed, {b:11.4g} here, ratio {b / a:6.2f}")
+print(f"median ratio {np.median(ratio):.3f}")
+
+# %%
+figure, panels = drawing.panels(drawing.COLUMN, 3.2, 1, 1)
+axes = panels[0, 0]
+axes.loglog(np.abs(old_values), np.abs(new_values), "o", ms=3.5, color=BLUE, label="coefficients")
+ends = np.array([2e12, 1e16])
+axes.loglog(ends, ends, ":", color="0.4", label="as printed")
+axes.loglog(ends, 3 * ends, "-", color=ORANGE, label="three times the print")
+drawing.name_axes(axes, "", "Printed (kg⁻² m⁻² s⁻²)", "Finite elements (kg⁻² m⁻² s⁻²)")
+drawing.legend(figure)
+show(figure, "flat_beam_coefficients")
+
+# %% [markdown]
+# They lie on one line, three times the print, but for one (1134, small, of the wrong sign). So the
+# table holds the right polynomial of this beam with its cubic forces divided by about three. The
+# closed form of the first mode alone (von Kármán, β = E·12.3026² / (2 ρ² A L⁵)) says the same.
+
+# %%
+closed = 204.8e9 * 12.3026**2 / (2 * 7870.0**2 * 0.0127 * 0.787e-3 * 0.2286**5)
+first = 4 * float(new[0, 0, 0, 0])
+printed_first = 4 * old_values[quartic.index((0, 0, 0, 0))]
+print(f"β: closed form {closed:.4g}, finite elements {first:.4g}, printed {printed_first:.4g}")
+headline["β of mode 1 is the closed form's within 1 %"] = bool(abs(first / closed - 1) < 0.01)
+headline["and 2.8 to 3.0 times the print"] = bool(2.8 < first / printed_first < 3.0)
+headline["half of all 35 ratios lie between 2.7 and 3.1"] = bool(
+    np.mean((ratio > 2.7) & (ratio < 3.1)) > 0.5
+)
+
+# %% [markdown]
+# For section 3.1 this is a change of scale: dividing every cubic term by three multiplies all
+# amplitudes by √3 at the same frequency. What the paper shows of its method does not depend on it.
+#
+# ## 3. The curved beam
+#
+# A rise of twice the thickness. At loads that move it by a twentieth of its thickness:
+
+# %%
+THICKNESS = 0.508e-3
+rise = fe.rise_of_radius(0.3048, 11.43)
+curved = fe.Beam(0.3048, 0.0127, THICKNESS, rise=rise, young=204e9, density=7860.0, elements=40)
+arch = fe.beam_modes(curved, (1,))
+small = fe.modal_loads(arch, 0.05 * THICKNESS)
+arch_model = fe.condense(arch, fe.static_cases(curved, arch, small.force))
+alpha, beta = np.asarray(arch_model.potential.coefficient) * np.array([3.0, 4.0])
+ALPHA, BETA = -3.4380e9, 6.2183e12  # Tab. 4; the positive direction there is inwards
+hertz = float(arch.frequency[0]) / HERTZ
+print(f"{hertz:.2f} Hz, printed 64.78 Hz")
+print(f"|α| over the print {alpha / abs(ALPHA):.3f}, β over the print {beta / BETA:.3f}")
+headline["curved beam: frequency within 0.5 % of the print"] = abs(hertz / 64.78 - 1) < 5e-3
+headline["curved beam: α within 3 % of the print"] = bool(abs(alpha / abs(ALPHA) - 1) < 0.03)
+headline["curved beam: β is about twice the print"] = bool(1.9 < beta / BETA < 2.1)
+
+# %% [markdown]
+# Frequency and quadratic coefficient are those of the print; the cubic one is twice, not three
+# times. What does that mean for the text, which says that the beam softens and then stiffens? The
+# finite elements are loaded along mode 1, inwards and outwards, as far as they go.
+
+# %%
+squared = float(arch.frequency[0]) ** 2
+one = THICKNESS / float(arch.largest[0])  # q at one thickness
+levels = np.array([-0.37, -0.35, -0.32, -0.28, -0.2, -0.1, 0.1, 0.3, 0.6, 1.0, 1.6])
+modal = jnp.asarray(levels[:, None] * squared * one)
+path = fe.static_cases(curved, arch, modal)
+beyond = fe.static_cases(curved, arch, jnp.asarray([[-0.4 * squared * one]]))
+moved = -np.asarray(path.modal_displacement)[:, 0] / one  # inwards positive
+print("inward load of 0.4 reached on the path from rest:", bool(beyond.converged[0]))
+
+q = np.linspace(-1.2, 4.0, 300)
+readings = {
+    "Tab. 4 as printed": (ALPHA, BETA, GREEN, ":"),
+    "its cubic term times 3": (ALPHA, 3 * BETA, ORANGE, "--"),
+    "condensed at small loads": (-abs(alpha), beta, BLUE, "-"),
+}
+figure, panels = drawing.panels(drawing.COLUMN, 3.4, 1, 1)
+axes = panels[0, 0]
+for name, (a, b, colour, line) in readings.items():
+    f = q + a * one / squared * q**2 + b * one**2 / squared * q**3
+    axes.plot(q, f, line, color=colour, linewidth=drawing.LINE, label=name)
+axes.plot(moved, -levels, "o", ms=4, color="black", label="finite elements")
+axes.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
+axes.set(ylim=(-1.8, 1.2))
+drawing.name_axes(axes, "", "Inward displacement (thicknesses)", "Load f/ω² (thicknesses)")
+drawing.legend(figure)
+show(figure, "curved_beam_readings")
+
+# %% [markdown]
+# The finite elements lose their stability at an inward load of about 0.38 and jump. All three
+# polynomials turn there, too. They differ in whether the force comes back through zero, that is
+# whether the unloaded beam can rest in a second shape: a cubic force has a second equilibrium where
+# α² > 4 β ω².
+
+# %%
+second = {name: a**2 / (4 * b * squared) for name, (a, b, *_) in readings.items()}
+for name, size in second.items():
+    print(f"{name}: α²/(4βω²) = {size:.3f}")
+headline["as printed the curved beam is bistable"] = second["Tab. 4 as printed"] > 1
+headline["with three times the cubic term it is not"] = second["its cubic term times 3"] < 1
+headline["the finite elements lose stability below an inward load of 0.4"] = not bool(
+    beyond.converged[0]
+)
+
+# %% [markdown]
+# The cubic polynomial that is right at small loads is bistable as well, while the beam itself is
+# not. CalculiX's shells jump at the limit point (`benchmarks/paper_models.py`): loads of 0.6 and 0.8
+# rest at 3.39 and 3.69 thicknesses, and a force of degree nine through all its points has a valley
+# of 0.23 near two thicknesses, above zero. Three times the printed cubic term gives 0.63 at 3.39
+# thicknesses, the other two curves are far below zero. So it is the reading that is right over the
+# whole path, softening, then stiffening and at rest in one place, as section 3.2 says; it is not the
+# expansion of the force at small displacements. One mode with a cubic force cannot be both.
+#
+# ## 4. The same by CalculiX
+#
+# A deck of the flat beam with CalculiX's own beam elements, which are solids inside. Poisson's
+# ratio is zero, since our beams are free to narrow across their width.
+
+# %%
+COUNT = 40
+nodes = "\n".join(f"{i + 1}, {0.2286 * i / (2 * COUNT):.10g}, 0., 0." for i in range(2 * COUNT + 1))
+elements = "\n".join(f"{e + 1}, {2 * e + 1}, {2 * e + 2}, {2 * e + 3}" for e in range(COUNT))
+DECK = f"""*NODE
+{nodes}
+*ELEMENT, TYPE=B32R, ELSET=BEAM
+{elements}
+*MATERIAL, NAME=STEEL
+*ELASTIC
+204.8e9, 0.
+*DENSITY
+7870.
+*BEAM SECTION, ELSET=BEAM, MATERIAL=STEEL, SECTION=RECT
+0.000787, 0.0127
+0., 0., 1.
+*BOUNDARY
+1, 1, 6
+{2 * COUNT + 1}, 1, 6
+"""
+if shutil.which("ccx") is None:
+    print("CalculiX is not installed here; its numbers stand in the next paragraph.")
+else:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "flat.inp").write_text(DECK, encoding="utf-8")
+        deck = sj.io.calculix.read_deck(Path(folder) / "flat.inp")
+        modes = sj.io.calculix.modes_of_deck(deck, (1,), folder)
+        single = fe.modal_loads(modes.basis, 0.25 * 0.787e-3)
+        run = sj.io.calculix.run_static_cases(modes, single.force, folder)
+        by_calculix = fe.condense(modes.basis, run.cases, expand=False)
+    there = 4 * float(by_calculix.potential.coefficient[1])
+    print(f"{modes.basis.frequency[0] / HERTZ:.2f} Hz, β {there:.4g}, {there / first:.4f} of ours")
+    print(f"{np.sum(run.seconds):.1f} s for {len(run.status)} load cases")
+    headline["CalculiX has the same β within 1 %"] = bool(abs(there / first - 1) < 0.01)
+
+# %% [markdown]
+# All modes of both beams by beams and shells of CalculiX, beside every printed coefficient, come
+# from `python benchmarks/paper_models.py --table table.md`. Over the print, median of the flat
+# beam's cubic coefficients of one or two modes: 2.93 by beams without Poisson's effect, 3.00 with
+# it, 2.99 by shells. Curved beam by 400 shell elements, the paper's own mesh: α 0.986, β 2.03.
+#
+# ## The headline, checked
+
+# %%
+for text, held in headline.items():
+    print("yes" if held else "NO ", "", text)
