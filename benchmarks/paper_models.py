@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.condense import Beam as FiniteElements
 from snrmjax.condense import (
     ReductionBasis,
     StaticCases,
@@ -33,7 +34,6 @@ from snrmjax.condense import (
     shape_at,
     static_cases,
 )
-from snrmjax.condense import Beam as FiniteElements
 from snrmjax.io import calculix
 from snrmjax.model.beams import curved_beam, flat_beam
 from snrmjax.model.potential import monomial_key
@@ -132,7 +132,12 @@ def strip_deck(beam: PaperBeam, kind: str, along: int, across: int, poisson: flo
 
 
 def by_calculix(
-    beam: PaperBeam, kind: str, mesh: tuple[int, int], poisson: float, scale: float | None, folder: Path
+    beam: PaperBeam,
+    kind: str,
+    mesh: tuple[int, int],
+    poisson: float,
+    scale: float | None,
+    folder: Path,
 ) -> Condensed:
     """Condense a beam from CalculiX's elements."""
     begin = time.perf_counter()

@@ -207,12 +207,13 @@ headline["the finite elements lose stability below an inward load of 0.4"] = not
 
 # %% [markdown]
 # The cubic polynomial that is right at small loads is bistable as well, while the beam itself is
-# not. CalculiX's shells jump at the limit point (`benchmarks/paper_models.py`): loads of 0.6 and 0.8
-# rest at 3.39 and 3.69 thicknesses, and a force of degree nine through all its points has a valley
-# of 0.23 near two thicknesses, above zero. Three times the printed cubic term gives 0.63 at 3.39
-# thicknesses, the other two curves are far below zero. So it is the reading that is right over the
-# whole path, softening, then stiffening and at rest in one place, as section 3.2 says; it is not the
-# expansion of the force at small displacements. One mode with a cubic force cannot be both.
+# not. CalculiX's shells jump at the limit point (`benchmarks/paper_models.py`): loads of 0.6 and
+# 0.8 rest at 3.39 and 3.69 thicknesses, and a force of degree nine through all its points has a
+# valley of 0.23 near two thicknesses, above zero. Three times the printed cubic term gives 0.63 at
+# 3.39 and 1.07 at 3.69 thicknesses, where the other two curves are far below zero. So it is the
+# reading nearest to the beam over the whole path: softening, then stiffening and at rest in one
+# place, as section 3.2 says. It is not the expansion of the force at small displacements; one mode
+# with a cubic force cannot be both.
 #
 # ## 4. The same by CalculiX
 #
