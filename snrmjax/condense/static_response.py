@@ -9,6 +9,7 @@ from snrmjax.model.potential import PolynomialPotential
 
 _STEPS, _ITERATIONS = 40, 6
 _TOLERANCE = 1e-9  # of the force
+_JUMP = 2.0
 
 
 @eqx.filter_jit
@@ -33,14 +34,22 @@ def static_displacement(
     def balance(q: Array, f: Array) -> Array:
         return squared * q + potential.force(q) - f
 
+    def slope(q: Array) -> Array:
+        return jnp.diag(squared) + potential.stiffness(q)
+
     def at_rest(full: Array) -> Array:
         def step(carry: tuple[Array, Array], fraction: Array) -> tuple[tuple[Array, Array], None]:
-            q, stable = carry
+            before, good = carry
+            q = predicted = before - jnp.linalg.solve(
+                slope(before), balance(before, fraction * full)
+            )
             for _ in range(_ITERATIONS):
-                tangent = jnp.diag(squared) + potential.stiffness(q)
-                q = q - jnp.linalg.solve(tangent, balance(q, fraction * full))
-            scaled = jnp.eye(q.size) + potential.stiffness(q) / jnp.sqrt(squared[:, None] * squared)
-            return (q, stable & (jnp.linalg.eigvalsh(scaled)[0] > 0)), None
+                q = q - jnp.linalg.solve(slope(q), balance(q, fraction * full))
+            scaled = slope(q) / jnp.sqrt(squared[:, None] * squared)
+            moved, expected = (jnp.linalg.norm((x - before) * frequency) for x in (q, predicted))
+            # A step much longer than its tangent predicts has gone to another path.
+            good = good & (jnp.linalg.eigvalsh(scaled)[0] > 0) & (moved <= _JUMP * expected)
+            return (q, good), None
 
         fractions = jnp.arange(1, _STEPS + 1) / _STEPS
         start = jnp.zeros_like(full), jnp.array(True)

@@ -65,9 +65,10 @@ def test_a_static_path_ends_where_it_snaps_through():
     potential = polynomial_potential({"111": -1.0, "1111": 0.55}, 1)
     turn = (6 - np.sqrt(36 - 26.4)) / 13.2
     limit = turn - 3 * turn**2 + 2.2 * turn**3
-    forces = jnp.array([[0.5 * limit], [0.99 * limit], [1.05 * limit], [-1.0]])
+    beyond = limit * np.linspace(1.05, 4.0, 30)[:, None]
+    forces = jnp.array([[0.5 * limit], [0.99 * limit], [1.05 * limit], [-1.0], *beyond])
     found = np.asarray(static_displacement(jnp.array([1.0]), potential, forces))[:, 0]
-    assert np.isnan(found[2])
+    assert np.all(np.isnan(found[[2, *range(4, 34)]]))  # though there is another branch
     held = found - 3 * found**2 + 2.2 * found**3
     np.testing.assert_allclose(held[[0, 1, 3]], np.asarray(forces)[[0, 1, 3], 0], rtol=1e-9)
     assert found[1] < turn
