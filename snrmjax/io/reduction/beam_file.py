@@ -30,7 +30,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.condense.corotational_beam import SupportStiffness
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, Rule
@@ -44,13 +43,21 @@ _POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
 _MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
 
 
+class SupportStiffness(NamedTuple):
+    """Springs at an end; infinite is held, zero free."""
+
+    axial: float  # N/m, along the chord
+    transverse: float  # N/m, across it
+    rotation: float  # N m/rad
+
+
 class BeamDescription(NamedTuple):
     """A beam or arch as its file says."""
 
     name: str
     young: float  # Pa
     density: float  # kg/m³
-    poisson: float
+    poisson: float | None  # None: no shear deformation
     width: float  # m
     thickness: float  # m
     length: float  # m, of the chord
@@ -102,7 +109,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         name=top.text("name", file.removesuffix(".toml")),
         young=material.number("young_pa", POSITIVE),
         density=material.number("density_kg_m3", POSITIVE),
-        poisson=material.number("poisson", _POISSON, default=0.3),
+        poisson=material.number("poisson", _POISSON) if "poisson" in material.entries else None,
         width=section.number("width_m", POSITIVE),
         thickness=thickness,
         length=length,

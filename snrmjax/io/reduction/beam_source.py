@@ -5,15 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.condense.corotational_beam import (
-    CorotationalBeam,
-    RectangularSection,
-    beam_static_cases,
-    corotational_beam,
-    line_load,
-    transverse_row,
-)
-from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.condense.elements.beam import Beam, Support, rise_of_radius
+from snrmjax.condense.elements.beam_cases import static_cases
+from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
+from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
@@ -30,43 +25,42 @@ def read_beam(path: FilePath) -> ReductionSource:
     Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes
     or a sensor or force is at a place that none of them moves.
     """
-    beam, file = read_beam_description(path), file_name(path)
-    elements = _elements(beam)
-    basis = elements.modes(beam.modes)
-    frequency = np.asarray(basis.frequency)
-    if not np.all(np.isfinite(frequency)):
-        raise ValueError(f"[supports] of {file} leave a mechanism: its stiffness is singular.")
-    shapes = np.asarray(basis.shapes)
-    largest = np.max(np.abs(shapes[elements.translations]))
+    stated, file = read_beam_description(path), file_name(path)
+    beam = _elements(stated)
+    try:
+        basis = beam_modes(beam, stated.modes)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    largest = float(np.max(basis.largest))
     sensors = {}
-    for name, at in beam.sensors.items():
-        sensors[name] = transverse_row(elements, at) @ shapes
+    for name, at in stated.sensors.items():
+        sensors[name] = np.asarray(shape_at(beam, basis, at))
         if not np.max(np.abs(sensors[name])) > _NOWHERE * largest:
             raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
-    if beam.force_at is None:
-        participation = np.asarray(line_load(elements)) @ shapes
-    else:
-        participation = transverse_row(elements, beam.force_at) @ shapes
-        if not np.max(np.abs(participation)) > _NOWHERE * largest:
-            raise ValueError(f"[force] of {file} is at {beam.force_at:g}, where no mode moves.")
+    driven = np.asarray(participation(beam, basis, stated.force_at))
+    if not np.max(np.abs(driven)) > _NOWHERE * largest:
+        place = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
+        raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
 
     def solve(force: Float[np.ndarray, "case mode"]) -> StaticCases:
-        return _in_blocks(lambda rows: beam_static_cases(elements, basis, rows), force)
+        return _in_blocks(lambda rows: static_cases(beam, basis, rows), force)
 
-    stated = beam.damping_ratio
+    damping = stated.damping_ratio
     note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
+    places = np.linspace(0.0, 1.0, stated.elements + 1)
+    shapes = np.array([np.asarray(shape_at(beam, basis, float(at))) for at in places])
     return ReductionSource(
-        name=beam.name,
+        name=stated.name,
         basis=basis,
-        damping_ratio=np.array(stated or (ASSUMED_DAMPING,) * len(beam.modes)),
+        damping_ratio=np.array(damping or (ASSUMED_DAMPING,) * len(stated.modes)),
         sensors=sensors,
-        participation=participation,
+        participation=driven,
         solve=solve,
-        thickness=beam.thickness,
-        load_scale=beam.load_scale,
-        degree=beam.degree,
-        lines=_lines(elements, basis),
-        notes=() if stated is not None else (note,),
+        thickness=stated.thickness,
+        load_scale=stated.load_scale,
+        degree=stated.degree,
+        lines=ShapeLines(places, shapes, "Position along the beam (fraction)"),
+        notes=() if damping is not None else (note,),
     )
 
 
@@ -79,17 +73,18 @@ def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> St
     return found
 
 
-def _elements(beam: BeamDescription) -> CorotationalBeam:
-    return corotational_beam(
-        beam.length,
-        RectangularSection(beam.width, beam.thickness, beam.young, beam.density),
-        beam.supports,
-        elements=beam.elements,
-        radius=beam.radius,
+def _elements(stated: BeamDescription) -> Beam:
+    left, right = (Support(*one) for one in stated.supports)
+    rise = 0.0 if stated.radius is None else rise_of_radius(stated.length, stated.radius)
+    return Beam(
+        stated.length,
+        stated.width,
+        stated.thickness,
+        rise=rise,
+        young=stated.young,
+        density=stated.density,
+        poisson=stated.poisson,
+        elements=stated.elements,
+        left=left,
+        right=right,
     )
-
-
-def _lines(elements: CorotationalBeam, basis: ReductionBasis) -> ShapeLines:
-    x = np.asarray(elements.nodes)[:, 0]
-    rows = [transverse_row(elements, k / (len(x) - 1)) for k in range(len(x))]
-    return ShapeLines(x, np.array(rows) @ np.asarray(basis.shapes), "Position along the chord (m)")
