@@ -1,12 +1,13 @@
 """Where a condensed model ends to hold: its normal mode against that of all finite elements.
 
 The full model (20 elements, 57 degrees of freedom) is balanced in its own coordinates:
-M ü + f(u) = 0 for u = Σ a_h cos hΩt, h = 0…H, with f the elements' internal force at samples of the period
-(alternating frequency-time), for given fundamental q₁ of the first mode. It shares the elements
-with the condensation, but neither modes, potential nor solver. Each answer is integrated over one
-period from rest by Newmark's rule: `period_error` is how far it is from where it began, over the
-amplitude (the rule's own error included). The reduced model's mode is `nonlinear_normal_mode`.
-Amplitudes: fundamental at midspan over the thickness. One JSON line a case.
+M ü + f(u) = 0 for u = Σ a_h cos hΩt, h = 0…H, with f the elements' internal force at samples of
+the period (alternating frequency-time), for given fundamental q₁ of the first mode. It shares the
+elements with the condensation, but neither modes, potential nor solver. Each answer is integrated
+over one period from rest by Newmark's rule: `period_error` is how far it is from where it began,
+over the amplitude (the rule's own error included). The reduced model's mode is
+`nonlinear_normal_mode`. Amplitudes: fundamental at midspan over the thickness. One JSON line a
+case.
 
     python benchmarks/rom_full_order.py [--out FOLDER]
 """
