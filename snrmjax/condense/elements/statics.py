@@ -75,7 +75,7 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
 
     def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
         # One more Newton step: nothing but rounding in value, the whole of the derivative.
-        u = u - jnp.linalg.solve(k, _force(beam, u) - one)
+        u = u - jnp.linalg.solve(k, free_force(beam, u) - one)
         whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 
@@ -97,11 +97,13 @@ class _Path(NamedTuple):
     iterations: Array  # in it
 
 
-def _force(beam: Beam, u: Array) -> Array:
+def free_force(beam: Beam, u: Array) -> Array:
+    """Internal force on the degrees of freedom that are not held, at displacements of them."""
     return internal_force(beam, jnp.zeros(beam.n_dof).at[beam.free].set(u))[beam.free]
 
 
-def _tangent(beam: Beam, u: Array) -> Array:
+def free_tangent(beam: Beam, u: Array) -> Array:
+    """Tangent stiffness of the degrees of freedom that are not held."""
     free = beam.free
     whole = tangent_stiffness(beam, jnp.zeros(beam.n_dof).at[free].set(u))
     return whole[free[:, None], free]
@@ -115,8 +117,8 @@ def _followed(beam: Beam, load: Array) -> tuple[Array, Array, Array, Array]:
 
     def step(path: _Path) -> _Path:
         target = jnp.minimum(path.reached + path.size, 1.0)
-        residual = target * load - _force(beam, path.u)
-        stiffness = _tangent(beam, path.u)
+        residual = target * load - free_force(beam, path.u)
+        stiffness = free_tangent(beam, path.u)
         change = jnp.linalg.solve(stiffness, residual)
         u, first = path.u + change, path.iterations == 0
         predicted = jnp.where(first, jnp.abs(load @ change), path.predicted)
