@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from snrmjax.report.condense.reduction_report import Reduction
 
 _SAID = 3  # steps of the study between lines in a log
+_FEW_SCALES = (0.1, 0.3, 1.0, 3.0)  # of a study whose load cases take long
 
 
 def rom(
@@ -100,11 +101,14 @@ def _source(
         return read_beam(beam)
     from snrmjax.io.calculix.reduction import read_deck_source
 
-    return read_deck_source(calculix or "", _mode_numbers(modes))
+    source = read_deck_source(calculix or "", _mode_numbers(modes))
+    return source._replace(scales=_FEW_SCALES)
 
 
 def _mode_numbers(modes: str | None) -> tuple[int, ...]:
-    parts = [] if modes is None else [part.strip() for part in modes.split(",")]
+    if modes is None:
+        raise ValueError("`--modes` must be mode numbers such as 1,3,5, but is not given.")
+    parts = [part.strip() for part in modes.split(",")]
     if not parts or not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise ValueError(f"`--modes` must be mode numbers such as 1,3,5, but is {modes!r}.")
     numbers = tuple(int(part) for part in parts)

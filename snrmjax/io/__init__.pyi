@@ -1,6 +1,9 @@
 from . import calculix
 from .joint_results import read_joint_fit, write_fitted_backbone, write_joint_fit, write_next
 from .models import read_model, write_model
+from .reduction.beam_source import read_beam
+from .reduction.load_tables import read_load_tables
+from .reduction.source import write_load_cases
 from .results import (
     write_backbone,
     write_normal_mode,
@@ -12,12 +15,15 @@ from .tables import read_steady_states, write_steady_states, write_table
 
 __all__ = [
     "calculix",
+    "read_beam",
     "read_joint_fit",
+    "read_load_tables",
     "read_model",
     "read_steady_states",
     "write_backbone",
     "write_fitted_backbone",
     "write_joint_fit",
+    "write_load_cases",
     "write_model",
     "write_next",
     "write_normal_mode",

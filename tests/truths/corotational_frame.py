@@ -1,9 +1,9 @@
 """A plane frame of corotational beam elements, by its strain energy: finite elements for tests.
 
 Each element keeps its small deformation in a frame that turns with its ends: stretching
-½ EA/L (l − L)² and bending 2EI/L (θ₁² + θ₁θ₂ + θ₂²) with the end rotations θ relative to the chord.
-Forces and tangents are derivatives of the energy. Reference: M. A. Crisfield, Non-linear Finite
-Element Analysis of Solids and Structures, vol. 1 (1991), ch. 7.
+½ EA/L e², e = l − L + L (2θ₁² − θ₁θ₂ + 2θ₂²)/30, and bending 2EI/L (θ₁² + θ₁θ₂ + θ₂²), with the end
+rotations θ relative to the chord. Forces and tangents are derivatives of the energy. Reference:
+M. A. Crisfield, Non-linear Finite Element Analysis of Solids and Structures, vol. 1 (1991), ch. 7.
 """
 
 from functools import partial
@@ -47,6 +47,8 @@ def energy(u, frame):
     across = d0[:, 0] * du[:, 1] - d0[:, 1] * du[:, 0]
     turn = jnp.arctan2(across, length**2 + jnp.sum(d0 * du, axis=1))
     a, b = v[first, 2] - turn, v[second, 2] - turn
+    # Ends that turn against the chord bow the element: its line is longer than the chord.
+    stretch = stretch + length / 30 * (2 * a**2 - a * b + 2 * b**2)
     bent = 2 * frame.bending / length * (a**2 + a * b + b**2)
     held = sum(0.5 * k * u[dof] ** 2 for dof, k in (frame.springs or {}).items())
     return jnp.sum(0.5 * frame.axial / length * stretch**2 + bent) + held

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
+from snrmjax.condense.scale_study import SCALES
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
 from snrmjax.model.structures import Structure
@@ -43,6 +44,7 @@ class ReductionSource(NamedTuple):
     thickness: float | None = None  # m, the unit of `load_scale`
     load_scale: float | None = None  # thicknesses that single modes move linearly
     degree: int = 3
+    scales: tuple[float, ...] = SCALES  # of the study over load scale
     lines: ShapeLines | None = None
     notes: tuple[str, ...] = ()
 

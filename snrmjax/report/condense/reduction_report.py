@@ -107,7 +107,12 @@ def reduce(
         sweep = source.solve(np.asarray(far.force))
     if study and source.solve is not None and displacement is not None:
         scales = load_scale_study(
-            source.basis, source.solve, displacement, degree=source.degree, report=report
+            source.basis,
+            source.solve,
+            displacement,
+            degree=source.degree,
+            scales=source.scales,
+            report=report,
         )
     structure = source.structure(found)
     notes = [*source.notes, *(one.message for one in found.warnings)]
