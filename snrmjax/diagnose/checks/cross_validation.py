@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
+from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
 
@@ -125,13 +125,12 @@ def _refitted(
     slopes = fit.slopes
     if not slopes.shape[1]:
         return np.zeros(0), fit.rows, slopes
-    lower = misfit.noise.of_rows(kept)
     size = np.linalg.norm(slopes, axis=0)
     size = np.where(size > 0, size, 1.0)
     scaled = slopes / size
-    arms = solve_triangular(lower, scaled[kept], lower=True)
+    both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
+    arms, left = both[:-1].T, both[-1]
     matrix = arms.T @ arms
-    left = solve_triangular(lower, fit.rows[kept], lower=True)
     change = -np.linalg.pinv(matrix, rcond=1e-12) @ (arms.T @ left)
     values, vectors = np.linalg.eigh(matrix)
     # What the kept rows do not determine at all is open: it may have any size.
@@ -156,15 +155,10 @@ def chi_square_of_level(
     """χ² of rows left out, given the others, with parameters taken as known and as uncertain.
 
     Arguments: `rows` of a fit to the others; `root` of the covariance of the parameters' part of
-    the rows. By one factor of the covariance with the rows left out last, where nothing large
-    cancels.
+    the rows.
     """
-    shared, n_out = misfit.noise.shared, int(out.sum())
-    last = np.argsort(out, kind="stable")
-    lower = np.linalg.cholesky(np.eye(len(shared)) + shared[last] @ shared[last].T)
-    left, spread = (
-        solve_triangular(lower, part[last], lower=True)[-n_out:] for part in (rows, root)
-    )
+    given = misfit.noise.covariance.given_rows(~out)
+    left, spread = given.decorrelated(rows), given.decorrelated(root.T).T
     known = float(left @ left)
-    uncertain = float(left @ np.linalg.solve(np.eye(n_out) + spread @ spread.T, left))
+    uncertain = float(np.sum(shared_covariance(spread).decorrelated(left) ** 2))
     return known, uncertain

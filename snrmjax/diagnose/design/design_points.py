@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
-from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_errors_passed_on
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions, predictions_of
 from snrmjax.diagnose.misfit.programs import COMPARED
+from snrmjax.diagnose.misfit.shared_covariance import SharedCovariance, shared_covariance
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.measure.states import SteadyStates, steady_states
 
@@ -213,16 +213,14 @@ def shared_by_both(
 
 def refitted_chi_square(rows: Rows, shared: Float[np.ndarray, "row shared"]) -> float:
     """χ² when a fit's parameters have moved to where all rows put them, to first order."""
-    return _least(rows, np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T))
+    return _least(rows, shared_covariance(shared))
 
 
-def _least(rows: Rows, lower: Float[np.ndarray, "row row"]) -> float:
-    """The same from the covariance's Cholesky factor."""
+def _least(rows: Rows, covariance: SharedCovariance) -> float:
+    """The same from the covariance."""
     size = np.linalg.norm(rows.slopes, axis=0)
     arms = rows.slopes / np.where(size > 0, size, 1.0)
-    arms, left = (
-        solve_triangular(lower, part, lower=True, check_finite=False) for part in (arms, rows.left)
-    )
+    arms, left = covariance.decorrelated(arms.T).T, covariance.decorrelated(rows.left)
     along, values, _ = np.linalg.svd(arms, full_matrices=False)
     along = along[:, values > _RESOLUTION * max(values.max(initial=0.0), 1.0)]
     return float(np.sum((left - along @ (along.T @ left)) ** 2))
@@ -243,9 +241,9 @@ def separation(
     for _, _, rows in (truth, rival):
         kept = kept & np.isfinite(rows.left) & np.all(np.isfinite(rows.slopes), axis=1)
     shared = shared_by_both(old, new, kept)
-    lower = np.linalg.cholesky(np.eye(len(shared)) + shared @ shared.T)
+    covariance = shared_covariance(shared)
     gains = []
     for before, least, after in (truth, rival):
         both = Rows(*(np.concatenate([a, b[kept]]) for a, b in zip(before, after, strict=True)))
-        gains.append(_least(both, lower) - least)
+        gains.append(_least(both, covariance) - least)
     return gains[1] - gains[0]

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import solve_triangular
 
 from snrmjax.diagnose.laws.law_columns import TABLES, LawColumns, LawKnots, law_columns
 from snrmjax.diagnose.laws.law_prior import (
@@ -142,11 +141,7 @@ def law_problem(
         ]
         whole.append(units[name] * sum(signed))
         place[name] = np.log(knots_of_table(knots, part.tables[0]))
-    both = np.column_stack([*whole, rows])
-    if kept is None:
-        both = noise.decorrelated(both.T).T
-    else:
-        both = solve_triangular(noise.of_rows(kept), both[kept], lower=True)
+    both = noise.decorrelated(np.column_stack([*whole, rows]).T, kept).T
     columns_of, left = both[:, :-1], both[:, -1]
     gram, pull = columns_of.T @ columns_of, -columns_of.T @ left
     return LawProblem(gram, pull, float(left @ left), place)

@@ -4,27 +4,30 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
 from snrmjax.diagnose.misfit.predictions import Measured
+from snrmjax.diagnose.misfit.shared_covariance import SharedCovariance, shared_covariance
 from snrmjax.identify.calibrate.calibration_states import whitened_columns
 
 
 class NoiseModel(NamedTuple):
     """Covariance of the misfits of all states, in units of each state's own noise.
 
-    A row is one measured number: a column of a state. The covariance is I + S Sᵀ: 1 for a state's
-    own noise, and S for errors that states share, which are those of a level and those of the
-    baseline model's parameters.
+    A row is one measured number: a column of a state. Every row has the noise of its own state;
+    rows share the errors of a level and those of the baseline model's parameters.
     """
 
     whiten: Float[np.ndarray, "state column column"]
     known: Bool[np.ndarray, "state column"]
-    shared: Float[np.ndarray, "row shared"]  # S: slopes by the shared errors, times their 1σ
-    lower: Float[np.ndarray, "row row"]  # Cholesky's factor of the covariance
+    covariance: SharedCovariance
     state: Int[np.ndarray, " row"]
     column: Int[np.ndarray, " row"]
+
+    @property
+    def shared(self) -> Float[np.ndarray, "row shared"]:
+        """Slopes of the rows by the shared errors, times their 1σ."""
+        return self.covariance.shared
 
     def noise_units(
         self, columns: Float[np.ndarray, "trial state column"]
@@ -33,33 +36,28 @@ class NoiseModel(NamedTuple):
         return np.einsum("sij,...sj->...si", self.whiten, columns)[..., self.known]
 
     def decorrelated(
-        self, rows: Float[np.ndarray, "*entry row"]
+        self, rows: Float[np.ndarray, "*entry row"], kept: Bool[np.ndarray, " row"] | None = None
     ) -> Float[np.ndarray, "*entry row"]:
-        """Rows made independent and of unit variance, shared errors included."""
+        """Rows, or the rows `kept`, made independent and of unit variance.
+
+        An entry that is not finite throughout is NaN.
+        """
+        if kept is not None:
+            return self.covariance.of_rows(kept).decorrelated(rows[..., kept])
         good = np.all(np.isfinite(rows), axis=-1, keepdims=True)
-        flat = np.where(good, rows, 0.0).reshape(-1, rows.shape[-1])
-        found = solve_triangular(self.lower, flat.T, lower=True).T.reshape(rows.shape)
-        return np.where(good, found, np.nan)
+        return np.where(good, self.covariance.decorrelated(np.where(good, rows, 0.0)), np.nan)
 
     def without_shared(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
         """Rows less the most likely values of the shared errors."""
-        half = solve_triangular(self.lower, rows, lower=True)
-        return np.asarray(solve_triangular(self.lower, half, lower=True, trans="T"))
+        return self.covariance.solved(rows)
 
     def shared_errors(
         self, rows: Float[np.ndarray, " row"], kept: Bool[np.ndarray, " row"] | None = None
     ) -> Float[np.ndarray, " shared"]:
         """Most likely values of the shared errors in units of their 1σ, from all rows or some."""
         if kept is not None:
-            half = solve_triangular(self.of_rows(kept), rows[kept], lower=True)
-            left = solve_triangular(self.of_rows(kept), half, lower=True, trans="T")
-            return np.asarray(-self.shared[kept].T @ left)
-        return np.asarray(-self.shared.T @ self.without_shared(rows))
-
-    def of_rows(self, keep: Bool[np.ndarray, " row"]) -> Float[np.ndarray, "kept kept"]:
-        """Cholesky's factor of the covariance of some of the rows."""
-        shared = self.shared[keep]
-        return np.linalg.cholesky(np.eye(int(keep.sum())) + shared @ shared.T)
+            return -self.covariance.of_rows(kept).most_likely_errors(rows[kept])
+        return -self.covariance.most_likely_errors(rows)
 
 
 def noise_model(
@@ -89,8 +87,7 @@ def noise_model(
     every = np.concatenate([baseline, *parts], axis=2)
     own = np.asarray(whitened_columns(measured.whiten, every))[known]
     state, column = np.nonzero(known)
-    lower = np.linalg.cholesky(np.eye(len(own)) + own @ own.T)
-    return NoiseModel(measured.whiten, known, own, lower, state, column)
+    return NoiseModel(measured.whiten, known, shared_covariance(own), state, column)
 
 
 def chi_square_p_value(chi_square: float, freedom: int) -> float:

@@ -173,15 +173,19 @@ class _Rows:
 
     def __init__(self, misfit: WeightedMisfit, keep: np.ndarray):
         self.keep = keep
-        self.root = np.linalg.inv(misfit.noise.of_rows(keep))
+        self.covariance = misfit.noise.covariance.of_rows(keep)
+
+    def decorrelated(self, rows: np.ndarray) -> np.ndarray:
+        """The kept ones of rows, or of columns of them, made independent and of unit variance."""
+        return self.covariance.decorrelated(rows[self.keep].T).T
 
     def chi_square(
         self, rows: np.ndarray, columns: Float[np.ndarray, "row column"]
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        left = self.root @ rows[self.keep]
+        left = self.decorrelated(rows)
         if not columns.shape[1]:
             return float(left @ left), np.zeros(0), np.zeros((0, 0))
-        arms = self.root @ columns[self.keep]
+        arms = self.decorrelated(columns)
         size = np.linalg.norm(arms, axis=0)
         size = np.where(size > 0, size, 1.0)
         inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-10, hermitian=True)
@@ -199,7 +203,7 @@ class _Rows:
         def linearised(points: np.ndarray) -> list[_Linearised]:
             pairs = [curves.at(values) for values in points]
             return [
-                _Linearised(slopes, self.root @ rows[self.keep], self.root @ slopes[self.keep])
+                _Linearised(slopes, self.decorrelated(rows), self.decorrelated(slopes))
                 for rows, slopes in pairs
             ]
 

@@ -8,6 +8,7 @@ import pytest
 from snrmjax.diagnose.checks.patterns import left_curve, pattern
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
+from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 
 LEVELS, PER_LEVEL, DAMPING = 5, 16, 0.01
 N = LEVELS * PER_LEVEL
@@ -37,7 +38,6 @@ def misfit_of(phase_unknown=False):
     state, column = np.repeat(np.arange(N), 2), np.tile([0, 1], N)
     known = np.ones((N, 2), dtype=bool)
     shared = 0.002 * by_linear.reshape(2 * N, 2)[:, :1]  # of the linear test
-    lower = np.linalg.cholesky(np.eye(2 * N) + shared @ shared.T)
     velocity = (SIZE * np.exp(1j * ANGLE))[:, None]
     chosen = SimpleNamespace(
         states=SimpleNamespace(level=LEVEL, velocity=velocity),
@@ -46,7 +46,7 @@ def misfit_of(phase_unknown=False):
         phase_unknown=np.full((N, 1), phase_unknown),
     )
     return SimpleNamespace(
-        noise=NoiseModel(whiten, known, shared, lower, state, column),
+        noise=NoiseModel(whiten, known, shared_covariance(shared), state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
         by_linear=by_linear.reshape(2 * N, 2),

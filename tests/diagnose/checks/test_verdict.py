@@ -17,6 +17,7 @@ from snrmjax.diagnose.checks.verdict import (
 )
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
+from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 from snrmjax.diagnose.search.model_search import FoundEffects
 
 LEVELS, PER_LEVEL = 4, 15
@@ -38,7 +39,6 @@ def misfit_of(order=None, shared=None, phase_unknown=False):
     """Evidence of states in a given order, with real and imaginary part of the force each."""
     order = np.arange(len(LEVEL)) if order is None else order
     shared = np.zeros((N_ROWS, 0)) if shared is None else shared
-    lower = np.linalg.cholesky(np.eye(N_ROWS) + shared @ shared.T)
     state, column = np.repeat(np.arange(len(LEVEL)), 2), np.tile([0, 1], len(LEVEL))
     known = np.ones((len(LEVEL), 2), dtype=bool)
     whiten = np.tile(np.eye(2), (len(LEVEL), 1, 1))
@@ -53,7 +53,7 @@ def misfit_of(order=None, shared=None, phase_unknown=False):
     )
     chosen.phase_unknown = np.full((len(LEVEL), 1), phase_unknown)
     return SimpleNamespace(
-        noise=NoiseModel(whiten, known, shared, lower, state, column),
+        noise=NoiseModel(whiten, known, shared_covariance(shared), state, column),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
         by_linear=np.tile(np.eye(2), (len(LEVEL), 1)),

@@ -7,6 +7,7 @@ import pytest
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate
 from snrmjax.diagnose.misfit.noise_model import NoiseModel
+from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 from snrmjax.diagnose.search.screening import screened_pairs
 
 N = 60
@@ -16,7 +17,9 @@ def made_up(columns, base):
     """Evidence in which a candidate's starts change all rows by given columns."""
     empty = np.zeros((N, 0))
     whiten, known = np.ones((N, 1, 1)), np.ones((N, 1), dtype=bool)
-    noise = NoiseModel(whiten, known, empty, np.eye(N), np.arange(N), np.zeros(N, dtype=int))
+    noise = NoiseModel(
+        whiten, known, shared_covariance(empty), np.arange(N), np.zeros(N, dtype=int)
+    )
     return SimpleNamespace(
         noise=noise,
         base=base,
