@@ -19,9 +19,20 @@ or nodal ones `u_1 …` in the order of the rows of the shapes; optionally `ener
 free check. Empty displacements mark a case without solution. All numbers are SI.
 
 A code that writes only nodal displacements needs `case, f_1 …, u_1 …` and the shapes at the same
-degrees of freedom. Modal coordinates are q = ΦᵀM u where a mass matrix is given, else
-q = filter u, else the least-squares fit q = Φ⁺u at the freedoms that were written: with enough of
-them that is as good, since what the load cases add to the modes is then mostly orthogonal to them.
+degrees of freedom, such as
+
+    case,f_1,u_1,u_2,u_3                  (cases.csv)
+    up,12.5,1.14e-4,2.31e-4,1.14e-4
+    down,-12.5,-1.14e-4,-2.31e-4,-1.14e-4
+    shape_1                               (shapes.csv: at the freedoms u_1, u_2, u_3)
+    5.95
+    12.04
+    5.95
+
+Modal coordinates are q = ΦᵀM u where a mass matrix is given, else q = filter u, else the
+least-squares fit q = Φ⁺u at the freedoms that were written. That is exact where what the load cases
+add to the modes is orthogonal to the shapes there, as the stretching of a flat structure is; else
+state a mass matrix or a filter.
 
 `cases.npz` holds the same as arrays: `force` (case, mode) or `load` (case, dof),
 `modal_displacement` or `displacement`, and optionally `energy`, `names`, `shapes` (dof, mode),
