@@ -47,6 +47,43 @@ def test_reactions_of_supports_are_no_inertia(write, tmp_path):
     np.testing.assert_allclose(masses[:2] / mass, wanted, atol=5e-3)
 
 
+def shell_deck(elements=8):
+    """The cantilever of quadratic shells, one across the width."""
+    number = {}
+    for i in range(2 * elements + 1):
+        for j in range(3):
+            if i % 2 == 0 or j % 2 == 0:
+                number[i, j] = len(number) + 1
+    nodes = [
+        f"{n}, {LENGTH * i / (2 * elements):.10g}, {WIDTH * j / 2:.10g}, 0."
+        for (i, j), n in number.items()
+    ]
+    around = [(0, 0), (2, 0), (2, 2), (0, 2), (1, 0), (2, 1), (1, 2), (0, 1)]
+    rows = [
+        ", ".join([str(e + 1), *(str(number[2 * e + i, j]) for i, j in around)])
+        for e in range(elements)
+    ]
+    return "\n".join(
+        [
+            *("*NODE", *nodes, "*ELEMENT, TYPE=S8R, ELSET=E", *rows),
+            f"*MATERIAL, NAME=M\n*ELASTIC\n{YOUNG}, {POISSON}\n*DENSITY\n{DENSITY}",
+            f"*SHELL SECTION, ELSET=E, MATERIAL=M\n{THICKNESS}\n*BOUNDARY",
+            *(f"{number[0, j]}, 1, 6" for j in range(3)),
+            "",
+        ]
+    )
+
+
+@needs_calculix
+def test_a_cantilever_of_shells_has_its_frequency(write, tmp_path):
+    modes = modes_of_deck(read_deck(write(shell_deck())), (1,), tmp_path / "jobs")
+    frequency = float(modes.basis.frequency[0])
+    assert abs(frequency / bending_frequency(ROOTS[0], THICKNESS) - 1) < 3e-3  # as for beams
+    assert abs(modes.carried[0] - 1) < 1e-3
+    # What gives way at the nodes under the nodal loads is next to nothing for shells.
+    assert abs(modes.residual_flexibility[0, 0]) * frequency**2 < 1e-5
+
+
 def solid_deck():
     """A clamped block of two quadratic bricks along x."""
     places = {}
