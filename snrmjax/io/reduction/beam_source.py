@@ -47,8 +47,6 @@ def read_beam(path: FilePath) -> ReductionSource:
 
     damping = stated.damping_ratio
     note = f"no damping is stated: {ASSUMED_DAMPING:g} is taken for every mode"
-    places = np.linspace(0.0, 1.0, stated.elements + 1)
-    shapes = np.array([np.asarray(shape_at(beam, basis, float(at))) for at in places])
     return ReductionSource(
         name=stated.name,
         basis=basis,
@@ -59,7 +57,12 @@ def read_beam(path: FilePath) -> ReductionSource:
         thickness=stated.thickness,
         load_scale=stated.load_scale,
         degree=stated.degree,
-        lines=ShapeLines(places, shapes, "Position along the beam (fraction)"),
+        # Rows of the shapes are x, y and rotation of each node.
+        lines=ShapeLines(
+            np.asarray(beam.nodes)[:, 0],
+            np.asarray(basis.shapes)[1::3],
+            "Position along the chord (m)",
+        ),
         notes=() if damping is not None else (note,),
     )
 

@@ -168,3 +168,6 @@ def test_damping_is_assumed_aloud_and_a_force_may_be_at_a_point(tmp_path):
     np.testing.assert_array_equal(source.damping_ratio, [0.01])
     assert "no damping is stated" in source.notes[0]
     assert source.thickness == 0.000508
+    middle = len(source.lines.position) // 2
+    assert source.lines.position[middle] == pytest.approx(0.2286 / 2)
+    np.testing.assert_allclose(source.lines.shape[middle], source.sensors["midspan"])
