@@ -1,6 +1,7 @@
 """Sets of static load cases: forces along combinations of modes, and how large they are."""
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -176,7 +177,7 @@ def _power(before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndar
     """The power of displacement with which the ratio grows: 1 for an arch, 2 for a flat beam."""
     known = np.isfinite(before[1]) & np.isfinite(now[1]) & (before[0] != now[0])
     rise = np.log(np.where(known, now[1], 1.0) / np.where(known, before[1], 1.0))
-    run = np.log(np.where(known, now[0] / before[0], np.e))
+    run = np.log(np.where(known, now[0] / before[0], math.e))
     return np.where(known, np.clip(rise / run, 0.7, 4.0), 1.5)
 
 
