@@ -433,6 +433,7 @@ def test_a_level_left_out_is_judged_to_digits_where_noise_is_small_beside_what_s
     assert found.after == found.before == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.long
 def test_data_of_another_mode_and_of_one_level_are_said():
     far = sj.diagnose_model(linear_model(frequency=1.4 * OMEGA), balanced(quadratic))
     assert "linear_frequency_shift" in far.effects

@@ -147,7 +147,13 @@ def of_the_others(relative, data):
 
 
 class TestIdentifyPoints:
-    @pytest.mark.parametrize("stated", STATED)
+    @pytest.mark.parametrize(
+        "stated",
+        [
+            pytest.param(stated, marks=pytest.mark.long if stated == "nothing stated" else ())
+            for stated in STATED
+        ],
+    )
     def test_by_what_was_measured(self, stated):
         check_derivatives(by_measurements, 4 * N, table(**STATED[stated]))
 
@@ -159,7 +165,9 @@ class TestIdentifyPoints:
             function, 12 if sensors == 1 else 9, table(sensors=sensors, **STATED["all stated"])
         )
 
-    @pytest.mark.parametrize("stated", ["nothing stated", "all stated"])
+    @pytest.mark.parametrize(
+        "stated", [pytest.param("nothing stated", marks=pytest.mark.long), "all stated"]
+    )
     @pytest.mark.parametrize("failure", FAILURES)
     def test_a_failed_state_leaves_the_others_alone(self, failure, stated):
         data = table(failure, **STATED[stated])

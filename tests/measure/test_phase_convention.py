@@ -172,7 +172,8 @@ def test_the_joint_fit_says_it():
     check_named([str(error.value)], "opposite")
 
 
-@pytest.mark.parametrize("how", [pytest.param("conjugated", marks=pytest.mark.long), "opposite"])
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["conjugated", "opposite"])
 def test_the_diagnosis_says_it(how):
     """Of opposite signs it ended in a minimum of nothing."""
     found = sj.diagnose_model(linear_model(), recorded(balanced(quadratic), how))

@@ -72,6 +72,7 @@ def test_bands_hold_what_was_measured_at_resonance(beside):
     assert not np.any(fit.noise.level_std[:2])  # nothing was wrong with the instruments
 
 
+@pytest.mark.long
 def test_a_free_force_gain_moves_no_velocity():
     gains = (1.06, 1.02, 0.98, 0.94)
     level, frequency, force, velocity = rows_of(0.0, seed=6, gain=gains)

@@ -181,6 +181,7 @@ def test_implicit_derivatives_know_how_smooth_a_curve_is_expected_to_be(fits):
     assert std[:n] == pytest.approx(np.sqrt(np.diag(fits[0].covariance))[:n], rel=0.2)
 
 
+@pytest.mark.long
 def test_a_smoothing_spline_comes_back_from_its_file(fits, tmp_path):
     write_joint_fit(tmp_path / "fit.json", fits[0])
     again = read_joint_fit(tmp_path / "fit.json")

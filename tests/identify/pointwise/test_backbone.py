@@ -200,6 +200,7 @@ class TestBands:
         # 40 seeds of 4 predicted levels know it to 8 %; the method's own factor 1.5 to 20 %.
         np.testing.assert_allclose(found, 0.03 * damping, rtol=0.3)
 
+    @pytest.mark.long
     def test_noise_that_was_not_stated_is_found(self):
         scores, sizes = study(40, amplitude=0.01, phase=0.01, stated=False)
         # Relative noise 1 %; points off resonance are mistrusted up to 3 times as much.
