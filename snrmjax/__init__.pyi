@@ -1,5 +1,5 @@
 # The ten verbs to start with, and the namespaces that hold the rest.
-from . import condense, diagnose, identify, io, measure, model, plot, simulate, study
+from . import condense, diagnose, identify, io, measure, methods, model, plot, simulate, study
 from .diagnose.diagnosis import diagnose_model
 from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.optimal_design import next_measurements
@@ -23,6 +23,7 @@ __all__ = [
     "identify_backbone",
     "io",
     "measure",
+    "methods",
     "model",
     "next_measurements",
     "nonlinear_normal_mode",

@@ -1,0 +1,105 @@
+"""CONCERTO: natural frequency and loss factor from two frequencies of equal displacement.
+
+At equal amplitude of displacement a nonlinear structure has one equivalent stiffness and damping,
+so that the two states of that amplitude, below and above resonance, obey one linear mode,
+α (λ − Ω²) = C with λ = ω̃²(1 + iη). Two receptances give λ = (α₂Ω₂² − α₁Ω₁²)/(α₂ − α₁), whatever
+the complex modal constant C.
+
+Reference: A. Carrella & D. J. Ewins, Mech. Syst. Signal Process. 25 (2011) 1011,
+doi:10.1016/j.ymssp.2010.09.011.
+"""
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.measure.states import SteadyStates
+from snrmjax.methods.one_sensor import SensorStates, sensor_states
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.model.modes import LinearModes
+
+_ROUNDING = 1e-9  # relative: what two states of equal displacement may differ by
+
+
+def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
+    """Natural frequency and damping of every level at amplitudes reached on both sides.
+
+    Every measured state that has a partner of equal displacement across resonance gives a point;
+    the partner's frequency and receptance are interpolated in amplitude. Sides are told by phase,
+    so that states of a rising and a falling sweep may be mixed. The force may vary within a level.
+
+    Arguments: `data` with forces in N and phases; `modes` names the sensor, its numbers do not
+    enter. Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the displacement.
+    1σ from the stated errors of both states, to first order: they grow towards the peak, where
+    both states become one. Levels without a pair are `ONE_SIDE`.
+    Raises `ValueError` where the data have no forces or no phases.
+    Validity: one mode, damping that counts as hysteretic (η is constant between the two
+    frequencies), no more than one amplitude on each side.
+    """
+    states = sensor_states(data, modes, "concerto")
+    points = [point for level, one in states.levels() for point in _pairs(level, one)]
+    return method_result("concerto", points, len(states.level))
+
+
+def _pairs(level: int, states: SensorStates) -> list[MethodPoint]:
+    """The points of one level, one for each state with a partner."""
+    size = np.abs(states.displacement)
+    below, above = (_rising(states, side) for side in (states.phase >= 0, states.phase < 0))
+    points = []
+    for own, other in ((below, above), (above, below)):
+        if len(other) < 2:
+            continue
+        reach = size[other]
+        for k in own:
+            if not reach[0] * (1 - _ROUNDING) <= size[k] <= reach[-1] * (1 + _ROUNDING):
+                continue
+            upper = int(np.clip(np.searchsorted(reach, size[k]), 1, len(other) - 1))
+            two = other[[upper - 1, upper]]
+            share = (size[k] - size[two[0]]) / (size[two[1]] - size[two[0]])
+            points.append(_point(level, states, int(k), two, np.array([1 - share, share])))
+    return points or [MethodPoint(MethodStatus.ONE_SIDE, level)]
+
+
+def _rising(states: SensorStates, side: np.ndarray) -> np.ndarray:
+    """Rows of one side by rising displacement, without those of equal displacement."""
+    rows = np.flatnonzero(side)
+    _, first = np.unique(np.abs(states.displacement)[rows], return_index=True)
+    return rows[first]
+
+
+def _point(
+    level: int, states: SensorStates, k: int, two: np.ndarray, weight: np.ndarray
+) -> MethodPoint:
+    """The mode that one state and its interpolated partner have in common."""
+    alpha = states.receptance
+    here, there = alpha[k], complex(weight @ alpha[two])
+    square, other = states.frequency[k] ** 2, float(weight @ states.frequency[two] ** 2)
+    difference = there - here
+    eigenvalue = (there * other - here * square) / difference
+    if not (eigenvalue.real > 0 and eigenvalue.imag > 0):
+        return MethodPoint(MethodStatus.NOT_A_MODE, level)
+    natural = float(np.sqrt(eigenvalue.real))
+    loss = float(eigenvalue.imag / eigenvalue.real)
+    # dλ = λ_α₁ dα₁ + λ_α₂ dα₂, and λ_α = α₂(Ω₂² − Ω₁²)/(α₂ − α₁)² or −α₁(…): per relative error.
+    gain = here * there * (other - square) / difference**2
+    real, imag = _variance(gain, states, np.array([k]), np.ones(1)) + _variance(
+        -gain, states, two, weight
+    )
+    return MethodPoint(
+        MethodStatus.FOUND,
+        level,
+        natural * float(np.abs(states.displacement)[k]),
+        natural,
+        float(np.sqrt(real)) / (2 * natural),
+        loss / 2,
+        float(np.sqrt(imag + loss**2 * real)) / (2 * eigenvalue.real),
+    )
+
+
+def _variance(
+    gain: Complex[np.ndarray, ""], states: SensorStates, rows: np.ndarray, weight: np.ndarray
+) -> Float[np.ndarray, "2"]:
+    """Variances of Re λ and Im λ from relative errors of amplitude and of phase of α."""
+    amplitude = float(np.sum((weight * states.amplitude_std[rows]) ** 2))
+    phase = float(np.sum((weight * states.phase_std[rows]) ** 2))
+    parts = np.array([[gain.real**2, gain.imag**2], [gain.imag**2, gain.real**2]])
+    return parts @ np.array([amplitude, phase])

@@ -1,0 +1,135 @@
+"""Harmonic force surface: the force that a response needs, over frequency and amplitude.
+
+Response-controlled levels give the complex force F(Ω, X) at each frequency and displacement. The
+surface between them, cut at a constant |F|, is the response that a test under that force would
+show, with the parts that it would jump over: they are ordinary points of the surface.
+
+Reference: T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 146 (2021) 107023,
+doi:10.1016/j.ymssp.2020.107023.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.measure.states import SteadyStates
+from snrmjax.methods.equal_amplitude import AmplitudeSection, sections_of
+from snrmjax.methods.one_sensor import drive_point, sensor_states
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.model.modes import LinearModes
+
+_FEWEST_LEVELS, _FEWEST_STATES = 2, 3
+_WITHIN = 2.0  # times the least force: states that the parabola is fitted to
+_FINE = 400  # amplitudes between levels at which a cut looks for the force
+
+
+class ForceSurface(NamedTuple):
+    """The measured surface: complex forces by level of displacement and frequency."""
+
+    amplitude: Float[np.ndarray, " level"]  # m, rising
+    frequency: Float[np.ndarray, " frequency"]  # rad/s, common to all levels
+    force: Complex[np.ndarray, "level frequency"]  # N, relative to the displacement
+
+    def cut(self, force: float) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
+        """Frequencies (rad/s) and displacement amplitudes (m) that a constant force (N) holds.
+
+        At each frequency every amplitude at which |F| passes the force is a point, so that up to
+        three share a frequency. Sorted by frequency; empty where the force is off the surface.
+        """
+        fine = np.linspace(self.amplitude[0], self.amplitude[-1], _FINE)
+        found: list[tuple[float, float]] = []
+        for k, omega in enumerate(self.frequency):
+            column = self.force[:, k]
+            real = np.interp(fine, self.amplitude, column.real)
+            size = np.abs(real + 1j * np.interp(fine, self.amplitude, column.imag)) - force
+            for j in np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:])):
+                share = size[j] / (size[j] - size[j + 1])
+                found.append((float(omega), float(fine[j] + share * (fine[j + 1] - fine[j]))))
+        points = np.array(sorted(found)).reshape(-1, 2)
+        return points[:, 0], points[:, 1]
+
+
+def force_surface(data: SteadyStates, modes: LinearModes) -> ForceSurface:
+    """The surface between the levels of a test, on the frequencies that all of them cover.
+
+    Raises `ValueError` where fewer than two amplitudes have three states, or share no frequencies.
+    """
+    sections = _usable(data, modes)
+    if len(sections) < _FEWEST_LEVELS:
+        raise ValueError(
+            "harmonic_force_surface needs at least two levels of held displacement with three "
+            f"states each, but the data have {len(sections)}."
+        )
+    low = max(one.frequency[0] for one in sections)
+    high = min(one.frequency[-1] for one in sections)
+    if not low < high:
+        raise ValueError("harmonic_force_surface needs levels that share a range of frequencies.")
+    every = np.unique(np.concatenate([one.frequency for one in sections]))
+    frequency = every[(every >= low) & (every <= high)]
+    rows = sorted(sections, key=lambda one: one.amplitude)
+    forces = [one.amplitude * _interpolated(frequency, one) for one in rows]
+    return ForceSurface(np.array([one.amplitude for one in rows]), frequency, np.array(forces))
+
+
+def harmonic_force_surface(data: SteadyStates, modes: LinearModes) -> MethodResult:
+    """The peak of the response that each cut would show, by level of displacement.
+
+    At each amplitude the force that holds it is least at the peak of the response under that
+    force: a parabola through |F|² against Ω² near it gives its frequency, and the balance of
+    power, 2ζ̃ω̃ = |Φ_r Φᵀb| |F| / |v|, its damping.
+
+    Arguments: `data` with forces in N and phases; `modes` has the modal mass of the mode of
+    interest. Returns a `MethodResult` with one point an amplitude; without 1σ, which the method
+    does not give. Levels whose least force lies at their end are `NO_RESONANCE`.
+    Raises `ValueError` where the data have no forces or no phases.
+    """
+    sections = _usable(data, modes)
+    points = [_peak(one, drive_point(modes)) for one in sections]
+    if not points:
+        points = [MethodPoint(MethodStatus.TOO_FEW_STATES, -1)]
+    count = sum(len(one.frequency) for one in sections)
+    return method_result("harmonic_force_surface", points, count)
+
+
+def _usable(data: SteadyStates, modes: LinearModes) -> list[AmplitudeSection]:
+    sections, _ = sections_of(sensor_states(data, modes, "harmonic_force_surface"))
+    return [one for one in sections if len(one.frequency) >= _FEWEST_STATES]
+
+
+def _interpolated(
+    frequency: np.ndarray, section: AmplitudeSection
+) -> Complex[Array | np.ndarray, " k"]:
+    real = np.interp(frequency, section.frequency, section.stiffness.real)
+    return real + 1j * np.interp(frequency, section.frequency, section.stiffness.imag)
+
+
+def _peak(section: AmplitudeSection, per_force: float) -> MethodPoint:
+    """The frequency of least force of one section.
+
+    |F|² of a linear mode is a parabola in Ω²: it is fitted to the states of up to twice the least
+    force, relative errors alike, and to the three about the least one where those are fewer.
+    """
+    square = np.abs(section.stiffness) ** 2
+    k = int(np.argmin(square))
+    if k in (0, len(square) - 1):
+        return MethodPoint(MethodStatus.NO_RESONANCE, section.level)
+    near = square <= _WITHIN**2 * square[k]
+    near[k - 1 : k + 2] = True
+    center = section.frequency[k] ** 2
+    away = section.frequency[near] ** 2 - center
+    width = np.max(np.abs(away))
+    curve = np.polyfit(away / width, square[near], 2, w=1 / square[near])
+    lowest = -curve[1] / (2 * curve[0])
+    least = float(np.polyval(curve, lowest))
+    if not (curve[0] > 0 and least > 0 and center + width * lowest > 0):
+        return MethodPoint(MethodStatus.NOT_A_MODE, section.level)
+    omega = float(np.sqrt(center + width * lowest))
+    damping = per_force * np.sqrt(least) / omega
+    return MethodPoint(
+        MethodStatus.FOUND,
+        section.level,
+        velocity=omega * section.amplitude,
+        natural_frequency=omega,
+        damping_ratio=float(damping / (2 * omega)),
+    )

@@ -1,0 +1,98 @@
+"""Steady states as the other methods see them: one sensor, by level, force and displacement."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates
+from snrmjax.model.modes import LinearModes
+
+
+class SensorStates(NamedTuple):
+    """States of the reference sensor whose force, amplitude and phase were measured."""
+
+    level: Int[np.ndarray, " state"]
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N
+    velocity: Complex[np.ndarray, " state"]  # m/s, relative to the force
+    amplitude_std: Float[np.ndarray, " state"]  # relative, of velocity over force; NaN = unstated
+    phase_std: Float[np.ndarray, " state"]  # rad, NaN = not stated
+
+    @property
+    def displacement(self) -> Complex[np.ndarray, " state"]:
+        """Displacement phasor, m."""
+        return self.velocity / (1j * self.frequency)
+
+    @property
+    def receptance(self) -> Complex[np.ndarray, " state"]:
+        """Displacement over force, m/N."""
+        return self.displacement / self.force
+
+    @property
+    def phase(self) -> Float[np.ndarray, " state"]:
+        """Phase of the velocity relative to the force, rad: positive below resonance."""
+        return np.angle(self.velocity)
+
+    def of(self, rows: Bool[np.ndarray, " state"] | Int[np.ndarray, " row"]) -> "SensorStates":
+        """Some of the states."""
+        return SensorStates(*(column[rows] for column in self))
+
+    def levels(self) -> Iterator[tuple[int, "SensorStates"]]:
+        """The states of each level."""
+        for level in np.unique(self.level):
+            yield int(level), self.of(self.level == level)
+
+
+def sensor_states(data: SteadyStates, modes: LinearModes, method: str) -> SensorStates:
+    """The states that a method of one sensor can use, velocities turned to the mode's sign.
+
+    Arguments: `method` is named in errors. Raises `ValueError` where no force or no phase was
+    measured, or where the reference sensor is not in the data.
+    """
+    name = modes.sensors[reference_sensor(modes)]
+    if name not in data.sensors:
+        raise ValueError(
+            f"{method} needs the sensor {name}, where the mode moves most, but the data have "
+            f"{', '.join(data.sensors)}."
+        )
+    at = data.sensors.index(name)
+    force, velocity = np.asarray(data.force), np.asarray(data.velocity)[:, at]
+    phase_std = np.asarray(data.phase_std)[:, at]
+    measured = np.asarray(data.measured)[:, at] & (np.abs(velocity) > 0)
+    forced = measured & np.isfinite(force) & (force > 0)
+    if not forced.any():
+        raise ValueError(f"{method} needs forces in N, but the data have none (force_n).")
+    phased = forced & ~(phase_std >= PHASE_UNKNOWN * (1 - 1e-12))
+    if not phased.any():
+        raise ValueError(f"{method} needs phases, but the data have amplitudes alone.")
+    kept = np.flatnonzero(phased)
+    turn = np.sign(_drive_point(modes))
+    velocity_std = np.asarray(data.velocity_std)[kept, at] / np.abs(velocity[kept])
+    force_std = np.asarray(data.force_std)[kept] / force[kept]
+    return SensorStates(
+        np.asarray(data.level)[kept],
+        np.asarray(data.frequency)[kept],
+        force[kept],
+        turn * velocity[kept],
+        np.hypot(velocity_std, np.where(np.isfinite(force_std), force_std, 0.0)),
+        phase_std[kept],
+    )
+
+
+def _drive_point(modes: LinearModes) -> float:
+    """Shape at the reference sensor times participation: 1 / modal mass there, 1/kg, signed."""
+    k = modes.mode_of_interest
+    return float(modes.mode_shape[reference_sensor(modes), k] * modes.participation[k])
+
+
+def drive_point(modes: LinearModes) -> float:
+    """Velocity of the reference sensor per modal velocity and force: |Φ_r Φᵀb|, 1/kg."""
+    return abs(_drive_point(modes))
+
+
+def modal_damping_at_resonance(states: SensorStates, modes: LinearModes) -> np.ndarray:
+    """2ζ̃ω̃ (1/s) from the balance of power at resonance: force in over velocity out."""
+    return drive_point(modes) * states.force / np.abs(states.velocity)

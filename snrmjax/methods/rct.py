@@ -1,0 +1,92 @@
+"""Response-controlled stepped sine: a linear mode fitted at each held amplitude.
+
+With the amplitude of displacement held, a nonlinear mode answers as a linear one, so that
+standard modal analysis of each level gives natural frequency and damping at its amplitude. The
+analysis here is the straight line of inverse receptance, F/X = (λ − Ω²)/C, by least squares.
+
+Reference: T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 146 (2021) 107023,
+doi:10.1016/j.ymssp.2020.107023; for the line, D. J. Ewins, Modal Testing (2000), section 4.2.
+"""
+
+import numpy as np
+
+from snrmjax.measure.states import SteadyStates
+from snrmjax.methods.equal_amplitude import CONTROLLED, AmplitudeSection, sections_of
+from snrmjax.methods.one_sensor import sensor_states
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.model.modes import LinearModes
+
+_UNKNOWNS = 2  # complex: 1/C and λ/C
+_NEAR = 3.0  # half-power widths about resonance that a section keeps
+
+
+def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
+    """Natural frequency and damping at each held amplitude of displacement.
+
+    Levels whose displacement stays within ±10 % are fitted as they are. Where there are none
+    (tests of constant force) the levels are cut at amplitudes that both sides of several reach.
+
+    Arguments: `data` with forces in N and phases; `modes` names the sensor, its numbers do not
+    enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter about the
+    line, NaN for two states too few to have one.
+    Raises `ValueError` where the data have no forces or no phases.
+    Validity: one mode near resonance with damping that counts as hysteretic; a response level
+    that wanders within ±10 % is averaged.
+    """
+    states = sensor_states(data, modes, "rct")
+    sections, held = sections_of(states)
+    notes: tuple[str, ...] = ()
+    if not held:
+        notes = (
+            f"no level holds its displacement within ±{100 * CONTROLLED:.0f} %: sections of equal "
+            "displacement are interpolated between levels",
+        )
+    points = [_mode_of(one) for one in sections]
+    if not points:
+        points = [MethodPoint(MethodStatus.ONE_SIDE, level) for level, _ in states.levels()]
+    return method_result("rct", points, len(states.level), notes)
+
+
+def _mode_of(section: AmplitudeSection) -> MethodPoint:
+    """The linear mode of one section, by weighted least squares and once more near resonance."""
+    if len(section.frequency) <= _UNKNOWNS:
+        return MethodPoint(MethodStatus.TOO_FEW_STATES, section.level)
+    eigenvalue, variance = _line(section.frequency, section.stiffness)
+    if eigenvalue.real > 0 and eigenvalue.imag > 0:
+        natural = np.sqrt(eigenvalue.real)
+        width = eigenvalue.imag / natural  # η ω̃: between half-power points
+        near = np.abs(section.frequency - natural) < _NEAR * width
+        if near.sum() > _UNKNOWNS:
+            eigenvalue, variance = _line(section.frequency[near], section.stiffness[near])
+    if not (eigenvalue.real > 0 and eigenvalue.imag > 0):
+        return MethodPoint(MethodStatus.NOT_A_MODE, section.level)
+    natural = float(np.sqrt(eigenvalue.real))
+    loss = float(eigenvalue.imag / eigenvalue.real)
+    std = float(np.sqrt(variance))  # of Re λ and of Im λ
+    return MethodPoint(
+        MethodStatus.FOUND,
+        section.level,
+        natural * section.amplitude,
+        natural,
+        std / (2 * natural),
+        loss / 2,
+        float(np.hypot(1.0, loss)) * std / (2 * eigenvalue.real),
+    )
+
+
+def _line(frequency: np.ndarray, stiffness: np.ndarray) -> tuple[complex, float]:
+    """λ of F/X = (λ − Ω²)/C, and the variance of its real and of its imaginary part."""
+    center = float(np.mean(frequency**2))
+    # Relative errors of receptances weigh alike; squares about their mean keep the digits.
+    size = np.abs(stiffness)
+    design = np.stack([np.ones_like(frequency), -(frequency**2 - center)], axis=1) / size[:, None]
+    scale = np.linalg.norm(design, axis=0)
+    solved, *_ = np.linalg.lstsq(design / scale, stiffness / size, rcond=None)
+    numerator, inverse = solved / scale  # (λ − center)/C and 1/C
+    eigenvalue = complex(center + numerator / inverse)
+    residual = stiffness / size - design @ np.array([numerator, inverse])
+    freedom = len(frequency) - _UNKNOWNS
+    noise = float(np.sum(np.abs(residual) ** 2) / (2 * freedom)) if freedom else np.nan
+    covariance = np.linalg.inv(design.T @ design) * noise
+    slope = np.array([1.0, -(eigenvalue - center)]) / inverse
+    return eigenvalue, float(np.real(slope.conj() @ covariance @ slope))
