@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.pointwise.identification import identify_backbone
 from snrmjax.measure.states import SteadyStates
 from snrmjax.methods.arslan_ozguven import arslan_ozguven
@@ -24,13 +26,19 @@ Method = Callable[[SteadyStates, LinearModes], MethodResult]
 def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """The inverse single nonlinear resonant mode method: its curves at 41 amplitudes.
 
-    `identify_backbone` in the form of the other methods. Arguments: `data` and `modes` as there.
-    Returns a `MethodResult`; 1σ as stated by the data or from the scatter about the curve.
-    Raises `ValueError` as `identify_backbone` does.
+    `identify_backbone` in the form of the other methods; where the force is known only as a drive
+    voltage `fit_jointly`, with the gain and the instrument's phase as unknowns. Arguments: `data`
+    and `modes` as there. Returns a `MethodResult` between the smallest and the largest measured
+    amplitude; 1σ as stated by the data or from the scatter about the curve.
+    Raises `ValueError` as these do.
     Reference: Kwarta & Allen, section 2.2.
     """
-    found = identify_backbone(data, modes)
-    backbone = found.fit.backbone
+    if np.isfinite(np.asarray(data.force)).any():
+        found = identify_backbone(data, modes)
+        backbone, notes = found.fit.backbone, found.notes
+    else:
+        joint = fit_jointly(data, modes, free=("instrument_phase",))
+        backbone, notes = as_backbone(joint), joint.notes
     ends = float(backbone.smallest), float(backbone.largest)
     curve = backbone.values(jnp.linspace(*ends, _SAMPLES))
     columns = (
@@ -41,7 +49,7 @@ def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
         MethodPoint(MethodStatus.FOUND, -1, *(float(value) for value in row))
         for row in np.stack([np.asarray(one) for one in columns], axis=1)
     ]
-    return method_result("snrm", points, data.n_states, found.notes)
+    return method_result("snrm", points, data.n_states, notes)
 
 
 METHODS: dict[str, Method] = {

@@ -27,15 +27,15 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
     the partner's frequency and receptance are interpolated in amplitude. Sides are told by phase,
     so that states of a rising and a falling sweep may be mixed. The force may vary within a level.
 
-    Arguments: `data` with forces in N and phases; `modes` names the sensor, its numbers do not
-    enter. Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the displacement.
+    Arguments: `data` with forces (or drive voltages) and phases; `modes` names the sensor, its
+    numbers do not enter. Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the displacement.
     1σ from the stated errors of both states, to first order: they grow towards the peak, where
     both states become one. Levels without a pair are `ONE_SIDE`.
-    Raises `ValueError` where the data have no forces or no phases.
+    Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
     Validity: one mode, damping that counts as hysteretic (η is constant between the two
     frequencies), no more than one amplitude on each side.
     """
-    states = sensor_states(data, modes, "concerto")
+    states = sensor_states(data, modes, "concerto", any_scale=True)
     points = [point for level, one in states.levels() for point in _pairs(level, one)]
     return method_result("concerto", points, len(states.level))
 

@@ -98,8 +98,8 @@ def _usable(data: SteadyStates, modes: LinearModes) -> list[AmplitudeSection]:
 
 
 def _interpolated(
-    frequency: np.ndarray, section: AmplitudeSection
-) -> Complex[Array | np.ndarray, " k"]:
+    frequency: Float[np.ndarray, " k"], section: AmplitudeSection
+) -> Complex[np.ndarray, " k"]:
     real = np.interp(frequency, section.frequency, section.stiffness.real)
     return real + 1j * np.interp(frequency, section.frequency, section.stiffness.imag)
 

@@ -46,11 +46,16 @@ class SensorStates(NamedTuple):
             yield int(level), self.of(self.level == level)
 
 
-def sensor_states(data: SteadyStates, modes: LinearModes, method: str) -> SensorStates:
+def sensor_states(
+    data: SteadyStates, modes: LinearModes, method: str, *, any_scale: bool = False
+) -> SensorStates:
     """The states that a method of one sensor can use, velocities turned to the mode's sign.
 
-    Arguments: `method` is named in errors. Raises `ValueError` where no force or no phase was
-    measured, or where the reference sensor is not in the data.
+    Arguments: `method` is named in errors; with `any_scale` a drive voltage stands for the force
+    where no force was measured, for methods to which the modal constant does not matter.
+    A phase whose error is not stated is as wrong, in rad, as its amplitude is relatively.
+    Raises `ValueError` where no force or no phase was measured, or where the reference sensor is
+    not in the data.
     """
     name = modes.sensors[reference_sensor(modes)]
     if name not in data.sensors:
@@ -60,6 +65,8 @@ def sensor_states(data: SteadyStates, modes: LinearModes, method: str) -> Sensor
         )
     at = data.sensors.index(name)
     force, velocity = np.asarray(data.force), np.asarray(data.velocity)[:, at]
+    if any_scale and not np.isfinite(force).any():
+        force = np.asarray(data.drive)
     phase_std = np.asarray(data.phase_std)[:, at]
     measured = np.asarray(data.measured)[:, at] & (np.abs(velocity) > 0)
     forced = measured & np.isfinite(force) & (force > 0)
@@ -78,7 +85,7 @@ def sensor_states(data: SteadyStates, modes: LinearModes, method: str) -> Sensor
         force[kept],
         turn * velocity[kept],
         np.hypot(velocity_std, np.where(np.isfinite(force_std), force_std, 0.0)),
-        phase_std[kept],
+        np.where(np.isfinite(phase_std[kept]), phase_std[kept], velocity_std),
     )
 
 

@@ -26,14 +26,14 @@ def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
     Levels whose displacement stays within ±10 % are fitted as they are. Where there are none
     (tests of constant force) the levels are cut at amplitudes that both sides of several reach.
 
-    Arguments: `data` with forces in N and phases; `modes` names the sensor, its numbers do not
-    enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter about the
+    Arguments: `data` with forces (or drive voltages) and phases; `modes` names the sensor, its
+    numbers do not enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter about the
     line, NaN for two states too few to have one.
-    Raises `ValueError` where the data have no forces or no phases.
+    Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
     Validity: one mode near resonance with damping that counts as hysteretic; a response level
     that wanders within ±10 % is averaged.
     """
-    states = sensor_states(data, modes, "rct")
+    states = sensor_states(data, modes, "rct", any_scale=True)
     sections, held = sections_of(states)
     notes: tuple[str, ...] = ()
     if not held:
