@@ -57,6 +57,7 @@ SUB_ROOMS = {
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},
+    "report.methods": {"report.style", "report.html"},
     "report.study": {"report.style", "report.html"},
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),

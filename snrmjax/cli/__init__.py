@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify, diagnose, study, rom.
+"""The commands: demo, simulate, nnm, identify, compare, diagnose, study, rom.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import typer
 
+from snrmjax.cli.compare_command import compare
 from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
@@ -36,6 +37,7 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
     "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
     "--next 5 --out result",
+    compare: "Example: snrmjax compare measured.csv --model model.toml --out compared",
     diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
     "snrmjax diagnose sets/*.csv --model model.toml --out results",
     rom: "Examples: snrmjax rom beam.toml --out reduced\n\n"

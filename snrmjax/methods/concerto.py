@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.measure.states import SteadyStates
+from snrmjax.methods.equal_amplitude import CONTROLLED, displacement_spread
 from snrmjax.methods.one_sensor import SensorStates, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.model.modes import LinearModes
@@ -28,9 +29,11 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
     so that states of a rising and a falling sweep may be mixed. The force may vary within a level.
 
     Arguments: `data` with forces (or drive voltages) and phases; `modes` names the sensor, its
-    numbers do not enter. Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the displacement.
+    numbers do not enter. Returns a `MethodResult`; damping ratio is η/2, velocity is ω̃ times the
+    displacement.
     1σ from the stated errors of both states, to first order: they grow towards the peak, where
-    both states become one. Levels without a pair are `ONE_SIDE`.
+    both states become one. Levels without a pair are `ONE_SIDE`, those whose displacement was
+    held `AMPLITUDE_HELD`.
     Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
     Validity: one mode, damping that counts as hysteretic (η is constant between the two
     frequencies), no more than one amplitude on each side.
@@ -42,6 +45,8 @@ def concerto(data: SteadyStates, modes: LinearModes) -> MethodResult:
 
 def _pairs(level: int, states: SensorStates) -> list[MethodPoint]:
     """The points of one level, one for each state with a partner."""
+    if displacement_spread(states) <= CONTROLLED:
+        return [MethodPoint(MethodStatus.AMPLITUDE_HELD, level)]
     size = np.abs(states.displacement)
     below, above = (_rising(states, side) for side in (states.phase >= 0, states.phase < 0))
     points = []

@@ -27,8 +27,8 @@ def rct(data: SteadyStates, modes: LinearModes) -> MethodResult:
     (tests of constant force) the levels are cut at amplitudes that both sides of several reach.
 
     Arguments: `data` with forces (or drive voltages) and phases; `modes` names the sensor, its
-    numbers do not enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter about the
-    line, NaN for two states too few to have one.
+    numbers do not enter. Returns a `MethodResult` with one point an amplitude; 1σ from the scatter
+    about the line. Sections of fewer than three states are `TOO_FEW_STATES`.
     Raises `ValueError` where the data have neither forces nor drive voltages, or no phases.
     Validity: one mode near resonance with damping that counts as hysteretic; a response level
     that wanders within ±10 % is averaged.

@@ -21,7 +21,7 @@ class MethodStatus(IntEnum):
     ONE_SIDE = 2  # measured on one side of resonance only at this amplitude
     TOO_FEW_STATES = 3
     NOT_A_MODE = 4  # numbers came out that no damped mode has
-    NO_PHASE = 5  # amplitudes alone were measured
+    AMPLITUDE_HELD = 5  # the displacement was controlled: all states are of equal amplitude
 
 
 METHOD_MESSAGE: dict[MethodStatus, str] = {
@@ -33,7 +33,9 @@ METHOD_MESSAGE: dict[MethodStatus, str] = {
     MethodStatus.ONE_SIDE: "no states of equal amplitude on both sides of resonance",
     MethodStatus.TOO_FEW_STATES: "too few states of this amplitude",
     MethodStatus.NOT_A_MODE: "a stiffness or damping came out that is not positive",
-    MethodStatus.NO_PHASE: "the phase was not measured",
+    MethodStatus.AMPLITUDE_HELD: (
+        "the displacement was held, so that states of equal amplitude are not a pair"
+    ),
 }
 
 

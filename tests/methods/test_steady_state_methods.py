@@ -100,6 +100,11 @@ def test_response_control_is_a_linear_mode_at_each_level():
         assert max(errors(result)) < 1e-6
 
 
+def test_held_displacements_are_no_pairs():
+    result = sj.methods.concerto(constant_response(), modes_of())
+    assert list(result.status) == 4 * [int(MethodStatus.AMPLITUDE_HELD)]
+
+
 def test_levels_of_constant_force_are_cut_at_equal_displacement():
     data = constant_force(forces=(0.05, 0.07, 0.1, 0.14), shares=np.linspace(0.3, 0.999, 60))
     result = sj.methods.rct(data, modes_of())
@@ -206,10 +211,13 @@ def test_methods_that_cannot_run_say_why_and_the_others_run():
         np.asarray(data.frequency),
         np.full(data.n_states, np.nan),
         np.asarray(data.velocity),
-        drive=np.ones(data.n_states),
+        drive=3.0 * np.asarray(data.force),
     )
-    with pytest.raises(ValueError, match="no method could run; concerto: concerto needs forces"):
-        sj.methods.compare_methods(volts, modes_of(), ["concerto"])
+    with pytest.raises(ValueError, match="no method could run; phase_resonance: phase_resonance n"):
+        sj.methods.compare_methods(volts, modes_of(), ["phase_resonance"])
+    found = sj.methods.compare_methods(volts, modes_of(), ["arslan_ozguven", "concerto"])
+    assert list(found.stopped) == ["arslan_ozguven"]
+    assert max(errors(found.results[0])) < 1e-7
     with pytest.raises(ValueError, match=r"must be among snrm, concerto.*but has hilbert"):
         sj.methods.compare_methods(data, modes_of(), ["hilbert"])
     found = sj.methods.compare_methods(data, modes_of())

@@ -1,0 +1,1 @@
+"""Reports of several methods on the same data."""
