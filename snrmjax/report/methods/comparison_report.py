@@ -96,6 +96,8 @@ def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
     values: list[list[np.ndarray]] = [[], []]
     for k, one in enumerate(results):
         at = one.found
+        if not at.any():
+            continue
         x = np.asarray(one.velocity)[at] / unit.size
         columns = (
             (one.natural_frequency / HERTZ, one.natural_frequency_std / HERTZ),
