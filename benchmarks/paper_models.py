@@ -6,7 +6,7 @@ Kwarta & Allen, Tabs. 1 to 4 and A.1: a flat clamped beam (40 elements, bending 
 and a curved one (400 shell elements, mode 1). Each is condensed from CalculiX beams and shells of
 several kinds, with and without Poisson's effect across the width, and from the built-in elements.
 Loads move single modes by `--scale` thicknesses (default: the package's own rule, the nonlinear
-force a tenth of the linear one). One JSON line a model: frequencies, ratios to the print, misfit,
+force 2 % of the linear one). One JSON line a model: frequencies, ratios to the print, misfit,
 seconds; `--table` writes all coefficients side by side. Jobs found in the folder are not run again.
 Without CalculiX its columns are left out.
 """

@@ -4,6 +4,7 @@ from .concerto import concerto
 from .harmonic_force_surface import ForceSurface, force_surface, harmonic_force_surface
 from .phase_resonance import phase_resonance
 from .rct import rct
+from .resonant_decay import resonant_decay
 from .result import MethodResult, MethodStatus
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "harmonic_force_surface",
     "phase_resonance",
     "rct",
+    "resonant_decay",
     "snrm",
 ]

@@ -1,0 +1,238 @@
+"""Resonant decay: frequency and damping against amplitude from a free decay after resonance.
+
+The force is taken away at resonance, and the motion falls along the backbone of one mode. Three
+readings of the record are offered. *peaks* fits a parabola to every extreme of the velocity and
+takes times and sizes of extremes; *zero_crossings* takes times from the zeros and sizes from the
+extremes between them; *hilbert* takes phase and envelope of the analytic signal, whose ends are
+wrong for some cycles and are cut. Local straight lines of phase and of the logarithm of the
+envelope, over a window of cycles, then give ω̃ and 2ζ̃ω̃ = −2 d(ln v)/dt.
+
+References: J. M. Londoño, S. A. Neild & J. E. Cooper, J. Sound Vib. 348 (2015) 224,
+doi:10.1016/j.jsv.2015.03.015 (zero crossings); M. Jin, W. Chen, M. R. W. Brake & H. Song,
+IEEE Trans. Instrum. Meas. 69 (2020) (peak finding and fitting); M. Feldman, Mech. Syst. Signal
+Process. 8 (1994) 119, doi:10.1006/mssp.1994.1011 (Hilbert transform).
+"""
+
+import itertools
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+
+Reading = Literal["peaks", "zero_crossings", "hilbert"]
+
+_FEWEST_CYCLES = 12
+_FEWEST_SAMPLES = 8  # a cycle: a parabola through an extreme is then within 2 % of a cosine
+_CLIPPED = 4  # neighbouring samples at the largest value that a free decay does not have
+_EVEN = 1e-3  # largest relative deviation of a sampling interval
+_HILBERT_ENDS = 4  # cycles at each end at which the analytic signal is wrong
+_MIRRORED = 3  # a part of the record, 1/3, is mirrored at each of its ends
+_FILTER_ENDS = 8.0  # times 1/width (s), after which the filter has settled to e^(−19)
+_FILTER_ORDER = 4
+_MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, over 1σ
+
+
+class _Trace(NamedTuple):
+    """Phase and logarithm of the velocity's amplitude at some times."""
+
+    time: Float[np.ndarray, " k"]  # s
+    phase: Float[np.ndarray, " k"]  # rad, rising
+    log_amplitude: Float[np.ndarray, " k"]  # of m/s
+    per_cycle: float  # entries a cycle
+
+
+def resonant_decay(
+    time: Float[np.ndarray, " sample"],
+    velocity: Float[np.ndarray, " sample"],
+    *,
+    reading: Reading = "peaks",
+    band: tuple[float, float] | None = None,
+    window: float = 8.0,
+    least_amplitude: float = 0.0,
+) -> MethodResult:
+    """Natural frequency and damping against velocity along a free decay of one mode.
+
+    Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the force
+    was gone; `reading` says how phase and amplitude are read; `band`, two frequencies in Hz, is
+    passed by a Butterworth filter of order 4 run forwards and backwards (no phase shift; its
+    ends are cut); `window` is how many cycles a local straight line spans; the record is read down
+    to `least_amplitude` (m/s), where noise takes over.
+    Returns a `MethodResult` with a point every half window: the velocity is that of the peak, by
+    *hilbert* and with a `band` without harmonics that of the fundamental; 1σ from how far the
+    windows scatter about one another, growing as the amplitude falls. Where a line rises (the
+    mode gains energy) the point is `NOT_A_MODE`.
+    Raises `ValueError` for uneven times, a rate below eight samples a cycle, fewer than twelve
+    cycles, a clipped record and numbers that are not finite.
+    Validity: one mode, light damping, nothing driving; a filter narrower than the frequency moves
+    within its memory smooths both curves.
+    """
+    times, signal = _checked(time, velocity)
+    if reading not in get_args(Reading):
+        raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
+    step = float(np.mean(np.diff(times)))
+    if band is not None:
+        signal, settled = _filtered(signal, step, band)
+        times, signal = times[settled], signal[settled]
+    trace = _TRACES[reading](times, signal)
+    kept = trace.log_amplitude >= np.log(max(least_amplitude, np.finfo(float).tiny))
+    # The first time that it falls below: what comes after is noise.
+    end = len(kept) if kept.all() else int(np.argmin(kept))
+    points = _local_lines(trace, end, window)
+    return method_result("resonant_decay", points, 0, (f"read by {reading}",))
+
+
+def _checked(time: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
+    if times.ndim != 1 or times.shape != signal.shape or len(times) < _FEWEST_SAMPLES:
+        raise ValueError(
+            "resonant_decay needs `time` and `velocity` of one length, but they have shapes "
+            f"{times.shape} and {signal.shape}."
+        )
+    if not (np.isfinite(times).all() and np.isfinite(signal).all()):
+        raise ValueError("resonant_decay needs a record of finite numbers, but it has NaN or inf.")
+    steps = np.diff(times)
+    if steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean():
+        raise ValueError("resonant_decay needs evenly spaced rising times, but they are not.")
+    largest = np.abs(signal).max()
+    flat = np.abs(signal) >= largest * (1 - 1e-9)
+    run = np.convolve(flat, np.ones(_CLIPPED), "valid").max()
+    if largest > 0 and run >= _CLIPPED:
+        raise ValueError(
+            f"resonant_decay: the record stays at its largest value, {largest:.4g} m/s, for "
+            f"{_CLIPPED} samples or more: it is clipped."
+        )
+    signal = signal - signal.mean()
+    ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
+    if ups < _FEWEST_CYCLES:
+        raise ValueError(f"resonant_decay needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
+    if len(signal) / ups < _FEWEST_SAMPLES:
+        raise ValueError(
+            f"resonant_decay needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
+            "`band`)."
+        )
+    return times, signal
+
+
+def _filtered(
+    signal: np.ndarray, step: float, band: tuple[float, float]
+) -> tuple[np.ndarray, slice]:
+    """The band-passed record, and where its ends have settled."""
+    from scipy.signal import butter, sosfiltfilt
+
+    low, high = band
+    if not 0 < low < high < 0.5 / step:
+        raise ValueError(
+            f"`band` must rise between 0 and half the sampling rate, {0.5 / step:.4g} Hz, but is "
+            f"{low:g} to {high:g} Hz."
+        )
+    sections = butter(_FILTER_ORDER, band, "bandpass", fs=1 / step, output="sos")
+    ends = int(np.ceil(_FILTER_ENDS / ((high - low) * step)))
+    if 3 * ends > len(signal):
+        raise ValueError(
+            f"resonant_decay: a band of {high - low:g} Hz spoils {ends * step:.3g} s at each end, "
+            f"but the record has {len(signal) * step:.3g} s: widen the band."
+        )
+    return sosfiltfilt(sections, signal), slice(ends, len(signal) - ends)
+
+
+def _extremes(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and sizes of the largest |velocity| between zeros, by parabolas."""
+    crossings = np.flatnonzero(np.signbit(signal[:-1]) != np.signbit(signal[1:])) + 1
+    size = np.abs(signal)
+    rows = [
+        start + int(np.argmax(size[start:stop])) for start, stop in itertools.pairwise(crossings)
+    ]
+    middle = np.array([k for k in rows if 0 < k < len(signal) - 1])
+    before, at, after = size[middle - 1], size[middle], size[middle + 1]
+    curvature = before - 2 * at + after
+    shift = np.where(curvature < 0, 0.5 * (before - after) / np.where(curvature, curvature, 1), 0)
+    step = time[1] - time[0]
+    return time[middle] + shift * step, at - 0.25 * (before - after) * shift
+
+
+def _of_neighbours(values: np.ndarray) -> np.ndarray:
+    """Means of neighbours, upper and lower half: an offset of the record moves both apart."""
+    return (values[1:] + values[:-1]) / 2
+
+
+def _by_peaks(time: np.ndarray, signal: np.ndarray) -> _Trace:
+    at, size = _extremes(time, signal)
+    at, log_size = _of_neighbours(at), np.log(_of_neighbours(size))
+    return _Trace(at, np.pi * np.arange(len(at)), log_size, 2.0)
+
+
+def _by_zero_crossings(time: np.ndarray, signal: np.ndarray) -> _Trace:
+    before = np.flatnonzero(np.signbit(signal[:-1]) != np.signbit(signal[1:]))
+    share = signal[before] / (signal[before] - signal[before + 1])
+    zeros = time[before] + share * (time[before + 1] - time[before])
+    zeros = _of_neighbours(zeros)
+    peaks, size = _extremes(time, signal)
+    peaks = _of_neighbours(peaks)
+    log_size = np.interp(zeros, peaks, np.log(_of_neighbours(size)))
+    inside = (zeros >= peaks[0]) & (zeros <= peaks[-1])
+    return _Trace(zeros[inside], np.pi * np.arange(inside.sum()), log_size[inside], 2.0)
+
+
+def _by_hilbert(time: np.ndarray, signal: np.ndarray) -> _Trace:
+    from scipy.signal import hilbert
+
+    # Mirrored through zeros at both ends the motion goes on without a jump.
+    zeros = np.flatnonzero(np.signbit(signal[:-1]) != np.signbit(signal[1:]))
+    time, signal = time[zeros[0] : zeros[-1] + 2], signal[zeros[0] : zeros[-1] + 2]
+    beyond = len(signal) // _MIRRORED
+    mirrored = np.pad(signal, beyond, mode="reflect", reflect_type="odd")
+    analytic = hilbert(mirrored)[beyond : beyond + len(signal)]
+    phase = np.unwrap(np.angle(analytic))
+    per_cycle = 2 * np.pi * len(time) / (phase[-1] - phase[0])
+    cut = int(np.ceil(_HILBERT_ENDS * per_cycle))
+    inside = slice(cut, len(time) - cut)
+    return _Trace(time[inside], phase[inside], np.log(np.abs(analytic[inside])), per_cycle)
+
+
+_TRACES = {"peaks": _by_peaks, "zero_crossings": _by_zero_crossings, "hilbert": _by_hilbert}
+
+
+def _local_lines(trace: _Trace, end: int, window: float) -> list[MethodPoint]:
+    """A straight line of phase and of log amplitude over every half window."""
+    width = max(4, round(window * trace.per_cycle))
+    if end < width:
+        raise ValueError(
+            f"resonant_decay needs {window:g} cycles above the least amplitude, but the record has "
+            f"{end / trace.per_cycle:.3g}."
+        )
+    starts = np.arange(0, end - width + 1, max(1, width // 2))
+    lines = np.array([_line(trace, slice(start, start + width)) for start in starts])
+    speed, omega, decay = np.exp(lines[:, 0]), lines[:, 1], lines[:, 2]
+    omega_std, decay_std = (_scatter(one, speed) for one in (omega, decay))
+    return [
+        MethodPoint(MethodStatus.FOUND, -1, *(float(value) for value in row))
+        if row[3] > 0
+        else MethodPoint(MethodStatus.NOT_A_MODE, -1)
+        for row in np.stack([speed, omega, omega_std, -decay / omega, decay_std / omega], axis=1)
+    ]
+
+
+def _line(trace: _Trace, part: slice) -> tuple[float, float, float]:
+    """Mean log amplitude, slope of phase and of log amplitude of one window.
+
+    A curvature is fitted beside each slope, which it does not move.
+    """
+    away = trace.time[part] - trace.time[part].mean()
+    phase = np.polyfit(away, trace.phase[part], 2)[1]
+    decay = np.polyfit(away, trace.log_amplitude[part], 2)[1]
+    return float(trace.log_amplitude[part].mean()), float(phase), float(decay)
+
+
+def _scatter(values: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """1σ of values from how far windows that do not overlap are off their neighbours' mean.
+
+    Noise of a record weighs as the inverse of the amplitude. NaN where there are too few windows.
+    """
+    bend = values[:-4] - 2 * values[2:-2] + values[4:]
+    if not bend.size:
+        return np.full(len(values), np.nan)
+    size = np.median(np.abs(bend * amplitude[2:-2])) / (_MEDIAN_OF_NORMAL * np.sqrt(6))
+    return size / amplitude

@@ -1,0 +1,93 @@
+"""Resonant decay against decays whose frequency and damping are known without it."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+
+import snrmjax as sj
+
+REST, DAMPING, CUBIC = 2 * np.pi * 40.0, 1.2, 6e9  # rad/s, 1/s, 1/(m² s²)
+READINGS = ("peaks", "zero_crossings", "hilbert")
+# Relative errors of frequency and damping: the analytic signal is wrong by 1/cycles near its ends.
+ACCURACY = {"peaks": (2e-5, 0.025), "zero_crossings": (2e-5, 0.025), "hilbert": (2e-4, 0.04)}
+
+
+@pytest.fixture(scope="module")
+def decay():
+    """Duffing's oscillator released at 2 mm: q̈ + D q̇ + ω² q + β q³ = 0, integrated in time."""
+    time = np.arange(0, 2.5, 1 / 4000)
+
+    def rate(_, state):
+        q, v = state
+        return v, -DAMPING * v - REST**2 * q - CUBIC * q**3
+
+    found = solve_ivp(rate, (0, time[-1]), (2e-3, 0.0), t_eval=time, rtol=1e-10, atol=1e-14)
+    return time, found.y[1]
+
+
+def free_motion(size):
+    """Exact frequency, peak and fundamental velocity of the undamped oscillator, X cn(u | m)."""
+    stiff = REST**2 + CUBIC * size**2
+    m = CUBIC * size**2 / (2 * stiff)
+    omega = np.pi * np.sqrt(stiff) / (2 * ellipk(m))
+    nome = np.exp(-np.pi * ellipk(1 - m) / ellipk(m))
+    fundamental = 2 * np.pi / (np.sqrt(m) * ellipk(m)) * np.sqrt(nome) / (1 + nome)
+    peak = np.sqrt(REST**2 * size**2 + CUBIC * size**4 / 2)
+    return omega, peak, omega * size * fundamental
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_duffing_decays_along_its_backbone(decay, reading):
+    result = sj.methods.resonant_decay(*decay, reading=reading)
+    assert result.found.all()
+    omega, peak, fundamental = free_motion(np.linspace(1e-5, 2.1e-3, 4000))
+    velocity = fundamental if reading == "hilbert" else peak
+    true = np.interp(result.velocity, velocity, omega)
+    assert true.max() / true.min() > 1.08
+    np.testing.assert_allclose(result.natural_frequency, true, rtol=1e-3)
+    low = result.velocity < 0.25  # where the motion is a cosine and D = −2 d ln v / dt holds
+    assert low.sum() > 5
+    modal = 2 * result.damping_ratio * result.natural_frequency
+    np.testing.assert_allclose(modal[low], DAMPING, rtol=ACCURACY[reading][1])
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_a_linear_decay_in_noise_with_its_error(reading):
+    time = np.arange(0, 3, 1 / 2000)
+    ratio = 0.004
+    rng = np.random.default_rng(2)
+    signal = np.exp(-ratio * REST * time) * np.cos(REST * np.sqrt(1 - ratio**2) * time)
+    noisy = 0.3 * (signal + 1e-3 * rng.standard_normal(len(time)))
+    result = sj.methods.resonant_decay(
+        time, noisy, reading=reading, band=(30.0, 50.0), least_amplitude=0.02
+    )
+    assert abs(np.median(result.natural_frequency) / REST - 1) < ACCURACY[reading][0]
+    assert abs(np.median(result.damping_ratio) / ratio - 1) < 0.01
+    score = (result.damping_ratio - ratio) / result.damping_ratio_std
+    assert 0.5 < np.sqrt(np.mean(score**2)) < 2.0
+
+
+def test_bad_records_are_refused(decay):
+    time, velocity = decay
+    for times, record, words in (
+        (time[:300], velocity[:300], "needs 12 cycles, but the record has"),
+        (time, np.clip(velocity, -0.2, 0.2), "it is clipped"),
+        (time[::20], velocity[::20], "samples a cycle"),
+        (time**1.1, velocity, "evenly spaced"),
+        (time, np.where(time > 1, np.nan, velocity), "NaN or inf"),
+        (time, velocity[1:], "of one length"),
+    ):
+        with pytest.raises(ValueError, match=f"resonant_decay.*{words}"):
+            sj.methods.resonant_decay(times, record)
+    with pytest.raises(ValueError, match="`band` must rise"):
+        sj.methods.resonant_decay(time, velocity, band=(50.0, 30.0))
+    with pytest.raises(ValueError, match="`reading` must be one of"):
+        sj.methods.resonant_decay(time, velocity, reading="wavelet")
+
+
+def test_growth_is_no_mode(decay):
+    time, velocity = decay
+    result = sj.methods.resonant_decay(time, velocity[::-1].copy())
+    assert not result.found.any()
+    assert "not positive" in repr(result)
