@@ -10,12 +10,12 @@ from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.pointwise.identification import identify_backbone
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.arslan_ozguven import arslan_ozguven
-from snrmjax.methods.concerto import concerto
-from snrmjax.methods.harmonic_force_surface import harmonic_force_surface
-from snrmjax.methods.phase_resonance import phase_resonance
-from snrmjax.methods.rct import rct
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.steady.arslan_ozguven import arslan_ozguven
+from snrmjax.methods.steady.concerto import concerto
+from snrmjax.methods.steady.harmonic_force_surface import harmonic_force_surface
+from snrmjax.methods.steady.phase_resonance import phase_resonance
+from snrmjax.methods.steady.rct import rct
 from snrmjax.model.modes import LinearModes
 
 _SAMPLES = 41  # of the curves that the inverse method gives

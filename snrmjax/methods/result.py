@@ -22,6 +22,7 @@ class MethodStatus(IntEnum):
     TOO_FEW_STATES = 3
     NOT_A_MODE = 4  # numbers came out that no damped mode has
     AMPLITUDE_HELD = 5  # the displacement was controlled: all states are of equal amplitude
+    NOT_LOCKED = 6  # the controller did not hold its target
 
 
 METHOD_MESSAGE: dict[MethodStatus, str] = {
@@ -35,6 +36,9 @@ METHOD_MESSAGE: dict[MethodStatus, str] = {
     MethodStatus.NOT_A_MODE: "a stiffness or damping came out that is not positive",
     MethodStatus.AMPLITUDE_HELD: (
         "the displacement was held, so that states of equal amplitude are not a pair"
+    ),
+    MethodStatus.NOT_LOCKED: (
+        "the controller did not hold its target: other gains, smaller steps or more time"
     ),
 }
 
@@ -70,6 +74,7 @@ class MethodResult(AbstractResult):
     status: Int[Array | np.ndarray, " point"]  # a `MethodStatus`
     level: Int[Array | np.ndarray, " point"]  # of the test; -1 from several levels
     n_states: int = eqx.field(static=True)  # steady states that it used
+    test_seconds: float = eqx.field(static=True, default=np.nan)  # of a test that it ran itself
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
@@ -84,6 +89,8 @@ class MethodResult(AbstractResult):
             f"MethodResult: {self.method}, {found.sum()} of {found.size} points, from "
             f"{self.n_states} states"
         ]
+        if np.isfinite(self.test_seconds):
+            lines.append(f"{self.test_seconds:.4g} s of test")
         if found.any():
             hertz = np.asarray(self.natural_frequency)[found] / _HERTZ
             ratio = 100 * np.asarray(self.damping_ratio)[found]
@@ -115,11 +122,17 @@ class MethodResult(AbstractResult):
 
     def attributes(self) -> dict[str, str | float | int]:
         """See `AbstractResult`."""
-        return {"method": self.method, "n_states": self.n_states, "notes": "\n".join(self.notes)}
+        own: dict[str, str | float | int] = {"method": self.method, "n_states": self.n_states}
+        return {**own, "test_seconds": self.test_seconds, "notes": "\n".join(self.notes)}
 
 
 def method_result(
-    method: str, points: Sequence[MethodPoint], n_states: int, notes: Sequence[str] = ()
+    method: str,
+    points: Sequence[MethodPoint],
+    n_states: int,
+    notes: Sequence[str] = (),
+    *,
+    test_seconds: float = np.nan,
 ) -> MethodResult:
     """A method's points as one result, by rising velocity, those without an answer last."""
     kept = sorted(points, key=lambda one: (one.status != MethodStatus.FOUND, one.velocity))
@@ -137,6 +150,7 @@ def method_result(
         np.array([int(one.status) for one in kept], dtype=int),
         np.array([one.level for one in kept], dtype=int),
         n_states,
+        test_seconds,
         tuple(notes),
     )
 

@@ -4,16 +4,16 @@ With the amplitude of displacement held, a nonlinear mode answers as a linear on
 standard modal analysis of each level gives natural frequency and damping at its amplitude. The
 analysis here is the straight line of inverse receptance, F/X = (λ − Ω²)/C, by least squares.
 
-Reference: T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 146 (2021) 107023,
-doi:10.1016/j.ymssp.2020.107023; for the line, D. J. Ewins, Modal Testing (2000), section 4.2.
+Reference: T. Karaağaçlı & H. N. Özgüven, Vibration 3 (2020) 266,
+doi:10.3390/vibration3030019; for the line, D. J. Ewins, Modal Testing (2000), section 4.2.
 """
 
 import numpy as np
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.equal_amplitude import CONTROLLED, AmplitudeSection, sections_of
 from snrmjax.methods.one_sensor import sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.steady.equal_amplitude import CONTROLLED, AmplitudeSection, sections_of
 from snrmjax.model.modes import LinearModes
 
 _UNKNOWNS = 2  # complex: 1/C and λ/C

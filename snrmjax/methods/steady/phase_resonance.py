@@ -12,9 +12,9 @@ doi:10.1016/j.jsv.2010.08.028.
 import numpy as np
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.equal_amplitude import CONTROLLED, displacement_spread
 from snrmjax.methods.one_sensor import SensorStates, drive_point, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.steady.equal_amplitude import CONTROLLED, displacement_spread
 from snrmjax.model.modes import LinearModes
 
 _WIDEST = 2 * np.pi / 3  # rad between two states: beyond, the motion has jumped

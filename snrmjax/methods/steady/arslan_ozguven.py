@@ -4,8 +4,7 @@ One element between a known point and the ground is all that is nonlinear. What 
 what the measured motion lacks to the linear one, X = H_rb F − H_rr N, and N = v(X) X is its
 describing function: Re v a stiffness and Im v a loss at that amplitude.
 
-Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 25 (2011) 1210,
-doi:10.1016/j.ymssp.2010.08.010.
+Reference: Ö. Arslan, M. Aykan & H. N. Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112.
 """
 
 import numpy as np

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.equal_amplitude import CONTROLLED, displacement_spread
 from snrmjax.methods.one_sensor import SensorStates, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.steady.equal_amplitude import CONTROLLED, displacement_spread
 from snrmjax.model.modes import LinearModes
 
 _ROUNDING = 1e-9  # relative: what two states of equal displacement may differ by

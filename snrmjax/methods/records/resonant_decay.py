@@ -9,7 +9,7 @@ envelope, over a window of cycles, then give ω̃ and 2ζ̃ω̃ = −2 d(ln v)/d
 
 References: J. M. Londoño, S. A. Neild & J. E. Cooper, J. Sound Vib. 348 (2015) 224,
 doi:10.1016/j.jsv.2015.03.015 (zero crossings); M. Jin, W. Chen, M. R. W. Brake & H. Song,
-IEEE Trans. Instrum. Meas. 69 (2020) (peak finding and fitting); M. Feldman, Mech. Syst. Signal
+J. Vib. Acoust. 142 (2020) 051111 (peak finding and fitting); M. Feldman, Mech. Syst. Signal
 Process. 8 (1994) 119, doi:10.1006/mssp.1994.1011 (Hilbert transform).
 """
 
@@ -68,7 +68,7 @@ def resonant_decay(
     Validity: one mode, light damping, nothing driving; a filter narrower than the frequency moves
     within its memory smooths both curves.
     """
-    times, signal = _checked(time, velocity)
+    times, signal = checked_record(time, velocity, "resonant_decay")
     if reading not in get_args(Reading):
         raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
     step = float(np.mean(np.diff(times)))
@@ -83,33 +83,36 @@ def resonant_decay(
     return method_result("resonant_decay", points, 0, (f"read by {reading}",))
 
 
-def _checked(time: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def checked_record(
+    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"], method: str
+) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
+    """A record of one channel as arrays, if a method can read it; `method` is named in errors."""
     times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
     if times.ndim != 1 or times.shape != signal.shape or len(times) < _FEWEST_SAMPLES:
         raise ValueError(
-            "resonant_decay needs `time` and `velocity` of one length, but they have shapes "
+            f"{method} needs `time` and `velocity` of one length, but they have shapes "
             f"{times.shape} and {signal.shape}."
         )
     if not (np.isfinite(times).all() and np.isfinite(signal).all()):
-        raise ValueError("resonant_decay needs a record of finite numbers, but it has NaN or inf.")
+        raise ValueError(f"{method} needs a record of finite numbers, but it has NaN or inf.")
     steps = np.diff(times)
     if steps.min() <= 0 or np.ptp(steps) > _EVEN * steps.mean():
-        raise ValueError("resonant_decay needs evenly spaced rising times, but they are not.")
+        raise ValueError(f"{method} needs evenly spaced rising times, but they are not.")
     largest = np.abs(signal).max()
     flat = np.abs(signal) >= largest * (1 - 1e-9)
     run = np.convolve(flat, np.ones(_CLIPPED), "valid").max()
     if largest > 0 and run >= _CLIPPED:
         raise ValueError(
-            f"resonant_decay: the record stays at its largest value, {largest:.4g} m/s, for "
+            f"{method}: the record stays at its largest value, {largest:.4g} m/s, for "
             f"{_CLIPPED} samples or more: it is clipped."
         )
     signal = signal - signal.mean()
     ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
     if ups < _FEWEST_CYCLES:
-        raise ValueError(f"resonant_decay needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
+        raise ValueError(f"{method} needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
     if len(signal) / ups < _FEWEST_SAMPLES:
         raise ValueError(
-            f"resonant_decay needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{method} needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
             f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
             "`band`)."
         )
@@ -138,7 +141,7 @@ def _filtered(
     return sosfiltfilt(sections, signal), slice(ends, len(signal) - ends)
 
 
-def _extremes(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def velocity_extremes(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Times and sizes of the largest |velocity| between zeros, by parabolas."""
     crossings = np.flatnonzero(np.signbit(signal[:-1]) != np.signbit(signal[1:])) + 1
     size = np.abs(signal)
@@ -159,7 +162,7 @@ def _of_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def _by_peaks(time: np.ndarray, signal: np.ndarray) -> _Trace:
-    at, size = _extremes(time, signal)
+    at, size = velocity_extremes(time, signal)
     at, log_size = _of_neighbours(at), np.log(_of_neighbours(size))
     return _Trace(at, np.pi * np.arange(len(at)), log_size, 2.0)
 
@@ -169,7 +172,7 @@ def _by_zero_crossings(time: np.ndarray, signal: np.ndarray) -> _Trace:
     share = signal[before] / (signal[before] - signal[before + 1])
     zeros = time[before] + share * (time[before + 1] - time[before])
     zeros = _of_neighbours(zeros)
-    peaks, size = _extremes(time, signal)
+    peaks, size = velocity_extremes(time, signal)
     peaks = _of_neighbours(peaks)
     log_size = np.interp(zeros, peaks, np.log(_of_neighbours(size)))
     inside = (zeros >= peaks[0]) & (zeros <= peaks[-1])

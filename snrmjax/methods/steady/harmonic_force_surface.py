@@ -4,8 +4,8 @@ Response-controlled levels give the complex force F(Ω, X) at each frequency and
 surface between them, cut at a constant |F|, is the response that a test under that force would
 show, with the parts that it would jump over: they are ordinary points of the surface.
 
-Reference: T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 146 (2021) 107023,
-doi:10.1016/j.ymssp.2020.107023.
+Reference: T. Karaağaçlı & H. N. Özgüven, Vibration 3 (2020) 266,
+doi:10.3390/vibration3030019.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.measure.states import SteadyStates
-from snrmjax.methods.equal_amplitude import AmplitudeSection, sections_of
 from snrmjax.methods.one_sensor import drive_point, sensor_states
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.methods.steady.equal_amplitude import AmplitudeSection, sections_of
 from snrmjax.model.modes import LinearModes
 
 _FEWEST_LEVELS, _FEWEST_STATES = 2, 3

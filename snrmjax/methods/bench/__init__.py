@@ -1,0 +1,1 @@
+"""Methods that run a test by themselves, in a virtual laboratory."""

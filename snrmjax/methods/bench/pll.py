@@ -1,0 +1,191 @@
+"""Phase-locked loop: a controller that holds phase resonance while the drive is raised.
+
+Adaptive filters follow the Fourier coefficients of force and velocity; the phase between their
+fundamentals, zero at resonance, goes through a proportional-integral law to the frequency of the
+drive. Near resonance the phase obeys φ̇ = (ω̃ − Ω) − ζ̃ω̃ φ, so that Ω = Ω₀ + k_p φ + k_i ∫φ makes
+φ̈ + (ζ̃ω̃ + k_p) φ̇ + k_i φ = 0: both gains follow from one rate λ, k_p = 2λ − ζω and k_i = λ².
+The loop holds branches that an open loop jumps off, since frequency is no longer prescribed.
+
+References: S. Peter & R. I. Leine, Mech. Syst. Signal Process. 96 (2017) 139,
+doi:10.1016/j.ymssp.2017.04.011; M. Scheel, S. Peter, R. I. Leine & M. Krack, J. Sound Vib. 435
+(2018) 56, doi:10.1016/j.jsv.2018.07.010; for adaptive filters in the loop, arXiv:2403.06639.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.methods.bench.laboratory import (
+    AbstractController,
+    Laboratory,
+    LabState,
+    Sample,
+    TestRecord,
+    run_test,
+)
+from snrmjax.methods.one_sensor import drive_point
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+
+_ORDERS = np.arange(1, 6)  # harmonics that the filters follow beside the mean
+_PARTS = 10  # of a record, for its scatter
+_LOCKED_PHASE = np.radians(1.0)  # mean error that counts as locked
+_LOCKED_SCATTER = 0.5  # 1σ of the frequency over the record, in half-power half widths ζω
+
+
+class LoopGains(NamedTuple):
+    """Rates of the loop, in multiples of 1/s.
+
+    `filter_rate` is how fast the filters forget and `loop_rate` is λ; a loop is well tuned where
+    λ is several times the decay ζω of the structure and a fifth of the filter's rate or less.
+    """
+
+    filter_rate: float
+    loop_rate: float
+
+
+class LoopState(NamedTuple):
+    """Angle and integral of the loop, and the filters' coefficients."""
+
+    angle: Float[Array, ""]
+    integral: Float[Array, ""]  # rad/s
+    force: Complex[Array, " order"]
+    velocity: Complex[Array, " order"]
+    means: Float[Array, "2"]
+    frequency: Float[Array, ""]  # rad/s
+
+
+class LoopReport(NamedTuple):
+    """What the loop writes down at a sample."""
+
+    frequency: Float[Array, ""]  # rad/s
+    angle: Float[Array, ""]  # rad, of the drive at the sample
+
+
+class PhaseLockedLoop(AbstractController):
+    """The controller: a voltage of constant amplitude whose frequency holds the phase at zero."""
+
+    voltage: Float[Array, ""]
+    start_frequency: Float[Array, ""]  # rad/s
+    decay: Float[Array, ""]  # ζω of the linear mode, 1/s
+    filter_rate: Float[Array, ""]  # 1/s
+    loop_rate: Float[Array, ""]  # 1/s
+
+    def initial(self) -> LoopState:
+        """See `AbstractController.initial`."""
+        none = jnp.zeros(len(_ORDERS), dtype=complex)
+        zero = jnp.zeros(())
+        return LoopState(zero, zero, none, none, jnp.zeros(2), self.start_frequency)
+
+    def step(
+        self, state: LoopState, sample: Sample, period: Float[Array, ""]
+    ) -> tuple[LoopState, Array, LoopReport]:
+        """See `AbstractController.step`."""
+        basis = jnp.exp(1j * _ORDERS * state.angle)
+        gain = 2 * self.filter_rate * period
+        seen = jnp.stack([sample.force, sample.velocity])
+        both = jnp.stack([state.force, state.velocity])
+        error = seen - state.means - jnp.real(both @ basis)
+        both = both + gain * error[:, None] * jnp.conj(basis)
+        means = state.means + gain / 2 * error
+        force, velocity = both[0], both[1]
+        ratio = velocity[0] * jnp.conj(force[0])
+        phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(ratio), 0.0)
+        proportional = 2 * self.loop_rate - self.decay
+        integral = state.integral + self.loop_rate**2 * phase * period
+        frequency = self.start_frequency + proportional * phase + integral
+        # A frequency off by more than half of it means that the loop is lost.
+        frequency = jnp.clip(frequency, 0.5 * self.start_frequency, 2.0 * self.start_frequency)
+        angle = jnp.mod(state.angle + frequency * period, 2 * jnp.pi)
+        report = LoopReport(frequency, state.angle)
+        after = LoopState(angle, integral, force, velocity, means, frequency)
+        return after, self.voltage * jnp.cos(angle), report
+
+
+def standard_gains(laboratory: Laboratory) -> LoopGains:
+    """Gains from the linear mode of interest: a filter of ω/20 and a loop of a sixth of that."""
+    modes = laboratory.structure.modes
+    omega = float(modes.natural_frequency[modes.mode_of_interest])
+    return LoopGains(omega / 20, omega / 120)
+
+
+def phase_locked_loop(
+    laboratory: Laboratory,
+    voltages: Float[np.ndarray, " level"],
+    *,
+    gains: LoopGains | None = None,
+    settle_cycles: int = 300,
+    record_cycles: int = 50,
+    seed: int = 0,
+) -> MethodResult:
+    """Track the backbone: the loop stays closed while the drive voltage steps up.
+
+    At each voltage the loop has `settle_cycles` of the linear mode to lock, then `record_cycles`
+    are recorded. Fundamentals of force and velocity come from the record itself, by projection on
+    the drive's angle; damping is from the balance of power, 2ζ̃ω̃ = |Φ_r Φᵀb| F / |v|.
+
+    Arguments: `voltages` in V, in the order of the test; `gains` by default `standard_gains`.
+    Returns a `MethodResult` with a point a voltage; 1σ from the scatter between
+    tenths of the record. Levels whose record is off phase resonance by more than 1°, or whose
+    frequency wandered by more than half of ζω (1σ), are `NOT_LOCKED`. `test_seconds` counts
+    everything.
+    Raises `ValueError` for voltages or cycles that are not positive.
+    """
+    levels = np.asarray(voltages, dtype=float).ravel()
+    if not levels.size or not np.all(np.isfinite(levels) & (levels > 0)):
+        raise ValueError(f"`voltages` must be positive and finite, but are {voltages}.")
+    if settle_cycles < 1 or record_cycles < 1:
+        raise ValueError(
+            f"`settle_cycles` and `record_cycles` must be 1 or more, but are {settle_cycles} and "
+            f"{record_cycles}."
+        )
+    rates = standard_gains(laboratory) if gains is None else gains
+    modes = laboratory.structure.modes
+    j = modes.mode_of_interest
+    omega, ratio = modes.natural_frequency[j], modes.damping_ratio[j]
+    cycle = laboratory.sampling_rate * 2 * np.pi / float(omega)
+    settle, keep = round(settle_cycles * cycle), round(record_cycles * cycle)
+    points: list[MethodPoint] = []
+    state: LabState | None = None
+    for level, voltage in enumerate(levels, 1):
+        loop = PhaseLockedLoop(
+            *(jnp.asarray(value, dtype=float) for value in (voltage, omega, ratio * omega, *rates))
+        )
+        record, state = run_test(
+            laboratory, loop, settle + keep, start=state, seed=seed + 7919 * level
+        )
+        points.append(_point(level, record, keep, drive_point(modes), float(ratio * omega)))
+    seconds = len(levels) * (settle + keep) / laboratory.sampling_rate
+    return method_result("pll", points, len(levels), test_seconds=seconds)
+
+
+def _point(
+    level: int, record: TestRecord, keep: int, per_force: float, decay: float
+) -> MethodPoint:
+    """The locked state at the end of a record, or that there is none."""
+    frequency, angle, force, velocity = (
+        np.asarray(column)[-keep:]
+        for column in (record.report.frequency, record.report.angle, record.force, record.velocity)
+    )
+    # A Hann window: the record need not hold whole cycles.
+    turned = 2 * np.exp(-1j * angle) * np.hanning(keep) / np.hanning(keep).mean()
+    ratio = np.mean(force * turned) / np.mean(velocity * turned)  # N s/m
+    wanders = float(np.std(frequency))
+    if not (np.isfinite(ratio) and abs(np.angle(ratio)) < _LOCKED_PHASE) or not (
+        wanders < _LOCKED_SCATTER * decay
+    ):
+        return MethodPoint(MethodStatus.NOT_LOCKED, level)
+    parts = np.array_split(np.arange(keep), _PARTS)
+    each = [np.mean((force * turned)[k]) / np.mean((velocity * turned)[k]) for k in parts[1:-1]]
+    omega = float(np.mean(frequency))
+    spread = np.array([np.mean(frequency[k]) for k in parts])
+    return MethodPoint(
+        MethodStatus.FOUND,
+        level,
+        float(np.abs(np.mean(velocity * turned))),
+        omega,
+        float(np.hypot(np.std(spread), decay * np.std(np.angle(each))) / np.sqrt(_PARTS - 1)),
+        per_force * float(np.real(ratio)) / (2 * omega),
+        per_force * float(np.std(np.real(each))) / (2 * omega) / np.sqrt(len(each) - 1),
+    )

@@ -1,0 +1,79 @@
+"""The phase-locked loop in the virtual laboratory, against an oscillator's exact backbone."""
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.methods import MethodStatus
+
+REST, RATIO, CUBIC = 2 * np.pi * 40.0, 0.01, 3e9  # cubic per unit of modal mass, 1/(m² s²)
+MASS = 0.8
+
+
+@pytest.fixture(scope="module")
+def beam():
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
+    # ẍ + … + β x³ with x = φ q is q̈ + … + β φ² q³: V = β φ² q⁴ / 4.
+    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
+    return sj.model.structure(modes, potential)
+
+
+def laboratory(beam, **noise):
+    shaker = sj.methods.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    return sj.methods.Laboratory(beam, shaker, sj.methods.Instruments(**noise), 6000.0)
+
+
+def backbone(velocity):
+    """ω̃ at a velocity amplitude, one term of harmonic balance: ω̃² = ω² + ¾ β (v/ω̃)²."""
+    half = REST**2 / 2
+    return np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * velocity**2))
+
+
+VOLTAGES = np.array([0.5, 1.5, 3.0, 5.0])
+
+
+def test_it_climbs_the_backbone_on_a_shaker_whose_force_drops(beam):
+    result = sj.methods.phase_locked_loop(laboratory(beam), VOLTAGES)
+    assert result.found.all()
+    assert result.natural_frequency[-1] / REST > 1.05
+    np.testing.assert_allclose(result.natural_frequency, backbone(result.velocity), rtol=2e-4)
+    modal = 2 * result.damping_ratio * result.natural_frequency
+    np.testing.assert_allclose(modal, 2 * RATIO * REST, rtol=3e-3)
+    assert result.test_seconds == pytest.approx(4 * 350 / 40.0, rel=1e-3)
+
+
+def test_gains_do_not_move_the_answer_and_bad_ones_say_so(beam):
+    lab = laboratory(beam)
+    one = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3])
+    gains = sj.methods.LoopGains(2 * np.pi * 3.0, 2 * np.pi * 0.25)
+    other = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3], gains=gains, settle_cycles=500)
+    np.testing.assert_allclose(one.natural_frequency, other.natural_frequency, rtol=1e-5)
+    np.testing.assert_allclose(one.damping_ratio, other.damping_ratio, rtol=1e-4)
+    wild = sj.methods.LoopGains(2 * np.pi * 0.2, 2 * np.pi * 40.0)
+    lost = sj.methods.phase_locked_loop(lab, VOLTAGES[1:3], gains=wild)
+    assert list(lost.status) == 2 * [int(MethodStatus.NOT_LOCKED)]
+    assert "did not hold its target" in repr(lost)
+
+
+def test_noise_and_a_converter_stay_within_their_error(beam):
+    lab = laboratory(
+        beam,
+        **{"force_noise": 0.02, "velocity_noise": 2e-3, "force_range": 20.0},
+        **{"velocity_range": 1.0, "bits": 12},
+    )
+    result = sj.methods.phase_locked_loop(lab, VOLTAGES[2:3].repeat(6))
+    assert result.found.all()
+    off = result.natural_frequency - backbone(result.velocity)
+    score = (off - off.mean()) / result.natural_frequency_std
+    assert 0.4 < np.sqrt(np.mean(score**2)) < 2.5
+    np.testing.assert_allclose(result.natural_frequency, backbone(result.velocity), rtol=5e-4)
+
+
+def test_settings_that_make_no_sense_are_refused(beam):
+    with pytest.raises(ValueError, match="`voltages` must be positive"):
+        sj.methods.phase_locked_loop(laboratory(beam), np.array([1.0, -1.0]))
+    with pytest.raises(ValueError, match="`sampling_rate` must be 10 times"):
+        sj.methods.Laboratory(beam, sj.methods.Shaker(), sj.methods.Instruments(), 100.0)
+    with pytest.raises(ValueError, match="must not be negative"):
+        sj.methods.Laboratory(beam, sj.methods.Shaker(mass=-1.0), sj.methods.Instruments(), 2000.0)

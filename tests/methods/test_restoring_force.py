@@ -1,0 +1,61 @@
+"""Restoring-force surfaces of motions integrated in time with forces that are written down."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import snrmjax as sj
+
+REST, CUBIC = 2 * np.pi * 40.0, 6e9
+VISCOUS, QUADRATIC = 1.0, 2.0  # 1/s, 1/m
+MASS = 0.5  # kg at the sensor
+
+
+def integrated(start, force=None, seconds=2.0):
+    time = np.arange(0, seconds, 1 / 4000)
+    load = force or (lambda t: 0.0 * t)
+
+    def rate(t, state):
+        q, v = state
+        pull = REST**2 * q + CUBIC * q**3 + VISCOUS * v + QUADRATIC * v * abs(v)
+        return v, load(t) / MASS - pull
+
+    found = solve_ivp(rate, (0, seconds), start, t_eval=time, rtol=1e-9, atol=1e-13)
+    return time, found.y[1], load(time)
+
+
+@pytest.mark.parametrize("forced", [False, True])
+def test_forces_and_mode_of_a_duffing_oscillator(forced):
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [0.002], [[shape]], [shape])
+
+    def sweep(t):
+        return 4.0 * np.sin(2 * np.pi * (36 * t + 3 * t**2))
+
+    start, load = ((0.0, 0.0), sweep) if forced else ((1.5e-3, 0.0), None)
+    time, velocity, force = integrated(start, load)
+    given = (force, modes) if forced else ()
+    fitted = sj.methods.fit_restoring_force(time, velocity, *given)
+    assert fitted.misfit < 5e-3
+    np.testing.assert_allclose(fitted.elastic[0], REST**2, rtol=2e-3)
+    np.testing.assert_allclose(fitted.elastic[2], CUBIC, rtol=0.05)
+    result = sj.methods.restoring_force(time, velocity, *given)
+    size = result.velocity / result.natural_frequency
+    true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)  # one term of harmonic balance
+    np.testing.assert_allclose(result.natural_frequency, true, rtol=1e-3)
+    modal = 2 * result.damping_ratio * result.natural_frequency
+    lost = VISCOUS + 8 / (3 * np.pi) * QUADRATIC * result.velocity
+    np.testing.assert_allclose(modal, lost, rtol=0.05)
+
+
+def test_what_cannot_be_fitted_is_refused():
+    time, velocity, force = integrated((1e-3, 0.0), seconds=0.5)
+    with pytest.raises(ValueError, match="`degree` must be from 1 to 9"):
+        sj.methods.fit_restoring_force(time, velocity, degree=0)
+    with pytest.raises(ValueError, match="restoring_force needs `modes` with a force"):
+        sj.methods.fit_restoring_force(time, velocity, force)
+    with pytest.raises(ValueError, match=r"restoring_force.*samples a cycle"):
+        sj.methods.fit_restoring_force(time[::20], velocity[::20])
+    modes = sj.model.linear_modes([REST], [0.002], [[1.0]], [1.0])
+    with pytest.raises(ValueError, match="restoring_force needs a finite `force`"):
+        sj.methods.fit_restoring_force(time, velocity, force[1:], modes)
