@@ -1,0 +1,236 @@
+"""Control-based continuation: a feedback that holds a target motion, and vanishes on it.
+
+The voltage is k (w(t) − v(t)), w the target velocity. The target's fundamental is prescribed; its
+higher harmonics are set to those measured until the feedback has none of its own (Picard
+iteration), so that what drives the structure is a force of one frequency: motions that an open
+loop cannot hold, on the middle branch of a fold, are then held as any other. At fixed frequency
+the force over the amplitude is an S-curve; where force and velocity are in phase lies the
+backbone, found by the secant method in frequency.
+
+References: J. Sieber & B. Krauskopf, Nonlinear Dyn. 51 (2008) 365,
+doi:10.1007/s11071-007-9217-2; L. Renson, A. Gonzalez-Buelga, D. A. W. Barton & S. A. Neild,
+J. Sound Vib. 367 (2016) 145, doi:10.1016/j.jsv.2015.12.035.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.methods.bench.laboratory import (
+    AbstractController,
+    Laboratory,
+    LabState,
+    Sample,
+    run_test,
+)
+from snrmjax.methods.one_sensor import drive_point
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+
+_ORDERS = np.arange(1, 8)  # harmonics of the target
+_PHASE = np.radians(0.5)  # between force and velocity, below which a motion is on the backbone
+_MOST_STEPS = 8  # of frequency at one amplitude
+_FIRST_STEP = 0.002  # of the frequency, relative, where a slope is not yet known
+
+
+class FeedbackSettings(NamedTuple):
+    """The feedback and how long each measurement takes."""
+
+    gain: float  # V s/m
+    settle_cycles: int = 60
+    record_cycles: int = 20
+    picard_steps: int = 6
+    invasive: float = 0.02  # higher harmonics of the feedback over its fundamental, at most
+
+
+class HeldMotion(NamedTuple):
+    """A motion that the feedback holds: fundamentals and how far it disturbs."""
+
+    frequency: float  # rad/s
+    force: complex  # N
+    velocity: complex  # m/s
+    invasive: float  # higher harmonics of the voltage over its fundamental
+
+
+class SCurve(NamedTuple):
+    """Force over amplitude at one frequency, folds included."""
+
+    velocity: Float[np.ndarray, " point"]  # m/s
+    force: Float[np.ndarray, " point"]  # N
+    invasive: Float[np.ndarray, " point"]
+    test_seconds: float
+
+
+class TargetFeedback(AbstractController):
+    """The controller: velocity feedback towards a periodic target."""
+
+    gain: Float[Array, ""]
+    frequency: Float[Array, ""]  # rad/s
+    target: Complex[Array, " order"]  # m/s
+
+    def initial(self) -> Float[Array, ""]:
+        """See `AbstractController.initial`: the angle of the target."""
+        return jnp.zeros(())
+
+    def step(
+        self, state: Float[Array, ""], sample: Sample, period: Float[Array, ""]
+    ) -> tuple[Array, Array, Array]:
+        """See `AbstractController.step`."""
+        wanted = jnp.sum(jnp.real(self.target * jnp.exp(1j * _ORDERS * state)))
+        voltage = self.gain * (wanted - sample.velocity)
+        return jnp.mod(state + self.frequency * period, 2 * jnp.pi), voltage, state
+
+
+class _Bench:
+    """The laboratory as it goes on from one measurement to the next."""
+
+    def __init__(self, laboratory: Laboratory, settings: FeedbackSettings, seed: int):
+        self.laboratory, self.settings, self.seed = laboratory, settings, seed
+        self.samples, self.runs = 0, 0
+        self.state: LabState | None = None
+        modes = laboratory.structure.modes
+        own = float(modes.natural_frequency[modes.mode_of_interest])
+        cycle = laboratory.sampling_rate * 2 * np.pi / own
+        self.settle = round(settings.settle_cycles * cycle)
+        self.keep = round(settings.record_cycles * cycle)
+        self.higher = np.zeros(len(_ORDERS) - 1, dtype=complex)
+
+    @property
+    def seconds(self) -> float:
+        return self.samples / self.laboratory.sampling_rate
+
+    def held(self, frequency: float, amplitude: float) -> HeldMotion:
+        """The motion under a target of this amplitude, higher harmonics left alone."""
+        for _ in range(self.settings.picard_steps):
+            target = np.concatenate([[amplitude], self.higher])
+            feedback = TargetFeedback(
+                jnp.asarray(float(self.settings.gain)),
+                jnp.asarray(float(frequency)),
+                jnp.asarray(target),
+            )
+            self.runs += 1
+            count = self.settle + self.keep
+            record, self.state = run_test(
+                self.laboratory,
+                feedback,
+                count,
+                start=self.state,
+                seed=self.seed + 7919 * self.runs,
+            )
+            self.samples += count
+            angle, force, velocity, voltage = (
+                np.asarray(column)[-self.keep :]
+                for column in (record.report, record.force, record.velocity, record.voltage)
+            )
+            window = 2 * np.hanning(self.keep) / np.hanning(self.keep).mean()
+            basis = np.exp(-1j * _ORDERS[:, None] * angle) * window / self.keep
+            moved, drive = basis @ velocity, basis @ voltage
+            invasive = float(np.linalg.norm(drive[1:]) / np.abs(drive[0]))
+            self.higher = moved[1:]
+            if invasive < self.settings.invasive:
+                break
+        return HeldMotion(frequency, complex(basis[0] @ force), complex(moved[0]), invasive)
+
+
+def s_curve(
+    laboratory: Laboratory,
+    frequency: float,
+    amplitudes: Float[np.ndarray, " point"],
+    settings: FeedbackSettings,
+    *,
+    seed: int = 0,
+) -> SCurve:
+    """Force over velocity at one frequency, by raising the target's amplitude.
+
+    Arguments: `frequency` in rad/s; `amplitudes` of the target in m/s, above those that result,
+    since the feedback leaves a distance. Returns an `SCurve`: where the force falls while the
+    velocity rises, an open loop under that force would jump.
+    Raises `ValueError` for numbers that are not positive.
+    """
+    targets = _positive("amplitudes", amplitudes)
+    (omega,) = _positive("frequency", frequency)
+    bench = _Bench(laboratory, _checked(settings), seed)
+    found = [bench.held(float(omega), float(size)) for size in targets]
+    return SCurve(
+        np.array([abs(one.velocity) for one in found]),
+        np.array([abs(one.force) for one in found]),
+        np.array([one.invasive for one in found]),
+        bench.seconds,
+    )
+
+
+def control_based_continuation(
+    laboratory: Laboratory,
+    amplitudes: Float[np.ndarray, " level"],
+    settings: FeedbackSettings,
+    *,
+    seed: int = 0,
+) -> MethodResult:
+    """The backbone: at each target amplitude the frequency at which force and velocity agree.
+
+    Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
+    amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
+    or whose feedback kept harmonics of its own beyond `settings.invasive`, are `NOT_LOCKED`.
+    Without 1σ, which the method does not give. `test_seconds` counts everything.
+    Raises `ValueError` for numbers that are not positive.
+    """
+    targets = _positive("amplitudes", amplitudes)
+    bench = _Bench(laboratory, _checked(settings), seed)
+    modes = laboratory.structure.modes
+    own = modes.mode_of_interest
+    omega = float(modes.natural_frequency[own])
+    decay = float(modes.damping_ratio[own]) * omega
+    points = []
+    for level, size in enumerate(targets, 1):
+        found = _resonance(bench, omega, float(size), decay)
+        if found is None:
+            points.append(MethodPoint(MethodStatus.NOT_LOCKED, level))
+            continue
+        omega = found.frequency
+        ratio = (found.force / found.velocity).real
+        points.append(
+            MethodPoint(
+                MethodStatus.FOUND,
+                level,
+                velocity=abs(found.velocity),
+                natural_frequency=omega,
+                damping_ratio=drive_point(modes) * ratio / (2 * omega),
+            )
+        )
+    return method_result("cbc", points, len(targets), test_seconds=bench.seconds)
+
+
+def _resonance(bench: _Bench, omega: float, size: float, decay: float) -> HeldMotion | None:
+    """The motion in phase with its force at one amplitude, by the secant method."""
+    before: tuple[float, float] | None = None
+    for _ in range(_MOST_STEPS):
+        found = bench.held(omega, size)
+        phase = float(np.angle(found.velocity / found.force))
+        if not np.isfinite(phase):
+            return None
+        if abs(phase) < _PHASE:
+            return found if found.invasive < bench.settings.invasive else None
+        # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): straight in frequency, with slope −1/(ζ̃ω̃).
+        error = np.tan(np.clip(phase, -1.4, 1.4))
+        step = decay * error
+        if before is not None and before[1] != error:
+            secant = -error * (omega - before[0]) / (error - before[1])
+            step = secant if abs(secant) < 10 * abs(step) else step
+        before = omega, float(error)
+        largest = 10 * _FIRST_STEP * omega
+        omega += float(np.clip(step, -largest, largest))
+    return None
+
+
+def _positive(name: str, values: Float[np.ndarray, "..."] | float) -> np.ndarray:
+    each = np.asarray(values, dtype=float).ravel()
+    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
+        raise ValueError(f"`{name}` must be positive and finite, but are {values}.")
+    return each
+
+
+def _checked(settings: FeedbackSettings) -> FeedbackSettings:
+    if not all(np.isfinite(value) and value > 0 for value in settings):
+        raise ValueError(f"the settings of the feedback must be positive, but are {settings}.")
+    return settings

@@ -1,0 +1,67 @@
+"""Control-based continuation in the virtual laboratory, against the forced Duffing oscillator."""
+
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.methods import MethodStatus
+
+REST, RATIO, CUBIC = 2 * np.pi * 40.0, 0.01, 3e9  # cubic in 1/(m² s²)
+MASS = 0.8
+
+
+@pytest.fixture(scope="module")
+def laboratory():
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
+    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
+    shaker = sj.methods.Shaker(3.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    beam = sj.model.structure(modes, potential)
+    return sj.methods.Laboratory(beam, shaker, sj.methods.Instruments(), 6000.0)
+
+
+def stiffness(velocity, omega):
+    """F/v of one term of harmonic balance, N s/m."""
+    size = velocity / omega
+    square = REST**2 + 0.75 * CUBIC * size**2 - omega**2
+    return MASS * (2 * RATIO * REST + square / (1j * omega))
+
+
+def test_it_holds_the_branch_that_an_open_loop_jumps_over(laboratory):
+    omega = 1.03 * REST
+    settings = sj.methods.FeedbackSettings(20.0)
+    curve = sj.methods.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 12), settings)
+    assert (curve.invasive < settings.invasive).all()
+    exact = np.abs(stiffness(curve.velocity, omega)) * curve.velocity
+    np.testing.assert_allclose(curve.force, exact, rtol=0.02, atol=0.01 * exact.max())
+    falls = np.diff(curve.force) < 0
+    assert falls.any()
+    assert (np.diff(curve.force) > 0)[: int(np.argmax(falls))].all()
+    assert np.diff(curve.force)[-1] > 0  # up, down and up again
+
+
+def test_the_backbone_does_not_depend_on_the_gain(laboratory):
+    found = [
+        sj.methods.control_based_continuation(
+            laboratory, np.array(targets), sj.methods.FeedbackSettings(gain)
+        )
+        for gain, targets in ((20.0, [0.3, 0.6]), (40.0, [0.25, 0.5]))
+    ]
+    for result in found:
+        assert result.found.all()
+        half = REST**2 / 2
+        size = result.velocity
+        true = np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * size**2))
+        np.testing.assert_allclose(result.natural_frequency, true, rtol=3e-4)
+        modal = 2 * result.damping_ratio * result.natural_frequency
+        np.testing.assert_allclose(modal, 2 * RATIO * REST, rtol=5e-3)
+
+
+def test_what_is_not_held_is_said(laboratory):
+    impatient = sj.methods.FeedbackSettings(20.0, invasive=1e-9)
+    result = sj.methods.control_based_continuation(laboratory, np.array([0.3]), impatient)
+    assert list(result.status) == [int(MethodStatus.NOT_LOCKED)]
+    with pytest.raises(ValueError, match="`amplitudes` must be positive"):
+        sj.methods.control_based_continuation(laboratory, np.array([-0.3]), impatient)
+    with pytest.raises(ValueError, match="settings of the feedback must be positive"):
+        sj.methods.s_curve(laboratory, REST, np.array([0.3]), sj.methods.FeedbackSettings(0.0))
