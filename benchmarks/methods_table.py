@@ -1,0 +1,122 @@
+"""All methods that read a table of steady states, on the same virtual tests: errors and coverage.
+
+Run: python benchmarks/methods_table.py [--seeds 20] [--structure flat|duffing|quadratic]
+
+Stepped sines by harmonic balance from both sides to resonance and past it, four levels of force,
+12 states a level within 75° of resonance, as far as a test can hold them. Three steps of noise:
+amplitude and phase errors of each state of 0.1 % and 0.1°, 0.5 % and 0.5°, 2 % and 2°, stated. The
+truth is the phase resonance of 16 exact response curves (frequency, velocity, force), which no
+method has seen: damping there by the balance of power of the fundamental.
+
+One JSON line a structure, noise and method: median and 90th percentile of the relative errors of
+frequency and damping at the method's own points between the lowest and the highest resonance,
+share of points whose 95 % band holds the truth (of those with a band), points, and the share of
+tests in which the method found nothing.
+"""
+
+import argparse
+import json
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+import snrmjax as sj
+from snrmjax.methods import METHODS, compare_methods
+from snrmjax.simulate.virtual_test.recording import MeasurementErrors, Recording
+
+HERTZ = 2 * np.pi
+NOISE = {"low": (0.001, 0.1), "middle": (0.005, 0.5), "high": (0.02, 2.0)}  # relative, degrees
+
+
+def _one_mode(effects=()):
+    modes = sj.model.linear_modes([50 * HERTZ], [0.01], [[1.0]], [1.0])
+    potential = sj.model.polynomial_potential({"1111": 2.5e8}, 1)
+    return sj.model.structure(modes, potential, effects=effects)
+
+
+STRUCTURES = {
+    "flat": (sj.model.flat_beam, (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2), 60.0, 120.0),
+    "duffing": (_one_mode, (1.0, 2.0, 4.0, 6.0), 45.0, 62.0),
+    "quadratic": (
+        lambda: _one_mode([sj.model.EFFECTS["quadratic_damping"](coefficient=10.0)]),
+        *((2.0, 4.0, 8.0, 14.0), 45.0, 62.0),
+    ),
+}
+
+
+def truth(model, forces, low, high):
+    """Velocity, frequency and damping ratio at the phase resonances of exact curves."""
+    curves = sj.forced_response(
+        model, np.geomspace(forces[0] / 2, forces[-1] * 1.2, 16), low, high, stability=False
+    )
+    rows = []
+    modes = model.modes
+    per_force = float(modes.mode_shape[0, 0] * modes.participation[0])
+    for curve in curves:
+        for k in curve.at_events("phase_resonance")[:1]:
+            speed, omega = abs(curve.velocity[k, 1, 0]), float(curve.frequency[k])
+            rows.append((speed, omega, per_force * float(curve.force) / speed / (2 * omega)))
+    return np.array(sorted(rows)).T
+
+
+def main() -> None:
+    """Print a line for every structure, noise and method."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--structure", choices=list(STRUCTURES))
+    given = parser.parse_args()
+    for name in [given.structure] if given.structure else STRUCTURES:
+        make, forces, *ends = STRUCTURES[name]
+        model = make()
+        low, high = (HERTZ * end for end in ends)
+        true = truth(model, forces, low, high)
+        laws = [CubicSpline(true[0] ** 2, values) for values in (true[1] ** 2, true[2])]
+        for noise, (amplitude, degrees) in NOISE.items():
+            errors = MeasurementErrors(amplitude=amplitude, phase=np.radians(degrees))
+            found: dict[str, list] = {method: [] for method in METHODS}
+            nothing = dict.fromkeys(METHODS, 0)
+            for seed in range(given.seeds):
+                test = sj.phase_resonance_test(
+                    model,
+                    forces,
+                    low,
+                    high,
+                    appropriation=(np.cos(np.radians(75)) ** 2, 1.0),
+                    points_per_level=12,
+                    recording=Recording(errors, seed),
+                )
+                for one in compare_methods(test.steady_states, model.modes).results:
+                    at = np.asarray(one.velocity)
+                    good = one.found & (at >= true[0, 0]) & (at <= true[0, -1])
+                    if not good.any():
+                        nothing[one.method] += 1
+                        continue
+                    omega, ratio = np.sqrt(laws[0](at[good] ** 2)), laws[1](at[good] ** 2)
+                    off = np.asarray(one.natural_frequency)[good] - omega
+                    off_damping = np.asarray(one.damping_ratio)[good] - ratio
+                    found[one.method] += list(
+                        zip(
+                            *(off / omega, off_damping / ratio),
+                            off / np.asarray(one.natural_frequency_std)[good],
+                            off_damping / np.asarray(one.damping_ratio_std)[good],
+                            strict=True,
+                        )
+                    )
+            for method, rows in found.items():
+                line = {"benchmark": "methods_table", "structure": name, "noise": noise}
+                line |= {"method": method, "nothing_found": nothing[method] / given.seeds}
+                if rows:
+                    each = np.abs(np.array(rows))
+                    for k, quantity in enumerate(("frequency", "damping")):
+                        line[f"{quantity}_error_median"] = float(np.median(each[:, k]))
+                        line[f"{quantity}_error_90"] = float(np.percentile(each[:, k], 90))
+                        score = each[np.isfinite(each[:, k + 2]), k + 2]
+                        line[f"{quantity}_coverage"] = (
+                            float(np.mean(score <= 1.96)) if score.size else None
+                        )
+                    line["points_a_test"] = len(rows) / given.seeds
+                print(json.dumps(line), flush=True)
+
+
+if __name__ == "__main__":
+    main()
