@@ -2,20 +2,26 @@ from .equivalent_force import EquivalentForce, ForceStatus, equivalent_force
 from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
 from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_relative_to_force
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
+from .recordings.channels import Channel
+from .recordings.frequency_responses import FrequencyResponses, frequency_responses
+from .recordings.time_recording import TimeRecording, time_recording
 from .records import RecordFit, fit_records, steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
 from .states import OptionalColumns, SteadyStates, join_steady_states, steady_states
 
 __all__ = [
+    "Channel",
     "EquivalentForce",
     "ForceCalibration",
     "ForceStatus",
     "ForceVelocityLoop",
+    "FrequencyResponses",
     "HarmonicFit",
     "HarmonicFitStatus",
     "OptionalColumns",
     "RecordFit",
     "SteadyStates",
+    "TimeRecording",
     "apply_calibration",
     "appropriation_of",
     "calibrate_force",
@@ -23,6 +29,7 @@ __all__ = [
     "fit_harmonics",
     "fit_records",
     "force_velocity_loop",
+    "frequency_responses",
     "join_steady_states",
     "mode_indicator",
     "nnm_appropriation",
@@ -31,4 +38,5 @@ __all__ = [
     "steady_state_from_records",
     "steady_states",
     "synthesise",
+    "time_recording",
 ]

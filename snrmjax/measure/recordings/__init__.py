@@ -1,0 +1,1 @@
+"""What a laboratory records: channels, time records and frequency responses."""
