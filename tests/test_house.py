@@ -58,6 +58,7 @@ SUB_ROOMS = {
     "diagnose.checks": {"diagnose.misfit", "diagnose.search"},
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
     "io.calculix": {"io.files", "io.reduction"},
+    "io.laboratory": {"io.files"},
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},

@@ -1,0 +1,6 @@
+"""Files of laboratories: UFF, MATLAB, HDF5, netCDF, TDMS, CSV, read into recordings and tables."""
+
+import lazy_loader
+
+# The public names are in `__init__.pyi`; each module is imported with its first name.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,11 @@
+from .contents import LaboratoryFile, MeasuredShapes, NumberTable, measured_shapes, number_table
+from .reading import read_laboratory_file
+
+__all__ = [
+    "LaboratoryFile",
+    "MeasuredShapes",
+    "NumberTable",
+    "measured_shapes",
+    "number_table",
+    "read_laboratory_file",
+]

@@ -1,0 +1,158 @@
+"""What a laboratory's file holds, whatever its format."""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Num
+
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+
+Kind = Literal["uff", "matlab", "hdf5", "netcdf", "tdms", "csv"]
+
+
+class NumberTable(NamedTuple):
+    """Columns of numbers by name, all of one length; see `number_table`.
+
+    One row may be a steady state (frequency, force, amplitude, phase), a step of a record or a
+    line of a spectrum. Numbers are as they stand in the file, real or complex; NaN where a field is
+    empty. `units` has the file's own word for each column that states one.
+    """
+
+    name: str
+    columns: Mapping[str, Num[np.ndarray, " row"]]
+    units: Mapping[str, str] = {}
+    notes: tuple[str, ...] = ()
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values())))
+
+    def column(self, name: str) -> Num[np.ndarray, " row"]:
+        """A column by name. Raises `ValueError` that lists those there are."""
+        if name not in self.columns:
+            listed = ", ".join(self.columns)
+            raise ValueError(f"table {self.name} has no column {name!r}; it has {listed}.")
+        return self.columns[name]
+
+
+class MeasuredShapes(NamedTuple):
+    """Mode shapes of a linear test, by point and direction; see `measured_shapes`.
+
+    `modal_mass` says how the shapes are scaled (1 kg: mass-normalised); NaN where a number was not
+    stated.
+    """
+
+    frequency: Float[np.ndarray, " mode"]  # rad/s, undamped natural frequency
+    damping_ratio: Float[np.ndarray, " mode"]
+    shapes: Complex[np.ndarray, "mode place"]
+    points: tuple[str, ...]
+    directions: tuple[str, ...]  # "+x", "-z", "+ry"; "" where not stated
+    modal_mass: Float[np.ndarray, " mode"]  # kg
+    name: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_real(self) -> bool:
+        """Whether no shape has an imaginary part."""
+        return not np.any(self.shapes.imag)
+
+
+class LaboratoryFile(NamedTuple):
+    """All that a file of a laboratory holds; see `read_laboratory_file`.
+
+    `levels` has one number for each of `responses` (UFF: the value on the z axis), NaN where the
+    file states none. `notes` say what was not read, and what was taken for what.
+    """
+
+    name: str
+    kind: Kind
+    recordings: tuple[TimeRecording, ...] = ()
+    responses: tuple[FrequencyResponses, ...] = ()
+    tables: tuple[NumberTable, ...] = ()
+    shapes: tuple[MeasuredShapes, ...] = ()
+    notes: tuple[str, ...] = ()
+    levels: tuple[float, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was found."""
+        return not (self.recordings or self.responses or self.tables or self.shapes)
+
+
+def number_table(
+    name: str,
+    columns: Mapping[str, Num[np.ndarray, " row"]],
+    units: Mapping[str, str] | None = None,
+    notes: Sequence[str] = (),
+) -> NumberTable:
+    """A table of numbers, checked.
+
+    Raises `ValueError` for no column, no row, an empty name, columns of unequal length or of
+    anything but real and complex numbers, and a unit of a column that is not there.
+
+    >>> number_table("states", {"frequency": [79.0, 79.5], "force": [0.1, 0.1]}).n_rows
+    2
+    """
+    held = {key: np.asarray(values) for key, values in columns.items()}
+    if not held or "" in held:
+        raise ValueError(f"table {name} needs columns with names.")
+    for key, values in held.items():
+        if values.ndim != 1 or values.dtype.kind not in "biufc":
+            raise ValueError(
+                f"column {key} of table {name} must be a vector of numbers, but has shape "
+                f"{values.shape} and type {values.dtype}."
+            )
+    lengths = {values.size for values in held.values()}
+    if len(lengths) > 1 or not lengths.pop():
+        listed = ", ".join(f"{key} {values.size}" for key, values in held.items())
+        raise ValueError(f"columns of table {name} must have one length above 0, but: {listed}.")
+    known = dict(units or {})
+    for key in known:
+        if key not in held:
+            raise ValueError(f"table {name} states a unit of {key!r}, which is no column.")
+    return NumberTable(name, held, known, tuple(notes))
+
+
+def measured_shapes(
+    frequency: Float[np.ndarray, " mode"],
+    damping_ratio: Float[np.ndarray, " mode"],
+    shapes: Complex[np.ndarray, "mode place"],
+    points: Sequence[str],
+    directions: Sequence[str] | None = None,
+    *,
+    modal_mass: Float[np.ndarray, " mode"] | None = None,
+    name: str = "",
+    notes: Sequence[str] = (),
+) -> MeasuredShapes:
+    """Mode shapes of a test, checked.
+
+    Arguments: `frequency` in rad/s; `damping_ratio` as a fraction of critical, NaN where unknown;
+    `shapes` real or complex, one row a mode; `points` and `directions` of its columns;
+    `modal_mass` in kg.
+    Raises `ValueError` for sizes that disagree, a place that stands twice, frequencies that are not
+    positive and finite, and shapes that are not finite.
+    """
+    omega = np.atleast_1d(np.asarray(frequency, dtype=float))
+    ratio = np.atleast_1d(np.asarray(damping_ratio, dtype=float))
+    every = np.asarray(shapes, dtype=complex)
+    places = tuple(points)
+    ways = ("",) * len(places) if directions is None else tuple(directions)
+    mass = np.full(omega.size, np.nan) if modal_mass is None else np.asarray(modal_mass, float)
+    if every.shape != (omega.size, len(places)) or not every.size:
+        raise ValueError(
+            f"`shapes` must have shape {(omega.size, len(places))} (modes, places) and not be "
+            f"empty, but have {every.shape}."
+        )
+    if ratio.shape != omega.shape or mass.shape != omega.shape or len(ways) != len(places):
+        raise ValueError(
+            "`damping_ratio` and `modal_mass` must have one number a mode, `directions` one word "
+            "a place."
+        )
+    if len(set(zip(places, ways, strict=True))) < len(places):
+        raise ValueError("each point and direction must stand once in `points`, `directions`.")
+    if not np.isfinite(omega).all() or np.any(omega <= 0) or not np.isfinite(every).all():
+        raise ValueError("frequencies must be positive and finite, shapes finite.")
+    return MeasuredShapes(omega, ratio, every, places, ways, mass, name, tuple(notes))

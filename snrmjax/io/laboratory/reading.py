@@ -1,0 +1,76 @@
+"""One reader for every file of a laboratory: its content decides, then its extension."""
+
+import importlib
+import os
+from pathlib import Path
+
+from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
+
+_READERS: dict[Kind, str] = {}
+_HEAD = 4096
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def read_laboratory_file(path: FilePath) -> LaboratoryFile:
+    """All recordings, frequency responses, tables and shapes of a file.
+
+    Formats: UFF/UNV (58, 58b, 55, 15, 151, 164), MATLAB v5 to v7.3, HDF5, netCDF 4, TDMS, and
+    CSV or other separated text. Long records are not read before they are asked for (HDF5,
+    netCDF, MATLAB v7.3, TDMS).
+    Returns `LaboratoryFile`. Raises `ValueError`, in one sentence that names the file, for a file
+    that is missing, empty, of another format, damaged, or that states more than it can hold; and
+    where the reader needs a package that is not installed.
+    """
+    kind = _kind(path)
+    if kind not in _READERS:
+        raise ValueError(f"{file_name(path)} is a file of kind {kind}, which cannot be read yet.")
+    found: LaboratoryFile = importlib.import_module(_READERS[kind]).read(Path(path))
+    if found.is_empty:
+        why = f": {found.notes[0]}" if found.notes else "."
+        raise ValueError(f"{found.name} holds nothing that could be read{why}")
+    return found
+
+
+def _kind(path: FilePath) -> Kind:
+    """The format of a file."""
+    name = file_name(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD)
+    except FileNotFoundError as error:
+        raise ValueError(f"{os.fspath(path)} does not exist.") from error
+    except IsADirectoryError as error:
+        raise ValueError(f"{os.fspath(path)} is a folder, but a file is expected.") from error
+    except OSError as error:
+        raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+    if not head:
+        raise ValueError(f"{name} is empty.")
+    if _HDF5 in (head[:8], head[512:520]):
+        matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
+        netcdf = Path(path).suffix.lower() in (".nc", ".nc4", ".cdf")
+        return "matlab" if matlab else "netcdf" if netcdf else "hdf5"
+    if head.startswith(b"TDSm"):
+        return "tdms"
+    if head.startswith(b"MATLAB 5"):
+        return "matlab"
+    first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
+    if first == b"    -1":
+        return "uff"
+    if b"\0" in head:
+        raise ValueError(f"{name} is of no known format ({_seen(head)}).")
+    return "csv"
+
+
+def _seen(head: bytes) -> str:
+    """What a file looks like that is none of ours."""
+    for start, meaning in (
+        (b"PK", "it is a zip archive: unpack it first"),
+        (b"\x1f\x8b", "it is a gzip archive: unpack it first"),
+        (b"7z\xbc\xaf", "it is a 7z archive: unpack it first"),
+        (b"CDF", "it is a classic netCDF 3 file: convert it by `nccopy -k netCDF-4`"),
+        (b"TDSh", "it is the index of a TDMS file: give the .tdms file itself"),
+    ):
+        if head.startswith(start):
+            return meaning
+    return f"it begins with the bytes {head[:8].hex(' ')}"
