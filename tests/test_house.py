@@ -63,6 +63,7 @@ SUB_ROOMS = {
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},
     "report.methods": {"report.style", "report.html"},
+    "report.interactive": {"report.style", "report.html"},
     "report.study": {"report.style", "report.html"},
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),

@@ -16,6 +16,13 @@ Rows = Sequence[tuple[str, str]]
 _REM_PER_INCH = 8.0  # of figures on the page: their letters are then as large as the text's
 
 
+class LiveFigures(NamedTuple):
+    """Figures that answer to the mouse, as parts of a page."""
+
+    program: str  # what the page's head needs, the same for every page
+    body: str  # scripts and places of the figures
+
+
 class ReportFigure(NamedTuple):
     """A figure, drawn already or not, with the words that explain how to read it."""
 
@@ -33,12 +40,13 @@ class ReportTable(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A part of a report: paragraphs, then figures, then tables."""
+    """A part of a report: paragraphs, then live figures, then drawn ones, then tables."""
 
     heading: str
     text: Sequence[str] = ()
     figures: Sequence[ReportFigure] = ()
     tables: Sequence[ReportTable] = ()
+    live: LiveFigures | None = None
 
 
 class Report(NamedTuple):
@@ -75,7 +83,9 @@ def report_html(report: Report) -> str:
     ]
     template = environment.get_template("report.html.j2")
     notes = [_sentence(note) for note in report.notes]
-    return template.render(report=report._replace(notes=notes), sections=sections)
+    live = [section.live for section in report.sections if section.live is not None]
+    program = live[0].program if live else ""
+    return template.render(report=report._replace(notes=notes), sections=sections, program=program)
 
 
 def _embedded(one: ReportFigure) -> dict[str, str | bool]:
