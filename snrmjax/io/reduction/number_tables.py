@@ -14,7 +14,7 @@ from snrmjax.io.rows import Cells, split_rows
 _NUMBERED = re.compile(r"([a-z]+)_([1-9][0-9]{0,5})")
 
 
-class NumberTable(NamedTuple):
+class NumberedColumns(NamedTuple):
     """The rows of a CSV by column; `groups` are the numbered columns, by their stem."""
 
     cells: Cells
@@ -39,7 +39,7 @@ class NumberTable(NamedTuple):
 
 def read_number_table(
     path: FilePath, stems: tuple[str, ...], single: tuple[str, ...] = ()
-) -> NumberTable:
+) -> NumberedColumns:
     """Read a CSV whose columns are `stem_1 … stem_n` for some stems, and some single ones.
 
     Raises `ValueError` that names file, row or column for an unknown, doubled or missing column of
@@ -79,7 +79,7 @@ def read_number_table(
                 f"row {row.number} of {file} has {len(row.fields)} fields, but the header "
                 f"{len(names)}."
             )
-    return NumberTable(Cells(rows[1:], Header(position, len(names), (), ()), file), groups)
+    return NumberedColumns(Cells(rows[1:], Header(position, len(names), (), ()), file), groups)
 
 
 def read_arrays(path: FilePath, known: tuple[str, ...]) -> dict[str, np.ndarray]:
