@@ -1,12 +1,15 @@
 """All methods that read a table of steady states, on the same virtual tests: errors and coverage.
 
-Run: python benchmarks/methods_table.py [--seeds 20] [--structure flat|duffing|quadratic]
+Run: python benchmarks/methods_table.py [--seeds 20] [--structure flat|duffing|quadratic|curved|
+bolted|stop|two_modes]
 
 Stepped sines by harmonic balance from both sides to resonance and past it, four levels of force,
 12 states a level within 75° of resonance, as far as a test can hold them. Three steps of noise:
 amplitude and phase errors of each state of 0.1 % and 0.1°, 0.5 % and 0.5°, 2 % and 2°, stated. The
 truth is the phase resonance of 16 exact response curves (frequency, velocity, force), which no
-method has seen: damping there by the balance of power of the fundamental.
+method has seen: damping there by the balance of power of the fundamental. Where a second mode lies
+near (two_modes: 50 and 53 Hz) a resonance is not of one mode, and the truth is the damped
+nonlinear mode.
 
 One JSON line a structure, noise and method: median and 90th percentile of the relative errors of
 frequency and damping at the method's own points between the lowest and the highest resonance,
@@ -34,6 +37,18 @@ def _one_mode(effects=()):
     return sj.model.structure(modes, potential, effects=effects)
 
 
+def _effect(kind, **numbers):
+    return [sj.model.EFFECTS[kind](**numbers)]
+
+
+def _two_modes():
+    modes = sj.model.linear_modes(
+        [50 * HERTZ, 53 * HERTZ], [0.004, 0.006], [[1.0, 0.6]], [1.0, 0.6]
+    )
+    potential = sj.model.polynomial_potential({"1111": 2.5e8}, 2)
+    return sj.model.structure(modes, potential)
+
+
 STRUCTURES = {
     "flat": (sj.model.flat_beam, (2.669e-3, 4.448e-3, 8.896e-3, 1.334e-2), 60.0, 120.0),
     "duffing": (_one_mode, (1.0, 2.0, 4.0, 6.0), 45.0, 62.0),
@@ -41,6 +56,17 @@ STRUCTURES = {
         lambda: _one_mode([sj.model.EFFECTS["quadratic_damping"](coefficient=10.0)]),
         *((2.0, 4.0, 8.0, 14.0), 45.0, 62.0),
     ),
+    # Its softening part: beyond, three amplitudes of the backbone have one velocity.
+    "curved": (sj.model.curved_beam, (3e-5, 6e-5, 9e-5, 1.2e-4), 50.0, 80.0),
+    "bolted": (
+        lambda: _one_mode(_effect("jenkins_slider", stiffness=6e3, slip_displacement=2e-4)),
+        *((0.25, 0.5, 1.0, 2.0), 42.0, 60.0),
+    ),
+    "stop": (
+        lambda: _one_mode(_effect("one_sided_stop", stiffness=1e4, gap=3e-4)),
+        *((0.25, 0.5, 1.0, 2.0), 45.0, 62.0),
+    ),
+    "two_modes": (_two_modes, (0.25, 0.5, 1.0, 1.5), 46.0, 52.5),
 }
 
 
@@ -59,6 +85,16 @@ def truth(model, forces, low, high):
     return np.array(sorted(rows)).T
 
 
+def true_mode(model, forces, low, high):
+    """The same of the damped nonlinear mode, up to the largest velocity of the test."""
+    curve = sj.forced_response(model, forces[-1:], low, high, stability=False)[0]
+    largest = float(np.max(np.abs(curve.velocity[:, 1, 0])))
+    found = sj.simulate.damped_normal_mode(model, largest)
+    speed = np.abs(found.velocity[:, 1, 0])
+    kept = speed > largest / 50
+    return np.stack([speed, found.frequency, found.damping_ratio])[:, kept]
+
+
 def main() -> None:
     """Print a line for every structure, noise and method."""
     parser = argparse.ArgumentParser()
@@ -69,7 +105,7 @@ def main() -> None:
         make, forces, *ends = STRUCTURES[name]
         model = make()
         low, high = (HERTZ * end for end in ends)
-        true = truth(model, forces, low, high)
+        true = (true_mode if name == "two_modes" else truth)(model, forces, low, high)
         laws = [CubicSpline(true[0] ** 2, values) for values in (true[1] ** 2, true[2])]
         for noise, (amplitude, degrees) in NOISE.items():
             errors = MeasurementErrors(amplitude=amplitude, phase=np.radians(degrees))
