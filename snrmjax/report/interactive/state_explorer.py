@@ -40,10 +40,12 @@ class FoldedRecord(NamedTuple):
 
     phase: Float[np.ndarray, " sample"]  # rad, from 0 to 2π
     force: Float[np.ndarray, " sample"]  # N (or V)
-    velocity: Float[np.ndarray, " sample"]  # m/s, of the reference sensor
+    response: Float[np.ndarray, " sample"]  # as recorded, in the SI unit of its quantity
     force_harmonics: Complex[np.ndarray, " harmonic"]
-    velocity_harmonics: Complex[np.ndarray, " harmonic"]
+    response_harmonics: Complex[np.ndarray, " harmonic"]
     orders: tuple[int, ...]
+    quantity: str = "velocity"
+    unit: str = "m/s"
 
 
 def state_explorer(
@@ -103,7 +105,7 @@ def state_explorer(
     points_by_level(panels, source, np.asarray(data.level), hover)
     rows = [one for one, _, _ in panels]
     if any(one is not None for one in records):
-        rows += _record_panels(source, records, speed, load)
+        rows += _record_panels(source, records, load)
     return live_figures(column(*rows, sizing_mode="stretch_width"))
 
 
@@ -140,7 +142,7 @@ for (const [shown, every, size, title, name] of pairs) {
 
 
 def _record_panels(
-    source: "ColumnDataSource", records: Sequence[FoldedRecord | None], speed: Unit, load: Unit
+    source: "ColumnDataSource", records: Sequence[FoldedRecord | None], load: Unit
 ) -> list["figure"]:
     """Record and fit of one state over a period, and the harmonics of its force."""
     from bokeh.models import ColumnDataSource, CustomJS
@@ -151,9 +153,10 @@ def _record_panels(
     largest = int(np.nanargmax(np.where(np.array(row) < 0, -1.0, source.data["velocity"])))
     orders = [order for order in kept[0].orders if order >= 1]
     sizes = {"samples": _SAMPLES, "fit": _CURVE, "orders": len(orders)}
+    moved = unit_for(np.concatenate([one.response for one in kept]), kept[0].unit)
     every = {
-        "samples": _joined([_samples(one, speed, load) for one in kept]),
-        "fit": _joined([_fitted(one, speed, load) for one in kept]),
+        "samples": _joined([_samples(one, moved, load) for one in kept]),
+        "fit": _joined([_fitted(one, moved, load) for one in kept]),
         "orders": _joined([_force_orders(one, orders) for one in kept]),
     }
     start = row[largest]
@@ -164,9 +167,10 @@ def _record_panels(
         for key, data in every.items()
     }
     period = "Phase of the force (°)"
-    velocity = panel("Velocity", period, f"Velocity ({speed.name})")
-    force = panel("Force", period, f"Force ({load.name})", x_range=velocity.x_range)
-    for made, name in ((velocity, "velocity"), (force, "force")):
+    name = kept[0].quantity.capitalize()
+    response = panel(name, period, f"{name} ({moved.name})")
+    force = panel("Force", period, f"Force ({load.name})", x_range=response.x_range)
+    for made, name in ((response, "response"), (force, "force")):
         made.scatter("phase", name, source=shown["samples"], size=4, color=MEASURED,
                      legend_label="recorded")  # fmt: skip
         made.line("phase", name, source=shown["fit"], color=IDENTIFIED, width=2,
@@ -176,7 +180,7 @@ def _record_panels(
     made.vbar("order", 0.5, "share", source=shown["orders"], color=_BARS)
     made.y_range.start = 0
     made.xaxis.ticker = [order for order in orders if order > 1]
-    titles = {"samples": velocity.title, "fit": force.title, "orders": made.title}
+    titles = {"samples": response.title, "fit": force.title, "orders": made.title}
     pairs = [
         [shown[key], ColumnDataSource(every[key]), sizes[key], titles[key], titles[key].text]
         for key in every
@@ -188,7 +192,7 @@ def _record_panels(
         args={"states": source, "row": row, "first": largest, "pairs": pairs}, code=_SHOW
     )
     source.selected.js_on_change("indices", show)
-    return [velocity, force, made]
+    return [response, force, made]
 
 
 def _joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -196,23 +200,23 @@ def _joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([one[name] for one in parts]).astype("f4") for name in parts[0]}
 
 
-def _samples(one: FoldedRecord, speed: Unit, load: Unit) -> dict[str, np.ndarray]:
+def _samples(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]:
     """As many samples as are shown, in order of phase."""
     rows = np.linspace(0, len(one.phase) - 1, _SAMPLES).round().astype(int)
     rows = rows[np.argsort(one.phase[rows])]
     return {
         "phase": np.degrees(one.phase[rows]),
-        "velocity": one.velocity[rows] / speed.size,
+        "response": one.response[rows] / moved.size,
         "force": one.force[rows] / load.size,
     }
 
 
-def _fitted(one: FoldedRecord, speed: Unit, load: Unit) -> dict[str, np.ndarray]:
+def _fitted(one: FoldedRecord, moved: Unit, load: Unit) -> dict[str, np.ndarray]:
     phase = np.linspace(0, 2 * np.pi, _CURVE)
     turn = np.exp(1j * np.array(one.orders)[:, None] * phase)
     return {
         "phase": np.degrees(phase),
-        "velocity": (one.velocity_harmonics @ turn).real / speed.size,
+        "response": (one.response_harmonics @ turn).real / moved.size,
         "force": (one.force_harmonics @ turn).real / load.size,
     }
 
