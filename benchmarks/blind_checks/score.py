@@ -1,4 +1,4 @@
-"""Score `snrmjax check` on the tests of generate.py: what was found, named right, and raised wrongly.
+"""Score `snrmjax check` on the tests of generate.py: found, named right, raised wrongly.
 
     python benchmarks/blind_checks/score.py DIR [--show]
 
