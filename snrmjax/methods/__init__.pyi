@@ -6,15 +6,23 @@ from .bench.cbc import (
     control_based_continuation,
     s_curve,
 )
-from .bench.laboratory import (
-    AbstractController,
-    Instruments,
-    Laboratory,
-    Shaker,
-    TestRecord,
-    run_test,
-)
+from .bench.equipment import Instruments, Shaker
+from .bench.laboratory import AbstractController, Laboratory, TestRecord, detached, run_test
 from .bench.pll import LoopGains, PhaseLockedLoop, phase_locked_loop, standard_gains
+from .bench.programmes import (
+    AmplitudeGains,
+    DecayTest,
+    LaboratoryTest,
+    Playback,
+    SteppedSineDrive,
+    TestSteps,
+    decay_test,
+    multisine_test,
+    sine_sweep_test,
+    standard_amplitude_gains,
+    steady_states_of,
+    stepped_sine_test,
+)
 from .comparison import METHODS, Comparison, compare_methods, snrm
 from .records.resonant_decay import resonant_decay
 from .records.restoring_force import RestoringForce, fit_restoring_force, restoring_force
@@ -28,29 +36,38 @@ from .steady.rct import rct
 __all__ = [
     "METHODS",
     "AbstractController",
+    "AmplitudeGains",
     "Comparison",
+    "DecayTest",
     "FeedbackSettings",
     "ForceSurface",
     "HeldMotion",
     "Instruments",
     "Laboratory",
+    "LaboratoryTest",
     "LoopGains",
     "MethodResult",
     "MethodStatus",
     "PhaseLockedLoop",
+    "Playback",
     "RestoringForce",
     "SCurve",
     "Shaker",
+    "SteppedSineDrive",
     "TargetFeedback",
     "TestRecord",
+    "TestSteps",
     "arslan_ozguven",
     "compare_methods",
     "concerto",
     "control_based_continuation",
+    "decay_test",
     "describing_function",
+    "detached",
     "fit_restoring_force",
     "force_surface",
     "harmonic_force_surface",
+    "multisine_test",
     "phase_locked_loop",
     "phase_resonance",
     "rct",
@@ -58,6 +75,10 @@ __all__ = [
     "restoring_force",
     "run_test",
     "s_curve",
+    "sine_sweep_test",
     "snrm",
+    "standard_amplitude_gains",
     "standard_gains",
+    "steady_states_of",
+    "stepped_sine_test",
 ]

@@ -73,7 +73,7 @@ def test_noise_and_a_converter_stay_within_their_error(beam):
 def test_settings_that_make_no_sense_are_refused(beam):
     with pytest.raises(ValueError, match="`voltages` must be positive"):
         sj.methods.phase_locked_loop(laboratory(beam), np.array([1.0, -1.0]))
-    with pytest.raises(ValueError, match="`sampling_rate` must be 10 times"):
+    with pytest.raises(ValueError, match="`sampling_rate` times `substeps` must be 20 times"):
         sj.methods.Laboratory(beam, sj.methods.Shaker(), sj.methods.Instruments(), 100.0)
     with pytest.raises(ValueError, match="must not be negative"):
         sj.methods.Laboratory(beam, sj.methods.Shaker(mass=-1.0), sj.methods.Instruments(), 2000.0)

@@ -1,17 +1,20 @@
 """A virtual laboratory: structure, shaker, instruments and a sampled controller, in time.
 
-The shaker is an electrodynamic one, U = R i + G v, whose armature moves with the drive point
-(stiff stinger): what the force cell reads is G i less what the armature takes, so that the force
-drops at resonance and carries harmonics, as on a real shaker. From one sample of the controller
-to the next the voltage goes straight from the last command to the new one (a reconstruction
-filter's delay of one sample), and the equations of motion are integrated by the classical method
-of Runge and Kutta.
+The structure is any model of this package: modes, potential, contacts, friction with its memory.
+An electrodynamic shaker drives it through a stinger, so that the force drops at resonance and
+carries harmonics, as on a real shaker. From one sample of the controller to the next the voltage
+goes straight from the last command to the new one (a reconstruction filter's delay of one sample),
+and the equations of motion are integrated by the classical method of Runge and Kutta, of order 4,
+in substeps of equal length; sliders are moved exactly after each of them.
 
-Reference: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
-doi:10.1016/0022-460X(79)90681-9.
+References: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
+doi:10.1016/0022-460X(79)90681-9; for the flexible stinger, K. G. McConnell & P. S. Varoto,
+Vibration Testing (2008), chapter 7.
 """
 
 import abc
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,30 +24,28 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
-from snrmjax.model.structures import Structure
+from snrmjax.methods.bench.equipment import (
+    Instruments,
+    Shaker,
+    check_instruments,
+    check_shaker,
+    filter_sections,
+)
+from snrmjax.model.effect_base import (
+    AbstractForceSpectrum,
+    AbstractHysteresis,
+    AbstractKinked,
+    AbstractMeasurementEffect,
+)
+from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.simulate.solutions.hysteresis_cycles import (
+    memory_after_step,
+    memory_at_rest,
+    memory_rate,
+    scaled_friction,
+)
 
-_SUBSTEPS = 2  # of a sample
-_FEWEST_SAMPLES = 20  # a cycle of the highest mode's motion that the integration can follow
-
-
-class Shaker(NamedTuple):
-    """An electrodynamic shaker whose armature moves with the drive point."""
-
-    resistance: float = 3.0  # ohm
-    motor_constant: float = 15.0  # N/A, and V s/m
-    mass: float = 0.0  # kg, armature and force cell beyond its sensing element
-    damping: float = 0.0  # N s/m
-    stiffness: float = 0.0  # N/m, of the armature's suspension
-
-
-class Instruments(NamedTuple):
-    """What the channels add to force and velocity."""
-
-    force_noise: float = 0.0  # N, 1σ of a sample
-    velocity_noise: float = 0.0  # m/s, 1σ of a sample
-    force_range: float = np.inf  # N, beyond which the channel is clipped
-    velocity_range: float = np.inf  # m/s
-    bits: int = 0  # of the converter over both ranges; 0 for none
+_FEWEST_STEPS = 20  # a cycle of the fastest linear motion, that the integration can follow it
 
 
 class Sample(NamedTuple):
@@ -71,56 +72,118 @@ class TestRecord(NamedTuple):
     """Channels of a test, one entry a sample."""
 
     time: Float[Array, " sample"]  # s
-    voltage: Float[Array, " sample"]
+    voltage: Float[Array, " sample"]  # V, of the amplifier
     force: Float[Array, " sample"]  # N, as recorded
     velocity: Float[Array, " sample"]  # m/s, as recorded
     report: Any  # of the controller, arrays that lead with the sample
 
 
+class LabMotion(NamedTuple):
+    """What the equations of motion integrate."""
+
+    displacement: Float[Array, " mode"]  # kg^1/2 m
+    velocity: Float[Array, " mode"]  # kg^1/2 m/s
+    armature: Float[Array, "2"]  # displacement (m) and velocity (m/s); used with a flexible stinger
+    memory: tuple[Float[Array, " state"], ...]  # of friction, one entry an effect
+
+
 class LabState(NamedTuple):
     """Everything that goes on from one run to the next."""
 
-    displacement: Float[Array, " mode"]
-    velocity: Float[Array, " mode"]
+    motion: LabMotion
     controller: Any
     time: Float[Array, ""]
-    force: Float[Array, ""]  # N, last
-    voltage: Float[Array, ""]  # last command
+    voltage: Float[Array, ""]  # of the amplifier, V
+    seen: Float[Array, " channel"]  # force (N) and velocity (m/s) behind the anti-alias filter
+    filtered: Float[Array, "section 2 channel"]  # memory of the anti-alias filter
+    late: Float[Array, "delay channel"]  # samples on their way, the next one first
+    largest: Float[Array, ""]  # |q| of the mode of interest so far, kg^1/2 m
 
 
 class Laboratory(eqx.Module):
     """A structure on a shaker with its instruments.
 
-    `sampling_rate` in Hz is that of the controller and of the records. Effects with memory
-    (friction) are refused: they need their own integration. The corners of the voltage, which no
-    filter removes here, alias into the force by (ω period)²/12 of the shaker's own force, which
-    near resonance may be several times the force on the structure.
+    `sampling_rate` in Hz is that of the controller and of the records; each sample is integrated
+    in `substeps`, of which the fastest linear motion (a contact that is closed and the stinger
+    included) needs 20 a cycle. Effects with memory (friction) need `largest_displacement`, in m at
+    the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
+    motions up to it. With `attached` False the shaker is away and nothing drives the structure.
+    The corners of the voltage, which no filter removes here, alias into the force by
+    (ω period)²/12 of the shaker's own force, which near resonance may be several times the force
+    on the structure.
+    Raises `ValueError` for numbers that cannot be, a rate too low, and effects of the measurement
+    or of the force's spectrum, which the shaker and the instruments here have themselves.
     """
 
     structure: Structure
     shaker: Shaker
     instruments: Instruments
     sampling_rate: float = eqx.field(static=True)
+    substeps: int = eqx.field(static=True, default=2)
+    largest_displacement: float = eqx.field(static=True, default=np.nan)
+    attached: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self) -> None:
-        if self.structure.hysteretic:
+        check_shaker(self.shaker)
+        check_instruments(self.instruments, self.sampling_rate)
+        foreign = (AbstractMeasurementEffect, AbstractForceSpectrum)
+        kinds = ", ".join(e.kind for e in self.structure.effects if isinstance(e, foreign))
+        if kinds:
+            raise ValueError(
+                f"the virtual laboratory has its own shaker and instruments, but the model has "
+                f"{kinds}: state them in `shaker` and `instruments`."
+            )
+        if self.structure.hysteretic and not self.largest_displacement > 0:
             kinds = ", ".join(effect.kind for effect in self.structure.hysteretic)
             raise ValueError(
-                f"the virtual laboratory cannot integrate effects with memory: {kinds}."
+                f"{kinds} needs `largest_displacement`, in m at the reference sensor, but it is "
+                f"{self.largest_displacement}."
             )
-        if not self.shaker.resistance > 0 or min(self.shaker[1:]) < 0:
-            raise ValueError(f"a shaker's numbers must not be negative, but are {self.shaker}.")
-        highest = float(np.max(np.asarray(self.structure.modes.natural_frequency))) / (2 * np.pi)
-        if self.sampling_rate * _SUBSTEPS < _FEWEST_SAMPLES * highest:
+        if self.substeps < 1:
+            raise ValueError(f"`substeps` must be 1 or more, but is {self.substeps}.")
+        fastest = _fastest(self.structure, self.shaker) / (2 * np.pi)
+        if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
             raise ValueError(
-                f"`sampling_rate` must be {_FEWEST_SAMPLES / _SUBSTEPS:g} times the highest "
-                f"natural frequency, {highest:.4g} Hz, or more, but is {self.sampling_rate:g} Hz."
+                f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
+                f"frequency of structure, contacts and stinger, {fastest:.4g} Hz, or more, but is "
+                f"{self.sampling_rate * self.substeps:g} Hz: "
+                f"{int(np.ceil(_FEWEST_STEPS * fastest / self.sampling_rate))} substeps would do."
             )
 
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state before anything moves."""
-        rest = jnp.zeros(self.structure.n_modes)
-        return LabState(rest, rest, controller.initial(), *jnp.zeros((3,)))
+        n = simulated_structure(self.structure).n_modes
+        memory = tuple(memory_at_rest(e, jnp.zeros(())) for e in self.friction())
+        sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
+        return LabState(
+            LabMotion(jnp.zeros(n), jnp.zeros(n), jnp.zeros(2), memory),
+            controller.initial(),
+            jnp.zeros(()),
+            jnp.zeros(()),
+            jnp.zeros(2),
+            jnp.zeros((sections, 2, 2)),
+            jnp.zeros((int(self.instruments.delay), 2)),
+            jnp.zeros(()),
+        )
+
+    def reach(self) -> float:
+        """`largest_displacement` as |q| of the mode of interest, kg^1/2 m."""
+        modes = self.structure.modes
+        shape = modes.mode_shape[reference_sensor(modes), modes.mode_of_interest]
+        return self.largest_displacement / abs(float(shape))
+
+    def friction(self) -> tuple[AbstractHysteresis, ...]:
+        """The effects with a memory, set for motions up to `largest_displacement`."""
+        if not self.structure.hysteretic:
+            return ()
+        modes = self.structure.modes
+        omega = float(modes.natural_frequency[modes.mode_of_interest])
+        return scaled_friction(self.structure, self.reach(), self.reach() * omega / np.sqrt(2))
+
+
+def detached(laboratory: Laboratory) -> Laboratory:
+    """The same laboratory with the shaker taken away, for a free decay."""
+    return dataclasses.replace(laboratory, attached=False)
 
 
 def run_test(
@@ -135,63 +198,174 @@ def run_test(
 
     Arguments: `start` is where another run ended, by default rest; `seed` draws the noise.
     Returns the record and the state at its end. Deterministic for a seed.
+    Raises `ValueError` where a structure with friction went beyond `largest_displacement`.
     """
     begin = laboratory.at_rest(controller) if start is None else start
-    noise = jax.random.normal(jax.random.key(seed), (samples, 2))
-    return _run(laboratory, controller, begin, noise)
+    noise = np.random.default_rng(seed).standard_normal((samples, 2))
+    instruments = laboratory.instruments
+    sections = filter_sections(instruments, laboratory.sampling_rate * laboratory.substeps)
+    record, end = _run(laboratory, laboratory.friction(), controller, begin, sections, noise)
+    if laboratory.structure.hysteretic and float(end.largest) > laboratory.reach():
+        ratio = float(end.largest) / laboratory.reach()
+        raise ValueError(
+            f"the motion reached {ratio * laboratory.largest_displacement:.4g} m at the reference "
+            f"sensor, beyond `largest_displacement`, {laboratory.largest_displacement:g} m, up to "
+            "which friction is resolved."
+        )
+    return record, end
 
 
 @eqx.filter_jit
 def _run(
     laboratory: Laboratory,
+    friction: tuple[AbstractHysteresis, ...],
     controller: AbstractController,
     begin: LabState,
-    noise: Float[Array, "sample channel"],
+    sections: Float[np.ndarray, "section 6"],
+    noise: Float[Array | np.ndarray, "sample channel"],
 ) -> tuple[TestRecord, LabState]:
-    structure, shaker = laboratory.structure, laboratory.shaker
-    modes, terms = structure.modes, structure.linear_terms()
-    drive, shape = modes.participation, modes.mode_shape[reference_sensor(modes)]
-    turn = jnp.sign(shape[modes.mode_of_interest] * drive[modes.mode_of_interest])
+    structure, ins = simulated_structure(laboratory.structure), laboratory.instruments
+    modes, j = structure.modes, structure.modes.mode_of_interest
+    shape = modes.mode_shape[reference_sensor(laboratory.structure.modes)]
+    turn = jnp.sign(shape[j] * modes.participation[j])
     period = jnp.asarray(1 / laboratory.sampling_rate)
-    inertia = 1 + shaker.mass * (drive @ drive)
+    steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
+    slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
+    step = _integrator(slope, friction, j, period / steps)
 
-    def accelerations(q: Array, v: Array, voltage: Array) -> tuple[Array, Array]:
-        """Modal accelerations and the force that the cell reads."""
-        own = structure.memoryless_force(q[None], v[None])[0]
-        free = -(terms.damping * v + terms.stiffness * q + own) / terms.mass
-        at, speed = drive @ q, drive @ v
-        current = (voltage - shaker.motor_constant * speed) / shaker.resistance
-        push = shaker.motor_constant * current - shaker.damping * speed - shaker.stiffness * at
-        # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
-        force = (push - shaker.mass * (drive @ free)) / inertia
-        return free + drive * force, force
-
-    def substep(q: Array, v: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        h, (first, last) = period / _SUBSTEPS, ends
-        middle = (first + last) / 2
-        a1, _ = accelerations(q, v, first)
-        a2, _ = accelerations(q + h / 2 * v, v + h / 2 * a1, middle)
-        a3, _ = accelerations(q + h / 2 * v + h**2 / 4 * a1, v + h / 2 * a2, middle)
-        a4, _ = accelerations(q + h * v + h**2 / 2 * a2, v + h * a3, last)
-        return q + h * v + h**2 / 6 * (a1 + a2 + a3), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    def channels(motion: LabMotion, voltage: Array) -> Array:
+        return jnp.stack([slope(motion, voltage)[1], turn * (shape @ motion.velocity)])
 
     def sample(state: LabState, drawn: Array) -> tuple[LabState, tuple]:
-        ins = laboratory.instruments
-        force = _recorded(state.force + ins.force_noise * drawn[0], ins.force_range, ins.bits)
-        speed = turn * (shape @ state.velocity) + ins.velocity_noise * drawn[1]
+        arriving = jnp.concatenate([state.late, state.seen[None]])
+        force = arriving[0, 0] + ins.force_noise * drawn[0]
+        speed = arriving[0, 1] + ins.velocity_noise * drawn[1]
+        force = _recorded(force, ins.force_range, ins.bits)
         speed = _recorded(speed, ins.velocity_range, ins.bits)
-        seen = Sample(state.time, force, speed)
-        control, voltage, report = controller.step(state.controller, seen, period)
-        q, v = state.displacement, state.velocity
-        rise = (voltage - state.voltage) / _SUBSTEPS
-        for k in range(_SUBSTEPS):
-            q, v = substep(q, v, (state.voltage + k * rise, state.voltage + (k + 1) * rise))
-        _, read = accelerations(q, v, voltage)
-        after = LabState(q, v, control, state.time + period, read, voltage)
+        control, command, report = controller.step(
+            state.controller, Sample(state.time, force, speed), period
+        )
+        voltage = jnp.clip(command, -limit, limit)
+        rise = (voltage - state.voltage) / steps
+
+        def substep(now: tuple, k: Array) -> tuple[tuple, None]:
+            motion, filtered, seen = now
+            ends = state.voltage + k * rise, state.voltage + (k + 1) * rise
+            motion = step(motion, ends)
+            if len(sections):
+                seen, filtered = _filtered(sections, filtered, channels(motion, ends[1]))
+            return (motion, filtered, seen), None
+
+        now = (state.motion, state.filtered, state.seen)
+        (motion, filtered, seen), _ = jax.lax.scan(substep, now, jnp.arange(steps), unroll=2)
+        if not len(sections):
+            seen = channels(motion, voltage)
+        largest = jnp.maximum(state.largest, jnp.abs(motion.displacement[j]))
+        after = LabState(
+            *(motion, control, state.time + period, voltage, seen, filtered),
+            *(arriving[1:], largest),
+        )
         return after, (state.time, voltage, force, speed, report)
 
-    end, columns = jax.lax.scan(sample, begin, noise)
+    end, columns = jax.lax.scan(sample, begin, jnp.asarray(noise))
     return TestRecord(*columns), end
+
+
+def _equations(
+    shaker: Shaker,
+    attached: bool,
+    structure: Structure,
+    friction: tuple[AbstractHysteresis, ...],
+) -> Callable[[LabMotion, Array], tuple[LabMotion, Array]]:
+    """Rates of a motion under a voltage, and the force that the cell reads."""
+    terms, drive, j = (
+        structure.linear_terms(),
+        structure.modes.participation,
+        structure.modes.mode_of_interest,
+    )
+    per_force = drive / terms.mass
+    inertia = 1 + shaker.mass * (drive @ per_force)
+
+    def pushed(at: Array, speed: Array, voltage: Array) -> Array:
+        """What the armature gets from its coil and its suspension."""
+        current = (voltage - shaker.motor_constant * speed) / shaker.resistance
+        current = jnp.clip(current, -shaker.largest_current, shaker.largest_current)
+        return shaker.motor_constant * current - shaker.damping * speed - shaker.stiffness * at
+
+    def slope(motion: LabMotion, voltage: Array) -> tuple[LabMotion, Array]:
+        q, v = motion.displacement, motion.velocity
+        inner = (
+            terms.damping * v
+            + terms.stiffness * q
+            + structure.memoryless_force(q[None], v[None])[0]
+        )
+        for effect, own in zip(friction, motion.memory, strict=True):
+            inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
+        free = -inner / terms.mass
+        armature = jnp.zeros(2)
+        if not attached:
+            force = jnp.zeros(())
+        elif np.isinf(shaker.stinger_stiffness):
+            # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
+            push = pushed(drive @ q, drive @ v, voltage)
+            force = (push - shaker.mass * (drive @ free)) / inertia
+        else:
+            at, speed = motion.armature
+            force = shaker.stinger_stiffness * (at - drive @ q)
+            force = force + shaker.stinger_damping * (speed - drive @ v)
+            armature = jnp.stack([speed, (pushed(at, speed, voltage) - force) / shaker.mass])
+        memory = tuple(
+            memory_rate(effect, q[j], v[j], own)
+            for effect, own in zip(friction, motion.memory, strict=True)
+        )
+        return LabMotion(v, free + per_force * force, armature, memory), force
+
+    return slope
+
+
+def _integrator(
+    slope: Callable[[LabMotion, Array], tuple[LabMotion, Array]],
+    friction: tuple[AbstractHysteresis, ...],
+    j: int,
+    h: Array,
+) -> Callable[[LabMotion, tuple[Array, Array]], LabMotion]:
+    """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
+
+    def step(motion: LabMotion, ends: tuple[Array, Array]) -> LabMotion:
+        first, last = ends
+        middle = (first + last) / 2
+
+        def after(time: Array, rate: LabMotion) -> LabMotion:
+            return jax.tree.map(lambda at, by: at + time * by, motion, rate)
+
+        one = slope(motion, first)[0]
+        two = slope(after(h / 2, one), middle)[0]
+        three = slope(after(h / 2, two), middle)[0]
+        four = slope(after(h, three), last)[0]
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, one, two, three, four)
+        moved = after(h, mean)
+        way = [(one.displacement[j], one.velocity[j]) for one in (motion, moved)]
+        memory = (
+            memory_after_step(effect, own, way[0], way[1], h)
+            for effect, own in zip(friction, moved.memory, strict=True)
+        )
+        return moved._replace(memory=tuple(memory))
+
+    return step
+
+
+def _filtered(
+    sections: Float[np.ndarray, "section 6"],
+    memory: Float[Array, "section 2 channel"],
+    value: Float[Array, " channel"],
+) -> tuple[Float[Array, " channel"], Float[Array, "section 2 channel"]]:
+    """One sample through the sections, direct form II transposed."""
+    kept = []
+    for k, (b0, b1, b2, _, a1, a2) in enumerate(sections):
+        out = b0 * value + memory[k, 0]
+        kept.append(jnp.stack([b1 * value - a1 * out + memory[k, 1], b2 * value - a2 * out]))
+        value = out
+    return value, jnp.stack(kept)
 
 
 def _recorded(value: Array, limit: float, bits: int) -> Array:
@@ -203,3 +377,40 @@ def _recorded(value: Array, limit: float, bits: int) -> Array:
         return clipped
     step = 2 * limit / 2**bits
     return step * jnp.round(clipped / step)
+
+
+def _fastest(structure: Structure, shaker: Shaker) -> float:
+    """Largest |eigenvalue| (rad/s) of structure and shaker, closed contacts included."""
+    model = simulated_structure(structure)
+    n, j = model.n_modes, model.modes.mode_of_interest
+    mass, damping, stiffness = (np.diag(np.asarray(term)) for term in model.linear_terms())
+    grid = np.logspace(-12, 3, 301)
+    q = jnp.asarray(np.concatenate([-grid, grid]))
+    for effect in model.memoryless:
+        if isinstance(effect, AbstractKinked):
+            slope = jax.vmap(jax.grad(effect.force))(q, jnp.zeros_like(q))
+            stiffness[j, j] += float(jnp.max(slope))
+    drive = np.asarray(model.modes.participation)
+    coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
+    rigid = np.isinf(shaker.stinger_stiffness)
+    own, link = (np.outer(drive, drive), None) if rigid else _with_armature(drive)
+    if link is not None:
+        mass, damping, stiffness = (np.pad(matrix, (0, 1)) for matrix in (mass, damping, stiffness))
+        stiffness += shaker.stinger_stiffness * link
+        damping += shaker.stinger_damping * link
+    mass, damping = mass + shaker.mass * own, damping + coil * own
+    stiffness = stiffness + shaker.stiffness * own
+    size = n + (not rigid)
+    state = np.block(
+        [
+            [np.zeros((size, size)), np.eye(size)],
+            [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)],
+        ]
+    )
+    return float(np.abs(np.linalg.eigvals(state)).max())
+
+
+def _with_armature(drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The armature's own coordinate behind the modes, and the stinger's stretch, squared."""
+    armature, stretch = np.append(0 * drive, 1.0), np.append(-drive, 1.0)
+    return np.outer(armature, armature), np.outer(stretch, stretch)

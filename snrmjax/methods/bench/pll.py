@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
+from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.laboratory import (
     AbstractController,
     Laboratory,
@@ -46,13 +47,11 @@ class LoopGains(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Angle and integral of the loop, and the filters' coefficients."""
+    """Angle and integral of the loop, and what its filters know."""
 
     angle: Float[Array, ""]
     integral: Float[Array, ""]  # rad/s
-    force: Complex[Array, " order"]
-    velocity: Complex[Array, " order"]
-    means: Float[Array, "2"]
+    filters: FourierState  # force, velocity
     frequency: Float[Array, ""]  # rad/s
 
 
@@ -74,23 +73,16 @@ class PhaseLockedLoop(AbstractController):
 
     def initial(self) -> LoopState:
         """See `AbstractController.initial`."""
-        none = jnp.zeros(len(_ORDERS), dtype=complex)
         zero = jnp.zeros(())
-        return LoopState(zero, zero, none, none, jnp.zeros(2), self.start_frequency)
+        return LoopState(zero, zero, nothing_followed(2, _ORDERS), self.start_frequency)
 
     def step(
         self, state: LoopState, sample: Sample, period: Float[Array, ""]
     ) -> tuple[LoopState, Array, LoopReport]:
         """See `AbstractController.step`."""
-        basis = jnp.exp(1j * _ORDERS * state.angle)
-        gain = 2 * self.filter_rate * period
         seen = jnp.stack([sample.force, sample.velocity])
-        both = jnp.stack([state.force, state.velocity])
-        error = seen - state.means - jnp.real(both @ basis)
-        both = both + gain * error[:, None] * jnp.conj(basis)
-        means = state.means + gain / 2 * error
-        force, velocity = both[0], both[1]
-        ratio = velocity[0] * jnp.conj(force[0])
+        filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
+        ratio = filters.fundamental(1) * jnp.conj(filters.fundamental(0))
         phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(ratio), 0.0)
         proportional = 2 * self.loop_rate - self.decay
         integral = state.integral + self.loop_rate**2 * phase * period
@@ -99,7 +91,7 @@ class PhaseLockedLoop(AbstractController):
         frequency = jnp.clip(frequency, 0.5 * self.start_frequency, 2.0 * self.start_frequency)
         angle = jnp.mod(state.angle + frequency * period, 2 * jnp.pi)
         report = LoopReport(frequency, state.angle)
-        after = LoopState(angle, integral, force, velocity, means, frequency)
+        after = LoopState(angle, integral, filters, frequency)
         return after, self.voltage * jnp.cos(angle), report
 
 
@@ -140,24 +132,61 @@ def phase_locked_loop(
             f"`settle_cycles` and `record_cycles` must be 1 or more, but are {settle_cycles} and "
             f"{record_cycles}."
         )
+    points: list[MethodPoint] = []
+    state: LabState | None = None
+    seconds = 0.0
+    for level, voltage in enumerate(levels, 1):
+        held = lock_in(
+            laboratory,
+            float(voltage),
+            gains=gains,
+            settle_cycles=settle_cycles,
+            record_cycles=record_cycles,
+            start=state,
+            level=level,
+            seed=seed + 7919 * level,
+        )
+        points.append(held.point)
+        state, seconds = held.state, seconds + held.seconds
+    return method_result("pll", points, len(levels), test_seconds=seconds)
+
+
+class HeldResonance(NamedTuple):
+    """The resonance that a loop held, and where the test may go on from."""
+
+    point: MethodPoint
+    record: TestRecord
+    state: LabState
+    seconds: float
+
+
+def lock_in(
+    laboratory: Laboratory,
+    voltage: float,
+    *,
+    gains: LoopGains | None = None,
+    settle_cycles: int = 300,
+    record_cycles: int = 50,
+    start: LabState | None = None,
+    level: int = 1,
+    seed: int = 0,
+) -> HeldResonance:
+    """One level of `phase_locked_loop`.
+
+    Arguments: `start` is the state of the level before, by default rest; the others as there.
+    """
     rates = standard_gains(laboratory) if gains is None else gains
     modes = laboratory.structure.modes
     j = modes.mode_of_interest
     omega, ratio = modes.natural_frequency[j], modes.damping_ratio[j]
     cycle = laboratory.sampling_rate * 2 * np.pi / float(omega)
     settle, keep = round(settle_cycles * cycle), round(record_cycles * cycle)
-    points: list[MethodPoint] = []
-    state: LabState | None = None
-    for level, voltage in enumerate(levels, 1):
-        loop = PhaseLockedLoop(
-            *(jnp.asarray(value, dtype=float) for value in (voltage, omega, ratio * omega, *rates))
-        )
-        record, state = run_test(
-            laboratory, loop, settle + keep, start=state, seed=seed + 7919 * level
-        )
-        points.append(_point(level, record, keep, drive_point(modes), float(ratio * omega)))
-    seconds = len(levels) * (settle + keep) / laboratory.sampling_rate
-    return method_result("pll", points, len(levels), test_seconds=seconds)
+    loop = PhaseLockedLoop(
+        *(jnp.asarray(value, dtype=float) for value in (voltage, omega, ratio * omega, *rates))
+    )
+    record, state = run_test(laboratory, loop, settle + keep, start=start, seed=seed)
+    point = _point(level, record, keep, drive_point(modes), float(ratio * omega))
+    return HeldResonance(point, record, state, (settle + keep) / laboratory.sampling_rate)
 
 
 def _point(

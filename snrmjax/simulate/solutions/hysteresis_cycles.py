@@ -69,7 +69,7 @@ def integrated_cycle(
         inner = inner + model.memoryless_force(q[None], v[None])[0]
         for effect, own in zip(effects, memory, strict=True):
             inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
-        rates = tuple(map(lambda e, own: _rate(e, q[j], v[j], own), effects, memory))
+        rates = tuple(map(lambda e, own: memory_rate(e, q[j], v[j], own), effects, memory))
         return ravel_pytree((v, (drive - inner) / terms.mass, rates))[0] / frequency
 
     term, width = diffrax.ODETerm(slope), 2 * jnp.pi / n_samples
@@ -147,8 +147,8 @@ def _moved_memory(old: AbstractHysteresis, new: AbstractHysteresis, states: Arra
     return jnp.interp(wanted, slip, states)
 
 
-def _rate(effect: AbstractHysteresis, q: Array, v: Array, states: Array) -> Array:
-    """Rates of the memory during a step, through which sliders are held: see `_with_memory`."""
+def memory_rate(effect: AbstractHysteresis, q: Array, v: Array, states: Array) -> Array:
+    """Rates of the memory in a step, through which sliders are held: see `memory_after_step`."""
     if isinstance(effect, AbstractSliders):
         return jnp.zeros_like(states)
     return effect.state_rate(q, v, states)
@@ -158,17 +158,31 @@ def _with_memory(
     effects: tuple[AbstractHysteresis, ...], j: int, old: tuple, new: tuple, time: Array
 ) -> Float[Array, " unknown"]:
     """The new state with the sliders moved along the way of q, its turning point included."""
-    (q0, v0), (q1, v1) = (old[0][j], old[1][j]), (new[0][j], new[1][j])
+    ends = (old[0][j], old[1][j]), (new[0][j], new[1][j])
+    moved = (memory_after_step(e, own, *ends, time) for e, own in zip(effects, new[2], strict=True))
+    return ravel_pytree((*new[:2], tuple(moved)))[0]
+
+
+def memory_after_step(
+    effect: AbstractHysteresis,
+    states: Array,
+    begin: tuple[Array, Array],
+    end: tuple[Array, Array],
+    time: Array,
+) -> Array:
+    """Memory after a step of an integrator through which sliders were held.
+
+    Arguments: `states` as the integrator leaves them; q (kg^1/2 m) and q̇ (kg^1/2 m/s) of the mode
+    of interest at the `begin` and at the `end` of the step, of length `time` in s. A turning point
+    within the step is passed; other effects than sliders keep what the integrator found.
+    """
+    if not isinstance(effect, AbstractSliders):
+        return states
+    (q0, v0), (q1, v1) = begin, end
     turns = v0 * v1 < 0
     until = time * v0 / jnp.where(turns, v0 - v1, 1.0)
     turning = jnp.where(turns, q0 + 0.5 * v0 * until, q0)
-
-    def moved(effect: AbstractHysteresis, states: Array) -> Array:
-        if not isinstance(effect, AbstractSliders):
-            return states
-        return effect.moved_states(q1, effect.moved_states(turning, states))
-
-    return ravel_pytree((*new[:2], tuple(map(moved, effects, new[2]))))[0]
+    return effect.moved_states(q1, effect.moved_states(turning, states))
 
 
 def _diffrax() -> Any:
