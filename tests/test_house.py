@@ -37,7 +37,7 @@ SUB_ROOMS = {
     "model.library": {
         *("model.effect_base", "model.effect_metadata", "model.modes", "model.potential"),
     },
-    "measure.recordings": set(),
+    "measure.recordings": {"measure.signals", "measure.states"},
     "simulate.balance": set(),
     "simulate.continuation": {"simulate.balance"},
     "simulate.solutions": {"simulate.balance", "simulate.continuation"},

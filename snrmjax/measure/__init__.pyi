@@ -4,6 +4,7 @@ from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses
+from .recordings.stepped_sine import SteppedSineStates, StepStatus, stepped_sine_states
 from .recordings.time_recording import TimeRecording, time_recording
 from .records import RecordFit, fit_records, steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
@@ -21,6 +22,8 @@ __all__ = [
     "OptionalColumns",
     "RecordFit",
     "SteadyStates",
+    "StepStatus",
+    "SteppedSineStates",
     "TimeRecording",
     "apply_calibration",
     "appropriation_of",
@@ -37,6 +40,7 @@ __all__ = [
     "phasor_relative_to_force",
     "steady_state_from_records",
     "steady_states",
+    "stepped_sine_states",
     "synthesise",
     "time_recording",
 ]

@@ -1,0 +1,426 @@
+"""Steady states of a stepped sine from its time record."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.measure.recordings.block_phasors import BlockPhasors, block_phasors
+from snrmjax.measure.recordings.settling import (
+    Means,
+    mean_phasors,
+    moves,
+    settled_part,
+    steady_frequency,
+)
+from snrmjax.measure.recordings.steps import Step, recognise_steps
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.tone_track import check_rate, track_tone
+from snrmjax.measure.recordings.velocity_states import (
+    ChosenChannels,
+    Levels,
+    PhasorTable,
+    checked_orders,
+    choose_channels,
+    states_of_phasors,
+)
+from snrmjax.measure.states import SteadyStates
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+_FEWEST_CYCLES = 10
+_HIGHEST = 3  # harmonics that are always fitted, so that they do not pass for noise
+_NEAR_TABLE = 0.5  # cycles over a step by which a table's frequency may be off
+_BEYOND = 3.0  # times the usual residual of a block: it lies across the end of a step
+_COVERED = 0.3  # of the time in which there is a tone, that steps cover at least
+_TRIES = 5  # starts of the part that is used
+_QUIET = 1e-3  # of the largest force: a pause
+
+
+class StepStatus(IntEnum):
+    """Whether a step of a record became a steady state, or why it did not."""
+
+    SETTLED = 0
+    UNSETTLED = 1
+    TOO_SHORT = 2
+    NOT_FINITE = 3
+    CLIPPED = 4
+    NOT_FOUND = 5  # the frequency that a table states
+    NO_FORCE = 6
+
+
+STEP_MESSAGE: dict[StepStatus, str] = {
+    StepStatus.SETTLED: "settled",
+    StepStatus.UNSETTLED: "amplitude or phase still move at its end; dwell longer",
+    StepStatus.TOO_SHORT: f"fewer than {_FEWEST_CYCLES} cycles are left",
+    StepStatus.NOT_FINITE: "samples are missing or not finite",
+    StepStatus.CLIPPED: "a channel stays at its largest value: it is clipped",
+    StepStatus.NOT_FOUND: "the force has another frequency than the table says",
+    StepStatus.NO_FORCE: "the force is a thousandth of the largest or less: a pause",
+}
+
+
+class SteppedSineStates(AbstractResult):
+    """Steps of a record and the steady states of those that settled; see `stepped_sine_states`."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("step",)
+
+    states: SteadyStates
+    start: Float[np.ndarray, " step"]  # s
+    stop: Float[np.ndarray, " step"]  # s
+    settled_from: Float[np.ndarray, " step"]  # s, NaN where it did not settle
+    frequency: Float[np.ndarray, " step"]  # rad/s
+    force: Float[np.ndarray, " step"]  # N or V
+    decay_time: Float[np.ndarray, " step"]  # s, of the transient, NaN where none was seen
+    moved: Float[np.ndarray, " step"]  # share by which a phasor moves over the part used
+    colour: Float[np.ndarray, " step"]  # largest scatter of blocks over that of white noise
+    state: Int[np.ndarray, " step"]  # row of `states`, −1 where there is none
+    status: Int[np.ndarray, " step"]  # a `StepStatus`
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        hertz = self.frequency / _HERTZ
+        failed = [
+            f"{np.sum(self.status == int(kind))} left out: {STEP_MESSAGE[kind]}"
+            for kind in StepStatus
+            if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
+        ]
+        return (
+            f"SteppedSineStates: {len(self.status)} steps, {self.states.n_states} settled",
+            f"frequency {hertz.min():.6g} to {hertz.max():.6g} Hz",
+            f"dwell {np.min(self.stop - self.start):.3g} to {np.max(self.stop - self.start):.3g} s",
+            *failed,
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; the table of steps."""
+        at = ("step",)
+        names = np.array([StepStatus(int(k)).name.lower() for k in self.status], dtype=str)
+        reasons = np.array([STEP_MESSAGE[StepStatus(int(k))] for k in self.status], dtype=str)
+        return {
+            "step": Variable(at, np.arange(len(self.status)), "1", "step"),
+            "start_s": Variable(at, self.start, "s", "its start"),
+            "stop_s": Variable(at, self.stop, "s", "its end"),
+            "settled_from_s": Variable(at, self.settled_from, "s", "from where on it was used"),
+            "frequency_hz": Variable(at, self.frequency / _HERTZ, "Hz", "frequency of the force"),
+            "force": Variable(at, self.force, "N or V", "amplitude of the force"),
+            "decay_time_s": Variable(at, self.decay_time, "s", "decay time of the transient"),
+            "moved": Variable(at, self.moved, "1", "share that a phasor still moves"),
+            "colour": Variable(at, self.colour, "1", "scatter of blocks over white noise's"),
+            "state": Variable(at, self.state, "1", "row of the steady states, -1: none"),
+            "status": Variable(at, names, "", "whether it settled"),
+            "reason": Variable(at, reasons, "", "in words"),
+        }
+
+
+class _Measured(NamedTuple):
+    """One step with all that is known of it."""
+
+    step: Step
+    status: StepStatus
+    settled_from: float = np.nan
+    decay_time: float = np.nan
+    moved: float = np.nan
+    left: Float[np.ndarray, " channel"] | None = None
+    means: Means | None = None
+    middle: float = np.nan  # s, of the part used
+    drive: float = np.nan  # amplitude of the drive's channel
+
+
+def stepped_sine_states(
+    recording: TimeRecording,
+    force: str,
+    responses: Sequence[str],
+    *,
+    harmonic_order: Sequence[int] = (1, 2, 3),
+    level: Levels | int = "auto",
+    sensors: Sequence[str] | None = None,
+    frequencies: Sequence[tuple[float, float, float]] | None = None,
+    settle: float | None = None,
+    drive: str | None = None,
+    tolerance: float = 2e-3,
+    least_amplitude_step: float = 0.05,
+    least_frequency_step: float = 0.0,
+) -> SteppedSineStates:
+    """Steady states from the time record of a stepped sine.
+
+    Steps of frequency or amplitude are recognised by phase and amplitude of the drive; in each the
+    transient is left out, and harmonics are fitted by least squares to what is left.
+
+    Arguments: `force` names the channel of the force (N), or of a voltage that stands for it (the
+    states then have `drive` in place of `force`); `responses` the channels of motion, turned into
+    velocities by iΩ; `level` as in `number_levels`; `sensors` names the responses in the states;
+    `frequencies` is a table of steps, (start in s, end in s, frequency in rad/s), in place of
+    recognition; `settle` in s is left out of every step instead of what the transient asks for;
+    `drive` names the channel by whose tone steps are recognised and levels grouped, best the
+    voltage of the generator; `tolerance` is the share by which a phasor may still move over the
+    part that is used; `least_amplitude_step` as a share and `least_frequency_step` in rad/s are
+    the smallest steps that there are.
+    Returns `SteppedSineStates`: `states` in the order of time, with standard deviations (the
+    larger of that of white noise and of the scatter of blocks), harmonics and `order`; and the
+    table of steps, with those left out and why.
+    Raises `ValueError` for channels that do not fit, a record without steps or with one only
+    (state `frequencies` for a single tone), a table beyond the record, fewer than four samples a
+    cycle, harmonics above half the sampling rate, and a record none of whose steps settled.
+    Validity: 1σ holds for noise, also coloured, whose memory is short against a sixteenth of the
+    settled part; a dwell of ten cycles at least, of twenty where steps are to be recognised.
+
+    >>> from snrmjax.measure import Channel, time_recording
+    >>> t = np.arange(4000) / 1000
+    >>> turn = 2 * np.pi * np.where(t < 2, 20 * t, 21 * t - 2)
+    >>> record = time_recording(
+    ...     np.stack([2 * np.cos(turn), 0.1 * np.cos(turn + 0.2)]),
+    ...     [Channel("load cell", "force"), Channel("tip", "velocity")], 1000)
+    >>> found = stepped_sine_states(record, "load cell", ["tip"])
+    >>> found.states.force.round(3).tolist(), np.angle(found.states.velocity).round(3).tolist()
+    ([2.0, 2.0], [[0.2], [0.2]])
+    """
+    orders = checked_orders(harmonic_order)
+    chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
+    if frequencies is None:
+        steps = _recognised(recording, chosen, least_amplitude_step, least_frequency_step)
+    else:
+        steps = _of_table(recording, frequencies)
+    for step in steps:
+        check_rate(recording, step.frequency, force)
+    _check_highest(recording, steps, orders)
+    measured = [
+        _measure(recording, chosen, one, orders, settle, tolerance, frequencies is not None)
+        for one in steps
+    ]
+    measured = _without_pauses(measured)
+    return _result(recording, chosen, measured, orders, level)
+
+
+def _recognised(
+    recording: TimeRecording, chosen: ChosenChannels, amplitude_step: float, frequency_step: float
+) -> list[Step]:
+    if not 0 < amplitude_step < 1 or not frequency_step >= 0:
+        raise ValueError(
+            "`least_amplitude_step` must be between 0 and 1 and `least_frequency_step` not below "
+            f"0, but they are {amplitude_step:g} and {frequency_step:g}."
+        )
+    name = chosen.drive or chosen.force.name
+    track = track_tone(recording, name)
+    steps = recognise_steps(
+        track,
+        recording.sampling_rate,
+        least_amplitude_step=amplitude_step,
+        least_step=frequency_step,
+    )
+    long = [one for one in steps if _cycles(recording, one) >= _FEWEST_CYCLES]
+    if sum(one.stop - one.start for one in long) < _COVERED * np.ptp(track.middle):
+        raise ValueError(
+            f"the record has no steps: the tone of channel {name} does not stay at one frequency "
+            f"for {_FEWEST_CYCLES} cycles anywhere (a sweep? `sweep_states` reads it)."
+        )
+    if len(long) == 1:
+        raise ValueError(
+            f"the record has one step only, of {long[0].frequency / _HERTZ:.6g} Hz from "
+            f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
+            "single tone is meant."
+        )
+    return steps
+
+
+def _of_table(
+    recording: TimeRecording, frequencies: Sequence[tuple[float, float, float]]
+) -> list[Step]:
+    table = np.asarray(frequencies, dtype=float)
+    if table.ndim != 2 or table.shape[1:] != (3,) or not len(table):
+        raise ValueError(
+            "`frequencies` must have rows of start (s), end (s) and frequency (rad/s), but has "
+            f"shape {table.shape}."
+        )
+    begin, end = recording.start_time, recording.start_time + recording.duration
+    slack = 1.5 / recording.sampling_rate
+    steps = []
+    for k, (start, stop, omega) in enumerate(table):
+        if not (np.isfinite([start, stop, omega]).all() and start < stop and omega > 0):
+            raise ValueError(
+                f"row {k} of `frequencies` must rise from start to end with a frequency above 0, "
+                f"but is {start:g} s, {stop:g} s, {omega:g} rad/s."
+            )
+        if start < begin - slack or stop > end + slack:
+            raise ValueError(
+                f"row {k} of `frequencies` lies beyond the record: {start:g} to {stop:g} s, but "
+                f"the record goes from {begin:g} to {end:g} s."
+            )
+        first = max(0, int(np.ceil((start - begin) * recording.sampling_rate - 1e-6)))
+        last = min(recording.n_samples, int((stop - begin) * recording.sampling_rate + 1e-6))
+        steps.append(Step(first, last, float(omega), np.nan))
+    return steps
+
+
+def _check_highest(
+    recording: TimeRecording, steps: Sequence[Step], orders: tuple[int, ...]
+) -> None:
+    highest = max(one.frequency for one in steps) * max(orders)
+    if highest >= np.pi * recording.sampling_rate:
+        raise ValueError(
+            f"harmonic {max(orders)} of {highest / max(orders) / _HERTZ:.6g} Hz lies above half "
+            f"the sampling rate, {recording.sampling_rate / 2:.6g} Hz: ask for fewer harmonics."
+        )
+
+
+def _cycles(recording: TimeRecording, step: Step) -> float:
+    return (step.stop - step.start) * step.frequency / _HERTZ / recording.sampling_rate
+
+
+def _measure(
+    recording: TimeRecording,
+    chosen: ChosenChannels,
+    step: Step,
+    orders: tuple[int, ...],
+    settle: float | None,
+    tolerance: float,
+    of_table: bool,
+) -> _Measured:
+    """Fits one step."""
+    if settle is not None and not 0 <= settle < np.inf:
+        raise ValueError(f"`settle` must be a time of 0 s or more, but is {settle:g}.")
+    if _cycles(recording, step) < _FEWEST_CYCLES:
+        return _Measured(step, StepStatus.TOO_SHORT)
+    below = np.pi * recording.sampling_rate / step.frequency
+    highest = max(*orders, min(_HIGHEST, int(np.ceil(below) - 1)))
+    blocks = block_phasors(recording, chosen.names, step.start, step.stop, step.frequency, highest)
+    if not np.isfinite(blocks.phasors).all():
+        return _Measured(step, StepStatus.NOT_FINITE)
+    if blocks.clipped:
+        return _Measured(step, StepStatus.CLIPPED)
+    guide = chosen.names.index(chosen.drive) if chosen.drive is not None else 0
+    if not of_table:
+        blocks = _within_step(blocks, guide)
+    shift = steady_frequency(blocks, guide)
+    dwell = (step.stop - step.start) / recording.sampling_rate
+    if of_table and abs(shift) * dwell > _HERTZ * _NEAR_TABLE:
+        return _Measured(step, StepStatus.NOT_FOUND)
+    blocks = blocks.turned(shift)
+    step = step._replace(frequency=blocks.frequency)
+    motion = _without_drive(blocks, chosen)
+    part = settled_part(motion, settle)
+    # What one decaying mode does not explain still moves: then later, as far as there is time.
+    for first in np.unique(np.linspace(part.first, part.latest, _TRIES).astype(int)):
+        kept = _rows(motion, slice(first, None))
+        moved = moves(kept, tolerance) if len(kept.time) else 0.0
+        if moved == 0:
+            break
+    each = (blocks.time[-1] - blocks.time[0]) / max(len(blocks.time) - 1, 1)
+    if len(kept.time) * each * step.frequency < _HERTZ * _FEWEST_CYCLES / 2 or len(kept.time) < 3:
+        return _Measured(step, StepStatus.TOO_SHORT)
+    means = mean_phasors(kept)
+    left = part.left[:, first]
+    share = float(np.max(left / np.abs(means.phasors[:, 0])))
+    begins = float(kept.time[0] - each / 2)
+    unsettled = moved > 0 or share > tolerance
+    return _Measured(
+        step._replace(amplitude=float(np.abs(means.phasors[0, 0]))),
+        StepStatus.UNSETTLED if unsettled else StepStatus.SETTLED,
+        np.nan if unsettled else begins,
+        part.decay_time,
+        max(moved, share),
+        left,
+        means,
+        float(kept.time.mean()),
+        float(np.abs(blocks.phasors[guide, 0, first:]).mean()) if chosen.drive else np.nan,
+    )
+
+
+def _without_drive(blocks: BlockPhasors, chosen: ChosenChannels) -> BlockPhasors:
+    n = 1 + len(chosen.responses)
+    return blocks._replace(phasors=blocks.phasors[:n], noise=blocks.noise[:n], mean=blocks.mean[:n])
+
+
+def _within_step(blocks: BlockPhasors, guide: int) -> BlockPhasors:
+    """Without blocks at the ends in which the drive is no steady tone: the step is over there."""
+    rest = blocks.noise[guide]
+    good = np.flatnonzero(rest <= _BEYOND * np.median(rest))
+    return _rows(blocks, slice(int(good[0]), int(good[-1]) + 1))
+
+
+def _rows(blocks: BlockPhasors, rows: slice) -> BlockPhasors:
+    return blocks._replace(
+        time=blocks.time[rows],
+        phasors=blocks.phasors[:, :, rows],
+        noise=blocks.noise[:, rows],
+        mean=blocks.mean[:, rows],
+    )
+
+
+def _without_pauses(measured: list[_Measured]) -> list[_Measured]:
+    largest = max(
+        (one.step.amplitude for one in measured if np.isfinite(one.step.amplitude)), default=0.0
+    )
+    return [
+        one._replace(status=StepStatus.NO_FORCE, settled_from=np.nan)
+        if one.means is not None and one.step.amplitude <= _QUIET * largest
+        else one
+        for one in measured
+    ]
+
+
+def _result(
+    recording: TimeRecording,
+    chosen: ChosenChannels,
+    measured: list[_Measured],
+    orders: tuple[int, ...],
+    level: Levels | int,
+) -> SteppedSineStates:
+    status = np.array([int(one.status) for one in measured])
+    good = [one for one in measured if one.status is StepStatus.SETTLED]
+    if not good:
+        reasons = "; ".join(
+            f"{np.sum(status == int(kind))} because {STEP_MESSAGE[kind]}"
+            for kind in StepStatus
+            if np.any(status == int(kind))
+        )
+        moving = np.isin(status, (int(StepStatus.UNSETTLED), int(StepStatus.TOO_SHORT))).all()
+        hint = " (a sweep? `sweep_states` reads it)" if moving else ""
+        raise ValueError(
+            f"none of the {len(measured)} steps of the record settled: {reasons}{hint}."
+        )
+    states = states_of_phasors(recording, chosen, _table(good), orders, level)
+    number = np.full(len(measured), -1)
+    number[status == int(StepStatus.SETTLED)] = np.arange(len(good))
+    rate, begin = recording.sampling_rate, recording.start_time
+    return SteppedSineStates(
+        states,
+        begin + np.array([one.step.start for one in measured]) / rate,
+        begin + np.array([one.step.stop for one in measured]) / rate,
+        np.array([one.settled_from for one in measured]),
+        np.array([one.step.frequency for one in measured]),
+        np.array([one.step.amplitude for one in measured]),
+        np.array([one.decay_time for one in measured]),
+        np.array([one.moved for one in measured]),
+        np.array([np.nan if one.means is None else one.means.colour.max() for one in measured]),
+        number,
+        status,
+        states.notes,
+    )
+
+
+def _table(good: list[_Measured]) -> PhasorTable:
+    """Phasors of the settled steps; what may be left of a transient is added to the errors."""
+    means = [one.means for one in good if one.means is not None]
+    left = np.array([one.left for one in good])
+    first = np.array([np.abs(one.phasors[:, 0]) for one in means])
+    amplitude_std = np.hypot([one.amplitude_std for one in means], left)
+    phase_std = np.hypot([one.phase_std for one in means], (left / first)[:, :])
+    drive = np.array([one.drive for one in good])
+    return PhasorTable(
+        np.array([one.middle for one in good]),
+        np.array([one.step.frequency for one in good]),
+        first[:, 0],
+        amplitude_std[:, 0],
+        np.array([one.phasors[1:] for one in means]),
+        np.array([one.mean[1:] for one in means]),
+        amplitude_std[:, 1:],
+        phase_std[:, 1:],
+        np.array([one.harmonic_std[1:] for one in means]),
+        drive if np.isfinite(drive).all() else None,
+    )
