@@ -94,11 +94,12 @@ def shape_rows(beam: Beam, fraction: float) -> Float[Array, "3 dof"]:
 
 def uniform_load(beam: Beam) -> Float[Array, " dof"]:
     """Consistent nodal forces of one newton across the chord, spread evenly along the beam."""
-    node, weight = np.polynomial.legendre.leggauss(2)  # exact for cubics
-    places = (np.arange(beam.elements)[:, None] + 0.5 * (node + 1)) / beam.elements
-    rows = [shape_rows(beam, float(place))[1] for place in places.ravel()]
-    weights = np.tile(0.5 * weight / beam.elements, beam.elements)
-    return jnp.asarray(weights) @ jnp.stack(rows)
+    n, turned = beam.elements, _turned(beam)
+    # Of each element's share, along and across its own chord; moments ± p s²/12.
+    along, across = 0.5 * turned[:, 0, 1], 0.5 * turned[:, 0, 0]
+    moment = across * beam.arc_length / (6 * n)
+    local = jnp.stack([along, across, moment, along, across, -moment], axis=1) / n
+    return _gathered(jnp.einsum("ek,ekj->ej", local, turned))
 
 
 # What deforms an element: difference of displacements, mean and half difference of rotations.

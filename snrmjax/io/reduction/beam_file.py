@@ -13,8 +13,8 @@ length_m = 0.2286
 radius_m = 11.43                     # absent: straight
 elements = 40
 [supports]
-left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses:
-right = { axial_n_m = 1e6, transverse_n_m = 1e7, rotation_nm_rad = 50.0 }
+left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses (inf: held)
+right = { axial_n_m = 1e6, transverse_n_m = inf, rotation_nm_rad = 50.0 }
 [condense]
 modes = [1, 3, 5]
 load_scale = 0.3                     # thicknesses, optional
@@ -24,6 +24,10 @@ damping_ratio = [0.05, 0.001, 0.001] # optional, one number or one a mode
 midspan = 0.5                        # fraction of the length
 [force]
 distribution = "uniform"             # or: at = 0.5
+[[point_mass]]                       # optional, any number of them
+at = 0.25                            # fraction of the length
+mass_kg = 1e-3
+inertia_kg_m2 = 2e-8                 # optional, about the axis of bending
 """
 
 from typing import NamedTuple
@@ -39,8 +43,9 @@ SUPPORTS = ("clamped", "pinned", "free")
 STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
 
 _TABLES = ("material", "section", "geometry", "supports", "condense", "sensors", "force")
-_POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
-_MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
+_POINT_MASS = "point_mass"
+POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
+MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
 
 
 class SupportStiffness(NamedTuple):
@@ -49,6 +54,14 @@ class SupportStiffness(NamedTuple):
     axial: float  # N/m, along the chord
     transverse: float  # N/m, across it
     rotation: float  # N m/rad
+
+
+class PointMassEntry(NamedTuple):
+    """A mass fixed to the beam."""
+
+    at: float  # fraction of the length
+    mass: float  # kg
+    inertia: float  # kg m²
 
 
 class BeamDescription(NamedTuple):
@@ -70,6 +83,7 @@ class BeamDescription(NamedTuple):
     damping_ratio: tuple[float, ...] | None  # one a mode; None: not stated
     sensors: dict[str, float]  # fractions of the length
     force_at: float | None  # fraction of the length; None: uniform
+    point_masses: tuple[PointMassEntry, ...] = ()
 
 
 def read_beam_description(path: FilePath) -> BeamDescription:
@@ -80,7 +94,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     """
     file = file_name(path)
     top = parsed_toml(read_text(path), file)
-    top.check_keys(_TABLES[:5], ("name", *_TABLES[5:]))
+    top.check_keys(_TABLES[:5], ("name", *_TABLES[5:], _POINT_MASS))
     material, section, geometry, supports, of_modes, sensors, force = (
         top.table(name, f"[{name}] of {file}") for name in _TABLES
     )
@@ -91,8 +105,8 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     of_modes.check_keys(("modes",), ("load_scale", "degree", "damping_ratio"))
     length = geometry.number("length_m", POSITIVE)
     radius = geometry.number("radius_m", POSITIVE) if "radius_m" in geometry.entries else None
-    if radius is not None and not length < 2 * _MOST_RISE * radius:
-        raise geometry.refusal("radius_m", f"above {length / (2 * _MOST_RISE):.4g}", radius)
+    if radius is not None and not length < 2 * MOST_RISE * radius:
+        raise geometry.refusal("radius_m", f"above {length / (2 * MOST_RISE):.4g}", radius)
     thickness = section.number("thickness_m", POSITIVE)
     if not thickness < length:
         raise section.refusal("thickness_m", f"below the length ({length:g})", thickness)
@@ -109,7 +123,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         name=top.text("name", file.removesuffix(".toml")),
         young=material.number("young_pa", POSITIVE),
         density=material.number("density_kg_m3", POSITIVE),
-        poisson=material.number("poisson", _POISSON) if "poisson" in material.entries else None,
+        poisson=material.number("poisson", POISSON) if "poisson" in material.entries else None,
         width=section.number("width_m", POSITIVE),
         thickness=thickness,
         length=length,
@@ -122,7 +136,28 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         damping_ratio=_damping(of_modes, len(modes)),
         sensors=places or {"midspan": 0.5},
         force_at=_force(force),
+        point_masses=tuple(_point_mass(one) for one in top.tables(_POINT_MASS, file)),
     )
+
+
+def is_beam_file(path: FilePath) -> bool:
+    """Whether a TOML describes a beam (and not a model): whether it has a table of one.
+
+    Raises `ValueError` where it cannot be read.
+    """
+    top = parsed_toml(read_text(path), file_name(path))
+    return "mode" not in top.entries and any(name in top.entries for name in _TABLES[:5])
+
+
+def what_is_loose(left: SupportStiffness, right: SupportStiffness) -> str | None:
+    """Which rigid-body motion two supports leave, in words, or nothing."""
+    if not (left.axial or right.axial):
+        return "nothing holds the beam along its axis"
+    if not (left.transverse or right.transverse):
+        return "nothing holds the beam across its axis"
+    if not ((left.transverse and right.transverse) or left.rotation or right.rotation):
+        return "nothing keeps the beam from turning"
+    return None
 
 
 def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
@@ -150,26 +185,35 @@ def _support(table: TomlTable, side: str) -> SupportStiffness:
         springs.check_keys((), STIFFNESSES)
         if not value:
             raise table.refusal(side, f"a support or stiffnesses ({', '.join(STIFFNESSES)})", value)
-        sizes = [springs.number(key, NOT_NEGATIVE, default=0.0) for key in STIFFNESSES]
-        return SupportStiffness(*sizes)
+        return SupportStiffness(*(_stiffness(springs, key) for key in STIFFNESSES))
     kind = table.choice(side, SUPPORTS)
     held = np.inf if kind != "free" else 0.0
     return SupportStiffness(held, held, np.inf if kind == "clamped" else 0.0)
+
+
+def _stiffness(springs: TomlTable, key: str) -> float:
+    if springs.entries.get(key) == np.inf:
+        return np.inf
+    return springs.number(key, NOT_NEGATIVE, default=0.0)
+
+
+def _point_mass(table: TomlTable) -> PointMassEntry:
+    table.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
+    return PointMassEntry(
+        table.number("at", FRACTION),
+        table.number("mass_kg", NOT_NEGATIVE),
+        table.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0),
+    )
 
 
 def _held(
     left: SupportStiffness, right: SupportStiffness, table: TomlTable
 ) -> tuple[SupportStiffness, SupportStiffness]:
     """The supports, unless they leave a rigid-body motion: a mechanism has no static load cases."""
-    if not (left.axial or right.axial):
-        missing = "nothing holds the beam along its axis"
-    elif not (left.transverse or right.transverse):
-        missing = "nothing holds the beam across its axis"
-    elif not ((left.transverse and right.transverse) or left.rotation or right.rotation):
-        missing = "nothing keeps the beam from turning"
-    else:
-        return left, right
-    raise ValueError(f"{table.place} leave a mechanism: {missing}.")
+    missing = what_is_loose(left, right)
+    if missing is not None:
+        raise ValueError(f"{table.place} leave a mechanism: {missing}.")
+    return left, right
 
 
 def _damping(table: TomlTable, n: int) -> tuple[float, ...] | None:

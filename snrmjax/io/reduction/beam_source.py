@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.condense.elements.beam import Beam, Support, rise_of_radius
+from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
 from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
 from snrmjax.condense.load_cases import StaticCases
@@ -90,4 +90,5 @@ def _elements(stated: BeamDescription) -> Beam:
         elements=stated.elements,
         left=left,
         right=right,
+        point_masses=[PointMass(*one) for one in stated.point_masses],
     )

@@ -7,7 +7,12 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
-from snrmjax.io.reduction.beam_file import SupportStiffness, read_beam_description
+from snrmjax.io.reduction.beam_file import (
+    PointMassEntry,
+    SupportStiffness,
+    is_beam_file,
+    read_beam_description,
+)
 from snrmjax.io.reduction.beam_source import read_beam
 
 BEAM = """name = "flat beam"
@@ -31,6 +36,7 @@ midspan = 0.5
 [force]
 distribution = "uniform"
 """
+MASS = "[[point_mass]]\nat = 0.5\nmass_kg = 1e-3\n"
 SPRINGS = "{ axial_n_m = 1e6, transverse_n_m = 1e7 }"
 
 
@@ -47,9 +53,18 @@ def test_a_beam_file_says_what_the_description_has(tmp_path):
         'right = "clamped"', f"right = {SPRINGS}"
     )
     text = text.replace("3]", "3]\nload_scale = 0.3\ndegree = 5\ndamping_ratio = [0.05, 0.001]")
-    path.write_text(text.replace('distribution = "uniform"', "at = 0.25"))
+    text = text.replace("midspan = 0.5", "midspan = 0.5\nquarter = 0.25")
+    text = text.replace('"clamped"', "{ axial_n_m = inf, rotation_nm_rad = 50 }")
+    path.write_text(
+        text.replace('distribution = "uniform"', "at = 0.25")
+        + MASS
+        + "inertia_kg_m2 = 2e-8\n"
+        + MASS
+    )
     beam = read_beam_description(path)
-    assert beam.supports[1] == SupportStiffness(1e6, 1e7, 0.0)
+    assert beam.supports == (SupportStiffness(np.inf, 0, 50), SupportStiffness(1e6, 1e7, 0.0))
+    assert beam.point_masses == (PointMassEntry(0.5, 1e-3, 2e-8), PointMassEntry(0.5, 1e-3, 0.0))
+    assert beam.sensors == {"midspan": 0.5, "quarter": 0.25}
     assert (beam.radius, beam.load_scale, beam.degree) == (11.43, 0.3, 5)
     assert (beam.force_at, beam.damping_ratio) == (0.25, (0.05, 0.001))
 
@@ -95,6 +110,15 @@ BAD_BEAMS = [
     (edit("midspan = 0.5", "clamp = 0"), "`clamp` at 0, where no mode moves"),
     (edit('distribution = "uniform"', "at = 1.0"), "[force] of beam.toml is at 1, where no mode"),
     (edit("[1, 3]", "[1]\nload_scale = 1e8"), "none of the 4 load cases has a solution"),
+    (edit('"clamped"', "{ axial_n_m = -inf }"), "`axial_n_m` must be a finite number"),
+    (BEAM + MASS.replace("mass_kg", "mass"), "unknown key 'mass' (did you mean `mass_kg`?)"),
+    (BEAM + MASS.replace("0.5", "114"), "`at` must be from 0 to 1, but point_mass 1 of beam.toml"),
+    (
+        BEAM + MASS + MASS.replace("1e-3", "-1e-3"),
+        "zero or positive, but point_mass 2 of beam.toml",
+    ),
+    (BEAM + MASS.replace("mass_kg = 1e-3\n", ""), "point_mass 1 of beam.toml lacks the key"),
+    (BEAM + MASS.replace("[[point_mass]]", "[point_mass]"), "tables under [[point_mass]]"),
     (BEAM + "at = 0.5\n", "both `distribution` and `at`"),
     ("material = [", "is not valid TOML"),
 ]
@@ -171,3 +195,26 @@ def test_damping_is_assumed_aloud_and_a_force_may_be_at_a_point(tmp_path):
     middle = len(source.lines.position) // 2
     assert source.lines.position[middle] == pytest.approx(0.2286 / 2)
     np.testing.assert_allclose(source.lines.shape[middle], source.sensors["midspan"])
+
+
+def test_a_heavy_point_mass_swings_on_the_static_stiffness_of_the_beam(tmp_path):
+    path = tmp_path / "beam.toml"
+    path.write_text(edit("[1, 3]", "[1]") + MASS.replace("1e-3", "1.0"))
+    source = read_beam(path)
+    bending = 204.8e9 * 0.0127 * 0.000508**3 / 12
+    # 192 EI/L³ at midspan of a clamped beam; 13/35 of its own 11.6 g moves along, 0.43 % of 1 kg.
+    assert float(source.basis.frequency[0]) == pytest.approx(
+        np.sqrt(192 * bending / 0.2286**3 / 1.0043), rel=1e-3
+    )
+    assert float(source.sensors["midspan"][0]) == pytest.approx(1.0, rel=3e-3)  # 1/√kg
+
+
+def test_a_beam_file_is_told_from_a_model_file(tmp_path):
+    for text, expected in (
+        (BEAM, True),
+        ("[material]\n", True),
+        ("[[mode]]\n", False),
+        ("", False),
+    ):
+        (tmp_path / "one.toml").write_text(text)
+        assert is_beam_file(tmp_path / "one.toml") is expected
