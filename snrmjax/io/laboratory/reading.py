@@ -7,7 +7,8 @@ from pathlib import Path
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
 
-_READERS: dict[Kind, str] = {}
+_ROOM = "snrmjax.io.laboratory"
+_READERS: dict[Kind, tuple[str, str]] = {"uff": ("uff.reading", "read_uff")}
 _HEAD = 4096
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -25,7 +26,10 @@ def read_laboratory_file(path: FilePath) -> LaboratoryFile:
     kind = _kind(path)
     if kind not in _READERS:
         raise ValueError(f"{file_name(path)} is a file of kind {kind}, which cannot be read yet.")
-    found: LaboratoryFile = importlib.import_module(_READERS[kind]).read(Path(path))
+    module, function = _READERS[kind]
+    found: LaboratoryFile = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)(
+        Path(path)
+    )
     if found.is_empty:
         why = f": {found.notes[0]}" if found.notes else "."
         raise ValueError(f"{found.name} holds nothing that could be read{why}")

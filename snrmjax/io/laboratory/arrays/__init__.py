@@ -1,0 +1,1 @@
+"""Files of named arrays: MATLAB, HDF5, netCDF, and what their names and shapes say."""

@@ -1,0 +1,84 @@
+"""Abscissae of a universal file: six digits of step and start, and what they can mean."""
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+_EXACT = re.compile(r"snrmjax first=(\S+) rate=(\S+)")
+_EVEN = 1e-6  # of a step: an abscissa of doubles that is uneven by less is even
+_DIGITS = 5  # behind the first, in the header's E13.5
+
+
+class EvenAbscissa(NamedTuple):
+    """An abscissa at even steps: `first + k / rate`."""
+
+    first: float
+    rate: float
+    note: str
+
+
+def exact_line(first: float, rate: float) -> str:
+    """A line of identification that keeps start and rate of an even abscissa in full."""
+    return f"snrmjax first={first!r} rate={rate!r}"
+
+
+def even_abscissa(one: Mapping[str, Any]) -> EvenAbscissa | None:
+    """Start and rate of a function's abscissa, or None where its steps are uneven.
+
+    The header has both to six digits. Where these digits allow one whole number of samples per
+    unit (4.88281E-04 s: 2048 Hz), that is taken.
+    """
+    x = np.asarray(one["x"])
+    if one["abscissa_spacing"] != 1:
+        return _of_values(x)
+    first, step = float(one["abscissa_min"]), float(one["abscissa_inc"])
+    if not (math.isfinite(step) and step > 0):
+        return None
+    half = 0.5 * 10.0 ** (math.floor(math.log10(step)) - _DIGITS)
+    told = _EXACT.search(one.get("id4", ""))
+    if told:
+        exact = _finite(told[1], told[2])
+        if exact and abs(1 / exact[1] - step) <= 1.01 * half:
+            return EvenAbscissa(exact[0], exact[1], "")
+    low, high = math.ceil(1 / (step + half)), math.floor(1 / (step - half))
+    rounded = f"{step:.4e}"
+    if low == high and float(rounded) != step:
+        return EvenAbscissa(
+            first, float(low), f"rate {low} per unit, from a step of six digits, {step:.5e}."
+        )
+    wide = (x.size - 1) * half
+    note = f"the abscissa has six digits: its end may be off by {wide:.1g}."
+    return EvenAbscissa(first, 1 / step, "" if float(rounded) == step else note)
+
+
+def abscissa(one: Mapping[str, Any]) -> Float[np.ndarray, " point"]:
+    """The abscissa of a function, value by value."""
+    if one["abscissa_spacing"] != 1:
+        return np.asarray(one["x"], dtype=float)
+    even = even_abscissa(one)
+    if even is None:
+        return np.asarray(one["x"], dtype=float)
+    return even.first + np.arange(len(one["x"])) / even.rate
+
+
+def _of_values(x: Float[np.ndarray, " point"]) -> EvenAbscissa | None:
+    """Start and rate where stored values are even."""
+    if x.size < 2 or x[-1] <= x[0]:
+        return None
+    step = (x[-1] - x[0]) / (x.size - 1)
+    if np.max(np.abs(x - (x[0] + step * np.arange(x.size)))) > _EVEN * step:
+        return None
+    return EvenAbscissa(float(x[0]), float(1 / step), "")
+
+
+def _finite(first: str, rate: str) -> tuple[float, float] | None:
+    """Two numbers out of text, or None."""
+    try:
+        start, per_unit = float(first), float(rate)
+    except ValueError:
+        return None
+    return (start, per_unit) if math.isfinite(start) and 0 < per_unit < math.inf else None

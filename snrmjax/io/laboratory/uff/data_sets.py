@@ -1,0 +1,113 @@
+"""The data sets of a universal file by pyuff, with the checks that it leaves out."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
+
+_LARGEST = 2**29  # bytes: pyuff holds all of a file, and each number as an object for a while
+_READ = {15: "nodes", 55: "data at nodes", 58: "function", 151: "header", 164: "units"}
+_TAG = re.compile(rb"    -1(?=[\r\n]| {74}|\Z)")
+_SHORTEST = 8  # bytes of the shortest number: a double in binary; of text even a single has 13
+_DIRECTIONS = {0: ""} | {
+    sign * (k + 1): f"{'+' if sign > 0 else '-'}{name}"
+    for k, name in enumerate(("x", "y", "z", "rx", "ry", "rz"))
+    for sign in (1, -1)
+}
+
+
+class DataSets(NamedTuple):
+    """Data sets of a universal file in order, as pyuff's dictionaries, and what was not read."""
+
+    sets: tuple[Mapping[str, Any], ...]
+    notes: tuple[str, ...]
+
+    def of_type(self, number: int) -> tuple[Mapping[str, Any], ...]:
+        """Those of one type."""
+        return tuple(one for one in self.sets if one["type"] == number)
+
+
+def read_data_sets(path: Path) -> DataSets:
+    """The data sets of a universal file that are of use here.
+
+    Raises `ValueError` for a file that is damaged, ends within a data set, or states more numbers
+    than it holds.
+    """
+    pyuff = library("pyuff", "reading universal files")
+    file, size = path.name, path.stat().st_size
+    if size > _LARGEST:
+        raise ValueError(
+            f"{file} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB that are "
+            "read of a universal file: split it, or take HDF5 or TDMS for long records."
+        )
+    if len(_TAG.findall(path.read_bytes())) % 2:
+        raise ValueError(f"{file} is damaged: it ends within a data set (no closing -1).")
+    found: list[Mapping[str, Any]] = []
+    left_out: dict[int, int] = {}
+    with damaged_if_it_fails(file, "a universal file"):
+        source = pyuff.UFF(str(path))
+        types = [int(number) for number in source.get_set_types()]
+    for k, number in enumerate(types):
+        if number not in _READ:
+            left_out[number] = left_out.get(number, 0) + 1
+            continue
+        where = f"a universal file: its data set {k + 1} ({_READ[number]}, type {number})"
+        if number == 58:
+            with damaged_if_it_fails(file, where):
+                header = source.read_sets(k, header_only=True)
+            _check_count(header, size, file, k + 1)
+        with damaged_if_it_fails(file, where):
+            one = source.read_sets(k)
+        found.append(_checked_function(one, file, k + 1) if number == 58 else one)
+    notes = tuple(
+        f"{count} data set{'s' * (count > 1)} of type {number} not read."
+        for number, count in sorted(left_out.items())
+    )
+    return DataSets(tuple(found), notes)
+
+
+def direction_of(code: int) -> str:
+    """The direction of a code: 1 is +x, −3 is −z, 4 is +rx, 0 says nothing.
+
+    >>> direction_of(-3)
+    '-z'
+    """
+    return _DIRECTIONS.get(code, "")
+
+
+def stated(text: str) -> str:
+    """A field of text, empty where it says NONE."""
+    plain = text.strip().strip("\0").strip()
+    return "" if plain.upper() == "NONE" else plain
+
+
+def _check_count(header: Mapping[str, Any], size: int, file: str, number: int) -> None:
+    """Refuse a function that states more points than the file has bytes for."""
+    points, code = header["num_pts"], header["ord_data_type"]
+    if code not in (2, 4, 5, 6):
+        raise ValueError(
+            f"data set {number} of {file} has the ordinate type {code}, but 2, 4, 5 and 6 exist."
+        )
+    each = (2 if code > 4 else 1) * (4 if code in (2, 5) else _SHORTEST)
+    if points < 1 or points * each > size:
+        raise ValueError(
+            f"data set {number} of {file} states {points} points, which a file of {size} bytes "
+            "cannot hold."
+        )
+
+
+def _checked_function(one: dict[str, Any], file: str, number: int) -> dict[str, Any]:
+    """A function with as many values as it states. Trailing bytes (line ends) are dropped."""
+    points = one["num_pts"]
+    x, data = np.asarray(one["x"], float), np.asarray(one["data"])
+    if min(x.size, data.size) < points:
+        raise ValueError(
+            f"data set {number} of {file} states {points} points, but holds {data.size}."
+        )
+    if not np.isfinite(x[:points]).all() or not np.isfinite(one["z_axis_value"]):
+        raise ValueError(f"data set {number} of {file} has an abscissa that is not finite.")
+    return {**one, "x": x[:points], "data": data[:points], "number": number}

@@ -1,0 +1,199 @@
+"""Universal files: written by hand as the format says, by pyuff, and by ourselves."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import pyuff
+
+from snrmjax.io.laboratory import measured_shapes, read_laboratory_file
+from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.frequency_responses import frequency_responses
+from snrmjax.measure.recordings.time_recording import time_recording
+
+# By the definition of the format (SDRC, "Universal Dataset Number: 58" and "164"), column by
+# column: an FRF of an accelerometer in inches per second squared over pounds, at 3 frequencies.
+HAND = """    -1
+   164
+         7IN: Inch (pound f)           2
+  3.93700787401574800D+01  2.24808943099710500D-01  1.79999999999999990D+00
+  4.59670000000000020D+02
+    -1
+    -1
+    58
+Measured FRF
+NONE
+24-NOV-26 10:00:00
+NONE
+NONE
+    4         1    0         0       NONE        12   3       NONE         7  -1
+         5         3         1  7.90000E+01  5.00000E-01  2.50000E+00
+        18    0    0    0                 NONE                 NONE
+        12    0    0    0                 NONE                 NONE
+        13    0    0    0                 NONE                 NONE
+         0    0    0    0                 NONE                 NONE
+  1.00000E+00  2.00000E+00 -3.00000E+00  4.00000E+00  5.00000E-01 -6.00000E+00
+    -1
+"""
+
+
+# pyuff leaves the handle of a 58b open, which is a warning: it writes in a process of its own.
+BY_PYUFF = """
+import sys, numpy as np, pyuff
+common = dict(binary=1, rsp_node=1, rsp_dir=3, ref_node=1, ref_dir=3, id1="by pyuff")
+frf = dict(func_type=4, abscissa_spacing=0, abscissa_spec_data_type=18,
+    ordinate_spec_data_type=12, orddenom_spec_data_type=13, ordinate_axis_units_lab="g")
+record = dict(func_type=1, abscissa_spacing=1, abscissa_spec_data_type=17,
+    ordinate_spec_data_type=13, orddenom_spec_data_type=0)
+x = np.array([79.0, 79.3, 80.0])
+sets = [pyuff.prepare_58(x=x, data=np.full(3, z + 1j), z_axis_value=float(z), **common, **frf)
+    for z in (1, 2)]
+sets.append(pyuff.prepare_58(x=np.arange(9) / 2048, data=np.arange(9.0), **common, **record))
+pyuff.UFF(sys.argv[1]).write_sets(sets, "add")
+"""
+
+
+@pytest.fixture(scope="module")
+def by_pyuff(tmp_path_factory):
+    path = tmp_path_factory.mktemp("pyuff") / "levels.uff"
+    subprocess.run([sys.executable, "-c", BY_PYUFF, path], check=True)
+    return read_laboratory_file(path)
+
+
+def test_a_file_by_hand_in_inches_and_pounds(tmp_path):
+    path = tmp_path / "inches.unv"
+    path.write_text(HAND)
+    found = read_laboratory_file(path)
+    (one,) = found.responses
+    assert found.levels == (2.5,)
+    assert one.responses[0].point == "12"
+    assert one.responses[0].direction == "+z"
+    assert one.references[0].direction == "-x"
+    np.testing.assert_allclose(one.frequency / 2 / np.pi, [79, 79.5, 80], rtol=1e-15)
+    # 1 in = 0.0254 m and 1 lbf = 4.4482216152605 N exactly
+    expected = np.array([1 + 2j, -3 + 4j, 0.5 - 6j]) * 0.0254 / 4.4482216152605
+    np.testing.assert_allclose(one.values[0, 0], expected, rtol=1e-12)
+
+
+def test_levels_on_the_z_axis_and_labels_before_units(by_pyuff):
+    assert by_pyuff.levels == (1.0, 2.0)
+    one = by_pyuff.responses[1]
+    np.testing.assert_array_equal(one.frequency, np.array([79.0, 79.3, 80.0]) * 2 * np.pi)
+    np.testing.assert_allclose(one.values[0, 0], (2 + 1j) * 9.80665, rtol=1e-15)
+    assert one.responses[0].unit == "g"
+    assert one.responses[0].quantity == "acceleration"
+
+
+def test_steps_of_six_digits_that_mean_a_whole_rate(by_pyuff):
+    (record,) = by_pyuff.recordings
+    assert record.sampling_rate == 2048  # the header has 4.88281e-04 s: 2048.002 Hz
+    assert "2048" in record.notes[0]
+    np.testing.assert_array_equal(record.values()[0], np.arange(9.0))
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_round_trip_of_records_and_responses(tmp_path, binary):
+    rng = np.random.default_rng(1)
+    channels = [
+        Channel("force", "force", "N"),
+        Channel("3-y", "acceleration", "m/s^2", point="3", direction="-y"),
+    ]
+    # A rate and a start that six digits cannot hold.
+    record = time_recording(rng.normal(size=(2, 65)), channels, 51200.01, start_time=-1 / 3)
+    hertz = np.array([42.70541, 42.70544, 42.8])  # two of them alike in six digits
+    responses = frequency_responses(
+        hertz * 2 * np.pi,
+        rng.normal(size=(1, 1, 3)) + 1j,
+        channels[1:],
+        channels[:1],
+        coherence=np.full((1, 1, 3), 0.875),
+    )
+    path = tmp_path / "mine.uff"
+    write_uff(path, recordings=[record], responses=[responses], levels=[0.5], binary=binary)
+    found = read_laboratory_file(path)
+    (back,) = found.recordings
+    assert (back.sampling_rate, back.start_time) == (51200.01, -1 / 3)
+    assert back.channels == tuple(channels)
+    if binary:
+        np.testing.assert_array_equal(back.values(), record.values())
+        np.testing.assert_array_equal(found.responses[0].frequency, responses.frequency)
+        np.testing.assert_array_equal(found.responses[0].values, responses.values)
+        np.testing.assert_array_equal(found.responses[0].coherence, responses.coherence)
+        assert found.levels == (0.5,)
+    else:  # twelve digits of values, six of uneven abscissae: the format's own precision
+        np.testing.assert_allclose(back.values(), record.values(), rtol=6e-12)
+        assert any("do not rise" in note for note in found.notes)
+        (table,) = found.tables
+        np.testing.assert_allclose(table.columns["frequency"], hertz, atol=5.1e-5)
+        np.testing.assert_allclose(table.columns["3-y"], responses.values[0, 0], rtol=6e-12)
+
+
+def test_other_programs_read_what_is_written(tmp_path):
+    """pyuff alone, without our line of exact numbers, to six digits of the step."""
+    record = time_recording(np.arange(8.0)[None], [Channel("1+x", "force", "N", 1.0, "1", "+x")], 3)
+    path = tmp_path / "mine.uff"
+    for _ in range(2):  # written over itself
+        write_uff(path, recordings=[record])
+    sets = pyuff.UFF(str(path)).read_sets()
+    assert [one["type"] for one in sets] == [164, 58]
+    np.testing.assert_array_equal(sets[1]["data"], np.arange(8.0))
+    np.testing.assert_allclose(sets[1]["x"], np.arange(8) / 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["real", "complex"])
+def test_round_trip_of_shapes(tmp_path, kind):
+    shapes = np.array([[1.5, -0.25, 0.5], [0.125, 2.0, -1.0]]) * (1 if kind == "real" else 1 + 0.5j)
+    mass = np.array([1.0, 0.75]) if kind == "real" else None
+    modes = measured_shapes(
+        np.array([79.02, 250.5]) * 2 * np.pi,
+        np.array([0.0125, 0.005]),
+        shapes,
+        ["1", "2", "5"],
+        ["+z", "+z", "+x"],
+        modal_mass=mass,
+    )
+    path = tmp_path / "shapes.unv"
+    write_uff(path, shapes=[modes])
+    (back,) = read_laboratory_file(path).shapes
+    places = list(zip(back.points, back.directions, strict=True))
+    for k, place in enumerate(zip(modes.points, modes.directions, strict=True)):
+        np.testing.assert_allclose(back.shapes[:, places.index(place)], shapes[:, k], rtol=5e-6)
+    assert np.count_nonzero(back.shapes) == shapes.size
+    np.testing.assert_allclose(back.frequency, modes.frequency, rtol=5e-6)
+    np.testing.assert_allclose(back.damping_ratio, modes.damping_ratio, rtol=2e-5)
+    np.testing.assert_array_equal(back.modal_mass, np.full(2, np.nan) if mass is None else mass)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda text: text[:-40], "within a data set"),
+        (lambda text: text.replace("         5         3", "         5999999999"), "cannot hold"),
+        (lambda text: text.replace("         5         3", "         5         9"), "holds 3"),
+        (lambda text: text.replace("         5         3", "         7         3"), "type 7"),
+        (lambda text: text.replace("  1.00000E+00", "  one        "), "damaged"),
+        (lambda text: text.replace("3.93700787401574800D+01", "0.00000000000000000D+00"), "posit"),
+        (lambda text: text.replace("         1  7.9", "         1  NaN"), "damaged|finite"),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path, change, complaint):
+    path = tmp_path / "hurt.unv"
+    path.write_text(change(HAND))
+    with pytest.raises(ValueError, match=complaint):
+        read_laboratory_file(path)
+
+
+def test_what_the_format_cannot_say_is_refused(tmp_path):
+    path = tmp_path / "no.uff"
+    far = Channel("a name of many letters", "force")
+    record = time_recording(np.ones((1, 3)), [far], 1.0)
+    with pytest.raises(ValueError, match="ten letters"):
+        write_uff(path, recordings=[record])
+    record = time_recording(np.array([[1.0, np.nan]]), [Channel("a")], 1.0)
+    with pytest.raises(ValueError, match="finite"):
+        write_uff(path, recordings=[record])
+    with pytest.raises(ValueError, match="nothing to write"):
+        write_uff(path)
+    assert not path.exists()
