@@ -207,6 +207,13 @@ def _responses(
     )
 
 
+def _column(one: _Function, name: str) -> str:
+    """The name of a function in a table."""
+    if one["func_type"] == _COHERENCE:
+        return f"coherence of {name} over {_place(one, 'ref')}"
+    return f"{name} over {_place(one, 'ref')}" if one["func_type"] in _RESPONSE else name
+
+
 def _table(
     group: Sequence[_Function],
     name: str,
@@ -216,7 +223,13 @@ def _table(
 ) -> NumberTable:
     """Functions of one abscissa as columns beside it."""
     kind = "time" if group[0].get("abscissa_spec_data_type") == 17 else first
-    named = _unique([_channel(one, "rsp", "ordinate", units, notes) for one in group])
+    channels = [_channel(one, "rsp", "ordinate", units, notes) for one in group]
+    named = _unique(
+        [
+            channel._replace(name=_column(one, channel.name))
+            for one, channel in zip(group, channels, strict=True)
+        ]
+    )
     unit = stated(group[0].get("abscissa_axis_units_lab", "")) or ("s" if kind == "time" else "Hz")
     columns = {kind: abscissa(group[0])}
     known = {kind: unit}
