@@ -1,5 +1,6 @@
 from .bench.cbc import (
     FeedbackSettings,
+    FundamentalFeedback,
     HeldMotion,
     SCurve,
     TargetFeedback,
@@ -8,7 +9,14 @@ from .bench.cbc import (
 )
 from .bench.equipment import Instruments, Shaker
 from .bench.laboratory import AbstractController, Laboratory, TestRecord, detached, run_test
-from .bench.pll import LoopGains, PhaseLockedLoop, phase_locked_loop, standard_gains
+from .bench.pll import (
+    LoopGains,
+    PhaseLockedLoop,
+    PhaseSweep,
+    phase_locked_loop,
+    phase_sweep,
+    standard_gains,
+)
 from .bench.programmes import (
     AmplitudeGains,
     DecayTest,
@@ -41,6 +49,7 @@ __all__ = [
     "DecayTest",
     "FeedbackSettings",
     "ForceSurface",
+    "FundamentalFeedback",
     "HeldMotion",
     "Instruments",
     "Laboratory",
@@ -49,6 +58,7 @@ __all__ = [
     "MethodResult",
     "MethodStatus",
     "PhaseLockedLoop",
+    "PhaseSweep",
     "Playback",
     "RestoringForce",
     "SCurve",
@@ -70,6 +80,7 @@ __all__ = [
     "multisine_test",
     "phase_locked_loop",
     "phase_resonance",
+    "phase_sweep",
     "rct",
     "resonant_decay",
     "restoring_force",

@@ -65,3 +65,15 @@ def test_what_is_not_held_is_said(laboratory):
         sj.methods.control_based_continuation(laboratory, np.array([-0.3]), impatient)
     with pytest.raises(ValueError, match="settings of the feedback must be positive"):
         sj.methods.s_curve(laboratory, REST, np.array([0.3]), sj.methods.FeedbackSettings(0.0))
+
+
+def test_a_followed_fundamental_holds_the_same_branch_and_too_fast_a_filter_is_seen(laboratory):
+    omega = 1.03 * REST
+    settings = sj.methods.FeedbackSettings(20.0, filter_rate=80.0)
+    curve = sj.methods.s_curve(laboratory, omega, np.linspace(0.1, 1.2, 6), settings)
+    exact = np.abs(stiffness(curve.velocity, omega)) * curve.velocity
+    np.testing.assert_allclose(curve.force, exact, rtol=0.02, atol=0.01 * exact.max())
+    assert curve.invasive.max() < 1e-3
+    wild = settings._replace(gain=200.0, filter_rate=800.0)
+    lost = sj.methods.s_curve(laboratory, omega, np.array([0.3, 0.6]), wild)
+    assert np.isnan(lost.force).all()

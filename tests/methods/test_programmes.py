@@ -60,6 +60,21 @@ def test_an_open_loop_jumps_down_later_than_up(laboratory):
     np.testing.assert_allclose(up[[0, -1]], down[[0, -1]], rtol=0.01)
 
 
+def test_phase_after_phase_a_loop_goes_around_the_fold(laboratory):
+    phases, gains = np.radians([0.0, -40.0, -65.0, -80.0]), sj.methods.LoopGains(80.0, 12.0)
+    sweep = sj.methods.phase_sweep(laboratory, 20.0, phases, gains=gains, settle_cycles=150)
+    assert set(sweep.status) == {MethodStatus.FOUND}
+    size = np.abs(sweep.velocity) / sweep.frequency
+    needed = impedance(size, sweep.frequency) * sweep.velocity
+    np.testing.assert_allclose(needed.real, sweep.force, rtol=3e-3)
+    np.testing.assert_allclose(needed.imag / sweep.force, 0, atol=0.015)
+    np.testing.assert_allclose(np.angle(sweep.velocity), phases, atol=np.radians(0.5))
+    # Down from the resonance frequency falls, and then rises: the branch that open loops miss.
+    assert sweep.frequency[0] > sweep.frequency[1] < sweep.frequency[2] < sweep.frequency[3]
+    with pytest.raises(ValueError, match="`phases` within ±90°"):
+        sj.methods.phase_sweep(laboratory, 8.0, np.array([2.0]))
+
+
 def test_a_decay_begins_on_the_resonance_and_is_free(laboratory):
     test = sj.methods.decay_test(laboratory, 8.0, 3.0)
     assert test.resonance.status == MethodStatus.FOUND

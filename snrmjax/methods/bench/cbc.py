@@ -7,9 +7,15 @@ loop cannot hold, on the middle branch of a fold, are then held as any other. At
 the force over the amplitude is an S-curve; where force and velocity are in phase lies the
 backbone, found by the secant method in frequency.
 
+With a `filter_rate` only the fundamental is fed back, k (w − v₁) with v₁ from an adaptive filter:
+the voltage is then free of higher harmonics from the beginning, and modes above, which a feedback
+of the whole velocity might drive unstable, are left alone.
+
 References: J. Sieber & B. Krauskopf, Nonlinear Dyn. 51 (2008) 365,
 doi:10.1007/s11071-007-9217-2; L. Renson, A. Gonzalez-Buelga, D. A. W. Barton & S. A. Neild,
-J. Sound Vib. 367 (2016) 145, doi:10.1016/j.jsv.2015.12.035.
+J. Sound Vib. 367 (2016) 145, doi:10.1016/j.jsv.2015.12.035; for adaptive filters in the loop,
+G. Abeloos, L. Renson, C. Collette & G. Kerschen, Nonlinear Dyn. 104 (2021) 3793,
+doi:10.1007/s11071-021-06506-z.
 """
 
 from typing import NamedTuple
@@ -18,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.laboratory import (
     AbstractController,
     Laboratory,
@@ -30,6 +37,8 @@ from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, meth
 
 _ORDERS = np.arange(1, 8)  # harmonics of the target
 _PHASE = np.radians(0.5)  # between force and velocity, below which a motion is on the backbone
+_STEADY = 0.01  # change of the velocity's fundamental between the halves of a record, relative
+_LARGEST = 100.0  # times the target, beyond which the loop is unstable
 _MOST_STEPS = 8  # of frequency at one amplitude
 _FIRST_STEP = 0.002  # of the frequency, relative, where a slope is not yet known
 
@@ -42,6 +51,7 @@ class FeedbackSettings(NamedTuple):
     record_cycles: int = 20
     picard_steps: int = 6
     invasive: float = 0.02  # higher harmonics of the feedback over its fundamental, at most
+    filter_rate: float = 0.0  # 1/s, of the filter of the fundamental; 0 feeds the whole velocity
 
 
 class HeldMotion(NamedTuple):
@@ -51,10 +61,11 @@ class HeldMotion(NamedTuple):
     force: complex  # N
     velocity: complex  # m/s
     invasive: float  # higher harmonics of the voltage over its fundamental
+    unsteady: float  # change of the velocity between the halves of the record, relative
 
 
 class SCurve(NamedTuple):
-    """Force over amplitude at one frequency, folds included."""
+    """Force over amplitude at one frequency, folds included; NaN where no motion was held."""
 
     velocity: Float[np.ndarray, " point"]  # m/s
     force: Float[np.ndarray, " point"]  # N
@@ -82,6 +93,30 @@ class TargetFeedback(AbstractController):
         return jnp.mod(state + self.frequency * period, 2 * jnp.pi), voltage, state
 
 
+class FundamentalFeedback(AbstractController):
+    """The controller that feeds back what an adaptive filter follows of the fundamental."""
+
+    gain: Float[Array, ""]
+    frequency: Float[Array, ""]  # rad/s
+    target: Float[Array, ""]  # m/s
+    filter_rate: Float[Array, ""]  # 1/s
+
+    def initial(self) -> tuple[Float[Array, ""], FourierState]:
+        """See `AbstractController.initial`: the angle of the target, and the filter."""
+        return jnp.zeros(()), nothing_followed(1, _ORDERS)
+
+    def step(
+        self, state: tuple[Float[Array, ""], FourierState], sample: Sample, period: Float[Array, ""]
+    ) -> tuple[tuple[Array, FourierState], Array, Array]:
+        """See `AbstractController.step`."""
+        angle, filters = state
+        share = self.filter_rate * period
+        filters = followed(filters, sample.velocity[None], angle, _ORDERS, share)
+        missing = self.target - filters.fundamental(0)
+        voltage = self.gain * jnp.real(missing * jnp.exp(1j * angle))
+        return (jnp.mod(angle + self.frequency * period, 2 * jnp.pi), filters), voltage, angle
+
+
 class _Bench:
     """The laboratory as it goes on from one measurement to the next."""
 
@@ -100,15 +135,19 @@ class _Bench:
     def seconds(self) -> float:
         return self.samples / self.laboratory.sampling_rate
 
+    def feedback(self, frequency: float, amplitude: float) -> AbstractController:
+        """The controller of the next measurement."""
+        gain, omega = jnp.asarray(float(self.settings.gain)), jnp.asarray(float(frequency))
+        if self.settings.filter_rate:
+            rate = jnp.asarray(float(self.settings.filter_rate))
+            return FundamentalFeedback(gain, omega, jnp.asarray(float(amplitude)), rate)
+        target = np.concatenate([[amplitude], self.higher])
+        return TargetFeedback(gain, omega, jnp.asarray(target))
+
     def held(self, frequency: float, amplitude: float) -> HeldMotion:
         """The motion under a target of this amplitude, higher harmonics left alone."""
         for _ in range(self.settings.picard_steps):
-            target = np.concatenate([[amplitude], self.higher])
-            feedback = TargetFeedback(
-                jnp.asarray(float(self.settings.gain)),
-                jnp.asarray(float(frequency)),
-                jnp.asarray(target),
-            )
+            feedback = self.feedback(frequency, amplitude)
             self.runs += 1
             count = self.settle + self.keep
             record, self.state = run_test(
@@ -123,14 +162,31 @@ class _Bench:
                 np.asarray(column)[-self.keep :]
                 for column in (record.report, record.force, record.velocity, record.voltage)
             )
-            window = 2 * np.hanning(self.keep) / np.hanning(self.keep).mean()
-            basis = np.exp(-1j * _ORDERS[:, None] * angle) * window / self.keep
-            moved, drive = basis @ velocity, basis @ voltage
+            # A diverging loop may leave numbers whose squares overflow, or none at all.
+            if not np.abs(velocity).max() < _LARGEST * amplitude:
+                self.state, self.higher = None, np.zeros_like(self.higher)
+                return HeldMotion(frequency, *4 * (np.nan,))
+            moved, drive, pushed = (_harmonics(x, angle) for x in (velocity, voltage, force))
             invasive = float(np.linalg.norm(drive[1:]) / np.abs(drive[0]))
             self.higher = moved[1:]
-            if invasive < self.settings.invasive:
+            if invasive < self.settings.invasive or self.settings.filter_rate:
                 break
-        return HeldMotion(frequency, complex(basis[0] @ force), complex(moved[0]), invasive)
+        halves = [
+            _harmonics(velocity[part], angle[part])[0]
+            for part in (slice(self.keep // 2), slice(self.keep // 2, None))
+        ]
+        unsteady = float(abs(halves[1] - halves[0]) / abs(moved[0]))
+        return HeldMotion(frequency, complex(pushed[0]), complex(moved[0]), invasive, unsteady)
+
+    def holds(self, found: HeldMotion) -> bool:
+        """Whether a motion was held, steadily and without invasion."""
+        return found.invasive < self.settings.invasive and found.unsteady < _STEADY
+
+
+def _harmonics(signal: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Complex amplitudes of the target's harmonics, through a Hann window."""
+    window = 2 * np.hanning(len(angle)) / np.hanning(len(angle)).mean()
+    return (np.exp(-1j * _ORDERS[:, None] * angle) * window / len(angle)) @ signal
 
 
 def s_curve(
@@ -145,16 +201,18 @@ def s_curve(
 
     Arguments: `frequency` in rad/s; `amplitudes` of the target in m/s, above those that result,
     since the feedback leaves a distance. Returns an `SCurve`: where the force falls while the
-    velocity rises, an open loop under that force would jump.
+    velocity rises, an open loop under that force would jump. Motions whose feedback kept harmonics
+    of its own, or that were not steady within 1 %, are NaN.
     Raises `ValueError` for numbers that are not positive.
     """
     targets = _positive("amplitudes", amplitudes)
     (omega,) = _positive("frequency", frequency)
     bench = _Bench(laboratory, _checked(settings), seed)
     found = [bench.held(float(omega), float(size)) for size in targets]
+    held = np.array([bench.holds(one) for one in found])
     return SCurve(
-        np.array([abs(one.velocity) for one in found]),
-        np.array([abs(one.force) for one in found]),
+        np.where(held, [abs(one.velocity) for one in found], np.nan),
+        np.where(held, [abs(one.force) for one in found], np.nan),
         np.array([one.invasive for one in found]),
         bench.seconds,
     )
@@ -171,7 +229,8 @@ def control_based_continuation(
 
     Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
     amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
-    or whose feedback kept harmonics of its own beyond `settings.invasive`, are `NOT_LOCKED`.
+    whose feedback kept harmonics of its own beyond `settings.invasive`, or that were not steady
+    within 1 %, are `NOT_LOCKED`.
     Without 1σ, which the method does not give. `test_seconds` counts everything.
     Raises `ValueError` for numbers that are not positive.
     """
@@ -210,7 +269,7 @@ def _resonance(bench: _Bench, omega: float, size: float, decay: float) -> HeldMo
         if not np.isfinite(phase):
             return None
         if abs(phase) < _PHASE:
-            return found if found.invasive < bench.settings.invasive else None
+            return found if bench.holds(found) else None
         # A mode's tan φ = (ω̃² − Ω²)/(2ζ̃ω̃Ω): straight in frequency, with slope −1/(ζ̃ω̃).
         error = np.tan(np.clip(phase, -1.4, 1.4))
         step = decay * error
@@ -231,6 +290,8 @@ def _positive(name: str, values: Float[np.ndarray, "..."] | float) -> np.ndarray
 
 
 def _checked(settings: FeedbackSettings) -> FeedbackSettings:
-    if not all(np.isfinite(value) and value > 0 for value in settings):
+    if not all(np.isfinite(value) and value > 0 for value in settings[:-1]) or not (
+        0 <= settings.filter_rate < np.inf
+    ):
         raise ValueError(f"the settings of the feedback must be positive, but are {settings}.")
     return settings

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.laboratory import (
@@ -23,7 +23,6 @@ from snrmjax.methods.bench.laboratory import (
     Laboratory,
     LabState,
     Sample,
-    TestRecord,
     run_test,
 )
 from snrmjax.methods.one_sensor import drive_point
@@ -63,13 +62,14 @@ class LoopReport(NamedTuple):
 
 
 class PhaseLockedLoop(AbstractController):
-    """The controller: a voltage of constant amplitude whose frequency holds the phase at zero."""
+    """The controller: a voltage of constant amplitude whose frequency holds the phase."""
 
     voltage: Float[Array, ""]
     start_frequency: Float[Array, ""]  # rad/s
     decay: Float[Array, ""]  # ζω of the linear mode, 1/s
     filter_rate: Float[Array, ""]  # 1/s
     loop_rate: Float[Array, ""]  # 1/s
+    target: Float[Array, ""]  # rad, phase of the velocity ahead of the force
 
     def initial(self) -> LoopState:
         """See `AbstractController.initial`."""
@@ -83,7 +83,8 @@ class PhaseLockedLoop(AbstractController):
         seen = jnp.stack([sample.force, sample.velocity])
         filters = followed(state.filters, seen, state.angle, _ORDERS, self.filter_rate * period)
         ratio = filters.fundamental(1) * jnp.conj(filters.fundamental(0))
-        phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(ratio), 0.0)
+        turned = ratio * jnp.exp(-1j * self.target)
+        phase = jnp.where(jnp.abs(ratio) > 0, jnp.angle(turned), 0.0)
         proportional = 2 * self.loop_rate - self.decay
         integral = state.integral + self.loop_rate**2 * phase * period
         frequency = self.start_frequency + proportional * phase + integral
@@ -118,11 +119,13 @@ def phase_locked_loop(
     the drive's angle; damping is from the balance of power, 2ζ̃ω̃ = |Φ_r Φᵀb| F / |v|.
 
     Arguments: `voltages` in V, in the order of the test; `gains` by default `standard_gains`.
-    Returns a `MethodResult` with a point a voltage; 1σ from the scatter between
-    tenths of the record. Levels whose record is off phase resonance by more than 1°, or whose
+    Returns a `MethodResult` with a point a voltage; 1σ from the scatter between tenths of the
+    record. Levels whose record is off phase resonance by more than 1°, or whose
     frequency wandered by more than half of ζω (1σ), are `NOT_LOCKED`. `test_seconds` counts
     everything.
     Raises `ValueError` for voltages or cycles that are not positive.
+    Validity: where the natural frequency changes much with little amplitude (a stop, a gap) the
+    loop must follow faster than the motion grows: gains above the standard ones, or small steps.
     """
     levels = np.asarray(voltages, dtype=float).ravel()
     if not levels.size or not np.all(np.isfinite(levels) & (levels > 0)):
@@ -151,11 +154,74 @@ def phase_locked_loop(
     return method_result("pll", points, len(levels), test_seconds=seconds)
 
 
-class HeldResonance(NamedTuple):
-    """The resonance that a loop held, and where the test may go on from."""
+class PhaseSweep(NamedTuple):
+    """States of one drive voltage at held phases; NaN where a phase was not held."""
 
-    point: MethodPoint
-    record: TestRecord
+    phase: Float[np.ndarray, " state"]  # rad, asked for: velocity ahead of force
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N
+    velocity: Complex[np.ndarray, " state"]  # m/s, relative to the force
+    status: tuple[MethodStatus, ...]
+    test_seconds: float
+
+
+def phase_sweep(
+    laboratory: Laboratory,
+    voltage: float,
+    phases: Float[np.ndarray, " state"],
+    *,
+    gains: LoopGains | None = None,
+    settle_cycles: int = 300,
+    record_cycles: int = 50,
+    seed: int = 0,
+) -> PhaseSweep:
+    """A whole response at one drive voltage, its unstable part included, phase by phase.
+
+    On the response of one mode the phase falls steadily along the curve, around its folds too, so
+    that a loop that holds one phase after another meets no jump.
+
+    Arguments: `voltage` in V; `phases` in rad in the order of the test, positive below resonance;
+    the others as in `phase_locked_loop`. Returns a `PhaseSweep`.
+    Raises `ValueError` for a voltage that is not positive and phases beyond ±90°.
+    Reference: V. Denis, M. Jossic, C. Giraud-Audine, B. Chomette, A. Renault & O. Thomas, Mech.
+    Syst. Signal Process. 106 (2018) 430, doi:10.1016/j.ymssp.2018.01.014.
+    """
+    wanted = np.atleast_1d(np.asarray(phases, dtype=float))
+    if not (np.isfinite(voltage) and voltage > 0) or not np.all(np.abs(wanted) < np.pi / 2):
+        raise ValueError(
+            f"`voltage` must be positive and `phases` within ±90°, but are {voltage} and {phases}."
+        )
+    held: list[HeldPhase] = []
+    for number, phase in enumerate(wanted, 1):
+        held.append(
+            lock_in(
+                laboratory,
+                float(voltage),
+                phase=float(phase),
+                gains=gains,
+                settle_cycles=settle_cycles,
+                record_cycles=record_cycles,
+                start=held[-1].state if held else None,
+                seed=seed + 7919 * number,
+            )
+        )
+    return PhaseSweep(
+        wanted,
+        np.array([one.frequency for one in held]),
+        np.array([one.force for one in held]),
+        np.array([one.velocity for one in held]),
+        tuple(one.point.status for one in held),
+        sum(one.seconds for one in held),
+    )
+
+
+class HeldPhase(NamedTuple):
+    """The motion that a loop held, and where the test may go on from; NaN where it held none."""
+
+    point: MethodPoint  # a resonance where the phase was zero
+    frequency: float  # rad/s
+    force: float  # N
+    velocity: complex  # m/s, relative to the force
     state: LabState
     seconds: float
 
@@ -164,57 +230,75 @@ def lock_in(
     laboratory: Laboratory,
     voltage: float,
     *,
+    phase: float = 0.0,
     gains: LoopGains | None = None,
     settle_cycles: int = 300,
     record_cycles: int = 50,
     start: LabState | None = None,
     level: int = 1,
     seed: int = 0,
-) -> HeldResonance:
-    """One level of `phase_locked_loop`.
+) -> HeldPhase:
+    """One level of `phase_locked_loop`, or one phase of `phase_sweep`.
 
-    Arguments: `start` is the state of the level before, by default rest; the others as there.
+    Arguments: `phase` in rad, of the velocity ahead of the force; `start` is the state of the
+    level before, by default rest; the others as there.
     """
     rates = standard_gains(laboratory) if gains is None else gains
     modes = laboratory.structure.modes
     j = modes.mode_of_interest
-    omega, ratio = modes.natural_frequency[j], modes.damping_ratio[j]
-    cycle = laboratory.sampling_rate * 2 * np.pi / float(omega)
+    omega, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    cycle = laboratory.sampling_rate * 2 * np.pi / omega
     settle, keep = round(settle_cycles * cycle), round(record_cycles * cycle)
-    loop = PhaseLockedLoop(
-        *(jnp.asarray(value, dtype=float) for value in (voltage, omega, ratio * omega, *rates))
-    )
+    numbers = (voltage, omega, ratio * omega, *rates, phase)
+    loop = PhaseLockedLoop(*(jnp.asarray(value, dtype=float) for value in numbers))
     record, state = run_test(laboratory, loop, settle + keep, start=start, seed=seed)
-    point = _point(level, record, keep, drive_point(modes), float(ratio * omega))
-    return HeldResonance(point, record, state, (settle + keep) / laboratory.sampling_rate)
-
-
-def _point(
-    level: int, record: TestRecord, keep: int, per_force: float, decay: float
-) -> MethodPoint:
-    """The locked state at the end of a record, or that there is none."""
     frequency, angle, force, velocity = (
         np.asarray(column)[-keep:]
         for column in (record.report.frequency, record.report.angle, record.force, record.velocity)
     )
     # A Hann window: the record need not hold whole cycles.
     turned = 2 * np.exp(-1j * angle) * np.hanning(keep) / np.hanning(keep).mean()
-    ratio = np.mean(force * turned) / np.mean(velocity * turned)  # N s/m
-    wanders = float(np.std(frequency))
-    if not (np.isfinite(ratio) and abs(np.angle(ratio)) < _LOCKED_PHASE) or not (
-        wanders < _LOCKED_SCATTER * decay
-    ):
-        return MethodPoint(MethodStatus.NOT_LOCKED, level)
-    parts = np.array_split(np.arange(keep), _PARTS)
-    each = [np.mean((force * turned)[k]) / np.mean((velocity * turned)[k]) for k in parts[1:-1]]
-    omega = float(np.mean(frequency))
-    spread = np.array([np.mean(frequency[k]) for k in parts])
-    return MethodPoint(
-        MethodStatus.FOUND,
-        level,
-        float(np.abs(np.mean(velocity * turned))),
-        omega,
-        float(np.hypot(np.std(spread), decay * np.std(np.angle(each))) / np.sqrt(_PARTS - 1)),
-        per_force * float(np.real(ratio)) / (2 * omega),
-        per_force * float(np.std(np.real(each))) / (2 * omega) / np.sqrt(len(each) - 1),
-    )
+    locked = _Locked(frequency, force * turned, velocity * turned, ratio * omega, phase)
+    seconds = (settle + keep) / laboratory.sampling_rate
+    if not locked.holds():
+        lost = MethodPoint(MethodStatus.NOT_LOCKED, level)
+        return HeldPhase(lost, np.nan, np.nan, complex(np.nan), state, seconds)
+    push, speed = np.mean(locked.force), np.mean(locked.velocity)
+    relative = complex(speed * np.conj(push) / np.abs(push))
+    point = locked.point(level, drive_point(modes))
+    return HeldPhase(point, point.natural_frequency, float(np.abs(push)), relative, state, seconds)
+
+
+class _Locked(NamedTuple):
+    """The end of a record: frequency, and force and velocity turned against the drive."""
+
+    frequency: np.ndarray  # rad/s
+    force: np.ndarray  # N, complex
+    velocity: np.ndarray  # m/s, complex
+    decay: float  # ζω of the linear mode, 1/s
+    phase: float  # rad, asked for
+
+    def holds(self) -> bool:
+        ratio = np.mean(self.velocity) / np.mean(self.force) * np.exp(-1j * self.phase)
+        if not np.isfinite(ratio) or abs(np.angle(ratio)) > _LOCKED_PHASE:
+            return False
+        return float(np.std(self.frequency)) < _LOCKED_SCATTER * self.decay
+
+    def point(self, level: int, per_force: float) -> MethodPoint:
+        """Means over the record, and 1σ from the scatter between its tenths."""
+        parts = np.array_split(np.arange(len(self.frequency)), _PARTS)
+        inner = parts[1:-1]
+        each = [np.mean(self.force[k]) / np.mean(self.velocity[k]) for k in inner]
+        omega, damping = float(np.mean(self.frequency)), np.real(each)
+        spread = np.std([np.mean(self.frequency[k]) for k in parts])
+        turn = self.decay * np.std(np.angle(each))
+        ratio = np.mean(self.force) / np.mean(self.velocity)  # N s/m
+        return MethodPoint(
+            MethodStatus.FOUND,
+            level,
+            float(np.abs(np.mean(self.velocity))),
+            omega,
+            float(np.hypot(spread, turn) / np.sqrt(_PARTS - 1)),
+            per_force * float(np.real(ratio)) / (2 * omega),
+            per_force * float(np.std(damping)) / (2 * omega) / np.sqrt(len(inner) - 1),
+        )

@@ -6,7 +6,7 @@ proportional and integral in the logarithm: ln U = I + k e, İ = λ e with e = 1
 from adaptive filters at the frequency of the drive.
 
 References: for response control, T. Karaağaçlı & H. N. Özgüven, Mech. Syst. Signal Process. 144
-(2020) 106965, doi:10.1016/j.ymssp.2020.106965; for phases of multisines, M. R. Schroeder, IEEE
+(2020) 107023, doi:10.1016/j.ymssp.2020.107023; for phases of multisines, M. R. Schroeder, IEEE
 Trans. Inf. Theory 16 (1970) 85, doi:10.1109/TIT.1970.1054411.
 """
 
