@@ -34,6 +34,7 @@ from .bench.programmes import (
 from .comparison import METHODS, Comparison, compare_methods, snrm
 from .records.resonant_decay import resonant_decay
 from .records.restoring_force import RestoringForce, fit_restoring_force, restoring_force
+from .records.ssm import SpectralSubmanifold, fit_submanifold, ssm
 from .result import MethodResult, MethodStatus
 from .steady.arslan_ozguven import arslan_ozguven, describing_function
 from .steady.concerto import concerto
@@ -63,6 +64,7 @@ __all__ = [
     "RestoringForce",
     "SCurve",
     "Shaker",
+    "SpectralSubmanifold",
     "SteppedSineDrive",
     "TargetFeedback",
     "TestRecord",
@@ -75,6 +77,7 @@ __all__ = [
     "describing_function",
     "detached",
     "fit_restoring_force",
+    "fit_submanifold",
     "force_surface",
     "harmonic_force_surface",
     "multisine_test",
@@ -88,6 +91,7 @@ __all__ = [
     "s_curve",
     "sine_sweep_test",
     "snrm",
+    "ssm",
     "standard_amplitude_gains",
     "standard_gains",
     "steady_states_of",

@@ -87,6 +87,24 @@ def checked_record(
     time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"], method: str
 ) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
     """A record of one channel as arrays, if a method can read it; `method` is named in errors."""
+    times, signal = even_record(time, velocity, method)
+    signal = signal - signal.mean()
+    ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
+    if ups < _FEWEST_CYCLES:
+        raise ValueError(f"{method} needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
+    if len(signal) / ups < _FEWEST_SAMPLES:
+        raise ValueError(
+            f"{method} needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
+            "`band`)."
+        )
+    return times, signal
+
+
+def even_record(
+    time: Float[np.ndarray, " sample"], velocity: Float[np.ndarray, " sample"], method: str
+) -> tuple[Float[np.ndarray, " sample"], Float[np.ndarray, " sample"]]:
+    """A finite, evenly spaced record that is not clipped; `method` is named in errors."""
     times, signal = np.asarray(time, dtype=float), np.asarray(velocity, dtype=float)
     if times.ndim != 1 or times.shape != signal.shape or len(times) < _FEWEST_SAMPLES:
         raise ValueError(
@@ -105,16 +123,6 @@ def checked_record(
         raise ValueError(
             f"{method}: the record stays at its largest value, {largest:.4g} m/s, for "
             f"{_CLIPPED} samples or more: it is clipped."
-        )
-    signal = signal - signal.mean()
-    ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
-    if ups < _FEWEST_CYCLES:
-        raise ValueError(f"{method} needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
-    if len(signal) / ups < _FEWEST_SAMPLES:
-        raise ValueError(
-            f"{method} needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
-            f"{len(signal) / ups:.1f}: the sampling rate is too low, or noise crosses zero (state "
-            "`band`)."
         )
     return times, signal
 

@@ -1,0 +1,342 @@
+"""Spectral submanifold of one mode from a free decay: embedding, manifold, normal form, backbone.
+
+Delays of one velocity span a space in which the decaying motion lies on a two-dimensional
+invariant manifold, the spectral submanifold of the slowest mode. Its tangent plane comes from
+singular values, the manifold over the plane is a polynomial (how far the record is off it is
+reported), and the linear map in the plane gives the complex coordinate from which the polynomial
+normal form starts. The normal form's coefficients are then those whose *trajectory* fits the
+record best: all of it at once, without a derivative of the data, so that white noise gives
+honest standard deviations. (Cenedese et al. minimise the error of the reduced vector field
+instead; manifold, reduced dynamics and normal form are the same, their code is not used.)
+
+References: M. Cenedese, J. Axås, B. Bäuerlein, K. Avila & G. Haller, Nat. Commun. 13 (2022) 872,
+doi:10.1038/s41467-022-28518-y; G. Haller & S. Ponsioen, Nonlinear Dyn. 86 (2016) 1493,
+doi:10.1007/s11071-016-2974-z; for delays, F. Takens, Lect. Notes Math. 898 (1981) 366.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+from numpy.polynomial import chebyshev
+from scipy.signal import decimate
+
+from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
+from snrmjax.methods.records.resonant_decay import even_record
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
+
+_DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
+_FEWEST_CYCLES = 12
+_FEWEST_SAMPLES = 8  # a cycle
+_MOST_TERMS = 6  # of α and ω: polynomials of degree 11 in ρ e^{iθ}
+_ORDERS = (2, 3, 4, 5)  # harmonics in the record
+_START = 0.1  # of the largest amplitude: what the start is fitted to
+_MOST_SAMPLES = 2**18
+_ROUNDS = 4  # of fits whose unit is the misfit of the one before
+_SAME = 0.7  # of the misfit before: a round that lowers it less is the last
+_RULE = StepRule(steps=25, settled=0.1)
+_POINTS = 25
+_MANIFOLD_DEGREE = 5
+_NEAR = 0.25  # of the mode's frequency: where the residual's density counts for the bands
+_STEP = 1e-4  # of an unknown's own 1σ and size, for derivatives of the curves
+
+
+class SpectralSubmanifold(NamedTuple):
+    """What a decay says of its mode."""
+
+    form: NormalForm
+    covariance: Float[np.ndarray, "unknown unknown"]  # of the unknowns of the form
+    smallest: float  # m/s, fundamental velocity amplitude
+    largest: float
+    noise_std: float  # m/s, of a sample: what the trajectory leaves
+    manifold_misfit: float  # rms off the manifold over rms of the embedded record
+    samples: int
+
+
+class _Fit(NamedTuple):
+    """The trajectory that fits best."""
+
+    form: NormalForm
+    minimum: "Minimum[_Trial]"
+    mean_square: float  # of what it leaves, (m/s)²
+
+
+class _Trial(NamedTuple):
+    """The trajectory fit linearised at one point, in units of the misfit's size."""
+
+    residuals: Float[np.ndarray, " sample"]
+    jacobian: Float[np.ndarray, "sample unknown"]
+
+
+def ssm(
+    time: Float[np.ndarray, " sample"],
+    velocity: Float[np.ndarray, " sample"],
+    *,
+    terms: int | None = None,
+    least_amplitude: float = 0.0,
+) -> MethodResult:
+    """Natural frequency and damping against amplitude from the normal form on a decay's manifold.
+
+    The natural frequency is √(ω² + α²) of the decaying motion's ω(ρ) and α(ρ); the damping is the
+    power lost over ½ m V², as at phase resonance (`NormalForm.modal_damping`).
+
+    Arguments and errors as in `fit_submanifold`. Returns a `MethodResult` of 25 amplitudes whose
+    velocity is the fundamental's; 1σ from the fit's residual near the mode's frequency. An
+    amplitude at which the mode gains energy is `NOT_A_MODE`.
+    """
+    found = fit_submanifold(time, velocity, terms=terms, least_amplitude=least_amplitude)
+    amplitude = np.linspace(found.smallest, found.largest, _POINTS)
+    values = _curves(found.form, amplitude)
+    spread = _curve_std(found, amplitude)
+    points = [
+        MethodPoint(MethodStatus.FOUND, -1, *(float(one) for one in row))
+        if row[3] > 0
+        else MethodPoint(MethodStatus.NOT_A_MODE, -1)
+        for row in np.stack([amplitude, values[0], spread[0], values[1], spread[1]], axis=1)
+    ]
+    degree = 2 * len(found.form.decay) - 1
+    notes = (
+        f"normal form of degree {degree}, fitted to the trajectory (noise of a sample "
+        f"{found.noise_std:.2g} m/s)",
+        f"the record is {100 * found.manifold_misfit:.2g} % (rms) off a two-dimensional manifold",
+    )
+    return method_result("ssm", points, 0, notes)
+
+
+def fit_submanifold(
+    time: Float[np.ndarray, " sample"],
+    velocity: Float[np.ndarray, " sample"],
+    *,
+    terms: int | None = None,
+    least_amplitude: float = 0.0,
+) -> SpectralSubmanifold:
+    """The spectral submanifold and its normal form from one velocity in free decay.
+
+    Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the
+    force was gone; `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 6,
+    by default one more than Schwarz' criterion asks for; the record is read down to
+    `least_amplitude` (m/s).
+    Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay` and
+    where the record holds no decaying oscillation.
+    Validity: one mode (others fainter than the wanted accuracy), smooth forces: dry friction is
+    no polynomial, and 1σ does not know of it.
+    """
+    if terms is not None and not 1 <= terms <= _MOST_TERMS:
+        raise ValueError(f"`terms` must be from 1 to {_MOST_TERMS}, but is {terms}.")
+    times, signal = even_record(time, velocity, "ssm")
+    while len(times) > _MOST_SAMPLES:
+        signal, times = decimate(signal, 2, ftype="fir", zero_phase=True), times[::2]
+    step = float(np.mean(np.diff(times)))
+    times = times - times[0]
+    hertz = _main_frequency(signal, step)
+    if hertz * times[-1] < _FEWEST_CYCLES:
+        raise ValueError(
+            f"ssm needs {_FEWEST_CYCLES} cycles, but the record has {hertz * times[-1]:.1f}."
+        )
+    if 1 / (hertz * step) < _FEWEST_SAMPLES:
+        raise ValueError(
+            f"ssm needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
+            f"{1 / (hertz * step):.1f}: the sampling rate is too low."
+        )
+    lag = max(1, round(1 / (_DELAYS * hertz * step)))
+    coordinate, misfit = _on_the_plane(signal - signal.mean(), lag)
+    size = np.abs(coordinate)
+    below = np.flatnonzero(size < max(least_amplitude, 0.0))
+    end = below[0] if below.size else len(size)
+    if end * step * hertz < _FEWEST_CYCLES:
+        raise ValueError(
+            f"ssm needs {_FEWEST_CYCLES} cycles above the least amplitude, but the record has "
+            f"{end * step * hertz:.1f}."
+        )
+    times, signal, coordinate = times[:end], signal[:end], coordinate[:end]
+    per_cycle = 1 / (hertz * step)
+    orders = tuple(order for order in _ORDERS if order < per_cycle / 2)
+    best = _selected(times, signal, coordinate, orders, terms)
+    if best is None:
+        raise ValueError("ssm: the record holds no oscillation that decays smoothly.")
+    return _submanifold(best, times, signal, misfit, hertz)
+
+
+def _main_frequency(signal: np.ndarray, step: float) -> float:
+    """Frequency in Hz of the record's largest spectral line, its mean left out."""
+    spectrum = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(len(signal))))
+    return float(max(1, np.argmax(spectrum)) / (len(signal) * step))
+
+
+def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k"], float]:
+    """Complex coordinate of the decay in the manifold's tangent plane, and the manifold's misfit.
+
+    The coordinate's modulus is about the fundamental amplitude, its angle rises.
+    """
+    count = len(signal) - (_DELAYS - 1) * lag
+    delays = np.stack([signal[j * lag : j * lag + count] for j in range(_DELAYS)])
+    directions, _, _ = np.linalg.svd(delays @ delays.T)
+    plane = directions[:, :2].T @ delays
+    moved, *_ = np.linalg.lstsq(plane[:, :-lag].T, plane[:, lag:].T, rcond=None)
+    multipliers, left = np.linalg.eig(moved)  # rows: plane(t + lag)ᵀ = plane(t)ᵀ · moved
+    k = int(np.argmax(multipliers.imag))
+    if not multipliers[k].imag > 0:
+        raise ValueError("ssm: the record holds no oscillation in its plane of largest motion.")
+    turning = left[:, k] @ plane
+    design = np.stack([turning.real, -turning.imag], axis=1)
+    real, imaginary = np.linalg.lstsq(design, signal[:count], rcond=None)[0]
+    return (real + 1j * imaginary) * turning, _off_the_manifold(delays, directions, plane)
+
+
+def _off_the_manifold(delays: np.ndarray, directions: np.ndarray, plane: np.ndarray) -> float:
+    """How far the embedded record is off a polynomial over the plane, relative to its size."""
+    x, y = plane / np.abs(plane).max()
+    powers = [(a, d - a) for d in range(1, _MANIFOLD_DEGREE + 1) for a in range(d + 1)]
+    design = np.stack([x**a * y**b for a, b in powers], axis=1)
+    across = (directions[:, 2:].T @ delays).T
+    solved, *_ = np.linalg.lstsq(design, across, rcond=None)
+    return float(np.linalg.norm(across - design @ solved) / np.linalg.norm(delays))
+
+
+def _selected(
+    times: np.ndarray,
+    signal: np.ndarray,
+    coordinate: np.ndarray,
+    orders: tuple[int, ...],
+    wanted: int | None,
+) -> _Fit | None:
+    """The fit of as many terms as wanted, or one term more than Schwarz' criterion asks for.
+
+    What the terms left out would bend the curves is then small beside the bands; with the
+    criterion's own choice it is not, and the bands are too narrow.
+    """
+    n, best, least = len(times), None, np.inf
+    starts: list[NormalForm] = []
+    for terms in range(1, (wanted or _MOST_TERMS) + 1):
+        starts.append(_started(times, coordinate, orders, terms))
+        tried = [_with_terms(one, terms) for one in starts]
+        fit = _fitted(times, signal, tried if best is None else [*tried, best.form])
+        if fit is None:
+            return best
+        best = fit._replace(form=_with_terms(fit.form, terms + 1))
+        score = n * np.log(fit.mean_square) + len(fit.minimum.point) * np.log(n)
+        if wanted is None and score > least:
+            return fit
+        least = score
+    return fit
+
+
+def _with_terms(form: NormalForm, terms: int) -> NormalForm:
+    """The same normal form with room for more terms."""
+    more = (0, terms - len(form.decay))
+    return form._replace(decay=np.pad(form.decay, more), frequency=np.pad(form.frequency, more))
+
+
+def _started(
+    times: np.ndarray, coordinate: np.ndarray, orders: tuple[int, ...], terms: int
+) -> NormalForm:
+    """A normal form from integrals along the decay: no derivative of the data is taken."""
+    size, phase = np.abs(coordinate), np.unwrap(np.angle(coordinate))
+    scale = float(np.quantile(size[: max(8, len(size) // 50)], 0.9))
+    below = np.flatnonzero(size < _START * scale)
+    part = slice(0, below[0] if below.size else None)
+    size, phase, at = size[part], phase[part], times[: len(coordinate)][part]
+    ratio = size / scale
+    steps = np.diff(at)[:, None]
+    powers = chebyshev.chebvander(2 * ratio**2 - 1, terms - 1)
+    grown = np.concatenate(
+        [np.zeros((1, terms)), np.cumsum((powers[1:] + powers[:-1]) / 2 * steps, axis=0)]
+    )
+    design = np.concatenate([np.ones((len(at), 1)), grown], axis=1) * ratio[:, None]
+    length = np.linalg.norm(design, axis=0)
+    target = np.stack([np.log(ratio), phase], axis=1) * ratio[:, None]
+    solved = np.linalg.lstsq(design / length, target, rcond=None)[0] / length[:, None]
+    none = np.zeros((len(orders), 2), dtype=complex)
+    return NormalForm(solved[1:, 0], solved[1:, 1], none, orders, 0.0, scale, solved[0])
+
+
+def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> _Fit | None:
+    """The trajectory that fits best from the best of some starts, or None where there is none."""
+    squares = [float(np.mean(_trial(one, times, signal, 1.0).residuals ** 2)) for one in starts]
+    if not np.isfinite(squares).any():
+        return None
+    form = starts[int(np.nanargmin(squares))]
+    unit, point = float(np.sqrt(np.nanmin(squares))), unknowns_of(form)
+    terms, orders = len(form.decay), form.orders
+    unlimited = np.full(len(point), np.inf)
+    for _ in range(_ROUNDS):
+
+        def evaluate(points: np.ndarray, unit: float = unit) -> list[_Trial]:
+            return [
+                _trial(form_of(one, terms, orders, form.scale), times, signal, unit)
+                for one in points
+            ]
+
+        [fit] = minimise(
+            evaluate, point[None], evaluate(point[None]), (-unlimited, unlimited), _RULE
+        )
+        point = fit.point
+        before, unit = unit, unit * float(np.sqrt(fit.sum_of_squares / len(times)))
+        if unit > _SAME * before:
+            break
+    return _Fit(form_of(point, terms, orders, form.scale), fit, unit**2)
+
+
+def _trial(form: NormalForm, times: np.ndarray, signal: np.ndarray, unit: float) -> _Trial:
+    try:
+        found = seen(form, times)
+    except ArithmeticError:
+        unknown = len(unknowns_of(form))
+        return _Trial(np.full(len(times), np.nan), np.zeros((len(times), unknown)))
+    return _Trial((found.signal - signal) / unit, found.jacobian / unit)
+
+
+def _submanifold(
+    best: _Fit,
+    times: np.ndarray,
+    signal: np.ndarray,
+    misfit: float,
+    hertz: float,
+) -> SpectralSubmanifold:
+    form = best.form
+    found = seen(form, times)
+    left = signal - found.signal
+    free = len(times) - len(best.minimum.point)
+    variance = float(left @ left) / free
+    # Of coloured residuals only what lies near the mode's frequency moves its curves.
+    density = np.abs(np.fft.rfft(left)) ** 2
+    hertz_of = np.fft.rfftfreq(len(left), float(times[1] - times[0]))
+    near = np.abs(hertz_of / hertz - 1) < _NEAR
+    coloured = max(1.0, float(density[near].mean() / density[1:].mean()))
+    size = np.linalg.norm(found.jacobian, axis=0)
+    inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
+    noise = float(np.sqrt(variance))
+    return SpectralSubmanifold(
+        form,
+        variance * coloured * inverse / np.outer(size, size),
+        float(max(found.amplitude.min(), min(noise, 0.1 * found.amplitude.max()))),
+        float(found.amplitude.max()),
+        noise,
+        misfit,
+        len(times),
+    )
+
+
+def _curves(form: NormalForm, amplitude: np.ndarray) -> Float[np.ndarray, "2 k"]:
+    """Natural frequency (rad/s) and damping ratio."""
+    natural = np.hypot(form.angular_frequency(amplitude), form.decay_rate(amplitude))
+    return np.stack([natural, form.modal_damping(amplitude) / (2 * natural)])
+
+
+def _curve_std(found: SpectralSubmanifold, amplitude: np.ndarray) -> Float[np.ndarray, "2 k"]:
+    """1σ of both curves from the covariance of the form's unknowns."""
+    form = found.form
+    point, std = unknowns_of(form), np.sqrt(np.diag(found.covariance))
+    slopes = np.zeros((2, len(amplitude), len(point)))
+    for k in range(2, len(point) - 1):  # neither the start nor the offset moves the curves
+        step = np.zeros(len(point))
+        step[k] = _STEP * max(std[k], abs(point[k]), np.finfo(float).tiny)
+        ends = [
+            _curves(
+                form_of(point + sign * step, len(form.decay), form.orders, form.scale), amplitude
+            )
+            for sign in (1, -1)
+        ]
+        slopes[..., k] = (ends[0] - ends[1]) / (2 * step[k])
+    return np.sqrt(np.einsum("cki,ij,ckj->ck", slopes, found.covariance, slopes))

@@ -1,0 +1,123 @@
+"""Spectral submanifolds of decays whose backbone and damping are known without them."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipj, ellipk
+
+import snrmjax as sj
+from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
+
+REST, DAMPING, CUBIC = 2 * np.pi * 40.0, 1.2, 6e9  # rad/s, 1/s, 1/(m² s²)
+
+
+@pytest.fixture(scope="module")
+def decay():
+    """Duffing's oscillator released at 2 mm: q̈ + D q̇ + ω² q + β q³ = 0, integrated in time."""
+    time = np.arange(0, 2.5, 1 / 2000)
+
+    def rate(_, state):
+        q, v = state
+        return v, -DAMPING * v - REST**2 * q - CUBIC * q**3
+
+    found = solve_ivp(rate, (0, time[-1]), (2e-3, 0.0), t_eval=time, rtol=1e-10, atol=1e-14)
+    return time, found.y[1]
+
+
+def exact():
+    """Fundamental velocity, frequency and D ⟨v²⟩/(V²/2) of the undamped motion X cn(u | m)."""
+    rows = []
+    for size in np.linspace(1e-5, 2.1e-3, 200):
+        stiff = REST**2 + CUBIC * size**2
+        m = CUBIC * size**2 / (2 * stiff)
+        quarter = ellipk(m)
+        sn, _, dn, _ = ellipj(np.linspace(0, 4 * quarter, 257)[:-1], m)
+        speed = -size * np.sqrt(stiff) * sn * dn
+        fundamental = 2 * np.abs(np.fft.rfft(speed)[1]) / len(speed)
+        power = DAMPING * np.mean(speed**2) / (fundamental**2 / 2)
+        rows.append((fundamental, np.pi * np.sqrt(stiff) / (2 * quarter), power))
+    return np.array(rows).T
+
+
+def scores(result):
+    """Errors over 1σ, and relative errors, of frequency and modal damping."""
+    velocity, omega, lost = exact()
+    true = np.interp(result.velocity, velocity, omega)
+    ratio = np.interp(result.velocity, velocity, lost) / (2 * true)
+    found = result.natural_frequency, result.damping_ratio
+    std = result.natural_frequency_std, result.damping_ratio_std
+    away = np.stack(found) - np.stack([true, ratio])
+    return away / np.stack(std), away / np.stack([true, ratio])
+
+
+def test_duffing_decays_along_its_backbone(decay):
+    result = sj.methods.ssm(*decay, terms=5)
+    assert result.found.all()
+    assert np.ptp(result.natural_frequency) > 0.08 * REST
+    _, relative = scores(result)
+    # What a polynomial of degree 9 leaves of these curves, near the largest amplitude.
+    assert np.abs(relative[0]).max() < 5e-5
+    assert np.abs(relative[1]).max() < 0.01
+
+
+def test_the_record_of_a_form_and_its_derivatives():
+    time = np.arange(0, 1.0, 1 / 500)
+    harmonics = np.array([[0.02 + 0.01j, 0.003], [0.03j, 0.01 - 0.002j]])
+    decay, frequency = np.array([-1.2, -0.3, 0.05]), np.array([150.0, 8.0, -3.0])
+    form = NormalForm(decay, frequency, harmonics, (2, 3), 1e-3, 0.4, np.array([-0.1, 0.3]))
+
+    def rate(_, state):  # in Cartesian coordinates, with the polynomials written out
+        r = 2 * np.sum(state**2) / 0.4**2 - 1
+        known = np.array([1, r, 2 * r**2 - 1])
+        x, y = state
+        return decay @ known * x - frequency @ known * y, frequency @ known * x + decay @ known * y
+
+    begin = 0.4 * np.exp(-0.1) * np.array([np.cos(0.3), np.sin(0.3)])
+    x, y = solve_ivp(rate, (0, 1), begin, "DOP853", t_eval=time, rtol=1e-11, atol=1e-13).y
+    z = (x + 1j * y) / 0.4
+    wave = 0.4 * z + sum(
+        (c + d * abs(z) ** 2) * z**order for order, (c, d) in zip((2, 3), harmonics, strict=True)
+    )
+    found = seen(form, time)
+    np.testing.assert_allclose(found.signal, wave.real + 1e-3, atol=2e-6)
+    point = unknowns_of(form)
+    for k in range(len(point)):
+        step = 1e-5 * max(1, abs(point[k])) * np.eye(len(point))[k]
+        ends = [seen(form_of(point + s * step, 3, (2, 3), 0.4), time).signal for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step[k])
+        np.testing.assert_allclose(found.jacobian[:, k], slope, atol=2e-5 * np.abs(slope).max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("noise", [1e-3, 1e-2, 5e-2])
+def test_bands_cover_over_twenty_records(decay, noise):
+    time, velocity = decay
+    shares = []
+    for seed in range(20):
+        added = noise * velocity.max() * np.random.default_rng(seed).standard_normal(len(time))
+        shares.append(np.abs(scores(sj.methods.ssm(time, velocity + added))[0]))
+    # 20 records of about 5 free coefficients a curve: 0.68 ± 0.05 and 0.95 ± 0.02, twice that.
+    within = np.array(shares)
+    assert np.all(np.abs(np.mean(within < 1, axis=(0, 2)) - 0.683) < 0.1)
+    assert np.all(np.mean(within < 1.96, axis=(0, 2)) > 0.91)
+
+
+def test_bad_records_are_refused(decay):
+    time, velocity = decay
+    for times, record, words in (
+        (time[:300], velocity[:300], "ssm needs 12 cycles, but the record has"),
+        (time, np.clip(velocity, -0.2, 0.2), "it is clipped"),
+        (time[::8], velocity[::8], "samples a cycle"),
+        (time**1.1, velocity, "evenly spaced"),
+        (time, np.where(time > 1, np.nan, velocity), "NaN or inf"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            sj.methods.ssm(times, record)
+    with pytest.raises(ValueError, match="`terms` must be from 1 to 6"):
+        sj.methods.ssm(time, velocity, terms=7)
+
+
+def test_growth_is_no_mode(decay):
+    time, velocity = decay
+    result = sj.methods.ssm(time, velocity[::-1].copy(), terms=3)
+    assert not result.found.any()
