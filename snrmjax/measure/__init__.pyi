@@ -9,6 +9,8 @@ from .recordings.time_recording import TimeRecording, time_recording
 from .records import RecordFit, fit_records, steady_state_from_records
 from .signals import ForceVelocityLoop, force_velocity_loop, peak_amplitude, synthesise
 from .states import OptionalColumns, SteadyStates, join_steady_states, steady_states
+from .sweeps.slow_sweep import SweepStatus, SweptStates, sweep_states
+from .sweeps.sweep_bias import SweepBias, sweep_bias
 
 __all__ = [
     "Channel",
@@ -24,6 +26,9 @@ __all__ = [
     "SteadyStates",
     "StepStatus",
     "SteppedSineStates",
+    "SweepBias",
+    "SweepStatus",
+    "SweptStates",
     "TimeRecording",
     "apply_calibration",
     "appropriation_of",
@@ -41,6 +46,8 @@ __all__ = [
     "steady_state_from_records",
     "steady_states",
     "stepped_sine_states",
+    "sweep_bias",
+    "sweep_states",
     "synthesise",
     "time_recording",
 ]

@@ -13,9 +13,8 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from snrmjax.measure.recordings.tone_track import ToneTrack
+from snrmjax.measure.recordings.tone_track import ToneTrack, unwrapped_phase
 
 _PRICE = 25.0  # of a cut, in squared standard deviations
 _PHASE_FLOOR = 0.01  # rad: what moves less has not moved
@@ -56,7 +55,7 @@ def recognise_steps(
     Arguments: `least_amplitude_step` as a share of the amplitude; `least_step` in rad/s, the
     smallest difference of frequency that is a step (0: whatever can be told apart).
     """
-    phase = _unwrapped(track)
+    phase = unwrapped_phase(track)
     level = np.log(track.amplitude)
     cuts = _cuts(track, phase, level)
     pieces = [
@@ -84,13 +83,6 @@ def recognise_steps(
         )
         for first, longest, last in steps
     ]
-
-
-def _unwrapped(track: ToneTrack) -> Float[np.ndarray, " frame"]:
-    """Phase that goes on from frame to frame as the frequencies of both say."""
-    turned = np.diff(track.middle) * (track.frequency[1:] + track.frequency[:-1]) / 2
-    rest = np.angle(np.exp(1j * (np.diff(track.phase) - turned)))
-    return track.phase[0] + np.concatenate([[0.0], np.cumsum(turned + rest)])
 
 
 def _deviations(values: np.ndarray, middle: np.ndarray, floor: float) -> np.ndarray:

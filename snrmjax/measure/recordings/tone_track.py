@@ -52,6 +52,13 @@ def track_tone(recording: TimeRecording, name: str) -> ToneTrack:
     return ToneTrack._make(columns)
 
 
+def unwrapped_phase(track: ToneTrack) -> Float[np.ndarray, " frame"]:
+    """Phase in rad that goes on from frame to frame as the frequencies of both say."""
+    turned = np.diff(track.middle) * (track.frequency[1:] + track.frequency[:-1]) / 2
+    rest = np.angle(np.exp(1j * (np.diff(track.phase) - turned)))
+    return track.phase[0] + np.concatenate([[0.0], np.cumsum(turned + rest)])
+
+
 def check_rate(recording: TimeRecording, frequency: float, name: str) -> None:
     """Raises `ValueError` for a frequency (rad/s) with fewer than four samples a cycle."""
     samples = 2 * np.pi * recording.sampling_rate / frequency

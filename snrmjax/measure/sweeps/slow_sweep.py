@@ -1,0 +1,368 @@
+"""Steady states from slow sweeps, the bias of the sweep taken out."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.tone_track import (
+    ToneTrack,
+    check_rate,
+    track_tone,
+    unwrapped_phase,
+)
+from snrmjax.measure.recordings.velocity_states import (
+    ChosenChannels,
+    Levels,
+    checked_orders,
+    choose_channels,
+    states_of_phasors,
+)
+from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.sweeps.sweep_bias import SweepBias, sweep_bias_where_slow
+from snrmjax.measure.sweeps.sweep_correction import ModalBalance, modal_balance
+from snrmjax.measure.sweeps.sweep_runs import LEAST_RANGE, Sweep, sweep_runs, track_speed
+from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, swept_phasors
+from snrmjax.measure.sweeps.swept_table import (
+    Moment,
+    averaged_table,
+    held_force,
+    motion_of,
+    pairs_of,
+    reference_response,
+    swept_moment,
+    table_of,
+)
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+_START = 60  # states a sweep before the grid is made finer where the response changes
+_CHORD = 0.08  # of the largest response between neighbouring states
+_ROUNDS = 3
+_MUCH = 0.3  # of the force that may be taken to move the phasor
+_BLURRED = 0.1  # relative error of a phasor from which on the window is too wide for it
+
+
+class SweepStatus(IntEnum):
+    """Whether a moment of a sweep became a steady state, or why it did not."""
+
+    FOUND = 0
+    OUTSIDE = 1
+    TOO_FAST = 2
+    CLIPPED = 3
+
+
+SWEEP_MESSAGE: dict[SweepStatus, str] = {
+    SweepStatus.FOUND: "found",
+    SweepStatus.OUTSIDE: "the window leaves the sweep, or samples are missing",
+    SweepStatus.TOO_FAST: (
+        "the phasor changes so fast (a jump, or too fast a sweep) that its steady state cannot be "
+        "told"
+    ),
+    SweepStatus.CLIPPED: "a channel stays at its largest value: it is clipped",
+}
+
+
+class SweptStates(AbstractResult):
+    """Steady states of slow sweeps; see `sweep_states`."""
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state",)
+
+    states: SteadyStates
+    sweep: Int[np.ndarray, " state"]  # which sweep each state is from, −1: both directions
+    time: Float[np.ndarray, " state"]  # s
+    moving: Complex[np.ndarray, " state"]  # share of the force that moved the phasor, taken out
+    sweeps: tuple[Sweep, ...] = eqx.field(static=True)
+    bias: tuple[SweepBias | None, ...] = eqx.field(static=True)  # at resonance, uncorrected
+    balance: ModalBalance
+    left_out: tuple[int, ...] = eqx.field(static=True)  # moments, by `SweepStatus`
+    corrected: bool = eqx.field(static=True)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        lines = [f"SweptStates: {self.states.n_states} states of {len(self.sweeps)} sweeps"]
+        for sweep, bias in zip(self.sweeps, self.bias, strict=True):
+            says = (
+                ""
+                if bias is None
+                else (
+                    f": by itself it shifts the peak by {bias.frequency_shift / _HERTZ:.2g} Hz and "
+                    f"lowers it to {100 * bias.peak_ratio:.4g} % (normalised rate "
+                    f"{bias.normalised_rate:.2g})"
+                )
+            )
+            lines.append(
+                f"{sweep.first / _HERTZ:.5g} to {sweep.last / _HERTZ:.5g} Hz in "
+                f"{sweep.stop - sweep.start:.4g} s{says}"
+            )
+        share = np.abs(self.moving)
+        if self.corrected:
+            lines.append(f"taken out: up to {100 * share.max():.2g} % of the force")
+        lines += [
+            f"{count} left out: {SWEEP_MESSAGE[kind]}"
+            for kind, count in zip(SweepStatus, self.left_out, strict=True)
+            if count and kind is not SweepStatus.FOUND
+        ]
+        return (*lines, *(f"note: {note}" for note in self.states.notes))
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        at = ("state",)
+        hertz = np.asarray(self.states.frequency) / _HERTZ
+        return {
+            "state": Variable(at, np.arange(len(self.time)), "1", "steady state"),
+            "frequency_hz": Variable(at, hertz, "Hz", "frequency"),
+            "time_s": Variable(at, self.time, "s", "when it was passed"),
+            "sweep": Variable(at, self.sweep, "1", "sweep, -1: both directions"),
+            "moving_re": Variable(at, self.moving.real, "1", "share of the force taken out"),
+            "moving_im": Variable(at, self.moving.imag, "1", "its imaginary part"),
+        }
+
+
+def sweep_states(
+    recording: TimeRecording,
+    force: str,
+    responses: Sequence[str],
+    *,
+    harmonic_order: Sequence[int] = (1, 2, 3),
+    level: Levels | int = "auto",
+    sensors: Sequence[str] | None = None,
+    frequencies: Float[np.ndarray, " frequency"] | Sequence[float] | None = None,
+    drive: str | None = None,
+    cycles: float = 16.0,
+    correct: bool = True,
+    average: bool = False,
+) -> SweptStates:
+    """Steady states from the time record of slow linear or logarithmic sweeps.
+
+    Around each frequency the harmonics and how they change are fitted over a window of a chirp. A
+    state of a sweep is the steady state of another force: what the change of the phasor needs is
+    taken from the force, so that amplitude and frequency stay those that were measured.
+
+    Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors` and `drive` as in
+    `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
+    that is finer where the response changes); `cycles` is the width of the window; `correct` takes
+    the bias of the sweep out; `average` makes one state of those that an upward and a downward
+    sweep have at one of the `frequencies`, unless they differ by more than a fifth.
+    Returns `SweptStates` with the bias that each sweep has at resonance without correction.
+    Raises `ValueError` for channels that do not fit, a record in which no sweep is found, windows
+    of fewer than six cycles, fewer than four samples a cycle, frequencies outside every sweep and
+    a record of which no state can be told.
+    Validity: one mode near its resonance; the correction's error is stated by that of the modal
+    constant and of the phasor's derivatives, and grows where the window is longer than the time
+    in which the phasor changes (jumps are left out).
+    Reference: G. Gloth & M. Sinapius, Mech. Syst. Signal Process. 18 (2004) 1421.
+
+    >>> from snrmjax.measure import Channel, time_recording
+    >>> t = np.arange(60000) / 1000
+    >>> turn = 2 * np.pi * (20 * t + t**2 / 20)
+    >>> record = time_recording(
+    ...     np.stack([2 * np.cos(turn), 0.1 * np.cos(turn + 0.2)]),
+    ...     [Channel("load cell", "force"), Channel("tip", "velocity")], 1000)
+    >>> found = sweep_states(
+    ...     record, "load cell", ["tip"], frequencies=2 * np.pi * np.array([22, 24.0]),
+    ...     correct=False)
+    >>> found.states.force.round(4).tolist(), np.angle(found.states.velocity).round(4).tolist()
+    ([2.0, 2.0], [[0.2], [0.2]])
+    """
+    orders = checked_orders(harmonic_order)
+    chosen = choose_channels(recording, force, responses, sensors=sensors, drive=drive)
+    if not cycles >= 6:
+        raise ValueError(f"`cycles` must be 6 at least, but is {cycles:g}.")
+    guide = drive or force
+    track = track_tone(recording, guide)
+    phase = unwrapped_phase(track)
+    runs = sweep_runs(track, phase)
+    if not runs:
+        raise ValueError(
+            f"the record has no sweep: the frequency of channel {guide} does not move by "
+            f"{100 * LEAST_RANGE:g} % in one direction (steps? `stepped_sine_states` reads them)."
+        )
+    fastest = max(float(np.max(track_speed(track, phase)[rows])) for rows in runs)
+    check_rate(recording, fastest * recording.sampling_rate * max(orders) / 2, guide)
+    reader = _Reader(recording, chosen, track, phase, cycles, max(*orders, 3))
+    wanted = None if frequencies is None else _wanted(frequencies, reader, runs)
+    if average and wanted is None:
+        wanted = reader.grid(runs[0])
+    grids = [reader.along(rows, None) for rows in runs] if correct or wanted is None else []
+    passed = grids if wanted is None else [reader.along(rows, wanted) for rows in runs]
+    return _result(reader, runs, passed, grids, orders, level, correct, average)
+
+
+class _Reader(NamedTuple):
+    """What phasors of moments are read with."""
+
+    recording: TimeRecording
+    chosen: ChosenChannels
+    track: ToneTrack
+    phase: Float[np.ndarray, " frame"]
+    cycles: float
+    highest: int
+
+    def at(self, rows: slice, omega: float) -> SweptPhasors | None:
+        """Phasors where a sweep has the frequency `omega` (rad/s)."""
+        part = self.track.part(rows)
+        speed = track_speed(self.track, self.phase)[rows] * self.recording.sampling_rate
+        rising = speed[-1] > speed[0]
+        ordered = np.maximum.accumulate(speed if rising else -speed)
+        goal = omega if rising else -omega
+        if not ordered[0] <= goal <= ordered[-1]:
+            return None
+        place = float(np.interp(goal, ordered, part.middle))
+        names = (self.chosen.force.name, *(one.name for one in self.chosen.responses))
+        return swept_phasors(
+            *(self.recording, names, part, self.phase[rows]),
+            *(omega, place, self.cycles, self.highest),
+        )
+
+    def grid(self, rows: slice) -> np.ndarray:
+        """Frequencies along a sweep, closer where the response changes."""
+        return np.array([omega for omega, _ in self.along(rows, None)])
+
+    def along(
+        self, rows: slice, wanted: np.ndarray | None
+    ) -> list[tuple[float, SweptPhasors | None]]:
+        """Phasors at the wanted frequencies, or on a grid that is made finer."""
+        speed = track_speed(self.track, self.phase)[rows] * self.recording.sampling_rate
+        if wanted is not None:
+            inside = (wanted >= speed.min()) & (wanted <= speed.max())
+            return [(float(omega), self.at(rows, float(omega))) for omega in wanted[inside]]
+        middle = self.track.middle[rows] / self.recording.sampling_rate
+        edge = _HERTZ * self.cycles / speed.min()
+        rate = np.ptp(speed) / np.ptp(middle)
+        grid = np.linspace(speed[0], speed[-1], _START + 2)[1:-1]
+        found = {float(omega): self.at(rows, float(omega)) for omega in grid}
+        for _ in range(_ROUNDS):
+            known = sorted((omega, one) for omega, one in found.items() if one is not None)
+            if len(known) < 2:
+                break
+            answer = np.array([one.series[1:, 0] / one.series[0, 0] for _, one in known])
+            change = np.abs(np.diff(answer, axis=0)) / np.abs(answer).max(axis=0)
+            omegas = np.array([omega for omega, _ in known])
+            coarse = (change.max(axis=1) > _CHORD) & (np.diff(omegas) > rate * edge / 2)
+            for omega in (omegas[1:] + omegas[:-1])[coarse] / 2:
+                found[float(omega)] = self.at(rows, float(omega))
+        return sorted(found.items(), reverse=bool(speed[-1] < speed[0]))
+
+
+def _wanted(
+    frequencies: Float[np.ndarray, " frequency"] | Sequence[float],
+    reader: _Reader,
+    runs: list[slice],
+) -> Float[np.ndarray, " frequency"]:
+    wanted = np.asarray(frequencies, dtype=float)
+    if wanted.ndim != 1 or not wanted.size or not (np.isfinite(wanted) & (wanted > 0)).all():
+        raise ValueError("`frequencies` must be positive numbers in a vector (rad/s).")
+    speed = track_speed(reader.track, reader.phase) * reader.recording.sampling_rate
+    low = min(float(speed[rows].min()) for rows in runs)
+    high = max(float(speed[rows].max()) for rows in runs)
+    outside = wanted[(wanted < low) | (wanted > high)]
+    if outside.size:
+        raise ValueError(
+            f"`frequencies` must lie within the sweeps, {low / _HERTZ:.6g} to "
+            f"{high / _HERTZ:.6g} Hz, but one is {outside[0] / _HERTZ:.6g} Hz."
+        )
+    return wanted
+
+
+def _result(
+    reader: _Reader,
+    runs: list[slice],
+    passed: list[list[tuple[float, SweptPhasors | None]]],
+    grids: list[list[tuple[float, SweptPhasors | None]]],
+    orders: tuple[int, ...],
+    level: Levels | int,
+    correct: bool,
+    average: bool,
+) -> SweptStates:
+    moments, status = _moments(reader.chosen, passed)
+    left_out = [status.count(kind) for kind in SweepStatus]
+    if moments:
+        every = _moments(reader.chosen, grids)[0] or moments
+        reference = reference_response(every)
+        balance = modal_balance(motion_of(every, reference))
+        corrected = correct and bool(np.isfinite(balance.constant))
+        held, held_std = held_force(moments, reference, balance, corrected)
+        share = 1 - held / np.array([one.found.series[0, 0] for one in moments])
+        slow = np.abs(share) <= _MUCH
+        left_out[int(SweepStatus.TOO_FAST)] += int(np.sum(~slow))
+    if not moments or not slow.any():
+        reasons = "; ".join(
+            f"{count} because {SWEEP_MESSAGE[kind]}"
+            for kind, count in zip(SweepStatus, left_out, strict=True)
+            if count
+        )
+        nothing = "none passes the wanted frequencies, or samples are missing there"
+        raise ValueError(f"no state can be told from the sweeps: {reasons or nothing}.")
+    kept = [one for one, good in zip(moments, slow, strict=True) if good]
+    table = table_of(kept, reader.chosen, held[slow], held_std[slow])
+    number = np.array([one.sweep for one in kept])
+    share = share[slow]
+    if average:
+        rising = np.array([_rises(reader, rows) for rows in runs])[number]
+        pairs = pairs_of(np.array([one.wanted for one in kept]), rising, table)
+        table = averaged_table(table, pairs)
+        number = np.array([number[a] if a == b else -1 for a, b in pairs])
+        share = np.array([(share[a] + share[b]) / 2 for a, b in pairs])
+    notes = []
+    if correct and not corrected:
+        notes.append(
+            "the modal constant cannot be told from these sweeps (too few states near resonance): "
+            "the bias of the sweep is not taken out"
+        )
+    states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
+    rate, begin = reader.recording.sampling_rate, reader.recording.start_time
+    speed = track_speed(reader.track, reader.phase) * rate
+    sweeps = tuple(
+        Sweep(
+            *(begin + float(reader.track.middle[k]) / rate for k in (rows.start, rows.stop - 1)),
+            *(float(speed[k]) for k in (rows.start, rows.stop - 1)),
+        )
+        for rows in runs
+    )
+    bias = tuple(_bias(balance, every, k) for k in range(len(runs)))
+    left_out[0] = states.n_states
+    return SweptStates(
+        states, number, table.time, share, sweeps, bias, balance, tuple(left_out), corrected
+    )
+
+
+def _moments(
+    chosen: ChosenChannels, passed: list[list[tuple[float, SweptPhasors | None]]]
+) -> tuple[list[Moment], list[SweepStatus]]:
+    """States that can be read, and how every moment ended so far."""
+    moments, status = [], []
+    for k, run in enumerate(passed):
+        for omega, found in run:
+            if found is None:
+                status.append(SweepStatus.OUTSIDE)
+            elif found.clipped:
+                status.append(SweepStatus.CLIPPED)
+            else:
+                moment = swept_moment(chosen, k, omega, found)
+                error = np.min(found.std[1:, 0] / np.abs(found.series[1:, 0]))
+                blurred = not error < _BLURRED
+                status.append(SweepStatus.TOO_FAST if blurred else SweepStatus.FOUND)
+                moments += [] if blurred else [moment]
+    return moments, status
+
+
+def _rises(reader: _Reader, rows: slice) -> bool:
+    return bool(reader.track.frequency[rows.stop - 1] > reader.track.frequency[rows.start])
+
+
+def _bias(balance: ModalBalance, moments: list[Moment], sweep: int) -> SweepBias | None:
+    """What the sweep does to its resonance, by the mode that the balance found."""
+    own = [one for one in moments if one.sweep == sweep]
+    if not own or not np.isfinite(balance.constant):
+        return None
+    stiffness, damping = balance.stiffness[-1], balance.damping[-1]
+    if stiffness <= 0 or damping <= 0:
+        return None
+    omega = float(np.sqrt(stiffness))
+    near = min(own, key=lambda one: abs(one.found.rate[0] - omega))
+    return sweep_bias_where_slow(omega, float(damping / (2 * omega)), float(near.found.rate[1]))
