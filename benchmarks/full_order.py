@@ -1,0 +1,198 @@
+"""All finite elements of a beam in periodic motion: harmonic balance and Newmark's rule.
+
+M ü + C u̇ + f(u) = p cos Ωt for u = Σ_h a_h cos hΩt + b_h sin hΩt, with f the elements' internal
+force at samples of the period (alternating frequency-time). It shares the elements with a
+condensation, but neither modes, potential nor solver. Used by `rom_full_order.py` (normal modes)
+and `rom_forced_response.py`.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import snrmjax as sj
+from snrmjax.condense.elements.statics import free_force, free_tangent
+from snrmjax.condense.elements.strain_energy import mass_matrix
+
+ORDER, SAMPLES = 9, 40  # exact for a cubic force
+FLAT = sj.condense.Beam(0.2286, 0.0127, 0.787e-3, young=204.8e9, density=7870.0, elements=20)
+CURVED = sj.condense.Beam(
+    *(0.3048, 0.0127, 0.508e-3),
+    rise=sj.condense.rise_of_radius(0.3048, 11.43),
+    young=204e9,
+    density=7860.0,
+    elements=20,
+)
+_ITERATIONS, _SETTLED = 12, 1e-9
+
+
+class Waves(NamedTuple):
+    """Functions of the period that a motion is made of, at samples of it."""
+
+    value: np.ndarray  # (function, sample)
+    weight: np.ndarray  # (function, sample): coefficients from samples
+    first: np.ndarray  # (function, function): coefficients of the derivative by Ωt
+    second: np.ndarray
+
+
+class Motion(NamedTuple):
+    """A balanced motion; `moved` is the last correction over the motion, NaN where it failed."""
+
+    coefficients: jax.Array  # (function, free degree of freedom)
+    frequency: jax.Array  # rad/s
+    moved: jax.Array
+
+
+def cosines() -> Waves:
+    """cos hΩt, h = 0…`ORDER`: motions that start at rest."""
+    orders = np.arange(ORDER + 1)
+    value = np.cos(orders[:, None] * _phase())
+    weight = np.where(orders == 0, 1.0, 2.0)[:, None] * value / SAMPLES
+    return Waves(value, weight, np.zeros((orders.size, orders.size)), -np.diag(orders**2.0))
+
+
+def cosines_and_sines() -> Waves:
+    """cos hΩt, h = 0…`ORDER`, then sin hΩt, h = 1…`ORDER`."""
+    even, h = cosines(), np.arange(1, ORDER + 1)
+    sines = np.sin(h[:, None] * _phase())
+    first = np.zeros((2 * ORDER + 1, 2 * ORDER + 1))
+    first[h, ORDER + h], first[ORDER + h, h] = h, -h
+    weight = np.concatenate([even.weight, 2 * sines / SAMPLES])
+    return Waves(np.concatenate([even.value, sines]), weight, first, first @ first)
+
+
+def _phase() -> np.ndarray:
+    return 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+
+
+class Closing(NamedTuple):
+    """The equation that fixes the frequency: Σ row ∘ coefficients = value."""
+
+    row: jax.Array  # (function, free degree of freedom)
+    value: float
+
+
+@eqx.filter_jit
+def balanced(
+    beam: sj.condense.Beam,
+    damping: jax.Array,
+    load: jax.Array,
+    waves: Waves,
+    start: tuple[jax.Array, jax.Array],
+    closing: Closing,
+) -> Motion:
+    """Newton's method on all coefficients and the frequency.
+
+    Arguments: `damping` C and `load` p of the degrees of freedom that are not held (kg/s, N);
+    `start` coefficients (m, rad) and frequency (rad/s).
+    """
+    mass = free_mass(beam)
+    n, count = mass.shape[0], len(waves.value)
+    force = jnp.zeros((count, n)).at[1].set(load)
+
+    def step(carry):
+        c, omega, _, k = carry
+        u = waves.value.T @ c
+        internal = jax.vmap(lambda one: free_force(beam, one))(u)
+        tangent = jax.vmap(lambda one: free_tangent(beam, one))(u)
+        inertia, drag = waves.second @ c @ mass, waves.first @ c @ damping
+        residual = waves.weight @ internal + omega**2 * inertia + omega * drag - force
+        jacobian = jnp.einsum("hs,gs,sij->higj", waves.weight, waves.value, tangent)
+        jacobian += jnp.einsum("hg,ij->higj", omega**2 * waves.second, mass)
+        jacobian += jnp.einsum("hg,ij->higj", omega * waves.first, damping)
+        size = n * count
+        by_omega = (2 * omega * inertia + drag).reshape(size, 1)
+        top = jnp.concatenate([jacobian.reshape(size, size), by_omega], axis=1)
+        matrix = jnp.concatenate([top, jnp.append(closing.row.ravel(), 0.0)[None]])
+        missing = jnp.sum(closing.row * c) - closing.value
+        change = jnp.linalg.solve(matrix, jnp.append(residual.ravel(), missing))
+        new = c - change[:-1].reshape(c.shape)
+        moved = jnp.max(jnp.abs(change[:-1])) / jnp.max(jnp.abs(new))
+        return new, omega - change[-1], moved, k + 1
+
+    def goes_on(carry):
+        return (carry[3] < _ITERATIONS) & ~(carry[2] < _SETTLED)
+
+    begin = (*start, jnp.array(jnp.inf), jnp.array(0))
+    return Motion(*jax.lax.while_loop(goes_on, step, begin)[:3])
+
+
+def free_mass(beam: sj.condense.Beam) -> jax.Array:
+    """Mass matrix of the degrees of freedom that are not held."""
+    return mass_matrix(beam)[beam.free[:, None], beam.free]
+
+
+@eqx.filter_jit
+def integrated(
+    beam: sj.condense.Beam,
+    damping: jax.Array,
+    load: jax.Array,
+    start: tuple[jax.Array, jax.Array],
+    frequency: jax.Array,
+    steps: int,
+    periods: int,
+) -> jax.Array:
+    """Displacement at the end of every step of the last period, by Newmark's rule.
+
+    Constant mean acceleration, `steps` a period. Arguments: `start` displacement and velocity.
+    """
+    mass = free_mass(beam)
+    dt = 2 * jnp.pi / frequency / steps
+
+    def step(carry, k):
+        u, v, a = carry
+        known = u + dt * v + 0.25 * dt**2 * a
+        push = load * jnp.cos(2 * jnp.pi * (k + 1) / steps)
+
+        def velocity(acceleration):
+            return v + 0.5 * dt * (a + acceleration)
+
+        def newton(_, new):
+            later = (new - known) * 4 / dt**2
+            residual = mass @ later + damping @ velocity(later) + free_force(beam, new) - push
+            tangent = free_tangent(beam, new) + 4 / dt**2 * mass + 2 / dt * damping
+            return new - jnp.linalg.solve(tangent, residual)
+
+        new = jax.lax.fori_loop(0, 3, newton, known)
+        later = (new - known) * 4 / dt**2
+        return (new, velocity(later), later), new
+
+    def period(carry, _):
+        return jax.lax.scan(step, carry, jnp.arange(steps))
+
+    u, v = start
+    begin = (u, v, jnp.linalg.solve(mass, load - damping @ v - free_force(beam, u)))
+    before, _ = jax.lax.scan(lambda c, k: (period(c, k)[0], None), begin, None, periods - 1)
+    return period(before, None)[1]
+
+
+class Reduced(NamedTuple):
+    """A condensed model with a sensor at midspan under a uniform force, and what it took."""
+
+    model: sj.model.Structure
+    seconds: float
+    largest: float  # thicknesses that single modes move linearly in the load cases
+
+
+def condensed(beam: sj.condense.Beam, modes: Sequence[int], damping_ratio: np.ndarray) -> Reduced:
+    """Condense a beam, with load cases as large as the package's own rule has them."""
+    begin = time.perf_counter()
+    basis = sj.condense.beam_modes(beam, modes)
+
+    def solve(force):
+        return sj.condense.static_cases(beam, basis, force)
+
+    wanted = sj.condense.displacement_for_ratio(basis, solve, start=float(beam.thickness) / 4)
+    found = sj.condense.condense(basis, solve(sj.condense.modal_loads(basis, wanted).force))
+    seconds = time.perf_counter() - begin
+    model = found.structure(
+        damping_ratio,
+        sensors={"midspan": sj.condense.shape_at(beam, basis, 0.5)},
+        participation=np.asarray(sj.condense.participation(beam, basis)),
+    )
+    return Reduced(model, seconds, float(wanted[0]) / float(beam.thickness))
