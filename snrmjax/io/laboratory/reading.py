@@ -8,7 +8,12 @@ from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
 
 _ROOM = "snrmjax.io.laboratory"
-_READERS: dict[Kind, tuple[str, str]] = {"uff": ("uff.reading", "read_uff")}
+_READERS: dict[Kind, tuple[str, str]] = {
+    "uff": ("uff.reading", "read_uff"),
+    "matlab": ("arrays.matlab_files", "read_matlab"),
+    "hdf5": ("arrays.hdf5_files", "read_hdf5"),
+    "netcdf": ("arrays.hdf5_files", "read_netcdf"),
+}
 _HEAD = 4096
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 

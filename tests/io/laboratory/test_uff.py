@@ -127,7 +127,9 @@ def test_round_trip_of_records_and_responses(tmp_path, binary):
         assert any("do not rise" in note for note in found.notes)
         (table,) = found.tables
         np.testing.assert_allclose(table.columns["frequency"], hertz, atol=5.1e-5)
-        np.testing.assert_allclose(table.columns["3-y over force"], responses.values[0, 0], rtol=6e-12)
+        np.testing.assert_allclose(
+            table.columns["3-y over force"], responses.values[0, 0], rtol=6e-12
+        )
 
 
 def test_other_programs_read_what_is_written(tmp_path):

@@ -1,0 +1,250 @@
+"""HDF5, netCDF 4 and MATLAB v7.3 as a tree of named arrays, which stay in the file."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
+from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
+from snrmjax.io.laboratory.names import role_of
+
+_MOST_OBJECTS = 20_000
+_DEEPEST = 24
+_LONGEST_TEXT = 4096
+_INFLATES = 1100  # deflate cannot shrink by more
+_LARGEST_CHUNK = 2**26  # bytes
+_HIDDEN = ("#refs#", "#subsystem#")
+_UNITS = ("units", "unit", "Unit", "Units", "unit_string", "UNIT")
+_WORDS = ("quantity", "point", "direction")
+
+
+class _Walk(NamedTuple):
+    h5py: Any
+    path: Path
+    size: int
+    notes: list[str]
+    seen: list[Any]  # addresses of groups above, against links in a circle
+    objects: list[int]
+
+
+def open_tree(path: Path) -> tuple[dict[str, Node], list[str]]:
+    """The tree of an HDF5 file and what was not read. The file is closed again.
+
+    Links to other files, virtual and external data are not followed: a file is read alone.
+    Raises `ValueError` for a damaged file and for more than 20 000 objects.
+    """
+    h5py = library("h5py", "reading HDF5, netCDF and MATLAB v7.3")
+    notes: list[str] = []
+    walk = _Walk(h5py, path, os.path.getsize(path), notes, [], [0])
+    with damaged_if_it_fails(path.name, "an HDF5 file"), h5py.File(path, "r") as file:
+        return _group(walk, file), notes
+
+
+def _group(walk: _Walk, group: Any) -> dict[str, Node]:
+    """A group as a struct. Its attributes that state a rate are numbers of it."""
+    address = walk.h5py.h5o.get_info(group.id).addr
+    if address in walk.seen or len(walk.seen) > _DEEPEST:
+        walk.notes.append(f"{group.name} links in a circle or nests too deeply and is not read.")
+        return {}
+    walk.seen.append(address)
+    fields: dict[str, Node] = dict(_rates(group))
+    for name in group:
+        if name in _HIDDEN:
+            continue
+        walk.objects[0] += 1
+        if walk.objects[0] > _MOST_OBJECTS:
+            raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+        link = group.get(name, getlink=True)
+        if isinstance(link, walk.h5py.ExternalLink):
+            walk.notes.append(f"{name} is a link to another file and is not read.")
+            continue
+        one = group.get(name)
+        node = None if one is None else _object(walk, one, name)
+        if node is not None:
+            fields[name] = node
+        if isinstance(one, walk.h5py.Dataset):
+            for key, rate in _rates(one).items():
+                fields.setdefault(key, rate)
+    walk.seen.pop()
+    return fields
+
+
+def _rates(one: Any) -> dict[str, Numbers]:
+    """Attributes that state a sampling rate or step, or the start of a record."""
+    found = {}
+    for key in one.attrs:
+        if role_of(key.removesuffix("_hz").removesuffix("_s")) in ("rate", "step") or key in (
+            "start_time_s",
+        ):
+            value = np.asarray(one.attrs[key])
+            if value.size == 1 and value.dtype.kind in "iuf":
+                found[key] = held(value.astype(float).reshape(1))
+    return found
+
+
+def _object(walk: _Walk, one: Any, name: str) -> Node | None:
+    """A group or data set as a node, or None with a note."""
+    kind = _attribute(one, "MATLAB_class")
+    if "MATLAB_object_decode" in one.attrs or kind in ("function_handle", "opaque"):
+        walk.notes.append(
+            f"variable {name} is a function handle or an object (string, table, …), which is not "
+            "read: save numbers, text, structs and cells instead."
+        )
+        return None
+    if isinstance(one, walk.h5py.Group):
+        return _structs(_group(walk, one)) if kind == "struct" else _group(walk, one)
+    if not isinstance(one, walk.h5py.Dataset) or "MATLAB_empty" in one.attrs:
+        return None
+    if _attribute(one, "NAME").startswith("This is a netCDF dimension but not"):
+        return None
+    reference = walk.h5py.check_ref_dtype(one.dtype) is walk.h5py.Reference
+    if reference:
+        return _references(walk, one, name)
+    if walk.h5py.check_string_dtype(one.dtype) is not None or kind == "char":
+        return _text(one, is_matlab=kind == "char")
+    why = _cannot_hold(walk, one)
+    if why:
+        walk.notes.append(f"{name} {why} and is not read.")
+        return None
+    if one.dtype.names and set(one.dtype.names) not in ({"real", "imag"}, {"r", "i"}):
+        return {
+            field: _numbers(walk, one, field=field)
+            for field in one.dtype.names
+            if one.dtype[field].kind in "biuf" and one.ndim == 1
+        }
+    if one.dtype.names is None and one.dtype.kind not in "biufc":
+        walk.notes.append(f"{name} is of type {one.dtype} and is not read.")
+        return None
+    return _numbers(walk, one, transposed=bool(kind)) if one.size else None
+
+
+def _structs(fields: dict[str, Node]) -> Node:
+    """A struct array of MATLAB (each field a list) as a list of structs, else the struct."""
+    lists = [len(node) for node in fields.values() if isinstance(node, _ArrayField)]
+    if len(lists) != len(fields) or not lists or len(set(lists)) > 1:
+        return fields
+    columns = {key: node for key, node in fields.items() if isinstance(node, list)}
+    return [{key: nodes[k] for key, nodes in columns.items()} for k in range(lists[0])]
+
+
+class _ArrayField(list):
+    """The values of one field of a struct array: references without a class of their own."""
+
+
+def _references(walk: _Walk, one: Any, name: str) -> Node | None:
+    """A cell array, or a field of a struct array."""
+    if one.size > _MOST_OBJECTS:
+        raise ValueError(f"{name} lists {one.size} entries")
+    nodes: list[list[Node]] = []
+    # MATLAB's columns are the rows of the file.
+    for row in np.atleast_2d(one[()]).T:
+        line: list[Node] = []
+        for reference in row:
+            walk.objects[0] += 1
+            if walk.objects[0] > _MOST_OBJECTS:
+                raise ValueError(f"it has more than {_MOST_OBJECTS} objects")
+            inner = one.file[reference] if reference else None
+            node = None if inner is None else _object(walk, inner, name)
+            if node is not None:
+                line.append(node)
+        nodes.append(line)
+    if one.ndim == 2 and min(one.shape) > 1:
+        return list(nodes)
+    flat = [node for line in nodes for node in line]
+    return flat if _attribute(one, "MATLAB_class") == "cell" else _ArrayField(flat)
+
+
+def _text(one: Any, *, is_matlab: bool) -> Node | None:
+    """Text, or a list of texts."""
+    if one.size > _LONGEST_TEXT:
+        return None
+    value = one[()]
+    if is_matlab:
+        codes = np.asarray(value).T.reshape(-1)
+        return "".join(chr(int(code)) for code in codes if 0 < int(code) < 0xD800)
+    texts = [
+        text.decode("utf-8", errors="replace") if isinstance(text, bytes) else str(text)
+        for text in np.atleast_1d(value).reshape(-1)
+    ]
+    return texts[0] if np.ndim(value) == 0 else list(texts)
+
+
+def _cannot_hold(walk: _Walk, one: Any) -> str:
+    """Why the numbers of a data set cannot be in this file, or nothing."""
+    if one.is_virtual or one.external:
+        return "lies in other files"
+    stored, wanted = one.id.get_storage_size(), one.size * one.dtype.itemsize
+    if one.size and not stored:
+        return "was declared but never written"
+    if stored > walk.size:
+        return f"states {stored} bytes in a file of {walk.size}"
+    if wanted > (_INFLATES * stored if one.chunks else stored):
+        return f"states {one.size} numbers, which the file cannot hold,"
+    if one.chunks and int(np.prod(one.chunks, dtype=object)) * one.dtype.itemsize > _LARGEST_CHUNK:
+        return f"is stored in pieces of more than {_LARGEST_CHUNK // 2**20} MiB"
+    return ""
+
+
+def _numbers(walk: _Walk, one: Any, *, transposed: bool = False, field: str = "") -> Numbers:
+    """A data set as numbers, which are read by opening the file again."""
+    scale, offset = _single(one, "scale_factor", 1.0), _single(one, "add_offset", 0.0)
+    fill = _single(one, "_FillValue", np.nan)
+    words = {key: _attribute(one, key) for key in _WORDS if key in one.attrs}
+    unit = next((_attribute(one, key) for key in _UNITS if key in one.attrs), "")
+    kind = one.dtype[field] if field else one.dtype
+    is_complex = kind.names is not None or kind.kind == "c"
+    packed = (scale, offset) != (1.0, 0.0) or (kind.kind in "iu" and not np.isnan(fill))
+    read = _reader(walk.path, one.name, field, transposed)
+
+    def unpacked(at: Selection) -> np.ndarray:
+        raw = read(at)
+        values = raw * scale + offset
+        return np.where(raw == fill, np.nan, values)
+
+    return Numbers(
+        one.shape[::-1] if transposed else one.shape,
+        unpacked if packed and not is_complex else read,
+        is_complex,
+        {**words, "unit": unit} if unit else words,
+    )
+
+
+def _reader(
+    path: Path, name: str, field: str, transposed: bool
+) -> Callable[[Selection], np.ndarray]:
+    """Reads a part of a data set; the file is open for that long only."""
+
+    def read(at: Selection) -> np.ndarray:
+        h5py = library("h5py", "reading HDF5")
+        with damaged_if_it_fails(path.name, "an HDF5 file"), h5py.File(path, "r") as file:
+            source = file[name].fields(field) if field else file[name]
+            values = np.asarray(source[at[::-1] if transposed else at])
+        if values.dtype.names:
+            real, imaginary = values.dtype.names
+            values = values[real] + 1j * values[imaginary]
+        return values.T if transposed else values
+
+    return read
+
+
+def _attribute(one: Any, key: str) -> str:
+    """A text among the attributes, empty where it is none."""
+    if key not in one.attrs:
+        return ""
+    value = one.attrs[key]
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    return value if isinstance(value, str) else ""
+
+
+def _single(one: Any, key: str, default: float) -> float:
+    """A single number among the attributes."""
+    if key not in one.attrs:
+        return default
+    value = np.asarray(one.attrs[key])
+    return float(value.reshape(-1)[0]) if value.size == 1 and value.dtype.kind in "iuf" else default

@@ -1,0 +1,184 @@
+"""Time records among named arrays: samples beside a sampling rate, a step or an even time."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Node, Numbers, PlacedSamples
+from snrmjax.io.laboratory.names import role_of
+from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.measure.recordings.channels import Channel, Quantity
+from snrmjax.measure.recordings.time_recording import TimeRecording, time_recording
+
+_SHORTEST = 64  # samples; shorter vectors beside a time are a table
+_MOST_CHANNELS = 4096
+_LOOK = 4096  # samples of a long time vector that are looked at, at each of three places
+_EVEN = 1e-3  # of a step: what rounding leaves of an even time
+_QUANTITIES: dict[str, Quantity] = {
+    "force": "force",
+    "displacement": "displacement",
+    "velocity": "velocity",
+    "acceleration": "acceleration",
+    "voltage": "voltage",
+}
+
+
+class FewRecordings(NamedTuple):
+    """The recordings of a struct, the arrays that they used, and notes."""
+
+    recordings: tuple[TimeRecording, ...]
+    used: frozenset[str]
+    notes: tuple[str, ...]
+
+
+class _Axis(NamedTuple):
+    length: int | None  # of the time vector
+    rate: float
+    start: float
+    used: tuple[str, ...]
+    note: str
+
+
+def recording_of(
+    name: str, numbers: Mapping[str, Numbers], words: Sequence[Sequence[Node]]
+) -> FewRecordings:
+    """The time record of a struct, if it has one.
+
+    Arguments: `words` are lists of text beside the arrays, in which names of channels may stand.
+    """
+    axis = _time_axis(numbers)
+    if axis is None:
+        return FewRecordings((), frozenset(), ())
+    if isinstance(axis, str):
+        return FewRecordings((), frozenset(), (axis,))
+    sampled = {
+        key: one
+        for key, one in numbers.items()
+        if key not in axis.used and not one.is_complex and len([n for n in one.shape if n != 1]) < 3
+    }
+    lengths = [max(one.shape, default=1) for one in sampled.values()]
+    long = axis.length or max(lengths, default=0)
+    if long < _SHORTEST:
+        return FewRecordings((), frozenset(), ())
+    alike = {key: one for key, one in sampled.items() if long in one.shape}
+    if any(role_of(key) == "frequency" and one.length == long for key, one in alike.items()):
+        return FewRecordings((), frozenset(), ())
+    places: list[ChannelPlace] = []
+    channels: list[Channel] = []
+    for key, one in alike.items():
+        side = one.shape.index(long)
+        others = 1 if one.length is not None else one.size // long
+        labels = next((list(map(str, word)) for word in words if len(word) == others > 1), None)
+        for k in range(others):
+            label = key if others == 1 else labels[k] if labels else f"{key}_{k + 1}"
+            places.append(ChannelPlace(one, side, k))
+            channels.append(_channel(label, one))
+    names = [one.name for one in channels]
+    if not channels or len(channels) > _MOST_CHANNELS:
+        return FewRecordings((), frozenset(), ())
+    if len(set(names)) < len(names):
+        channels = [one._replace(name=f"{one.name} #{k + 1}") for k, one in enumerate(channels)]
+    record = time_recording(
+        PlacedSamples(places, long),
+        channels,
+        axis.rate,
+        start_time=axis.start,
+        name=name,
+        notes=[axis.note] if axis.note else [],
+    )
+    return FewRecordings((record,), frozenset((*alike, *axis.used)), ())
+
+
+def _channel(name: str, one: Numbers) -> Channel:
+    """A channel with what the file says of it."""
+    quantity, calibration = channel_meaning(one.unit)
+    told = _QUANTITIES.get(one.attributes.get("quantity", ""))
+    return Channel(
+        name,
+        quantity if quantity != "unknown" or told is None else told,
+        one.unit,
+        calibration,
+        one.attributes.get("point", ""),
+        one.attributes.get("direction", ""),
+    )
+
+
+def _time_axis(numbers: Mapping[str, Numbers]) -> _Axis | str | None:
+    """The rate of samples: stated, or of a time vector; a note where that one is uneven."""
+    single = {key: one for key, one in numbers.items() if one.size == 1 and not one.is_complex}
+    start = 0.0
+    used_start: tuple[str, ...] = ()
+    for key, one in single.items():
+        if key in ("start_time_s", "start_time", "t0"):
+            start, used_start = _only(one), (key,)
+    if not np.isfinite(start):
+        start, used_start = 0.0, ()
+    stated: tuple[float, str] | None = None
+    for key, one in single.items():
+        if role_of(key) in ("rate", "step"):
+            value = _only(one)
+            value = 1 / value if role_of(key) == "step" and value > 0 else value
+            if np.isfinite(value) and value > 0:
+                stated = (value, key)
+                break
+    vectors = [
+        key
+        for key, one in numbers.items()
+        if role_of(key.removesuffix("_s")) == "time"
+        and one.length is not None
+        and one.length >= _SHORTEST
+        and not one.is_complex
+    ]
+    if stated is not None:
+        used = (stated[1], *used_start, *vectors[:1])
+        length = numbers[vectors[0]].length if vectors else None
+        if vectors and not used_start:
+            start = float(_look(numbers[vectors[0]], 0, 1)[0])
+            start = start if np.isfinite(start) else 0.0
+        return _Axis(length, stated[0], start, used, "")
+    if not vectors:
+        return None
+    return _even_axis(vectors[0], numbers[vectors[0]])
+
+
+def _even_axis(key: str, one: Numbers) -> _Axis | str:
+    """Rate and start of a time vector, looked at whole or, where it is long, at three places."""
+    n = one.length or 0
+    first, last = float(_look(one, 0, 1)[0]), float(_look(one, n - 1, n)[0])
+    step = (last - first) / (n - 1)
+    uneven = f"{key} is no even time and is read as a column."
+    if not (np.isfinite(step) and step > 0 and np.isfinite(1 / step)):
+        return uneven
+    for start in sorted({0, max(0, n // 2 - _LOOK // 2), max(0, n - _LOOK)}):
+        stop = min(start + _LOOK, n)
+        expected = first + step * np.arange(start, stop)
+        # Times of many seconds in few digits: rounding by the resolution of what is written.
+        slack = _EVEN * step + 4e-16 * abs(last) + _single(one) * abs(last)
+        if not np.all(np.abs(_look(one, start, stop) - expected) <= slack):
+            return uneven
+    rate = 1 / step
+    whole = round(rate)
+    if whole and abs(rate - whole) < 1e-6 * rate * min(1.0, 1e3 / n):
+        rate = float(whole)
+    unit = one.unit.lower()
+    factor = 1e3 if unit in ("ms", "msec") else 1e6 if unit in ("us", "µs", "μs") else 1.0
+    note = f"{key} was looked at in three places: even steps." if n > 3 * _LOOK else ""
+    return _Axis(n, rate * factor, first / factor, (key,), note)
+
+
+def _single(one: Numbers) -> float:
+    """Relative resolution of times that are stored in single precision, else 0."""
+    kind = _look(one, 0, 1).dtype
+    return 1.2e-7 if kind == np.float32 else 0.0
+
+
+def _look(one: Numbers, start: int, stop: int) -> np.ndarray:
+    """A stretch of a vector, whichever way it lies."""
+    at = tuple(slice(start, stop) if n != 1 else slice(0, 1) for n in one.shape)
+    return one.read(at).reshape(-1)
+
+
+def _only(one: Numbers) -> float:
+    """A single number."""
+    return float(one.read(tuple(slice(0, 1) for _ in one.shape)).reshape(-1)[0])

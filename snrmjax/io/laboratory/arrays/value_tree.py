@@ -1,0 +1,105 @@
+"""Named arrays of a file as a tree of structs, lists, text and numbers that are read when asked."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Union
+
+import numpy as np
+from jaxtyping import Num
+
+from snrmjax.io.laboratory.libraries import Budget
+from snrmjax.measure.recordings.time_recording import AbstractSamples
+
+Selection = tuple[slice, ...]
+
+
+class Numbers(NamedTuple):
+    """An array of a file: its shape is known, its numbers are read when asked.
+
+    `read` takes one slice an axis. `attributes` are words that the file has for it: "unit",
+    "quantity", "point", "direction".
+    """
+
+    shape: tuple[int, ...]
+    read: Callable[[Selection], Num[np.ndarray, "..."]]
+    is_complex: bool = False
+    attributes: Mapping[str, str] = {}
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return int(np.prod(self.shape, dtype=object)) if self.shape else 1
+
+    @property
+    def length(self) -> int | None:
+        """Length of a vector (a row, a column, or of one axis), else None."""
+        long = [n for n in self.shape if n != 1]
+        return None if len(long) > 1 else (long[0] if long else 1)
+
+    @property
+    def unit(self) -> str:
+        """The file's word for the unit."""
+        return self.attributes.get("unit", "")
+
+    def all(self, budget: Budget, name: str) -> Num[np.ndarray, "..."]:
+        """All of it, counted; integers and booleans as they are."""
+        budget.spend(self.size * (2 if self.is_complex else 1), name)
+        return self.read(tuple(slice(0, n) for n in self.shape))
+
+    def vector(self, budget: Budget, name: str) -> Num[np.ndarray, " row"]:
+        """A vector, whichever way it lies."""
+        return self.all(budget, name).reshape(-1)
+
+
+Node = Union[Numbers, str, list["Node"], dict[str, "Node"]]  # noqa: UP007
+
+
+def held(values: Num[np.ndarray, "..."], attributes: Mapping[str, str] | None = None) -> Numbers:
+    """Numbers that are in memory already."""
+    array = np.asarray(values)
+    return Numbers(
+        array.shape, lambda at: array[at], bool(np.iscomplexobj(array)), dict(attributes or {})
+    )
+
+
+class ChannelPlace(NamedTuple):
+    """Where a channel's samples lie: an array, its axis of samples, and the place on the other."""
+
+    numbers: Numbers
+    axis: int
+    other: int
+
+
+class PlacedSamples(AbstractSamples):
+    """Channels in vectors and in columns of matrices of a file."""
+
+    def __init__(self, places: Sequence[ChannelPlace], n_samples: int) -> None:
+        self._places, self._samples = tuple(places), n_samples
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """See `AbstractSamples.shape`."""
+        return len(self._places), self._samples
+
+    def read(
+        self, channels: Sequence[int], start: int, stop: int
+    ) -> Num[np.ndarray, "channel sample"]:
+        """See `AbstractSamples.read`. Channels of one matrix are read together."""
+        chosen = [self._places[k] for k in channels]
+        rows: list[np.ndarray | None] = [None] * len(chosen)
+        for k, place in enumerate(chosen):
+            if rows[k] is not None:
+                continue
+            alike = [m for m, one in enumerate(chosen) if one.numbers is place.numbers]
+            others = [chosen[m].other for m in alike]
+            at = [slice(0, n) for n in place.numbers.shape]
+            at[place.axis] = slice(start, stop)
+            wide = len(at) > 1
+            if wide:
+                at[1 - place.axis] = slice(min(others), max(others) + 1)
+            found = place.numbers.read(tuple(at))
+            for m, other in zip(alike, others, strict=True):
+                if wide:
+                    rows[m] = np.take(found, other - min(others), axis=1 - place.axis)
+                else:
+                    rows[m] = found
+        return np.stack([row for row in rows if row is not None])

@@ -1,0 +1,225 @@
+"""MATLAB, HDF5 and netCDF files by scipy, h5py and xarray: what their structs hold."""
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import xarray
+
+from snrmjax.io.laboratory import read_laboratory_file
+
+HERTZ = np.array([79.0, 79.5, 80.0])
+
+
+def level(k):
+    return {
+        "frequency": HERTZ + k,
+        "force": np.full(3, 0.1 * k),
+        "amplitude": np.array([1.0, 2.0, 3.0]) * k,
+        "phase": np.array([10.0, 20.0, 30.0]),
+        "drive": 0.5 * k,
+    }
+
+
+def write_v73(path, fill):
+    """A file as MATLAB v7.3 lays it out: 512 bytes of user block, then HDF5."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        fill(file)
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\x00\x02IM")
+
+
+def put(group, name, value, matlab_class=b"double"):
+    """A matrix in MATLAB's layout: its columns are rows of the file."""
+    one = group.create_dataset(name, data=np.atleast_2d(value).T)
+    one.attrs["MATLAB_class"] = np.bytes_(matlab_class)
+    return one
+
+
+def struct_array(file, structs):
+    """A struct array: each field a data set of references."""
+    refs = file.create_group("#refs#")
+    group = file.create_group("data")
+    group.attrs["MATLAB_class"] = np.bytes_(b"struct")
+    for key in structs[0]:
+        inner = [put(refs, f"{key}{k}", one[key]).ref for k, one in enumerate(structs)]
+        group.create_dataset(key, data=np.array([inner], dtype=h5py.ref_dtype).T)
+
+
+def cells(file, structs):
+    """A cell array of structs."""
+    refs = file.create_group("#refs#")
+    inner = []
+    for k, one in enumerate(structs):
+        group = refs.create_group(f"s{k}")
+        group.attrs["MATLAB_class"] = np.bytes_(b"struct")
+        for key, value in one.items():
+            put(group, key, value)
+        inner.append(group.ref)
+    one = file.create_dataset("data", data=np.array([inner], dtype=h5py.ref_dtype).T)
+    one.attrs["MATLAB_class"] = np.bytes_(b"cell")
+
+
+@pytest.mark.parametrize("version", ["v5", "v5 compressed", "v5 cells", "v7.3", "v7.3 cells"])
+def test_one_list_entry_a_level(tmp_path, version):
+    path = tmp_path / "levels.mat"
+    structs = [level(1), level(2)]
+    if version.startswith("v5"):
+        data = np.empty(2, dtype=object)
+        data[:] = structs
+        if "cells" not in version:
+            kinds = [(key, object) for key in structs[0]]
+            data = np.array([tuple(one.values()) for one in structs], dtype=kinds)
+        scipy.io.savemat(path, {"data": data}, do_compression="comp" in version)
+    else:
+        write_v73(path, lambda file: (cells if "cells" in version else struct_array)(file, structs))
+    found = read_laboratory_file(path)
+    assert found.kind == "matlab"
+    (table,) = found.tables
+    assert table.name == "data"
+    np.testing.assert_array_equal(table.columns["entry"], [1, 1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(table.columns["frequency"], [*(HERTZ + 1), *(HERTZ + 2)])
+    np.testing.assert_array_equal(table.columns["amplitude"], [1, 2, 3, 2, 4, 6])
+    np.testing.assert_array_equal(table.columns["drive"], [0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+
+
+def test_matrices_of_states_by_levels(tmp_path):
+    path = tmp_path / "matrices.mat"
+    force = np.array([[0.1, 0.2], [0.1, 0.2], [0.1, 0.2]])
+    h = np.arange(6.0).reshape(3, 2) + 1j
+    scipy.io.savemat(path, {"freq": HERTZ, "Force": force, "X": h.real, "Y": h.imag})
+    (table,) = read_laboratory_file(path).tables
+    np.testing.assert_array_equal(table.columns["entry"], [1, 1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(table.columns["X"], [0, 2, 4, 1, 3, 5])
+    np.testing.assert_array_equal(table.columns["freq"], [*HERTZ, *HERTZ])
+
+
+def test_columns_of_sensors_stay_columns(tmp_path):
+    path = tmp_path / "sensors.mat"
+    scipy.io.savemat(
+        path,
+        {"freq": HERTZ, "force": np.ones(3), "amp": np.arange(6.0).reshape(3, 2), "ph": HERTZ},
+    )
+    (table,) = read_laboratory_file(path).tables
+    assert set(table.columns) == {"freq", "force", "ph", "amp_1", "amp_2"}
+    np.testing.assert_array_equal(table.columns["amp_2"], [1, 3, 5])
+
+
+def test_complex_columns_and_matrices_of_responses(tmp_path):
+    path = tmp_path / "frf.mat"
+    h = np.arange(6).reshape(2, 3) * (1 + 1j)
+    scipy.io.savemat(path, {"f": HERTZ, "H": h, "H1": h[0]})
+    found = read_laboratory_file(path)
+    (one,) = found.responses
+    np.testing.assert_array_equal(one.values[:, 0], h)
+    np.testing.assert_array_equal(one.frequency, HERTZ * 2 * np.pi)
+    np.testing.assert_array_equal(found.tables[0].columns["H1"], h[0])
+
+
+@pytest.mark.parametrize("version", ["v5", "v7.3", "hdf5", "netcdf"])
+def test_a_time_record_with_a_table_of_steps(tmp_path, version):
+    rng = np.random.default_rng(2)
+    time, force, response = np.arange(500) / 2048 + 0.25, rng.normal(size=500), rng.normal(size=500)
+    steps = {"frequency": HERTZ, "start": np.array([0.0, 0.1, 0.2]), "level": np.array([1.0, 1, 2])}
+    path = (
+        tmp_path / f"record.{'mat' if version[0] == 'v' else 'h5' if version[0] == 'h' else 'nc'}"
+    )
+    if version == "v5":
+        scipy.io.savemat(path, {"time": time, "F": force, "acc": response, "steps": steps})
+    elif version == "v7.3":
+
+        def fill(file):
+            for key, values in {"time": time, "F": force, "acc": response}.items():
+                put(file, key, values)
+            group = file.create_group("steps")
+            group.attrs["MATLAB_class"] = np.bytes_(b"struct")
+            for key, values in steps.items():
+                put(group, key, values)
+
+        write_v73(path, fill)
+    elif version == "hdf5":
+        with h5py.File(path, "w") as file:
+            both = file.create_dataset("run/channels", data=np.stack([force, response], axis=1))
+            both.attrs["sampling_rate"], both.attrs["unit"] = 2048.0, "g"
+            file.create_dataset("run/names", data=["F", "acc"])
+            for key, values in steps.items():
+                file.create_dataset(f"steps/{key}", data=values)
+    else:
+        steps = {key: ("step", values) for key, values in steps.items()}
+        units = {"units": "N"}
+        records = {"F": ("time", force, units), "acc": ("time", response)}
+        xarray.Dataset({**records, **steps}, coords={"time": time}).to_netcdf(
+            path, engine="h5netcdf"
+        )
+    found = read_laboratory_file(path)
+    (record,) = found.recordings
+    assert record.channel_names == ("F", "acc")
+    assert record.sampling_rate == 2048
+    assert record.start_time == (0.0 if version == "hdf5" else 0.25)
+    values = record.values() / (9.80665 if version == "hdf5" else 1)
+    np.testing.assert_allclose(values, [force, response], rtol=1e-15)
+    np.testing.assert_array_equal(record.values(["acc"], 3, 7), record.values()[1:, 3:7])
+    assert record.channels[0].quantity == {"hdf5": "acceleration", "netcdf": "force"}.get(
+        version, "unknown"
+    )
+    (table,) = found.tables
+    np.testing.assert_array_equal(table.columns["frequency"], HERTZ)
+
+
+def test_packed_netcdf_numbers_are_unpacked(tmp_path):
+    path = tmp_path / "packed.nc"
+    packing = {"dtype": "int16", "scale_factor": 0.25, "add_offset": 1.0, "_FillValue": -99}
+    xarray.Dataset({"force": ("n", [1.5, np.nan, 2.0])}).to_netcdf(
+        path, engine="h5netcdf", encoding={"force": packing}
+    )
+    (table,) = read_laboratory_file(path).tables
+    np.testing.assert_array_equal(table.columns["force"], [1.5, np.nan, 2.0])
+
+
+def test_an_uneven_time_is_a_column(tmp_path):
+    path = tmp_path / "uneven.mat"
+    time = np.cumsum(1 + 0.01 * np.random.default_rng(0).normal(size=100))
+    scipy.io.savemat(path, {"t": time, "x": time})
+    found = read_laboratory_file(path)
+    assert not found.recordings
+    assert "no even time" in found.notes[0]
+    assert set(found.tables[0].columns) == {"t", "x"}
+
+
+def test_function_handles_and_objects_are_named(tmp_path):
+    path = tmp_path / "handle.mat"
+
+    def fill(file):
+        put(file, "x", HERTZ)
+        put(file, "f", [[1.0]], b"function_handle")
+        one = put(file, "s", [[1.0, 2.0]], b"string")
+        one.attrs["MATLAB_object_decode"] = 3
+
+    write_v73(path, fill)
+    found = read_laboratory_file(path)
+    assert sum("function handle or an object" in note for note in found.notes) == 2
+    assert set(found.tables[0].columns) == {"x"}
+
+
+def test_links_to_other_files_are_not_followed(tmp_path):
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file["x"] = HERTZ
+    path = tmp_path / "links.h5"
+    with h5py.File(path, "w") as file:
+        file["a"] = h5py.ExternalLink(tmp_path / "secret.h5", "x")
+        file["again"] = h5py.SoftLink("/")
+        layout = h5py.VirtualLayout((3,), float)
+        layout[:] = h5py.VirtualSource(tmp_path / "secret.h5", "x", (3,))
+        file.create_virtual_dataset("v", layout)
+        file["gone"] = h5py.SoftLink("/nowhere")
+    with pytest.raises(ValueError, match="nothing that could be read"):
+        read_laboratory_file(path)
+
+
+def test_more_numbers_than_the_file_can_hold(tmp_path):
+    path = tmp_path / "empty.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", shape=(10**12,), dtype="f8", chunks=(1024,))
+        file.create_dataset("y", shape=(10**9,), dtype="f8")
+    with pytest.raises(ValueError, match="never written"):
+        read_laboratory_file(path)
