@@ -4,6 +4,8 @@ from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_
 from .indicators import appropriation_of, mode_indicator, nnm_appropriation
 from .recordings.channels import Channel
 from .recordings.frequency_responses import FrequencyResponses, frequency_responses
+from .recordings.multisine import MultisineResponses, multisine_responses
+from .recordings.ring_down import RingDown, find_ring_downs
 from .recordings.stepped_sine import SteppedSineStates, StepStatus, stepped_sine_states
 from .recordings.time_recording import TimeRecording, time_recording
 from .records import RecordFit, fit_records, steady_state_from_records
@@ -21,8 +23,10 @@ __all__ = [
     "FrequencyResponses",
     "HarmonicFit",
     "HarmonicFitStatus",
+    "MultisineResponses",
     "OptionalColumns",
     "RecordFit",
+    "RingDown",
     "SteadyStates",
     "StepStatus",
     "SteppedSineStates",
@@ -34,12 +38,14 @@ __all__ = [
     "appropriation_of",
     "calibrate_force",
     "equivalent_force",
+    "find_ring_downs",
     "fit_harmonics",
     "fit_records",
     "force_velocity_loop",
     "frequency_responses",
     "join_steady_states",
     "mode_indicator",
+    "multisine_responses",
     "nnm_appropriation",
     "peak_amplitude",
     "phasor_relative_to_force",

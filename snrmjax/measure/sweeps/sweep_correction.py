@@ -19,11 +19,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 _LOUD = 0.1  # of the largest amplitude: below, other modes are heard
-_KNOTS = 7
-_PER_KNOT = 6  # states
-_SMOOTH = 1e-3  # of the balance, against bends between knots that no state shows
+_STIFFNESS = (0, 1, 2, 3, 4)  # powers of |a| of which ω̃² is made
+_DAMPING = (0, -1, 1, 2)  # and c; friction's falls as 1/|a|
+_PER_POWER = 6  # states
+_KNOTS = 25  # amplitudes at which both are given
 _SURE = 0.25  # relative 1σ of the modal constant up to which it is believed
 _ROUNDS = 3
+_BLURRED = 0.01  # of the force: error by the phasor's change up to which a state is used
+_PARTS = 8  # of the states, left out one after the other
 
 
 class SweptMotion(NamedTuple):
@@ -35,6 +38,11 @@ class SweptMotion(NamedTuple):
     displacement: Complex[np.ndarray, " state"]  # m
     first: Complex[np.ndarray, " state"]  # m/s, its derivative
     second: Complex[np.ndarray, " state"]  # m/s²
+    first_std: Float[np.ndarray, " state"]  # m/s, of `first`
+
+    def part(self, rows: np.ndarray) -> "SweptMotion":
+        """Some of the states."""
+        return SweptMotion._make(column[rows] for column in self)
 
 
 class ModalBalance(NamedTuple):
@@ -54,58 +62,81 @@ class ModalBalance(NamedTuple):
 
 
 def modal_balance(motion: SweptMotion) -> ModalBalance:
-    """Modal constant, stiffness and damping by amplitude from swept states, by least squares."""
+    """Modal constant, stiffness and damping by amplitude from swept states, by least squares.
+
+    The 1σ of the constant is by leaving out one eighth of the states after the other: where each
+    amplitude is passed once only, the sweep hardly says it.
+    """
     size = np.abs(motion.displacement)
-    loud = size > _LOUD * size.max()
-    used = SweptMotion(*(column[loud] for column in motion))
-    size = size[loud]
-    count = int(np.clip(len(size) // _PER_KNOT, 1, _KNOTS))
-    knots = np.linspace(size.min(), size.max(), count) if count > 1 else np.array([size.max()])
-    hats = np.stack([np.interp(size, knots, row) for row in np.eye(count)], axis=1)
-    if len(size) < 2 * count + 2:
+    used = motion.part(size > _LOUD * size.max())
+    knots = np.linspace(*_range(used), _KNOTS)
+    found = _solved(used, knots)
+    if np.isfinite(found.constant):
+        # Once more without states that are blurred: at a jump, where a sweep begins.
+        blur = 2 * used.frequency * used.first_std / np.abs(found.constant * used.force)
+        used = used.part(blur < _BLURRED)
+        found = _solved(used, knots) if used.frequency.size else _unknown(knots)
+    if not np.isfinite(found.constant):
+        return found
+    place = np.arange(len(used.frequency)) * _PARTS // len(used.frequency)
+    others = np.array([_solved(used.part(place != k), knots).constant for k in range(_PARTS)])
+    std = float(np.sqrt((_PARTS - 1) / _PARTS * np.sum((others - others.mean()) ** 2)))
+    std = float(np.hypot(std, found.constant_std))
+    if not std < _SURE * abs(found.constant):
         return _unknown(knots)
+    return found._replace(constant_std=std)
+
+
+def _range(motion: SweptMotion) -> tuple[float, float]:
+    size = np.abs(motion.displacement)
+    return float(size.min()), float(size.max())
+
+
+def _solved(used: SweptMotion, knots: np.ndarray) -> ModalBalance:
+    """The least-squares fit to some states; its 1σ is that of independent errors."""
+    size, largest = np.abs(used.displacement), float(knots[-1])
+    powers = max(1, min(len(_STIFFNESS), len(size) // _PER_POWER))
+    damped = min(powers, len(_DAMPING))
+    if len(size) < powers + damped + 3:
+        return _unknown(knots)
+
+    def terms(amplitude: np.ndarray, of: tuple[int, ...]) -> np.ndarray:
+        return (amplitude[:, None] / largest) ** np.array(of, dtype=float)
+
     per_motion = used.force / used.displacement
-    none = np.zeros((len(size), count))
     # Each state weighs as its amplitude: errors of F/a grow as it falls.
-    weight = np.tile(size / size.max(), 2)
-    scale = np.median(used.frequency) ** 2
-    omega = used.frequency[:, None]
-    unit = scale / np.median(np.abs(per_motion))
+    weight = np.tile(size / largest, 2)
+    scale = float(np.median(used.frequency)) ** 2
+    unit = scale / float(np.median(np.abs(per_motion)))
+    stiff = terms(size, _STIFFNESS[:powers])
+    lossy = terms(size, _DAMPING[:damped])
+    none = [np.zeros_like(lossy), np.zeros_like(stiff)]
+    turned = used.frequency[:, None] * np.sqrt(scale)
     design = np.block(
         [
-            [per_motion.real[:, None] * unit, -hats * scale, none],
-            [per_motion.imag[:, None] * unit, none, -omega * hats * np.sqrt(scale)],
+            [per_motion.real[:, None] * unit, -stiff * scale, none[0]],
+            [per_motion.imag[:, None] * unit, none[1], -turned * lossy],
         ]
     )
-    bends = np.zeros((2 * max(count - 2, 0), design.shape[1]))
-    for k in range(count - 2):
-        for part in range(2):
-            at = 1 + part * count + k
-            bends[part * (count - 2) + k, at : at + 3] = [1, -2, 1]
-    bends *= _SMOOTH * scale * np.sqrt(len(size))
     damping = np.zeros(len(size))
     for _ in range(_ROUNDS):
         moving = _moving(used, damping) / used.displacement
         right = np.concatenate([moving.real - used.frequency**2, moving.imag])
-        rows = np.concatenate([design * weight[:, None], bends])
-        wanted = np.concatenate([right * weight, np.zeros(len(bends))])
+        rows, wanted = design * weight[:, None], right * weight
         found, _, rank, _ = np.linalg.lstsq(rows, wanted, rcond=None)
-        damping = hats @ found[1 + count :] * np.sqrt(scale)
+        damping = lossy @ found[1 + powers :] * np.sqrt(scale)
     if rank < design.shape[1]:
         return _unknown(knots)
     rest = rows @ found - wanted
-    freedom = max(2 * len(size) - design.shape[1], 1)
-    spread = np.linalg.inv(rows.T @ rows)[0, 0] * np.sum(rest**2) / freedom
-    constant, std = found[0] * unit, float(np.sqrt(spread)) * unit
-    if not (std < _SURE * abs(constant)):
-        return _unknown(knots)
-    left = (design @ found - right) * np.tile(size / np.abs(used.force), 2) / abs(constant)
+    spread = np.linalg.inv(rows.T @ rows)[0, 0] * np.sum(rest**2)
+    spread /= max(len(rest) - design.shape[1], 1)
+    left = (design @ found - right) * np.tile(size / np.abs(used.force), 2) / abs(found[0] * unit)
     return ModalBalance(
-        float(constant),
-        std,
+        float(found[0] * unit),
+        float(np.sqrt(spread)) * unit,
         knots,
-        found[1 : 1 + count] * scale,
-        found[1 + count :] * np.sqrt(scale),
+        terms(knots, _STIFFNESS[:powers]) @ found[1 : 1 + powers] * scale,
+        terms(knots, _DAMPING[:damped]) @ found[1 + powers :] * np.sqrt(scale),
         float(np.sqrt(2 * np.mean(left**2))),
     )
 

@@ -49,6 +49,7 @@ def motion_of(moments: list[Moment], reference: int) -> SweptMotion:
         series[:, 0],
         series[:, 1],
         2 * series[:, 2],
+        np.array([one.motion_std[reference, 1] for one in moments]),
     )
 
 
@@ -61,8 +62,7 @@ def held_force(
     if not corrected:
         return motion.force, std
     moving = balance.force_to_move(motion)
-    slope = np.array([one.motion_std[reference, 1] for one in moments])
-    of_slope = 2 * motion.frequency * slope / abs(balance.constant)
+    of_slope = 2 * motion.frequency * motion.first_std / abs(balance.constant)
     of_constant = np.abs(moving) * balance.constant_std / abs(balance.constant)
     return motion.force - moving, np.sqrt(std**2 + of_slope**2 + of_constant**2)
 

@@ -95,7 +95,9 @@ def test_swept_states_are_those_of_a_stepped_sine(name, first, last):
     plain = sj.measure.sweep_states(record, "CH1", ["CH2"], correct=False)
     assert found.corrected
     size = np.abs(np.asarray(found.states.velocity)[:, 0])
-    loud = np.flatnonzero(size > 0.3 * size.max())
+    # Close to a jump no force holds the state for long: it is not what a stepped sine could do.
+    slow = np.abs(found.moving) < (0.08 if name == "hardening" else 1.0)
+    loud = np.flatnonzero((size > 0.3 * size.max()) & slow)
     error, before = [], []
     for k in loud[:: max(1, len(loud) // 4)]:
         error.append(
@@ -110,7 +112,7 @@ def test_swept_states_are_those_of_a_stepped_sine(name, first, last):
     assert max(before) > 0.05 or name == "hardening"
     assert max(error) < 3e-3
     # The modal constant of 1 kg.
-    assert abs(found.balance.constant - 1) < max(3 * found.balance.constant_std, 5e-3)
+    assert abs(found.balance.constant - 1) < 3 * found.balance.constant_std
 
 
 def test_a_linear_sweep_in_exact_numbers_and_its_predicted_bias():

@@ -1,0 +1,327 @@
+"""Frequency responses and distortion levels from periodic multisines.
+
+Whatever repeats from period to period is signal, the rest is noise; whatever differs from one
+realisation of random phases to the next beyond noise is nonlinear. A multisine that leaves out some
+lines shows at odd and at even ones among them what an odd and an even nonlinearity do.
+
+Reference: R. Pintelon & J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.
+(2012), section 4.3 (robust and fast method for the best linear approximation).
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from snrmjax.measure.recordings.channels import Channel, channel_number
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+_EXCITED = 0.03  # of the largest line of the force, that an excited line has at least
+_SURE = 25.0  # and so many variances of its mean above noise
+_MOST_SAMPLES = 2**21  # from whose start a period is sought
+_REPEATS = 0.5  # least correlation of a record with itself a period later
+_BEST = 0.9  # of the best correlation: the first lag of so much is the period
+_OFF = 0.05  # samples by which a period may miss a whole number
+
+
+class MultisineResponses(AbstractResult):
+    """Best linear approximation of multisine tests, its errors and distortion levels.
+
+    Standard deviations are rms of the complex errors of the means. `total_std` holds nonlinear
+    scatter from realisation to realisation too; NaN for one realisation. Levels at detection lines
+    (not excited, within the excited band) are peak amplitudes in SI units of the responses.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("frequency_hz", "line_hz", "response")
+
+    responses: FrequencyResponses
+    noise_std: Float[np.ndarray, "response frequency"]
+    total_std: Float[np.ndarray, "response frequency"]
+    output: Float[np.ndarray, "response frequency"]  # amplitudes at the excited lines
+    line: Float[np.ndarray, " line"]  # rad/s, detection lines
+    odd: Bool[np.ndarray, " line"]  # whether a detection line is an odd multiple of 1/period
+    distortion: Float[np.ndarray, "response line"]
+    distortion_noise: Float[np.ndarray, "response line"]  # 1σ of noise there
+    period: float = eqx.field(static=True)  # s
+    periods: int = eqx.field(static=True)  # used of each realisation
+    realisations: int = eqx.field(static=True)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        hertz = self.responses.frequency / _HERTZ
+        size = np.sqrt(np.mean(self.output**2))
+        lines = [
+            f"MultisineResponses: {len(hertz)} lines, {hertz[0]:.6g} to {hertz[-1]:.6g} Hz, "
+            f"{self.periods} periods of {self.period:.4g} s, {self.realisations} realisations",
+            f"noise {100 * _relative(self.noise_std, self.responses.values):.2g} %",
+        ]
+        if self.realisations > 1:
+            share = 100 * _relative(self.total_std, self.responses.values)
+            lines.append(f"noise and nonlinear scatter {share:.2g} %")
+        for name, chosen in (("odd", self.odd), ("even", ~self.odd)):
+            if chosen.any():
+                level, noise = (
+                    20 * np.log10(max(np.sqrt(np.mean(one[:, chosen] ** 2)) / size, 1e-16))
+                    for one in (self.distortion, self.distortion_noise)
+                )
+                lines.append(
+                    f"{name} distortion {level:.1f} dB of the output, noise {noise:.1f} dB"
+                )
+        return tuple(lines)
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        at, seen = ("response", "frequency_hz"), ("response", "line_hz")
+        names = np.array([one.name for one in self.responses.responses], dtype=str)
+        hertz = self.responses.frequency / _HERTZ
+        values = self.responses.values[:, 0]
+        return {
+            "response": Variable(at[:1], names, "", "response channel"),
+            "frequency_hz": Variable(at[1:], hertz, "Hz", "excited line"),
+            "line_hz": Variable(seen[1:], self.line / _HERTZ, "Hz", "detection line"),
+            "value_re": Variable(at, values.real, "SI", "real part of the response"),
+            "value_im": Variable(at, values.imag, "SI", "imaginary part of the response"),
+            "noise_std": Variable(at, self.noise_std, "SI", "error by noise"),
+            "total_std": Variable(at, self.total_std, "SI", "error by noise and nonlinearity"),
+            "odd": Variable(seen[1:], self.odd, "", "odd line"),
+            "distortion": Variable(seen, self.distortion, "SI", "amplitude at the line"),
+            "distortion_noise": Variable(seen, self.distortion_noise, "SI", "noise at the line"),
+        }
+
+
+def _relative(std: np.ndarray, values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(std**2) / np.mean(np.abs(values) ** 2)))
+
+
+def multisine_responses(
+    recordings: TimeRecording | Sequence[TimeRecording],
+    force: str,
+    responses: Sequence[str],
+    *,
+    period: float | None = None,
+    skip: int = 1,
+    lines: Float[np.ndarray, " line"] | Sequence[float] | None = None,
+) -> MultisineResponses:
+    """Best linear approximation from several periods and realisations of a multisine.
+
+    G(k) is the mean over realisations of the ratio of the spectra's means over periods. Only one
+    period is held in memory.
+
+    Arguments: `recordings`, one a realisation of random phases, with the same channels and rate;
+    `force` and `responses` by their channels' names; `period` in s, found where it is not stated;
+    `skip` periods at the start of each record are left out, until the transient is over; `lines`
+    in rad/s are the excited ones, found where they are not stated.
+    Returns `MultisineResponses`. Raises `ValueError` for channels or rates that differ, a period
+    that is not found or no whole number of samples, fewer than two periods after those left out,
+    lines between multiples of 1/period, no excited line, and samples that are not finite.
+    Reference: Pintelon & Schoukens (2012), section 4.3.
+    """
+    records = (recordings,) if isinstance(recordings, TimeRecording) else tuple(recordings)
+    names = (force, *((responses,) if isinstance(responses, str) else tuple(responses)))
+    _check(records, names, skip)
+    rate = records[0].sampling_rate
+    samples = _found_period(records[0], force) if period is None else _stated(period, rate)
+    spectra = [_spectra(one, names, samples, skip) for one in records]
+    periods = min(one.periods for one in spectra)
+    excited = _lines(lines, spectra[0], rate, samples)
+    ratio, noise = zip(*(_response(one, excited) for one in spectra), strict=True)
+    mean = np.mean(ratio, axis=0)
+    count = len(records)
+    noise_std = np.sqrt(np.mean(noise, axis=0) / count)
+    scatter = np.sum(np.abs(np.array(ratio) - mean) ** 2, axis=0) / max(count - 1, 1) / count
+    total = (
+        np.sqrt(np.maximum(scatter, noise_std**2)) if count > 1 else np.full_like(scatter, np.nan)
+    )
+    detection = np.setdiff1d(np.arange(excited[0], excited[-1] + 1), excited)
+    level, floor = _distortion(spectra, mean, excited, detection)
+    turned = _HERTZ * rate / samples
+    found = frequency_responses(
+        excited * turned,
+        mean[:, None],
+        [_in_si(records[0], name) for name in names[1:]],
+        [_in_si(records[0], force)],
+        averages=periods * count,
+        name=records[0].name,
+    )
+    return MultisineResponses(
+        found,
+        noise_std,
+        total,
+        np.sqrt(np.mean([np.abs(one.mean[1:, excited]) ** 2 for one in spectra], axis=0)),
+        detection * turned,
+        detection % 2 == 1,
+        level,
+        floor,
+        samples / rate,
+        periods,
+        count,
+    )
+
+
+class _Spectra(NamedTuple):
+    """Mean spectrum over periods (peak amplitudes) and the covariance of a single period."""
+
+    mean: Complex[np.ndarray, "channel line"]
+    variance: Float[np.ndarray, "channel line"]
+    mixed: Complex[np.ndarray, "channel line"]  # covariance with the first channel
+    periods: int
+
+
+def _check(records: tuple[TimeRecording, ...], names: tuple[str, ...], skip: int) -> None:
+    if not records:
+        raise ValueError("`recordings` must hold one realisation at least, but is empty.")
+    if len(names) < 2 or len(set(names)) != len(names):
+        raise ValueError(f"name a force and other channels as responses, not {', '.join(names)}.")
+    for one in records:
+        for name in names:
+            channel_number(one.channels, name)
+        if one.sampling_rate != records[0].sampling_rate:
+            raise ValueError(
+                "realisations must have one sampling rate, but have "
+                f"{records[0].sampling_rate:g} and {one.sampling_rate:g} Hz."
+            )
+    if skip < 0 or int(skip) != skip:
+        raise ValueError(f"`skip` must be a whole number of periods from 0 on, but is {skip}.")
+
+
+def _in_si(recording: TimeRecording, name: str) -> Channel:
+    """The channel as its values are read: in SI units already."""
+    own = recording.channels[channel_number(recording.channels, name)]
+    return own._replace(calibration=1.0)
+
+
+def _stated(period: float, rate: float) -> int:
+    samples = round(period * rate) if np.isfinite(period) else 0
+    if samples < 4 or abs(period * rate - samples) > 1e-3:
+        raise ValueError(
+            f"`period` must be a whole number of samples, four at least, but {period:g} s are "
+            f"{period * rate:g}."
+        )
+    return samples
+
+
+def _found_period(recording: TimeRecording, force: str) -> int:
+    values = recording.values([force], 0, _MOST_SAMPLES)[0]
+    if not np.isfinite(values).all():
+        raise ValueError(f"channel {force} has samples that are not finite.")
+    values = values - values.mean()
+    n = len(values)
+    spectrum = np.abs(np.fft.rfft(values, 2 * n)) ** 2
+    lags = np.arange(n // 2)
+    likeness = np.fft.irfft(spectrum)[: n // 2] / (n - lags)
+    likeness /= max(likeness[0], np.finfo(float).tiny)
+    # Beyond the first fall: near lag zero everything is like itself.
+    falls = np.flatnonzero(likeness < _REPEATS)
+    after = int(falls[0]) if falls.size else n // 2
+    best = likeness[after:].max(initial=0.0)
+    if best < _REPEATS:
+        raise ValueError(
+            f"no period is found in channel {force}: it does not repeat within half the record; "
+            "state `period`."
+        )
+    late = likeness[after:]
+    inner = np.flatnonzero(
+        (late[1:-1] >= late[:-2]) & (late[1:-1] >= late[2:]) & (late[1:-1] >= _BEST * best)
+    )
+    if not inner.size:
+        raise ValueError(f"no period is found in channel {force}; state `period`.")
+    lag = after + 1 + int(inner[0])
+    a, b, c = likeness[lag - 1 : lag + 2]
+    off = 0.5 * (a - c) / (a - 2 * b + c)
+    if abs(off) > _OFF:
+        raise ValueError(
+            f"the period of channel {force}, about {lag + off:.2f} samples, is no whole number of "
+            "samples: sample in step with the generator, or state `period`."
+        )
+    return lag
+
+
+def _spectra(recording: TimeRecording, names: tuple[str, ...], samples: int, skip: int) -> _Spectra:
+    count = recording.n_samples // samples - skip
+    if count < 2:
+        raise ValueError(
+            f"two periods are needed after the {skip} left out, but the record has "
+            f"{recording.n_samples / samples:.3g} of {samples / recording.sampling_rate:.4g} s."
+        )
+    total = np.zeros((len(names), samples // 2 + 1), dtype=complex)
+    squares = np.zeros(total.shape)
+    mixed = np.zeros_like(total)
+    first = np.zeros_like(total)
+    for k in range(skip, skip + count):
+        values = recording.values(names, k * samples, (k + 1) * samples)
+        if not np.isfinite(values).all():
+            raise ValueError(f"period {k} of the record has samples that are not finite.")
+        spectrum = 2 / samples * np.fft.rfft(values, axis=1)
+        first = spectrum if k == skip else first
+        away = spectrum - first  # small numbers: nothing is lost in the squares
+        total += away
+        squares += np.abs(away) ** 2
+        mixed += away * away[0].conj()
+    mean = total / count
+    return _Spectra(
+        mean + first,
+        np.maximum(squares - count * np.abs(mean) ** 2, 0.0) / (count - 1),
+        (mixed - count * mean * mean[0].conj()) / (count - 1),
+        count,
+    )
+
+
+def _lines(
+    lines: Float[np.ndarray, " line"] | Sequence[float] | None,
+    spectra: _Spectra,
+    rate: float,
+    samples: int,
+) -> np.ndarray:
+    """Numbers of the excited lines."""
+    highest = spectra.mean.shape[1] - 1
+    if lines is not None:
+        place = np.asarray(lines, dtype=float) * samples / rate / _HERTZ
+        number = np.unique(np.round(place).astype(int))
+        if not place.size or np.any(np.abs(place - np.round(place)) > 1e-3):
+            raise ValueError("`lines` must be multiples of 1/period (in rad/s: times 2π).")
+        if number[0] < 1 or number[-1] >= highest:
+            raise ValueError("`lines` must lie between 0 and half the sampling rate.")
+        return number
+    size = np.abs(spectra.mean[0])
+    size[0] = 0.0
+    noise = spectra.variance[0] / spectra.periods
+    found = np.flatnonzero((size > _EXCITED * size.max()) & (size**2 > _SURE * noise))
+    if not found.size or size.max() == 0:
+        raise ValueError("no line of the force stands out of its noise: nothing is excited.")
+    return found
+
+
+def _response(spectra: _Spectra, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ratios at the excited lines and the variances of their complex errors."""
+    drive = spectra.mean[0, lines]
+    ratio = spectra.mean[1:, lines] / drive
+    variance = (
+        spectra.variance[1:, lines]
+        + np.abs(ratio) ** 2 * spectra.variance[0, lines]
+        - 2 * np.real(spectra.mixed[1:, lines] * ratio.conj())
+    )
+    return ratio, np.maximum(variance, 0.0) / np.abs(drive) ** 2 / spectra.periods
+
+
+def _distortion(
+    spectra: list[_Spectra], ratio: np.ndarray, excited: np.ndarray, detection: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitudes at lines that are not excited, without what the force itself has there."""
+    linear = np.array(
+        [
+            np.interp(detection, excited, row.real) + 1j * np.interp(detection, excited, row.imag)
+            for row in ratio
+        ]
+    )
+    squares, noise = [], []
+    for one in spectra:
+        left = one.mean[1:, detection] - linear * one.mean[0, detection]
+        squares.append(np.abs(left) ** 2)
+        noise.append(one.variance[1:, detection] / one.periods)
+    floor = np.mean(noise, axis=0)
+    return np.sqrt(np.mean(squares, axis=0)), np.sqrt(floor)
