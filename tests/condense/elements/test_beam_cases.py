@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from snrmjax.condense.elements.beam import Beam, rise_of_radius
+from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
 from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes
 from snrmjax.condense.load_set import modal_loads
@@ -62,23 +62,54 @@ def test_curved_beam_softens_then_hardens_as_galerkins_arch():
     np.testing.assert_allclose(quadratic, 3 * first[(0, 0, 0)], rtol=1e-2)
 
 
-@pytest.mark.long
-def test_coefficients_have_right_derivatives_by_the_geometry():
-    def told(numbers):
-        thickness, rise, young = numbers
-        beam = Beam(*(0.3, 0.0127, thickness), rise=rise, young=young, density=7800.0, elements=8)
-        basis = beam_modes(beam, (1, 3))
-        force = jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-        cases = static_cases(beam, basis, force * jnp.array([2.5, 45.0]))
-        return fit_potential(basis, cases).coefficient
-
-    at, told = jnp.array([0.6e-3, 0.9e-3, 2e11]), jax.jit(told)
+def _check_derivatives(told, at, names):
+    """Derivatives by relative changes against fourth-order differences, to 1e-6."""
+    told = jax.jit(told)
     value = told(at)
-    for k, name in enumerate(("thickness", "rise", "young")):
-        along = at * jnp.eye(3)[k]  # relative changes
+    for k, name in enumerate(names):
+        along = at * jnp.eye(len(names))[k]
         slope = jax.jvp(told, (at,), (along,))[1]
-        # Fourth-order differences.
         values = [told(at + n * 2e-4 * along) for n in (-2, -1, 1, 2)]
         expected = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / 24e-4
         size = np.maximum(np.abs(expected), np.abs(value))
         assert np.all(np.abs(slope - expected) < 1e-6 * size), name
+
+
+def _frequencies_and_coefficients(beam):
+    basis = beam_modes(beam, (1, 3))
+    force = jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+    cases = static_cases(beam, basis, force * jnp.array([2.5, 45.0]))
+    return jnp.concatenate([basis.frequency, fit_potential(basis, cases).coefficient])
+
+
+@pytest.mark.long
+def test_coefficients_have_right_derivatives_by_the_geometry():
+    def told(numbers):
+        thickness, rise, young = numbers
+        size = (0.3, 0.0127, thickness)
+        return _frequencies_and_coefficients(
+            Beam(*size, rise=rise, young=young, density=7800.0, elements=8)
+        )
+
+    _check_derivatives(told, jnp.array([0.6e-3, 0.9e-3, 2e11]), ("thickness", "rise", "young"))
+
+
+@pytest.mark.long
+def test_coefficients_have_right_derivatives_by_supports_and_point_masses():
+    def told(numbers):
+        axial, transverse, rotation, mass, inertia = numbers
+        return _frequencies_and_coefficients(
+            Beam(
+                *(0.3, 0.0127, 0.6e-3),
+                rise=0.9e-3,
+                young=2e11,
+                density=7800.0,
+                elements=8,
+                left=Support(axial, transverse, rotation),
+                point_masses=(PointMass(0.4, mass, inertia),),
+            )
+        )
+
+    # Springs as stiff as the beam in each direction, a mass of a fifth of it.
+    at = jnp.array([5e6, 3e3, 3.0, 3.5e-3, 2e-8])
+    _check_derivatives(told, at, ("axial", "transverse", "rotation", "mass", "inertia"))

@@ -92,6 +92,26 @@ def test_frequencies_and_shapes_have_right_derivatives():
         np.testing.assert_allclose(slope, exact[:, k], rtol=1e-6, atol=1e-8 * size)
 
 
+def test_derivatives_by_springs_and_point_masses_are_rayleighs():
+    # ∂ω²/∂k = (φ there)² and ∂ω²/∂m = −ω² (φ there)², by each direction's own shape.
+    def told(numbers):
+        axial, transverse, rotation, mass, inertia = numbers
+        beam = _beam(
+            rise=0.02,
+            left=Support(axial, transverse, rotation),
+            point_masses=(PointMass(0.5, mass, inertia),),
+        )
+        basis = beam_modes(beam, (1, 2))
+        return basis.frequency**2, basis.shapes
+
+    at = jnp.array([1e6, 3e3, 3.0, 3e-3, 1e-7])
+    (slopes, _), (squared, shapes) = jax.jacfwd(told)(at), told(at)
+    springs = shapes[:3].T ** 2
+    x, y, turn = shapes[18:21] ** 2  # the middle node
+    of_mass = -np.stack([(x + y) * squared, turn * squared], axis=1)
+    np.testing.assert_allclose(slopes, np.concatenate([springs, of_mass], axis=1), rtol=1e-8)
+
+
 @pytest.mark.long
 def test_a_mechanism_is_refused():
     with pytest.raises(ValueError, match="mechanism"):
