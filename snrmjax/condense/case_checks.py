@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -141,7 +140,7 @@ def energy_error(
     q = np.asarray(cases.modal_displacement)
     energy = np.asarray(cases.energy, dtype=float)
     linear = 0.5 * (q**2 @ np.asarray(basis.frequency) ** 2)
-    return (linear + np.asarray(potential.energy(jnp.asarray(q))) - energy) / energy
+    return (linear + np.asarray(potential.energy(q)) - energy) / energy
 
 
 def _repeated(every: StaticCases, used: np.ndarray) -> list[CaseWarning]:

@@ -221,7 +221,7 @@ def require_loaded(basis: ReductionBasis, cases: StaticCases) -> None:
 def _subset(cases: StaticCases, rows: np.ndarray) -> StaticCases:
     names = tuple(cases.names[k] for k in rows) if cases.names else ()
     arrays = dataclasses.replace(cases, names=())
-    subset: StaticCases = jax.tree.map(lambda values: jnp.asarray(values)[rows], arrays)
+    subset: StaticCases = jax.tree.map(lambda values: np.asarray(values)[rows], arrays)
     return dataclasses.replace(subset, names=names)
 
 

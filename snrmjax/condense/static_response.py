@@ -1,18 +1,18 @@
 """Static displacement of a reduced-order model under modal forces."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from snrmjax.model.potential import PolynomialPotential
+from snrmjax.numerics.compiled import compiled
 
 _STEPS, _ITERATIONS = 40, 6
 _TOLERANCE = 1e-9  # of the force
 _JUMP = 2.0
 
 
-@eqx.filter_jit
+@compiled
 def static_displacement(
     frequency: Float[Array, " mode"],
     potential: PolynomialPotential,
@@ -43,8 +43,11 @@ def static_displacement(
             q = predicted = before - jnp.linalg.solve(
                 slope(before), balance(before, fraction * full)
             )
-            for _ in range(_ITERATIONS):
-                q = q - jnp.linalg.solve(slope(q), balance(q, fraction * full))
+
+            def newton(_: int, q: Array) -> Array:
+                return q - jnp.linalg.solve(slope(q), balance(q, fraction * full))
+
+            q = jax.lax.fori_loop(0, _ITERATIONS, newton, q)
             scaled = slope(q) / jnp.sqrt(squared[:, None] * squared)
             moved, expected = (jnp.linalg.norm((x - before) * frequency) for x in (q, predicted))
             # A step much longer than its tangent predicts has gone to another path.

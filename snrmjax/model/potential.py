@@ -30,7 +30,9 @@ class PolynomialPotential(eqx.Module):
         """Highest degree of the potential (0 when it is empty)."""
         return max((len(m) for m in self.monomials), default=0)
 
-    def energy(self, displacement: Float[Array, "*batch mode"]) -> Float[Array, "*batch"]:
+    def energy(
+        self, displacement: Float[Array | np.ndarray, "*batch mode"]
+    ) -> Float[Array, "*batch"]:
         """Potential energy in J, without the linear stiffness's."""
         basis = _products(displacement, self.monomials)
         return basis @ self.coefficient
@@ -193,13 +195,15 @@ def potential_from_force_table(
 
 
 def _products(
-    displacement: Float[Array, "*batch mode"], monomials: tuple[Monomial, ...]
+    displacement: Float[Array | np.ndarray, "*batch mode"], monomials: tuple[Monomial, ...]
 ) -> Float[Array, "*batch monomial"]:
     """Π q_i for every monomial, built by multiplying a padding one in (index n = the one)."""
     if not monomials:
         return jnp.zeros((*displacement.shape[:-1], 0), dtype=displacement.dtype)
     index = _factors(monomials, displacement.shape[-1])
-    padded = jnp.concatenate([displacement, jnp.ones_like(displacement[..., :1])], axis=-1)
+    # NumPy's own arrays stay NumPy's: nothing is compiled then.
+    xp = np if isinstance(displacement, np.ndarray) else jnp
+    padded = xp.concatenate([displacement, xp.ones_like(displacement[..., :1])], axis=-1)
     product = padded[..., index[:, 0]]
     for column in range(1, index.shape[1]):
         product = product * padded[..., index[:, column]]

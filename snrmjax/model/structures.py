@@ -24,6 +24,7 @@ from snrmjax.model.effect_base import (
 )
 from snrmjax.model.modes import LinearModes, have_values
 from snrmjax.model.potential import PolynomialPotential, polynomial_potential
+from snrmjax.numerics.compiled import compiled
 
 
 class LinearTerms(NamedTuple):
@@ -320,15 +321,16 @@ def _equilibria_by_newton(model: Structure, n_starts: int, seed: int) -> tuple[n
     """Newton's method from random starts at the amplitudes where the potential matters."""
     n = model.n_modes
     scale = displacement_scale(model)
-    radius = 10.0 ** jax.random.uniform(jax.random.key(seed), (n_starts, 1), minval=-2, maxval=1)
-    direction = jax.random.normal(jax.random.key(seed + 1), (n_starts, n))
-    starts = jnp.concatenate([jnp.zeros((1, n)), radius * direction * scale])
+    drawn = np.random.default_rng(seed)
+    radius = 10.0 ** drawn.uniform(-2, 1, (n_starts, 1))
+    direction = drawn.normal(size=(n_starts, n))
+    starts = np.concatenate([np.zeros((1, n)), radius * direction * scale])
     ends, residual = (np.asarray(part) for part in _newton(model, starts))
     good = np.all(np.isfinite(ends), axis=1) & (residual < 1e-9 * np.max(scale))
     return ends[good], 1e-6 * float(np.max(scale))
 
 
-@eqx.filter_jit
+@compiled
 def _newton(
     model: Structure, starts: Float[Array, "start mode"]
 ) -> tuple[Float[Array, "start mode"], Float[Array, " start"]]:

@@ -1,6 +1,5 @@
 """Static load cases of a beam under modal forces, as a condensation takes them."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -8,9 +7,10 @@ from jaxtyping import Array, Float
 from snrmjax.condense.elements.beam import Beam
 from snrmjax.condense.elements.statics import static_solutions
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.numerics.compiled import compiled
 
 
-@eqx.filter_jit
+@compiled
 def static_cases(
     beam: Beam, basis: ReductionBasis, force: Float[Array | np.ndarray, "case mode"]
 ) -> StaticCases:

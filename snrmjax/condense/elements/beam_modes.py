@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from snrmjax.condense.elements.strain_energy import (
 )
 from snrmjax.condense.load_cases import ReductionBasis
 from snrmjax.model.modes import have_values
+from snrmjax.numerics.compiled import compiled
 
 _MIDSPAN_NODE = 0.05  # of the largest displacement: below it midspan does not choose the sign
 _MECHANISM = 1e-10  # of the largest squared frequency a beam of so many elements could have
@@ -52,7 +52,7 @@ def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
     return basis
 
 
-@eqx.filter_jit
+@compiled
 def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
     free = beam.free
     places = free[:, None], free

@@ -1,7 +1,6 @@
 """A beam file as what a reduced-order model is made from: its finite elements and their modes."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -72,7 +71,7 @@ def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> St
     count = len(force)
     rows = np.resize(np.arange(count), -(-count // _BLOCK) * _BLOCK)
     blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]
-    found: StaticCases = jax.tree.map(lambda *parts: jnp.concatenate(parts)[:count], *blocks)
+    found: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
     return found
 
 

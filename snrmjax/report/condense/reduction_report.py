@@ -339,7 +339,10 @@ def _coefficients(found: Condensation) -> ReportTable:
     rows = [
         (monomial_key(m), with_error(float(value), float(std)))
         for m, value, std in zip(
-            potential.monomials, potential.coefficient, potential.coefficient_std, strict=True
+            potential.monomials,
+            np.asarray(potential.coefficient),
+            np.asarray(potential.coefficient_std),
+            strict=True,
         )
     ]
     caption = (
