@@ -51,6 +51,7 @@ SUB_ROOMS = {
     "identify.joint": {"identify.checks", "identify.curves", "identify.pointwise"},
     "identify.inference": {"identify.curves", "identify.pointwise", "identify.joint"},
     "identify.calibrate": {"identify.pointwise"},
+    "identify.modal": set(),
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "methods.bench": {"methods.result", "methods.one_sensor"},

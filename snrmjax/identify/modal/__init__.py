@@ -1,0 +1,1 @@
+"""Linear modes from frequency responses, low-level steady states and free decays."""

@@ -1,0 +1,424 @@
+"""Linear modes from frequency responses over one reference, with their errors."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.modal.modal_bases import (
+    BasisSettings,
+    real_and_imaginary,
+    receptance_bases,
+    unpacked,
+)
+from snrmjax.identify.modal.modal_fit import LinearModalFit, ResponseCurves
+from snrmjax.identify.modal.modal_notes import (
+    complex_residues,
+    fit_notes,
+    lines_in_half_power,
+)
+from snrmjax.identify.modal.noise_model import (
+    coherence_of,
+    fitted_coherence_std,
+    std_from_residuals,
+)
+from snrmjax.identify.modal.pole_orders import PoleOrders, clusters, poles_of_responses
+from snrmjax.identify.modal.response_data import ResponseData, response_data
+from snrmjax.identify.modal.separable_fit import (
+    ChannelRows,
+    SeparableFit,
+    TermColumns,
+    fit_separable,
+)
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+
+ResidualTerms = Literal["auto", "both", "lower", "upper", "none"]
+
+_HERTZ = 2 * np.pi
+_HIGHEST = 40  # order, where there are lines enough
+_LINES_PER_ORDER = 4
+_MOST_DAMPED = 0.9
+_USUAL = 0.01  # damping ratio where no pole of the orders is near
+_NEAR = 0.02  # of a frequency: how far from one given by hand a pole may lie
+_NARROW = 1.1  # ratio of a band's ends, below which one residual term is enough
+_SIGNIFICANT = 4.0  # standard errors of a mode's largest residue, without which it is none
+_CURVED = 12.0  # a sensor, in units of the noise, that a further residual term must explain
+_ROUNDS = 3  # of fits and weights
+_EVEN = 1e-3  # of the line spacing
+
+
+def fit_linear_modes(
+    responses: FrequencyResponses,
+    *,
+    poles: Sequence[float] | None = None,
+    order: int | None = None,
+    highest_order: int | None = None,
+    std: Float[np.ndarray, "response frequency"] | None = None,
+    reference: str | None = None,
+    from_frequency: float | None = None,
+    to_frequency: float | None = None,
+    residual_terms: ResidualTerms = "auto",
+    instrument_phase: bool = False,
+    window: Literal["hann"] | None = None,
+) -> LinearModalFit:
+    """Natural frequencies, damping ratios and residues of real normal modes, with covariance.
+
+    Poles of all model orders (least-squares complex frequency estimator) are gathered into
+    clusters that are stable over the order; each starts a mode of
+    H = e^{iψ} [Σ A_r/(ω_r² − Ω² + 2iζ_rω_rΩ) + L/Ω² + U], fitted to all responses together by
+    weighted least squares. A mode whose residues are all within four standard errors of zero is
+    left out. Weights: stated `std`, or coherence, or sizes of additive and relative errors found
+    from the residuals. The sizes of the residuals scale the errors of each response, and the
+    correlation of neighbouring residuals widens them.
+
+    Arguments: `poles` natural frequencies in rad/s to take in place of clusters; `order` takes all
+    lightly damped poles of one model order; `std` 1σ of real and of imaginary part, SI;
+    `reference` names one of several; the band in rad/s; `residual_terms` for modes outside the
+    band (1/Ω² below, a constant above); `instrument_phase` frees ψ; `window` "hann" models the
+    leakage of averages of random excitation, whose line spacing is one over the window's length.
+    Raises `ValueError` as `response_data` does, for no pole that is stable, for poles outside the
+    band, and for responses that seem to be conjugated.
+    Validity: real modes (see `collinearity` and `mean_phase`), linear and time-invariant.
+
+    >>> w = 2 * np.pi * np.linspace(8, 12, 200)
+    >>> h = 2.0 / ((2 * np.pi * 10) ** 2 - w**2 + 2j * 0.01 * 2 * np.pi * 10 * w)
+    >>> from snrmjax.measure.recordings.channels import Channel
+    >>> from snrmjax.measure.recordings.frequency_responses import frequency_responses
+    >>> tip, force = Channel("tip", "displacement"), Channel("hammer", "force")
+    >>> found = fit_linear_modes(frequency_responses(w, h[None, None], [tip], [force]))
+    >>> (found.natural_frequency / 2 / np.pi).round(6), found.residue.round(6)
+    (array([10.]), array([[2.]]))
+    """
+    data = response_data(
+        responses,
+        std=std,
+        reference=reference,
+        from_frequency=from_frequency,
+        to_frequency=to_frequency,
+    )
+    settings = _settings(data, residual_terms, instrument_phase, window)
+    orders = _orders(data, highest_order)
+    start = _start(data, orders, poles, order)
+    fit, spread = _fitted(data, settings, start, keep_all=poles is not None)
+    if residual_terms == "auto" and settings.lower:
+        settings, fit, spread = _curved_too(data, settings, fit, spread)
+    _check_found(fit, settings)
+    return _result(data, settings, fit, spread, orders)
+
+
+def _settings(
+    data: ResponseData, terms: ResidualTerms, phase: bool, window: str | None
+) -> BasisSettings:
+    if terms not in get_args(ResidualTerms):
+        raise ValueError(
+            f"`residual_terms` must be one of {', '.join(get_args(ResidualTerms))}, but is "
+            f"{terms!r}."
+        )
+    if terms == "auto":
+        terms = "both" if data.omega[-1] > _NARROW * data.omega[0] else "upper"
+    time = None
+    if window is not None:
+        if window != "hann":
+            raise ValueError(f"`window` must be 'hann' or None, but is {window!r}.")
+        spacing = np.diff(data.omega)
+        step = float(np.median(spacing))
+        # Lines may be left out, but they lie on a grid.
+        if np.any(np.abs(spacing / step - np.round(spacing / step)) > _EVEN):
+            raise ValueError("leakage is modelled for evenly spaced lines, but these are not.")
+        time = 2 * np.pi / step
+    return BasisSettings(
+        lower=terms in ("both", "lower"),
+        upper=terms in ("both", "upper"),
+        phase=phase,
+        window_time=time,
+    )
+
+
+def _weights(data: ResponseData) -> Float[np.ndarray, "channel line"]:
+    """1/σ of receptances; of one size for all that a channel measured where σ is unknown."""
+    good = np.isfinite(data.receptance)
+    size = data.measured_size
+    rough = np.sqrt(np.nanmean(np.abs(data.receptance * size) ** 2, axis=1))[:, None] / size
+    std = np.where(np.isfinite(data.std), data.std, 1e-2 * rough)
+    return np.where(good, 1 / std, 0.0)
+
+
+def _orders(data: ResponseData, highest: int | None) -> PoleOrders:
+    lines = len(data.omega)
+    most = max(2, min(_HIGHEST, lines // _LINES_PER_ORDER))
+    if highest is not None and not 1 <= highest <= lines // 2:
+        raise ValueError(
+            f"the highest order must be from 1 to half the number of lines, {lines // 2}, but is "
+            f"{highest}."
+        )
+    weights = _weights(data)
+    weights = weights / np.sqrt(np.mean(np.abs(_filled(data) * weights) ** 2, axis=1))[:, None]
+    size = data.measured_size
+    turn = (1j ** np.array(data.powers))[:, None]
+    return poles_of_responses(
+        data.omega, _filled(data) * size * turn, weights / size, highest or most
+    )
+
+
+def _filled(data: ResponseData) -> Complex[np.ndarray, "channel line"]:
+    return np.where(np.isfinite(data.receptance), data.receptance, 0.0)
+
+
+def _start(
+    data: ResponseData,
+    orders: PoleOrders,
+    poles: Sequence[float] | None,
+    order: int | None,
+) -> Complex[np.ndarray, " mode"]:
+    """Poles to begin with."""
+    band = float(data.omega[0]), float(data.omega[-1])
+    if poles is not None:
+        return _by_hand(orders, np.asarray(poles, dtype=float), band)
+    if order is not None:
+        if not 1 <= order <= orders.highest:
+            raise ValueError(
+                f"`order` must be from 1 to {orders.highest}, the highest that was computed, but "
+                f"is {order}."
+            )
+        mine = orders.pole[orders.order == order]
+        inside = (np.abs(mine) >= band[0]) & (np.abs(mine) <= band[1])
+        mine = mine[inside & (mine.real < 0) & (-mine.real < 0.25 * np.abs(mine))]
+        if not mine.size:
+            raise ValueError(f"model order {order} has no lightly damped pole in the band.")
+        return mine[np.argsort(np.abs(mine))]
+    every = clusters(orders, band)
+    found = every.damped.pole
+    if found.size:
+        return found
+    where = f"between {band[0] / _HERTZ:.6g} and {band[1] / _HERTZ:.6g} Hz"
+    if every.growing.pole.size:
+        listed = ", ".join(
+            f"{100 * -p.real / abs(p):.3g} % at {abs(p) / _HERTZ:.6g} Hz"
+            for p in every.growing.pole[:3]
+        )
+        raise ValueError(
+            f"all modes {where} have negative damping ({listed}): the responses seem to be "
+            "conjugated (time dependence e^(-iΩt)); change the sign of their imaginary parts."
+        )
+    raise ValueError(
+        f"no pole is stable over the model orders {where}: widen the band, raise the highest "
+        "order, or give the natural frequencies by hand."
+    )
+
+
+def _by_hand(
+    orders: PoleOrders, wanted: np.ndarray, band: tuple[float, float]
+) -> Complex[np.ndarray, " mode"]:
+    if not wanted.size or not np.isfinite(wanted).all():
+        raise ValueError("`poles` must be natural frequencies, at least one.")
+    found = []
+    for omega in np.sort(wanted):
+        if not band[0] <= omega <= band[1]:
+            raise ValueError(
+                f"a pole must lie in the band, {band[0] / _HERTZ:.6g} to {band[1] / _HERTZ:.6g} "
+                f"Hz, but {omega / _HERTZ:.6g} Hz was given."
+            )
+        damped = orders.pole[(orders.pole.real < 0) & (orders.damping_ratio < 0.25)]
+        away = np.abs(np.abs(damped) - omega)
+        near = damped[away < _NEAR * omega]
+        ratio = _USUAL
+        if near.size:
+            best = near[np.argmin(away[away < _NEAR * omega])]
+            ratio = float(-best.real / abs(best))
+        found.append(complex(-ratio * omega, omega * np.sqrt(1 - ratio**2)))
+    return np.array(found)
+
+
+class _Spread(NamedTuple):
+    std: Float[np.ndarray, "channel line"]  # that weighted the last fit
+    misfit: Float[np.ndarray, " channel"]
+
+
+def _fitted(
+    data: ResponseData,
+    settings: BasisSettings,
+    start: Complex[np.ndarray, " mode"],
+    *,
+    keep_all: bool,
+) -> tuple[SeparableFit, _Spread]:
+    """The fit with its weights settled and insignificant modes left out."""
+    unknowns = np.concatenate(
+        [np.abs(start), -start.real / np.abs(start), np.zeros(int(settings.phase))]
+    )
+    std = 1 / np.maximum(_weights(data), 1e-300)
+    while True:
+        fit, spread = _weighted(data, settings, unknowns, std)
+        worst = None if keep_all else _least_certain(fit, settings, data)
+        if worst is None:
+            break
+        n = (len(unknowns) - settings.phase) // 2
+        if n == 1:
+            raise ValueError(
+                "no mode stands out of the errors of the responses: the residues of all are "
+                "within four standard errors of zero."
+            )
+        unknowns, std = np.delete(fit.unknowns, [worst, n + worst]), spread.std
+    return fit, spread
+
+
+def _curved_too(
+    data: ResponseData, settings: BasisSettings, fit: SeparableFit, spread: _Spread
+) -> tuple[BasisSettings, SeparableFit, _Spread]:
+    """The fit with a residual term Ω² where it lowers the sum of squares by far."""
+    wider = settings._replace(curved=True)
+    other, own = _weighted(data, wider, fit.unknowns, spread.std, rounds=1)
+    before, after = np.sum(fit.residuals**2), np.sum(other.residuals**2)
+    free = np.count_nonzero(np.isfinite(data.receptance)) * 2
+    if (before - after) * free <= _CURVED * len(data.channels) * after:
+        return settings, fit, spread
+    return wider, *_weighted(data, wider, other.unknowns, own.std)
+
+
+def _weighted(
+    data: ResponseData,
+    settings: BasisSettings,
+    unknowns: np.ndarray,
+    std: np.ndarray,
+    rounds: int = _ROUNDS,
+) -> tuple[SeparableFit, _Spread]:
+    good = np.isfinite(data.receptance)
+    values = real_and_imaginary(_filled(data))
+    powers = tuple(dict.fromkeys(data.powers)) if settings.window_time is not None else (0,)
+    groups = np.array([powers.index(p) if len(powers) > 1 else 0 for p in data.powers])
+    n = (len(unknowns) - settings.phase) // 2
+    low = np.concatenate([np.full(n, 0.5 * data.omega[0]), np.full(n, -_MOST_DAMPED)])
+    high = np.concatenate([np.full(n, 2 * data.omega[-1]), np.full(n, _MOST_DAMPED)])
+    if settings.phase:
+        low, high = np.append(low, -np.pi), np.append(high, np.pi)
+
+    def basis_at(point: np.ndarray) -> list[TermColumns]:
+        return receptance_bases(data.omega, point, settings, powers)
+
+    coherence = coherence_of(data) if data.source == "coherence" else None
+    scale = np.ones(len(values))
+    for turn in range(rounds):
+        weights = np.where(good, 1 / (std * scale[:, None]), 0.0)
+        measured = ChannelRows(values, np.tile(weights, (1, 2)), groups, 2)
+        fit = fit_separable(basis_at, measured, unknowns, (low, high))
+        unknowns = fit.unknowns
+        left = fit.residuals / np.maximum(np.tile(weights, (1, 2)), 1e-300)
+        lines = len(data.omega)
+        residuals = np.where(good, left[:, :lines] + 1j * left[:, lines:], np.nan)
+        fitted = _filled(data) - np.nan_to_num(residuals)
+        if turn == rounds - 1:
+            break
+        if data.source == "residuals":
+            std, scale = std_from_residuals(data, residuals, fitted), np.ones(len(values))
+        elif coherence is not None:
+            std = fitted_coherence_std(data, coherence, fitted)
+        # The size of each channel's errors is what its residuals show.
+        rms = _rms(residuals / std, fit, good)
+        scale = np.maximum(rms, 1e-12 * rms.max()) if rms.max() > 0 else np.ones(len(rms))
+    misfit = _rms(residuals / std, fit, good)
+    return _scaled(fit, _rms(residuals / (std * scale[:, None]), fit, good)), _Spread(
+        std * scale[:, None], misfit
+    )
+
+
+def _rms(residuals: np.ndarray, fit: SeparableFit, good: np.ndarray) -> np.ndarray:
+    """Root mean square of real and imaginary parts by the degrees of freedom of each channel."""
+    shared = len(fit.unknowns) / len(residuals)
+    free = np.maximum(2 * good.sum(axis=1) - fit.coefficients.shape[1] - shared, 1.0)
+    return np.sqrt(np.nansum(np.abs(residuals) ** 2, axis=1) / free)
+
+
+def _scaled(fit: SeparableFit, rms: np.ndarray) -> SeparableFit:
+    """Covariances for the mean size that the last residuals have, close to one."""
+    size = float(np.mean(rms**2))
+    return fit._replace(
+        covariance=fit.covariance * size, own=fit.own * size, mixed=fit.mixed * size
+    )
+
+
+def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseData) -> int | None:
+    """The mode that stands least out of the errors or is none; None where all are modes."""
+    natural, ratio, _ = unpacked(fit.unknowns, settings)
+    n = len(natural)
+    certain = np.zeros(n)
+    for k in range(n):
+        std = np.sqrt(np.abs(np.diag(fit.term_covariance(k))))
+        certain[k] = np.max(np.abs(fit.coefficients[:, k]) / np.maximum(std, 1e-300))
+    outside = (natural < data.omega[0]) | (natural > data.omega[-1])
+    odd = outside | (ratio <= 0) | (ratio > 0.5)
+    if odd.any() and not odd.all():
+        return int(np.flatnonzero(odd)[np.argmin(certain[odd])])
+    worst = int(np.argmin(certain))
+    return worst if certain[worst] < _SIGNIFICANT else None
+
+
+def _check_found(fit: SeparableFit, settings: BasisSettings) -> None:
+    natural, ratio, _ = unpacked(fit.unknowns, settings)
+    if np.all(ratio < 0):
+        raise ValueError(
+            f"all modes have negative damping ({100 * ratio[0]:.3g} % at "
+            f"{natural[0] / _HERTZ:.6g} Hz): the responses seem to be conjugated (time dependence "
+            "e^(-iΩt)); change the sign of their imaginary parts."
+        )
+    if np.any(ratio <= 0) or np.any(ratio >= _MOST_DAMPED):
+        k = int(np.argmax((ratio <= 0) | (ratio >= _MOST_DAMPED)))
+        raise ValueError(
+            f"the mode at {natural[k] / _HERTZ:.6g} Hz has the damping ratio {ratio[k]:.3g}: the "
+            "responses do not show such a mode; give other poles or another band."
+        )
+
+
+def _result(
+    data: ResponseData,
+    settings: BasisSettings,
+    fit: SeparableFit,
+    spread: _Spread,
+    orders: PoleOrders,
+) -> LinearModalFit:
+    natural, ratio, angle = unpacked(fit.unknowns, settings)
+    rank = np.argsort(natural)
+    n, sensors = len(natural), len(data.channels)
+    covariance = np.zeros((n, 2 + sensors, 2 + sensors))
+    for place, k in enumerate(rank):
+        own = [k, n + k]
+        covariance[place, :2, :2] = fit.covariance[np.ix_(own, own)]
+        cross = fit.cross_covariance(k)[own]
+        covariance[place, :2, 2:], covariance[place, 2:, :2] = cross, cross.T
+        covariance[place, 2:, 2:] = fit.term_covariance(k)
+    terms = [k for k, used in enumerate((settings.lower, settings.upper)) if used]
+    residual, residual_std = np.zeros((2, sensors)), np.zeros((2, sensors))
+    for place, k in enumerate(terms):
+        residual[k] = fit.coefficients[:, n + place]
+        residual_std[k] = np.sqrt(np.diag(fit.term_covariance(n + place)))
+    powers = tuple(dict.fromkeys(data.powers)) if settings.window_time is not None else (0,)
+    bases = receptance_bases(data.omega, fit.unknowns, settings, powers)
+    lines = len(data.omega)
+    columns = np.stack(
+        [bases[powers.index(p) if len(powers) > 1 else 0].columns for p in data.powers]
+    )
+    fitted = np.einsum("srt,st->sr", columns, fit.coefficients)
+    curves = ResponseCurves(
+        data.omega, data.receptance, fitted[:, :lines] + 1j * fitted[:, lines:], spread.std
+    )
+    found = LinearModalFit(
+        natural[rank],
+        ratio[rank],
+        fit.coefficients[:, rank],
+        covariance,
+        residual[0],
+        residual_std[0],
+        residual[1],
+        residual_std[1],
+        angle,
+        float(np.sqrt(fit.covariance[-1, -1])) if settings.phase else 0.0,
+        *complex_residues(data, settings, fit, spread.std, rank),
+        lines_in_half_power(data.omega, natural[rank], ratio[rank]),
+        spread.misfit if data.source != "residuals" else np.full(sensors, np.nan),
+        curves,
+        orders,
+        data.channels,
+        data.reference,
+        data.source,
+        fit.status,
+    )
+    return found.with_notes((*data.notes, *fit_notes(found, data, settings)))

@@ -1,0 +1,152 @@
+"""What a fit of linear modes found: poles, residues and residual terms with their errors."""
+
+import dataclasses
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.modal.pole_orders import PoleOrders
+from snrmjax.identify.modal.response_data import ErrorSource
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+_WIDE = 1.96  # standard deviations of a 95 % band
+
+
+class ResponseCurves(NamedTuple):
+    """Receptances as measured and as the modes give them, SI."""
+
+    omega: Float[np.ndarray, " line"]  # rad/s
+    measured: Complex[np.ndarray, "sensor line"]  # NaN where not measured
+    fitted: Complex[np.ndarray, "sensor line"]
+    std: Float[np.ndarray, "sensor line"]  # 1σ of real and of imaginary part that weighted them
+
+
+class LinearModalFit(AbstractResult):
+    """Linear modes from frequency responses over one reference; see `fit_linear_modes`.
+
+    H = e^{iψ} [Σ residue/(ω² − Ω² + 2iζωΩ) + lower/Ω² + upper] is a displacement over the
+    reference. Over a force in N a residue is φ_sensor φ_driven in 1/kg. `mode_covariance` is that
+    of natural frequency (rad/s), damping ratio and all residues of one mode.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("mode", "sensor")
+
+    natural_frequency: Float[np.ndarray, " mode"]  # rad/s
+    damping_ratio: Float[np.ndarray, " mode"]
+    residue: Float[np.ndarray, "sensor mode"]  # displacement over reference, times s^-2
+    mode_covariance: Float[np.ndarray, "mode entry entry"]
+    lower: Float[np.ndarray, " sensor"]  # of 1/Ω²; 0 where it was not fitted
+    lower_std: Float[np.ndarray, " sensor"]
+    upper: Float[np.ndarray, " sensor"]  # constant
+    upper_std: Float[np.ndarray, " sensor"]
+    phase: float  # rad, ψ of the instrument; 0 where it was not fitted
+    phase_std: float
+    collinearity: Float[np.ndarray, " mode"]  # modal phase collinearity, 1 = real; NaN: one sensor
+    mean_phase: Float[np.ndarray, " mode"]  # rad, of complex residues, away from real
+    mean_phase_std: Float[np.ndarray, " mode"]
+    lines_in_band: Float[np.ndarray, " mode"]  # spectral lines in the half-power band
+    misfit: Float[np.ndarray, " sensor"]  # rms residual over stated 1σ; NaN where none is stated
+    curves: ResponseCurves
+    orders: PoleOrders | None
+    sensors: tuple[Channel, ...] = eqx.field(static=True)
+    reference: Channel = eqx.field(static=True)
+    source: ErrorSource = eqx.field(static=True)
+    status: MinimisationStatus = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return len(self.natural_frequency)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the responses in order."""
+        return tuple(one.name for one in self.sensors)
+
+    @property
+    def natural_frequency_std(self) -> Float[np.ndarray, " mode"]:
+        """1σ, rad/s."""
+        return np.sqrt(self.mode_covariance[:, 0, 0])
+
+    @property
+    def damping_ratio_std(self) -> Float[np.ndarray, " mode"]:
+        """1σ."""
+        return np.sqrt(self.mode_covariance[:, 1, 1])
+
+    @property
+    def residue_std(self) -> Float[np.ndarray, "sensor mode"]:
+        """1σ of the residues."""
+        return np.sqrt(np.diagonal(self.mode_covariance, axis1=1, axis2=2)[:, 2:]).T
+
+    def with_notes(self, notes: tuple[str, ...]) -> "LinearModalFit":
+        """The same with other notes."""
+        return dataclasses.replace(self, notes=notes)
+
+    def sensor_number(self, name: str) -> int:
+        """Where a sensor stands. Raises `ValueError` that lists those there are."""
+        if name not in self.sensor_names:
+            raise ValueError(
+                f"there is no sensor {name!r}; there are {', '.join(self.sensor_names)}."
+            )
+        return self.sensor_names.index(name)
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`; 95 % bands."""
+        rows = zip(
+            self.natural_frequency / _HERTZ,
+            _WIDE * self.natural_frequency_std / _HERTZ,
+            100 * self.damping_ratio,
+            _WIDE * 100 * self.damping_ratio_std,
+            strict=True,
+        )
+        omega = self.curves.omega / _HERTZ
+        return (
+            f"LinearModalFit: {self.n_modes} modes at {len(self.sensors)} sensors over "
+            f"{self.reference.name}, {omega[0]:.6g} to {omega[-1]:.6g} Hz, {self.status.value}",
+            *(
+                f"mode {k + 1}: {f:.7g} ± {df:.2g} Hz, damping {z:.4g} ± {dz:.2g} %"
+                for k, (f, df, z, dz) in enumerate(rows)
+            ),
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        mode, both = ("mode",), ("sensor", "mode")
+        unit = "1/kg" if self.reference.quantity == "force" else "SI"
+        columns = {
+            "natural_frequency_hz": (self.natural_frequency / _HERTZ, "Hz", "natural frequency"),
+            "natural_frequency_std_hz": (self.natural_frequency_std / _HERTZ, "Hz", "its 1σ"),
+            "damping_ratio": (self.damping_ratio, "1", "damping ratio"),
+            "damping_ratio_std": (self.damping_ratio_std, "1", "its 1σ"),
+            "phase_collinearity": (self.collinearity, "1", "modal phase collinearity"),
+            "mean_phase_deg": (np.degrees(self.mean_phase), "deg", "phase of complex residues"),
+            "lines_in_half_power_band": (self.lines_in_band, "1", "lines in the half-power band"),
+        }
+        return {
+            "mode": Variable(mode, np.arange(1, self.n_modes + 1), "1", "mode"),
+            "sensor": Variable(("sensor",), np.array(self.sensor_names), "", "sensor"),
+            **{name: Variable(mode, *rest) for name, rest in columns.items()},
+            "residue": Variable(both, self.residue, unit, "residue of the receptance"),
+            "residue_std": Variable(both, self.residue_std, unit, "its 1σ"),
+            "lower_residual": Variable(("sensor",), self.lower, unit, "coefficient of 1/Ω²"),
+            "lower_residual_std": Variable(("sensor",), self.lower_std, unit, "its 1σ"),
+            "upper_residual": Variable(("sensor",), self.upper, "SI", "constant receptance"),
+            "upper_residual_std": Variable(("sensor",), self.upper_std, "SI", "its 1σ"),
+            "misfit": Variable(("sensor",), self.misfit, "1", "rms residual over stated 1σ"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {
+            "reference": self.reference.name,
+            "errors_from": self.source,
+            "status": self.status.value,
+            "notes": "\n".join(self.notes),
+        }

@@ -1,0 +1,165 @@
+"""What a reader of a modal fit must know: complex modes, leakage, misfit, doubtful residuals."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.identify.modal.modal_bases import (
+    BasisSettings,
+    real_and_imaginary,
+    receptance_bases,
+    unpacked,
+)
+from snrmjax.identify.modal.response_data import ResponseData
+from snrmjax.identify.modal.separable_fit import ChannelRows, SeparableFit, fit_separable
+
+if TYPE_CHECKING:
+    from snrmjax.identify.modal.modal_fit import LinearModalFit
+
+_HERTZ = 2 * np.pi
+_FEW_LINES = 8.0  # in the half-power band, below which leakage may count
+_BIASED = 0.01  # relative bias of damping that is worth a note
+_REAL = 0.9  # phase collinearity below which a mode is called complex
+_TURNED = np.radians(5.0)  # mean phase that is worth a note
+_CERTAIN = 3.0  # standard errors
+_MISFIT = 1.5  # rms residual over stated σ that is worth a note
+_AROUND = 30  # lines on both sides, for the leakage of one mode
+
+
+def complex_residues(
+    data: ResponseData,
+    settings: BasisSettings,
+    fit: SeparableFit,
+    std: Float[np.ndarray, "channel line"],
+    rank: Int[np.ndarray, " mode"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Modal phase collinearity, mean phase (rad) away from real and its 1σ, of every mode.
+
+    Of residues A + iB from a linear fit with terms iΩB/ω beside A, at the fitted poles.
+    Reference: Pappa, Elliott & Schenk, J. Guid. Control Dyn. 16 (1993) 860, doi:10.2514/3.21092.
+    """
+    natural = unpacked(fit.unknowns, settings)[0]
+    n, lines = len(natural), len(data.omega)
+    columns = receptance_bases(data.omega, fit.unknowns, settings)[0].columns
+    whole = columns[:lines] + 1j * columns[lines:]
+    more = 1j * data.omega[:, None] / natural * whole[:, :n]
+    both = real_and_imaginary(np.column_stack([whole, more]), 0)
+    good = np.isfinite(data.receptance)
+    values = real_and_imaginary(np.where(good, data.receptance, 0.0))
+    residue = np.zeros((len(values), n), dtype=complex)
+    spread = np.zeros((len(values), n))
+    for k, row in enumerate(values):
+        weight = np.tile(np.where(good[k], 1 / std[k], 0.0), 2)
+        weighted = both * weight[:, None]
+        size = np.linalg.norm(weighted, axis=0)
+        inverse = np.linalg.pinv(weighted / size, rcond=1e-10) / size[:, None]
+        found = inverse @ (row * weight)
+        residue[k] = found[:n] + 1j * found[-n:]
+        spread[k] = np.linalg.norm(inverse[-n:], axis=1)
+    a, b = residue.real, residue.imag
+    xx, yy, xy = np.sum(a * a, axis=0), np.sum(b * b, axis=0), np.sum(a * b, axis=0)
+    whole_size = np.maximum(xx + yy, 1e-300)
+    collinearity = ((xx - yy) ** 2 + 4 * xy**2) / whole_size**2
+    if len(values) < 2:
+        collinearity = np.full(n, np.nan)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
+    angle_std = np.sqrt(np.sum((a * spread) ** 2, axis=0)) / whole_size
+    return collinearity[rank], angle[rank], angle_std[rank]
+
+
+def lines_in_half_power(
+    omega: Float[np.ndarray, " line"],
+    natural: Float[np.ndarray, " mode"],
+    ratio: Float[np.ndarray, " mode"],
+) -> Float[np.ndarray, " mode"]:
+    """Width 2ζω of the half-power band over the spacing of the lines there."""
+    spacing = np.interp(natural, (omega[1:] + omega[:-1]) / 2, np.diff(omega))
+    return 2 * ratio * natural / spacing
+
+
+def leakage_bias(natural: float, ratio: float, spacing: float) -> tuple[float, float]:
+    """Relative errors of frequency and damping of a mode under Hann's window, if not modelled.
+
+    Of averages of stationary random excitation, `spacing` (rad/s) one over the window's length.
+    """
+    omega = natural + spacing * np.arange(-_AROUND, _AROUND + 1)
+    omega = omega[omega > 0]
+    truth = np.array([natural, ratio])
+    leaked = BasisSettings(False, False, window_time=2 * np.pi / spacing)
+    values = receptance_bases(omega, truth, leaked, (1,))[0].columns[:, :1].T
+    plain = BasisSettings(False, True)
+    size = np.full(values.shape, 1e3 / np.abs(values).max())
+    low, high = np.array([0.9 * natural, -0.5]), np.array([1.1 * natural, 0.9])
+    found = fit_separable(
+        lambda point: receptance_bases(omega, point, plain),
+        ChannelRows(values, size, np.zeros(1, dtype=int), 2),
+        np.array([natural, ratio + 0.3 * spacing / natural]),
+        (low, high),
+    )
+    return found.unknowns[0] / natural - 1, found.unknowns[1] / ratio - 1
+
+
+def fit_notes(
+    found: "LinearModalFit", data: ResponseData, settings: BasisSettings
+) -> tuple[str, ...]:
+    """Sentences on what the fit assumes and the data do not keep."""
+    notes = [*_leakage(found, data, settings), *_complexity(found), *_misfits(found)]
+    if not found.status.found_minimum:
+        notes.append("the least-squares fit had not settled after its last step")
+    if settings.window_time is not None:
+        notes.append(
+            "leakage of Hann's window is modelled: averages of stationary random excitation, "
+            f"windows of {settings.window_time:.4g} s"
+        )
+    return tuple(notes)
+
+
+def _leakage(found: "LinearModalFit", data: ResponseData, settings: BasisSettings) -> list[str]:
+    averaged = data.source == "coherence" or data.averages is not None
+    if settings.window_time is not None or not averaged:
+        return []
+    notes = []
+    for k in range(found.n_modes):
+        lines = found.lines_in_band[k]
+        if lines >= _FEW_LINES:
+            continue
+        natural, ratio = found.natural_frequency[k], found.damping_ratio[k]
+        spacing = 2 * ratio * natural / lines
+        shift = leakage_bias(float(natural), float(ratio), float(spacing))[1]
+        if abs(shift) > _BIASED:
+            notes.append(
+                f"the half-power band of mode {k + 1} ({natural / _HERTZ:.6g} Hz) has "
+                f"{lines:.1f} lines: if these are averages of random excitation under Hann's "
+                f"window, leakage makes its damping some {100 * shift:.2g} % too high, which is "
+                "not in the error; model it (window hann), or measure with finer lines"
+            )
+    return notes
+
+
+def _complexity(found: "LinearModalFit") -> list[str]:
+    notes = []
+    for k in range(found.n_modes):
+        where = f"mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz)"
+        phase, std = found.mean_phase[k], found.mean_phase_std[k]
+        if abs(phase) > max(_TURNED, _CERTAIN * std):
+            notes.append(
+                f"the residues of {where} are turned by {np.degrees(phase):.2g}° ± "
+                f"{np.degrees(1.96 * std):.2g}° from real ones: an instrument's phase (free it), "
+                "a neighbouring mode that was missed, or complex modes"
+            )
+        if found.collinearity[k] < _REAL:
+            notes.append(
+                f"{where} is complex: modal phase collinearity {found.collinearity[k]:.2f}; its "
+                "real shape is an approximation"
+            )
+    return notes
+
+
+def _misfits(found: "LinearModalFit") -> list[str]:
+    return [
+        f"the residuals of {name} are {value:.2g} times what is stated of its errors: the "
+        "errors of the modes are scaled by that"
+        for name, value in zip(found.sensor_names, found.misfit, strict=True)
+        if value > _MISFIT
+    ]

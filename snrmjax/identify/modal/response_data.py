@@ -1,0 +1,206 @@
+"""What a modal fit takes from frequency responses: one reference, one band, errors of each line."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+
+ErrorSource = Literal["stated", "coherence", "residuals"]
+"""Where the weights come from: stated 1σ, coherence, or the residuals themselves."""
+
+_HERTZ = 2 * np.pi
+_FEWEST_LINES = 6
+_POWERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+_LEAST_MISSING_COHERENCE = 1e-7  # 1 − γ² that a file's rounding leaves
+_SAME_FREQUENCY = 1e-9  # relative
+
+
+class ResponseData(NamedTuple):
+    """Receptances over one reference, with the 1σ of real and imaginary part of each."""
+
+    omega: Float[np.ndarray, " line"]  # rad/s
+    receptance: Complex[np.ndarray, "channel line"]  # NaN where not measured
+    std: Float[np.ndarray, "channel line"]  # 1σ of each part; NaN where the source is residuals
+    powers: tuple[int, ...]  # of iΩ, by which each channel measured its receptance
+    channels: tuple[Channel, ...]
+    reference: Channel
+    source: ErrorSource
+    averages: int | None
+    notes: tuple[str, ...]
+
+    @property
+    def measured_size(self) -> Float[np.ndarray, "channel line"]:
+        """|iΩ|^power of each channel: a receptance's factor to what was measured."""
+        return self.omega ** np.array(self.powers)[:, None]
+
+
+def response_data(
+    responses: FrequencyResponses,
+    *,
+    std: Float[np.ndarray, "response frequency"] | None = None,
+    reference: str | None = None,
+    from_frequency: float | None = None,
+    to_frequency: float | None = None,
+) -> ResponseData:
+    """The lines of a band over one reference, as receptances.
+
+    Arguments: `std` 1σ of real and of imaginary part of each value, SI of what was measured;
+    `reference` the name of a channel where there are several; the band in rad/s.
+    Raises `ValueError` for several references without a name, responses that are no motion, a
+    coherence outside 0 to 1, fewer than six lines in the band, and responses of zeros.
+    """
+    column = _reference(responses, reference)
+    _check_quantities(responses)
+    low = 0.0 if from_frequency is None else from_frequency
+    high = np.inf if to_frequency is None else to_frequency
+    if not low < high:
+        raise ValueError(
+            f"the band must rise, but is from {low / _HERTZ:.6g} to {high / _HERTZ:.6g} Hz."
+        )
+    omega = responses.frequency
+    keep = (omega > 0) & (omega >= low * (1 - 1e-12)) & (omega <= high * (1 + 1e-12))
+    keep &= np.isfinite(responses.values[:, column]).any(axis=0)
+    if keep.sum() < _FEWEST_LINES:
+        raise ValueError(
+            f"modes need {_FEWEST_LINES} lines at least, but {int(keep.sum())} of "
+            f"{len(omega)} lie in the band and were measured."
+        )
+    raw = responses.values[:, column][:, keep]
+    for one, row in zip(responses.responses, raw, strict=True):
+        if not np.any(np.nan_to_num(row)):
+            raise ValueError(f"the response {one.name} is zero or missing all over the band.")
+    coherence = responses.coherence[:, column][:, keep]
+    bad = np.argwhere((coherence < 0) | (coherence > 1 + 1e-9))
+    if bad.size:
+        k, line = bad[0]
+        raise ValueError(
+            f"a coherence must be from 0 to 1, but that of {responses.responses[k].name} at "
+            f"{omega[keep][line] / _HERTZ:.6g} Hz is {coherence[k, line]:.6g}."
+        )
+    powers = tuple(_POWERS[one.quantity] for one in responses.responses)
+    size = omega[keep] ** np.array(powers)[:, None]
+    turned = raw / (1j * omega[keep]) ** np.array(powers)[:, None]
+    spread, source, notes = _errors(responses, raw, coherence, std, keep)
+    return ResponseData(
+        omega[keep],
+        turned,
+        spread / size,
+        powers,
+        responses.responses,
+        responses.references[column],
+        source,
+        responses.averages,
+        (*responses.notes, *notes),
+    )
+
+
+def joined_responses(parts: Sequence[FrequencyResponses]) -> FrequencyResponses:
+    """Responses of several files of one test side by side, over the same reference.
+
+    Raises `ValueError` where frequencies or references differ, or a channel comes twice.
+    """
+    first = parts[0]
+    for one in parts[1:]:
+        place = one.name or "one file"
+        if one.frequency.shape != first.frequency.shape or np.any(
+            np.abs(one.frequency - first.frequency) > _SAME_FREQUENCY * first.frequency[-1]
+        ):
+            raise ValueError(
+                f"responses of one test must share their frequencies, but {place} has "
+                f"{len(one.frequency)} lines to {one.frequency[-1] / _HERTZ:.6g} Hz and "
+                f"{first.name or 'the first'} {len(first.frequency)} to "
+                f"{first.frequency[-1] / _HERTZ:.6g} Hz."
+            )
+        if [r.name for r in one.references] != [r.name for r in first.references]:
+            raise ValueError(
+                f"responses of one test must share their references, but {place} has "
+                f"{', '.join(r.name for r in one.references)} and {first.name or 'the first'} "
+                f"{', '.join(r.name for r in first.references)}."
+            )
+    channels = tuple(c for one in parts for c in one.responses)
+    names = [c.name for c in channels]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"the response {name} comes {names.count(name)} times in the files.")
+    return dataclasses.replace(
+        first,
+        values=np.concatenate([one.values for one in parts]),
+        coherence=np.concatenate([one.coherence for one in parts]),
+        responses=channels,
+        notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
+    )
+
+
+def _reference(responses: FrequencyResponses, name: str | None) -> int:
+    names = [one.name for one in responses.references]
+    if name is None and len(names) == 1:
+        return 0
+    if name is None:
+        raise ValueError(
+            f"modes are fitted over one reference, but there are {len(names)} "
+            f"({', '.join(names)}): name one as the reference."
+        )
+    if name not in names:
+        raise ValueError(f"there is no reference {name!r}; there are {', '.join(names)}.")
+    return names.index(name)
+
+
+def _check_quantities(responses: FrequencyResponses) -> None:
+    for one in responses.responses:
+        if one.quantity not in _POWERS:
+            raise ValueError(
+                f"a response must be a displacement, velocity or acceleration, but {one.name} is "
+                f"{one.quantity if one.quantity != 'unknown' else 'of no stated quantity'}."
+            )
+
+
+def _errors(
+    responses: FrequencyResponses,
+    raw: np.ndarray,
+    coherence: np.ndarray,
+    std: np.ndarray | None,
+    keep: np.ndarray,
+) -> tuple[np.ndarray, ErrorSource, list[str]]:
+    """1σ of real and imaginary part, in the unit of what was measured."""
+    unknown = np.full(raw.shape, np.nan)
+    if std is not None:
+        given = np.asarray(std, dtype=float)
+        if given.shape != (len(responses.responses), len(responses.frequency)):
+            raise ValueError(
+                f"`std` must have one value a response and line, "
+                f"{(len(responses.responses), len(responses.frequency))}, but has {given.shape}."
+            )
+        inside = given[:, keep]
+        if not np.all(inside[np.isfinite(raw)] > 0):
+            raise ValueError("`std` must be positive wherever a response was measured.")
+        return inside, "stated", []
+    stated = np.isfinite(coherence) & np.isfinite(raw)
+    if not stated.any():
+        return unknown, "residuals", []
+    if np.any(~stated & np.isfinite(raw)):
+        return unknown, "residuals", ["the coherence is stated in part and not used"]
+    if np.median(coherence[stated]) > 1 - _LEAST_MISSING_COHERENCE:
+        return unknown, "residuals", ["the coherence is 1 at most lines: it says nothing of errors"]
+    if np.median(coherence[stated]) <= 0:
+        raise ValueError("the coherence is zero at most lines: nothing follows the reference.")
+    return coherence_std(np.abs(raw), coherence, responses.averages), "coherence", []
+
+
+def coherence_std(
+    size: Float[np.ndarray, "channel line"],
+    coherence: Float[np.ndarray, "channel line"],
+    averages: int | None,
+) -> Float[np.ndarray, "channel line"]:
+    """1σ of real and imaginary part of an H1 estimate, |H| √((1 − γ²)/(2 γ² n)).
+
+    Relative only where the number n of averages is not stated (one is taken).
+    Reference: Bendat & Piersol, Random Data, 4th ed. (2010), section 9.2,
+    doi:10.1002/9781118032428.
+    """
+    kept = np.clip(coherence, 1e-6, 1 - _LEAST_MISSING_COHERENCE)
+    return size * np.sqrt((1 - kept) / kept / 2 / (averages or 1))

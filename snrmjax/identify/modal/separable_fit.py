@@ -1,0 +1,195 @@
+"""Weighted least squares where each channel is linear in its own unknowns, the poles shared.
+
+min over θ and c_i of Σ_i |W_i (y_i − B(θ) c_i)|²: the linear unknowns c_i are eliminated channel by
+channel (variable projection), so that many sensors cost no more than their sum.
+Reference: Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413, doi:10.1137/0710036; covariance of
+residuals that neighbours share: Newey & West, Econometrica 55 (1987) 703, doi:10.2307/1913610.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
+
+_RULE = StepRule(steps=80, settled=1e-7, damping=1e-4, largest_damping=1e9)
+_LAGS = 30  # rows, over which neighbours' residuals are looked at
+_WHITE = 2.5  # standard errors of a correlation that white noise may well have
+_TINY = 1e-150  # of a column's length, below which it is none
+
+
+class TermColumns(NamedTuple):
+    """Columns of the linear unknowns at some θ, and their derivatives.
+
+    Rows are `sequences` of equal length one after another (real and imaginary parts of a response).
+    """
+
+    columns: Float[np.ndarray, "row term"]
+    derivatives: Float[np.ndarray, "unknown row term"]
+
+
+ColumnsAt = Callable[[Float[np.ndarray, " unknown"]], Sequence[TermColumns]]
+"""The bases at θ, one a group of channels."""
+
+
+class ChannelRows(NamedTuple):
+    """Rows of all channels; `groups` says which basis is a channel's."""
+
+    values: Float[np.ndarray, "channel row"]
+    weights: Float[np.ndarray, "channel row"]  # 1/σ, 0 where not measured
+    groups: Int[np.ndarray, " channel"]
+    sequences: int  # of neighbouring rows, of equal length
+
+
+class SeparableFit(NamedTuple):
+    """Best θ and c, whitened residuals, and what covariances are made of.
+
+    An error of channel i is δc_i = B_i⁺ε_i − slopes_i δθ. `own` is the covariance of B_i⁺ε_i,
+    `mixed` that of it with δθ.
+    """
+
+    unknowns: Float[np.ndarray, " unknown"]
+    coefficients: Float[np.ndarray, "channel term"]
+    residuals: Float[np.ndarray, "channel row"]
+    covariance: Float[np.ndarray, "unknown unknown"]
+    slopes: Float[np.ndarray, "channel term unknown"]
+    own: Float[np.ndarray, "channel term term"]
+    mixed: Float[np.ndarray, "channel term unknown"]
+    correlation: Float[np.ndarray, " lag"]  # of neighbouring residuals, from lag one
+    status: MinimisationStatus
+
+    def term_covariance(self, term: int) -> Float[np.ndarray, "channel channel"]:
+        """Covariance of one linear unknown over all channels."""
+        k, t = self.slopes[:, term], self.mixed[:, term]
+        shared = k @ self.covariance @ k.T - t @ k.T - k @ t.T
+        return shared + np.diag(self.own[:, term, term])
+
+    def cross_covariance(self, term: int) -> Float[np.ndarray, "unknown channel"]:
+        """Covariance of θ with one linear unknown of every channel."""
+        return self.mixed[:, term].T - self.covariance @ self.slopes[:, term].T
+
+
+def fit_separable(
+    basis_at: ColumnsAt,
+    measured: ChannelRows,
+    start: Float[np.ndarray, " unknown"],
+    bounds: tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " unknown"]],
+) -> SeparableFit:
+    """The weighted least-squares fit and its covariance for errors of unit variance.
+
+    Residuals of neighbouring rows may be correlated (windows, smooth misfits): their correlation,
+    as long as it is significant, widens the covariance.
+    """
+
+    def linearised(points: np.ndarray) -> list["_Compressed"]:
+        return [_compressed(basis_at(point), measured) for point in points]
+
+    begin = np.clip(start, *bounds)[None]
+    rule = _RULE
+    found = minimise(linearised, begin, linearised(begin), bounds, rule)[0]
+    return _with_covariance(basis_at(found.point), measured, found.point, found.status)
+
+
+class _Compressed(NamedTuple):
+    """Residuals and Jacobian of the projected problem, each channel's rows by their triangle."""
+
+    residuals: Float[np.ndarray, " row"]
+    jacobian: Float[np.ndarray, "row unknown"]
+
+
+class _Projected(NamedTuple):
+    coefficients: np.ndarray  # term
+    inverse: np.ndarray  # term, row: pseudo-inverse of the weighted basis
+    slopes: np.ndarray  # row, unknown: weighted derivative of the model at fixed c
+    outside: np.ndarray  # row, unknown: the part of it that no c can follow
+    residuals: np.ndarray  # row
+
+
+def _projected(basis: TermColumns, values: np.ndarray, weights: np.ndarray) -> _Projected:
+    weighted = basis.columns * weights[:, None]
+    size = np.linalg.norm(weighted, axis=0)
+    size = np.where(size > _TINY, size, 1.0)
+    orthogonal, triangle = np.linalg.qr(weighted / size)
+    inverse = np.linalg.pinv(triangle, rcond=1e-12) @ orthogonal.T / size[:, None]
+    rows = values * weights
+    found = inverse @ rows
+    slopes = np.einsum("urt,t->ru", basis.derivatives, found) * weights[:, None]
+    outside = slopes - orthogonal @ (orthogonal.T @ slopes)
+    residuals = rows - orthogonal @ (orthogonal.T @ rows)
+    return _Projected(found, inverse, slopes, outside, residuals)
+
+
+def _compressed(bases: Sequence[TermColumns], measured: ChannelRows) -> _Compressed:
+    parts = []
+    for values, weights, group in zip(*measured[:3], strict=True):
+        one = _projected(bases[group], values, weights)
+        parts.append(np.linalg.qr(np.column_stack([-one.outside, one.residuals]), mode="r"))
+    every = np.concatenate(parts)
+    if not np.isfinite(every).all():
+        every = np.full_like(every, np.inf)
+    return _Compressed(every[:, -1], every[:, :-1])
+
+
+def _with_covariance(
+    bases: Sequence[TermColumns],
+    measured: ChannelRows,
+    point: np.ndarray,
+    status: MinimisationStatus,
+) -> SeparableFit:
+    every = [
+        _projected(bases[group], values, weights)
+        for values, weights, group in zip(*measured[:3], strict=True)
+    ]
+    residuals = np.stack([one.residuals for one in every])
+    correlation = _correlation(residuals, measured)
+    spread = _Spread(correlation, measured.sequences)
+    information = sum(one.outside.T @ one.outside for one in every)
+    gain = np.linalg.pinv(np.asarray(information), rcond=1e-15, hermitian=True)
+    meat = sum(spread.between(one.outside, one.outside) for one in every)
+    slopes = np.stack([one.inverse @ one.slopes for one in every])
+    own = np.stack([spread.between(one.inverse.T, one.inverse.T) for one in every])
+    mixed = np.stack([spread.between(one.inverse.T, one.outside) @ gain for one in every])
+    found = np.stack([one.coefficients for one in every])
+    covariance = gain @ meat @ gain
+    return SeparableFit(
+        point, found, residuals, covariance, slopes, own, mixed, correlation, status
+    )
+
+
+class _Spread(NamedTuple):
+    """Errors of unit variance whose neighbours are correlated."""
+
+    correlation: np.ndarray
+    sequences: int
+
+    def between(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """aᵀRb for the correlation matrix R of the rows."""
+        found = a.T @ b
+        if not self.correlation.size:
+            return found
+        x, y = (m.reshape(self.sequences, -1, m.shape[1]) for m in (a, b))
+        for lag, value in enumerate(self.correlation, start=1):
+            early, late = slice(None, -lag), slice(lag, None)
+            found = found + value * np.einsum("snu,snv->uv", x[:, early], y[:, late])
+            found = found + value * np.einsum("snu,snv->uv", x[:, late], y[:, early])
+        return found
+
+
+def _correlation(residuals: np.ndarray, measured: ChannelRows) -> np.ndarray:
+    """Correlations of neighbouring residuals up to the first that white noise may have."""
+    used = (measured.weights > 0).reshape(len(residuals) * measured.sequences, -1)
+    rows = np.where(used, residuals.reshape(used.shape), 0.0)
+    length = rows.shape[1]
+    variance = np.sum(rows**2) / max(used.sum(), 1)
+    found: list[float] = []
+    for lag in range(1, min(_LAGS, length // 4) + 1):
+        pairs = np.sum(used[:, :-lag] & used[:, lag:])
+        if not pairs or variance == 0:
+            break
+        value = np.sum(rows[:, :-lag] * rows[:, lag:]) / pairs / variance
+        if value * np.sqrt(pairs) < _WHITE:
+            break
+        found.append(float(value) * (1 - lag / length))
+    return np.array(found)
