@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import StaticCases
-from snrmjax.condense.scale_study import LoadScaleStudy
+from snrmjax.condense.scale_study import TOLERANCE, LoadScaleStudy
 from snrmjax.condense.static_response import static_displacement
 from snrmjax.io.reduction.source import ShapeLines
 from snrmjax.model.potential import monomial_key
@@ -34,8 +35,11 @@ from snrmjax.report.style import (
 
 _ACROSS = 3  # panels beside one another
 _ROW = 2.4  # inches
+_FRAME = 0.1  # of a decade between a point and the frame
+_TICKS = 12  # intervals between labels, of all panels of a row
 _POINTS = 60  # on each side of a static curve
 _MOST_LINES = 6  # coefficients that are drawn
+_MOST_CHANGE = 50.0  # per cent of a coefficient that is drawn
 FITTED, FURTHER = "finite elements, load cases of the fit", "finite elements, not fitted"
 
 
@@ -61,7 +65,7 @@ def static_figure(
     Loads are given as the displacement that they would cause in the linear structure.
     """
     n = len(names)
-    columns = min(_ACROSS, n)
+    columns = 2 if n == 4 else min(_ACROSS, n)
     rows = -(-n // columns)
     figure, grid = panels(PAGE if n > 1 else COLUMN, _ROW * rows + 0.4, rows, columns)
     largest, squared = np.asarray(found.basis.largest), np.asarray(found.basis.frequency) ** 2
@@ -92,6 +96,7 @@ def static_figure(
             np.nanmax(np.abs(x), initial=0.0), np.max(np.abs(every[:, 1])) * largest[k] / unit.size
         )
         axes.set_xlim(-reach, reach)
+        axes.xaxis.set_major_locator(MaxNLocator(_TICKS // columns))
     for axes in list(grid.flat)[n:]:
         axes.set_visible(False)
     legend(figure)
@@ -135,9 +140,10 @@ def quality_figure(found: Condensation) -> Figure:
 
 
 def _decades(values: np.ndarray) -> tuple[float, float]:
-    """Powers of ten around positive values."""
+    """Powers of ten around positive values, none of which lies on the frame."""
     power = np.log10(values)
-    return float(10.0 ** np.floor(power.min())), float(10.0 ** (np.floor(power.max()) + 1))
+    low, high = np.floor(power.min() - _FRAME), np.ceil(power.max() + _FRAME)
+    return float(10.0**low), float(10.0**high)
 
 
 def scale_figure(study: LoadScaleStudy) -> Figure:
@@ -147,18 +153,20 @@ def scale_figure(study: LoadScaleStudy) -> Figure:
     solved = np.isfinite(study.misfit)
     nearest = int(np.argmin(np.abs(np.log(study.scale))))
     listed = np.flatnonzero(study.leading)
+    change = 100 * (study.coefficient[:, listed] / study.coefficient[nearest, listed] - 1)
     for k, column in enumerate(listed[:_MOST_LINES]):
-        reference = study.coefficient[nearest, column]
         left.plot(
             study.scale[solved],
-            study.coefficient[solved, column] / reference,
+            change[solved, k],
             ".-",
             color=_colour(k),
             linewidth=LINE,
             label=f"coefficient {monomial_key(study.monomials[column])}",
         )
-    left.set_ylim(0.5, 1.5)
-    right.plot(study.scale[solved], study.misfit[solved], ".-", color=SERIES[1], linewidth=LINE)
+    reach = 1.2 * float(np.max(np.abs(change[solved]), initial=0.0))
+    reach = min(max(reach, 200 * TOLERANCE), _MOST_CHANGE)
+    left.set_ylim(-reach, reach)
+    right.plot(study.scale[solved], study.misfit[solved], ".-", color="0.1", linewidth=LINE)
     right.plot(
         study.scale[solved],
         study.nonlinear_ratio[solved],
@@ -167,7 +175,7 @@ def scale_figure(study: LoadScaleStudy) -> Figure:
         linewidth=LINE,
         label="nonlinear over linear force (right)",
     )
-    right.plot([], [], ".-", color=SERIES[1], label="residual over nonlinear force (right)")
+    right.plot([], [], ".-", color="0.1", label="residual over nonlinear force (right)")
     right.set_yscale("log")
     for axes in (left, right):
         axes.set_xscale("log")
@@ -184,7 +192,7 @@ def scale_figure(study: LoadScaleStudy) -> Figure:
             {**STAR, "transform": axes.get_xaxis_transform()},
             "load cases without solution",
         )
-    name_axes(left, "Coefficients", "Load scale", "Over value at scale 1")
+    name_axes(left, "Coefficients", "Load scale", "Change (%)")
     name_axes(right, "Fit", "Load scale", "Ratio")
     legend(figure)
     return figure

@@ -50,10 +50,11 @@ QUALITY = (
     "round-off."
 )
 SCALE = (
-    "The condensation repeated with loads of many sizes. Left: the leading coefficients over those "
-    "of the model. Small loads show the round-off of displacements, large ones the terms that the "
-    "polynomial lacks; between them the coefficients do not depend on the loads, and the model's "
-    f"own load scale should lie there. The plateau is where they stay within {100 * TOLERANCE:g} %."
+    "The condensation repeated with loads of many sizes. Left: how far the leading coefficients "
+    "are from those of the model. Small loads show the round-off of displacements, large ones the "
+    "terms that the polynomial lacks; between them the coefficients do not depend on the loads, "
+    "and the model's own load scale should lie there. The plateau is where they stay within "
+    f"{100 * TOLERANCE:g} %."
 )
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
 _REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
