@@ -52,6 +52,7 @@ SUB_ROOMS = {
     "identify.inference": {"identify.curves", "identify.pointwise", "identify.joint"},
     "identify.calibrate": {"identify.pointwise"},
     "identify.modal": set(),
+    "identify.scaling": {"identify.modal"},
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "methods.bench": {"methods.result", "methods.one_sensor"},

@@ -39,6 +39,17 @@ from .joint.joint_fit import (
 )
 from .joint.ranking import FamilyCandidate
 from .joint.selection import SelectionStatus
+from .modal.base_motion import BaseResponses, relative_to_base
+from .modal.free_decay import DecayModes, fit_free_decay
+from .modal.linear_fit import fit_linear_modes
+from .modal.modal_fit import LinearModalFit
+from .modal.response_data import joined_responses
+from .modal.state_responses import (
+    StateResponses,
+    amplitude_dependence,
+    levels_by_velocity,
+    responses_of_states,
+)
 from .pointwise.backbone import Backbone, BackboneFit, BackboneValues, fit_backbone
 from .pointwise.backbone_points import identify_points
 from .pointwise.identification import Identification, identify_backbone
@@ -48,29 +59,48 @@ from .pointwise.points_result import BackbonePoints
 from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
 from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+from .scaling.scale import (
+    AddedMass,
+    Calibration,
+    DrivePoint,
+    Free,
+    KnownShape,
+    SensorMasses,
+    decay_modes,
+    scale_modes,
+)
+from .scaling.scaled_modes import ScaledModes
 
 __all__ = [
     "FAMILIES",
+    "AddedMass",
     "AdviceStatus",
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
     "BackboneValues",
+    "BaseResponses",
     "CalibratedModel",
+    "Calibration",
     "ComparedBand",
     "ComparedBands",
     "Contribution",
     "Contributions",
+    "DecayModes",
+    "DrivePoint",
     "FailedRival",
     "FamilyCandidate",
     "FamilyChoice",
     "FitStatus",
     "FittedPoint",
     "FittedResponse",
+    "Free",
     "Identification",
     "IntervalEnd",
     "InverseForce",
     "JointFit",
+    "KnownShape",
+    "LinearModalFit",
     "LocatedStatus",
     "NextMeasurement",
     "NextMeasurements",
@@ -80,17 +110,24 @@ __all__ = [
     "Profile",
     "Resonance",
     "Rival",
+    "ScaledModes",
     "SelectionStatus",
     "Sensitivity",
+    "SensorMasses",
     "SnrmPoints",
+    "StateResponses",
+    "amplitude_dependence",
     "bootstrap",
     "calibrate_model",
     "closed_form",
     "compare_bands",
     "contributions",
     "corrected_states",
+    "decay_modes",
     "fit_backbone",
+    "fit_free_decay",
     "fit_jointly",
+    "fit_linear_modes",
     "fitted_response",
     "fitted_values",
     "identify_backbone",
@@ -99,14 +136,19 @@ __all__ = [
     "inverse_force",
     "invert_amplitude_phase",
     "invert_phasor",
+    "joined_responses",
+    "levels_by_velocity",
     "next_measurements",
     "nonlinear_mode_velocity",
     "predict_response",
     "profile",
     "reference_sensor",
+    "relative_to_base",
     "resonance_by_fixed_point",
     "resonances",
+    "responses_of_states",
     "sample_posterior",
+    "scale_modes",
     "sensitivity",
     "snrm_velocity",
 ]

@@ -1,0 +1,116 @@
+"""Low-level steady states as a frequency response, and whether they are low enough."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses, frequency_responses
+from snrmjax.measure.states import SteadyStates, relative_errors
+
+_HERTZ = 2 * np.pi
+_CERTAIN = 2.0  # standard errors of a difference between levels
+
+
+class StateResponses(NamedTuple):
+    """Velocity over force of one level."""
+
+    responses: FrequencyResponses
+    std: Float[np.ndarray, "response frequency"] | None  # of real and of imaginary part
+    level: int
+    velocity: float  # m/s, the largest
+
+
+def levels_by_velocity(data: SteadyStates) -> list[int]:
+    """The levels of a test, that of the smallest largest velocity first."""
+    size = np.where(np.asarray(data.measured), np.abs(np.asarray(data.velocity)), 0.0).max(axis=1)
+    level = np.asarray(data.level)
+    return sorted(np.unique(level).tolist(), key=lambda one: size[level == one].max())
+
+
+def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
+    """The mobilities of one level; states of one frequency are averaged.
+
+    Raises `ValueError` for a level that is not there, for phases that were not measured and for
+    states with neither a force nor a drive voltage.
+    """
+    rows = np.asarray(data.level) == level
+    if not rows.any():
+        listed = ", ".join(map(str, np.unique(np.asarray(data.level)).tolist()))
+        raise ValueError(f"there is no level {level}; there are {listed}.")
+    if np.any(np.asarray(data.phase_unknown)[rows]):
+        raise ValueError("modes need phases, but velocities of amplitude alone were measured.")
+    force = np.asarray(data.force)[rows]
+    volts = not np.isfinite(force).any()
+    if volts:
+        force = np.asarray(data.drive)[rows]
+    reference = Channel("drive", "voltage", "V") if volts else Channel("force", "force", "N")
+    seen = np.asarray(data.measured)[rows]
+    velocity = np.where(seen, np.asarray(data.velocity)[rows], np.nan)
+    mobility = velocity / force[:, None]
+    errors = np.asarray(relative_errors(data))[rows]
+    stated = np.isfinite(errors).all(axis=2)
+    parts = np.sqrt(np.nansum(errors**2, axis=2) / 2) * np.abs(mobility)
+    known = bool(np.all(stated[seen]) and np.all(parts[seen] > 0))
+    omega, place = np.unique(np.asarray(data.frequency)[rows], return_inverse=True)
+    shape = (velocity.shape[1], len(omega))
+    total, count, variance = np.zeros(shape, dtype=complex), np.zeros(shape), np.zeros(shape)
+    for k, row in enumerate(place):
+        total[:, row] += np.where(seen[k], mobility[k], 0.0)
+        count[:, row] += seen[k]
+        variance[:, row] += np.where(seen[k], parts[k] ** 2, 0.0)
+    values = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    std = np.sqrt(variance) / np.maximum(count, 1)
+    found = frequency_responses(
+        omega,
+        values[:, None],
+        [Channel(name, "velocity", "m/s") for name in data.sensors],
+        [reference],
+        name=f"level {level}",
+    )
+    largest = float(np.nanmax(np.abs(velocity)))
+    return StateResponses(found, std if known else None, level, largest)
+
+
+def amplitude_dependence(
+    lowest: LinearModalFit,
+    next_level: LinearModalFit,
+    velocities: tuple[float, float],
+) -> tuple[str, ...]:
+    """Sentences on modes that differ between the two lowest levels by more than their errors.
+
+    Arguments: the largest velocity of each level, m/s, the lower first. The error that may remain
+    at the lower level is the change times v₁/(v₂ − v₁), as if it grew with the amplitude.
+    """
+    notes = []
+    low, high = velocities
+    rest = low / (high - low) if high > low * 1.01 else np.nan
+    for k in range(lowest.n_modes):
+        omega = lowest.natural_frequency[k]
+        other = int(np.argmin(np.abs(next_level.natural_frequency - omega)))
+        place = f"mode {k + 1} ({omega / _HERTZ:.6g} Hz)"
+        change = (next_level.natural_frequency[other] - omega) / _HERTZ
+        error = (
+            np.hypot(next_level.natural_frequency_std[other], lowest.natural_frequency_std[k])
+            / _HERTZ
+        )
+        ratio = next_level.damping_ratio[other] - lowest.damping_ratio[k]
+        ratio_error = np.hypot(next_level.damping_ratio_std[other], lowest.damping_ratio_std[k])
+        for name, moved, spread, unit, size in (
+            ("frequency", change, error, "Hz", 1.0),
+            ("damping", ratio, ratio_error, "%", 100.0),
+        ):
+            if abs(moved) > _CERTAIN * spread:
+                notes.append(
+                    f"the {name} of {place} depends on the amplitude: {size * moved:+.3g} {unit} "
+                    f"from {low:.3g} to {high:.3g} m/s, where the errors allow "
+                    f"{size * _CERTAIN * spread:.2g} {unit}; at the lowest level some "
+                    f"{size * abs(moved * rest):.2g} {unit} may be left, which is not in its error"
+                )
+    if not notes:
+        notes.append(
+            "the two lowest levels agree within their errors: no amplitude dependence shows"
+        )
+    return tuple(notes)

@@ -1,0 +1,1 @@
+"""Mass-normalised shapes from the residues of linear modes."""

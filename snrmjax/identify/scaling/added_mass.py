@@ -1,0 +1,98 @@
+"""Squares of mass-normalised shapes from frequencies without and with a small mass."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+
+_HERTZ = 2 * np.pi
+_CERTAIN = 3.0  # standard errors of a shift, without which it gives no scale
+_LARGE = 0.1  # relative shift of frequency, beyond which the shapes change too
+_STEP = 1e-7
+
+
+class SquaredShapes(NamedTuple):
+    """φ² at the mass, 1/kg, one a mode."""
+
+    squared: Float[np.ndarray, " mode"]
+    squared_std: Float[np.ndarray, " mode"]
+    notes: tuple[str, ...]
+
+
+def squared_shapes(
+    without: LinearModalFit, with_mass: LinearModalFit, mass: float, mass_std: float = 0.0
+) -> SquaredShapes:
+    """φ² where a mass Δm is added, from ω₀ without and ω₁ with it.
+
+    The mass answers with the force Δm Ω² x: Σ_k φ_k²/(ω₀k² − ω₁r²) = 1/(Δm ω₁r²) for every mode r
+    with the mass. One mode alone: φ² = (ω₀²/ω₁² − 1)/Δm, exact as long as the mass does not
+    change the shape. To first order φ² = 2(ω₀ − ω₁)/(ω₀Δm), too small by the share 3/2 (ω₀ − ω₁)/ω₀.
+    Errors of both frequencies and of the mass are carried.
+
+    Raises `ValueError` for a mass that is not positive, another number of modes, and frequencies
+    that the mass does not lower by three standard errors.
+    """
+    if not (np.isfinite(mass) and mass > 0 and mass_std >= 0):
+        raise ValueError(f"an added mass must be positive (kg), but is {mass:g} ± {mass_std:g}.")
+    before, own_std = without.natural_frequency, without.natural_frequency_std
+    after, after_std = _partners(without, with_mass)
+    shift, spread = before - after, np.hypot(own_std, after_std)
+    for k in range(len(before)):
+        if shift[k] < _CERTAIN * spread[k]:
+            raise ValueError(
+                f"the added mass of {mass:.4g} kg must lower the frequency of mode {k + 1}, but "
+                f"it goes from {before[k] / _HERTZ:.7g} to {after[k] / _HERTZ:.7g} Hz, "
+                f"{shift[k] / _HERTZ:.2g} ± {1.96 * spread[k] / _HERTZ:.2g} Hz (95 %) lower: take "
+                "a larger mass, or a place that moves more."
+            )
+    squared = _solved(before, after, mass)
+    if np.any(squared <= 0):
+        k = int(np.argmin(squared))
+        raise ValueError(
+            f"the frequencies with the added mass of {mass:.4g} kg give mode {k + 1} a squared "
+            f"shape of {squared[k]:.3g} 1/kg: they are not those of the same structure with that "
+            "mass."
+        )
+    variance = (squared / mass * mass_std) ** 2
+    for values, errors, first in ((before, own_std, True), (after, after_std, False)):
+        for k, error in enumerate(errors):
+            moved = values.copy()
+            moved[k] *= 1 + _STEP
+            other = _solved(moved, after, mass) if first else _solved(before, moved, mass)
+            variance = variance + ((other - squared) / (_STEP * values[k]) * error) ** 2
+    notes = [
+        f"mode {k + 1}: the mass of {mass:.4g} kg lowers the frequency by "
+        f"{shift[k] / _HERTZ:.4g} ± {1.96 * spread[k] / _HERTZ:.2g} Hz; the first-order formula "
+        f"would give a squared shape {100 * (2 * shift[k] / before[k] / mass / squared[k] - 1):+.2g} "
+        "% from this one"
+        for k in range(len(before))
+    ]
+    if np.any(shift > _LARGE * before):
+        notes.append("the added mass is so large that shapes change with it: take a smaller one")
+    return SquaredShapes(squared, np.sqrt(variance), tuple(notes))
+
+
+def _solved(before: np.ndarray, after: np.ndarray, mass: float) -> np.ndarray:
+    matrix = 1 / (before[None] ** 2 - after[:, None] ** 2)
+    return np.linalg.solve(matrix, 1 / (mass * after**2))
+
+
+def _partners(without: LinearModalFit, with_mass: LinearModalFit) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies with the mass, one for each mode without it."""
+    before, after = without.natural_frequency, with_mass.natural_frequency
+    if len(after) == len(before):
+        return after, with_mass.natural_frequency_std
+    if len(after) < len(before):
+        raise ValueError(
+            f"the test with the added mass must show the {len(before)} modes of the test without "
+            f"it, but shows {len(after)}: choose the same band, or the poles by hand."
+        )
+    # A mass lowers each frequency, and not below the next lower one.
+    chosen = [int(np.argmin(np.where(after <= one, one - after, np.inf))) for one in before]
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(
+            "the modes of both tests cannot be paired: choose the same band, or the poles by hand."
+        )
+    return after[chosen], with_mass.natural_frequency_std[chosen]

@@ -1,0 +1,72 @@
+"""The rigid-body mode of a free structure, from low residuals or from its mass."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+
+if TYPE_CHECKING:
+    from snrmjax.identify.scaling.scale import DrivePoint
+
+_CERTAIN = 5.0  # standard errors of a low residual
+_APART = 1.2  # ratio of the residual's mass and the stated one that is worth a note
+
+
+def rigid_body_mode(
+    fit: LinearModalFit,
+    gain: float,
+    free: float | None,
+    drive: "DrivePoint | None",
+    scaled_by: str,
+) -> tuple[np.ndarray | None, float, tuple[str, ...]]:
+    """Shape at the sensors, participation (both kg^-1/2) and notes; no shape where none is due.
+
+    A rigid-body mode answers −φp/Ω²: the low residual of the drive point is −1/m of the mass that
+    the force feels. Modes below the band look alike, so that it is written only where the
+    structure is said to be free: `free` is its mass in kg, 0 where it is not known, None where
+    nobody said.
+    Raises `ValueError` where a free structure's residual refutes that.
+    """
+    lower, std = fit.lower / gain, fit.lower_std / abs(gain)
+    at = None if drive is None else fit.sensor_number(str(drive.sensor))
+    own = own_std = np.nan
+    if drive is not None and at is not None and std[at] > 0:
+        own, own_std = (-1.0 if drive.turned else 1.0) * lower[at], std[at]
+    shows = own < -_CERTAIN * own_std
+    if free is None:
+        note = (
+            f"the low residual at the drive point is that of a free mass of {-1 / own:.4g} kg or "
+            "of modes below the band: it is written as a rigid-body mode where the structure is said "
+            "to be free"
+        )
+        return None, 0.0, (note,) if shows else ()
+    if free < 0 or not np.isfinite(free):
+        raise ValueError(f"the mass of a free structure must be positive (kg), but is {free:g}.")
+    if free > 0:
+        ones = np.full(len(fit.sensors), free**-0.5)
+        if not shows:
+            return ones, free**-0.5, ("the rigid-body mode is that of the stated mass alone",)
+        ratio = -1 / own / free
+        said = f"the low residual at the drive point is that of {-1 / own:.4g} kg"
+        if not 1 / _APART < ratio < _APART:
+            said += (
+                f", {ratio:.2g} times the stated mass: the force acts off the centre of mass, or "
+                "the suspension's modes or missed modes are in it"
+            )
+        if drive is not None and at is not None:
+            signs = np.sign(lower) * np.sign(lower[at])
+            ones = ones * np.where(signs == 0, 1.0, signs) * (-1.0 if drive.turned else 1.0)
+        return ones, free**-0.5, (said,)
+    if not shows:
+        what = "is not known" if np.isnan(own) else f"is {own:.3g} ± {1.96 * own_std:.2g} 1/kg"
+        raise ValueError(
+            f"a free structure answers −1/(m Ω²) at low frequency, but the low residual at the "
+            f"drive point {what}: state its mass, or do not call it free."
+        )
+    participation = float(np.sqrt(-own))
+    note = (
+        f"rigid-body mode from the low residuals ({scaled_by}): the force feels {-1 / own:.4g} ± "
+        f"{1.96 * own_std / own**2:.2g} kg"
+    )
+    return -lower / participation, participation, (note,)
