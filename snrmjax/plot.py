@@ -23,6 +23,11 @@ from snrmjax.report.joint_figures import (
     profile_figure,
     residuals_figure,
 )
+from snrmjax.report.modal.modal_figures import (
+    decay_figure,
+    modal_responses_figure,
+    stabilisation_figure,
+)
 from snrmjax.report.simulation_figures import (
     batch_figure,
     damped_mode_figure,
@@ -45,11 +50,13 @@ __all__ = [
     "comparison_figure",
     "contributions_figure",
     "damped_mode_figure",
+    "decay_figure",
     "effect_laws_figure",
     "fitted_curves_figure",
     "force_velocity_figure",
     "misfit_figure",
     "modal_damping_figure",
+    "modal_responses_figure",
     "motions_figure",
     "next_measurements_figure",
     "normal_mode_figure",
@@ -61,5 +68,6 @@ __all__ = [
     "scatter_figure",
     "sensitivity_figure",
     "simulated_response_figure",
+    "stabilisation_figure",
     "style",
 ]

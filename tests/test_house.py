@@ -66,6 +66,7 @@ SUB_ROOMS = {
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},
     "report.methods": {"report.style", "report.html"},
+    "report.modal": {"report.style", "report.html"},
     "report.interactive": {"report.style", "report.html"},
     "report.study": {"report.style", "report.html"},
     "io.reduction": {

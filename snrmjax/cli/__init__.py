@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify, compare, diagnose, study, rom.
+"""The commands: demo, simulate, nnm, identify, compare, diagnose, modes, study, rom.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -14,6 +14,7 @@ from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
+from snrmjax.cli.modes_command import modes
 from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
@@ -40,6 +41,9 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     compare: "Example: snrmjax compare measured.csv --model model.toml --out compared",
     diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
     "snrmjax diagnose sets/*.csv --model model.toml --out results",
+    modes: "Examples: snrmjax modes frf.uff --out model.toml\n\n"
+    "snrmjax modes low_level.csv --drive-point tip --out model.toml\n\n"
+    "snrmjax modes decay.mat --to-hz 200 --unscaled --out model.toml",
     rom: "Examples: snrmjax rom beam.toml --out reduced\n\n"
     "snrmjax rom --tables load_cases --out reduced\n\n"
     "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",

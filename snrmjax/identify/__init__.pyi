@@ -45,6 +45,7 @@ from .modal.linear_fit import fit_linear_modes
 from .modal.modal_fit import LinearModalFit
 from .modal.response_data import joined_responses
 from .modal.state_responses import (
+    AmplitudeDependence,
     StateResponses,
     amplitude_dependence,
     levels_by_velocity,
@@ -59,6 +60,7 @@ from .pointwise.points_result import BackbonePoints
 from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
 from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+from .scaling.request import ModesRequest, find_modes, scale_of
 from .scaling.scale import (
     AddedMass,
     Calibration,
@@ -75,6 +77,7 @@ __all__ = [
     "FAMILIES",
     "AddedMass",
     "AdviceStatus",
+    "AmplitudeDependence",
     "Backbone",
     "BackboneFit",
     "BackbonePoints",
@@ -102,6 +105,7 @@ __all__ = [
     "KnownShape",
     "LinearModalFit",
     "LocatedStatus",
+    "ModesRequest",
     "NextMeasurement",
     "NextMeasurements",
     "NoiseEstimate",
@@ -124,6 +128,7 @@ __all__ = [
     "contributions",
     "corrected_states",
     "decay_modes",
+    "find_modes",
     "fit_backbone",
     "fit_free_decay",
     "fit_jointly",
@@ -149,6 +154,7 @@ __all__ = [
     "responses_of_states",
     "sample_posterior",
     "scale_modes",
+    "scale_of",
     "sensitivity",
     "snrm_velocity",
 ]

@@ -17,6 +17,8 @@ from snrmjax.identify.inference.optimal_design import NextMeasurements
 from snrmjax.identify.inference.profiles import Profile
 from snrmjax.identify.inference.sensitivity import Contributions
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.modal_fit import LinearModalFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneFit, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.points_result import BackbonePoints
@@ -28,6 +30,7 @@ from snrmjax.measure.harmonic_fit import HarmonicFit
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report import diagnosis_figures, figures, joint_figures, simulation_figures
 from snrmjax.report.condense.reduction_figures import scale_figure, static_figure
+from snrmjax.report.modal.modal_figures import decay_figure, modal_responses_figure
 from snrmjax.report.sampling import span_of
 from snrmjax.report.uncertainty import uncertainty_figures
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
@@ -247,3 +250,13 @@ def _(result: Condensation) -> Figure:
 @plot_result.register
 def _(result: LoadScaleStudy) -> Figure:
     return scale_figure(result)
+
+
+@plot_result.register
+def _(result: LinearModalFit, **settings: Any) -> Figure:
+    return modal_responses_figure(result, **settings)
+
+
+@plot_result.register
+def _(result: DecayModes) -> Figure:
+    return decay_figure(result)

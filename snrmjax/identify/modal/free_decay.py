@@ -1,7 +1,7 @@
 """Linear modes from free decays: eigensystem realisation, then a fit of decaying oscillations.
 
-y_i(t) = Σ_r e^(−ζωt) (a cos ω_d t + b sin ω_d t) + c. A decay has no force: frequencies, damping and
-ratios of shapes follow, no scale.
+y_i(t) = Σ_r e^(−ζωt) (a cos ω_d t + b sin ω_d t) + c. A decay has no force: frequencies, damping
+and ratios of shapes follow, no scale.
 Reference: Juang & Pappa, J. Guid. Control Dyn. 8 (1985) 620, doi:10.2514/3.20031.
 """
 

@@ -43,6 +43,7 @@ _USUAL = 0.01  # damping ratio where no pole of the orders is near
 _NEAR = 0.02  # of a frequency: how far from one given by hand a pole may lie
 _NARROW = 1.1  # ratio of a band's ends, below which one residual term is enough
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest residue, without which it is none
+_TWINS = 0.1  # of a decay rate: poles nearer than that are one mode, split by the fit
 _CURVED = 12.0  # a sensor, in units of the noise, that a further residual term must explain
 _ROUNDS = 3  # of fits and weights
 _EVEN = 1e-3  # of the line spacing
@@ -59,7 +60,7 @@ def fit_linear_modes(
     from_frequency: float | None = None,
     to_frequency: float | None = None,
     residual_terms: ResidualTerms = "auto",
-    instrument_phase: bool = False,
+    instrument_phase: bool | None = None,
     window: Literal["hann"] | None = None,
 ) -> LinearModalFit:
     """Natural frequencies, damping ratios and residues of real normal modes, with covariance.
@@ -75,8 +76,9 @@ def fit_linear_modes(
     Arguments: `poles` natural frequencies in rad/s to take in place of clusters; `order` takes all
     lightly damped poles of one model order; `std` 1σ of real and of imaginary part, SI;
     `reference` names one of several; the band in rad/s; `residual_terms` for modes outside the
-    band (1/Ω² below, a constant above); `instrument_phase` frees ψ; `window` "hann" models the
-    leakage of averages of random excitation, whose line spacing is one over the window's length.
+    band (1/Ω² below, a constant above, and Ω² where that shows); `instrument_phase` frees ψ, by
+    default over a voltage only; `window` "hann" models the leakage of averages of random
+    excitation, whose line spacing is one over the window's length.
     Raises `ValueError` as `response_data` does, for no pole that is stable, for poles outside the
     band, and for responses that seem to be conjugated.
     Validity: real modes (see `collinearity` and `mean_phase`), linear and time-invariant.
@@ -97,7 +99,8 @@ def fit_linear_modes(
         from_frequency=from_frequency,
         to_frequency=to_frequency,
     )
-    settings = _settings(data, residual_terms, instrument_phase, window)
+    free = data.reference.quantity == "voltage" if instrument_phase is None else instrument_phase
+    settings = _settings(data, residual_terms, free, window)
     orders = _orders(data, highest_order)
     start = _start(data, orders, poles, order)
     fit, spread = _fitted(data, settings, start, keep_all=poles is not None)
@@ -344,6 +347,11 @@ def _least_certain(fit: SeparableFit, settings: BasisSettings, data: ResponseDat
     for k in range(n):
         std = np.sqrt(np.abs(np.diag(fit.term_covariance(k))))
         certain[k] = np.max(np.abs(fit.coefficients[:, k]) / np.maximum(std, 1e-300))
+    pole = natural * (-ratio + 1j * np.sqrt(np.maximum(1 - ratio**2, 0.0)))
+    gap = np.abs(pole[:, None] - pole) + np.diag(np.full(n, np.inf))
+    twins = np.any(gap < _TWINS * np.abs(pole.real[:, None]), axis=1)
+    if twins.any():
+        return int(np.argmax(twins))
     outside = (natural < data.omega[0]) | (natural > data.omega[-1])
     odd = outside | (ratio <= 0) | (ratio > 0.5)
     if odd.any() and not odd.all():

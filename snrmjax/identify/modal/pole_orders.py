@@ -93,7 +93,7 @@ class PoleClusters(NamedTuple):
     """Means of clusters of stable poles, by frequency."""
 
     pole: Complex[np.ndarray, " cluster"]
-    count: Int[np.ndarray, " cluster"]  # orders that have it
+    shared_by: Int[np.ndarray, " cluster"]  # orders that have it
 
     @property
     def damped(self) -> "PoleClusters":

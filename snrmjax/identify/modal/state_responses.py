@@ -1,5 +1,6 @@
 """Low-level steady states as a frequency response, and whether they are low enough."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -74,43 +75,60 @@ def responses_of_states(data: SteadyStates, level: int) -> StateResponses:
     return StateResponses(found, std if known else None, level, largest)
 
 
+class AmplitudeDependence(NamedTuple):
+    """What two levels say of a fit at the lower one; see `amplitude_dependence`."""
+
+    frequency: Float[np.ndarray, " mode"]  # rad/s, 1σ to add for what may be left
+    damping_ratio: Float[np.ndarray, " mode"]
+    notes: tuple[str, ...]
+
+
 def amplitude_dependence(
     lowest: LinearModalFit,
     next_level: LinearModalFit,
     velocities: tuple[float, float],
-) -> tuple[str, ...]:
-    """Sentences on modes that differ between the two lowest levels by more than their errors.
+) -> AmplitudeDependence:
+    """Whether modes differ between the two lowest levels by more than their errors.
 
-    Arguments: the largest velocity of each level, m/s, the lower first. The error that may remain
-    at the lower level is the change times v₁/(v₂ − v₁), as if it grew with the amplitude.
+    Where one does, its value at no amplitude may differ from that of the lower level by the change
+    times v₁/(v₂ − v₁), as if it grew with the amplitude: that is the error to add.
+
+    Arguments: the largest velocity of each level, m/s, the lower first.
     """
-    notes = []
     low, high = velocities
-    rest = low / (high - low) if high > low * 1.01 else np.nan
+    rest = low / (high - low) if high > 1.01 * low else 1.0
+    added = np.zeros((2, lowest.n_modes))
+    notes = []
     for k in range(lowest.n_modes):
         omega = lowest.natural_frequency[k]
         other = int(np.argmin(np.abs(next_level.natural_frequency - omega)))
-        place = f"mode {k + 1} ({omega / _HERTZ:.6g} Hz)"
-        change = (next_level.natural_frequency[other] - omega) / _HERTZ
-        error = (
-            np.hypot(next_level.natural_frequency_std[other], lowest.natural_frequency_std[k])
-            / _HERTZ
-        )
+        change = next_level.natural_frequency[other] - omega
+        error = np.hypot(next_level.natural_frequency_std[other], lowest.natural_frequency_std[k])
         ratio = next_level.damping_ratio[other] - lowest.damping_ratio[k]
         ratio_error = np.hypot(next_level.damping_ratio_std[other], lowest.damping_ratio_std[k])
-        for name, moved, spread, unit, size in (
-            ("frequency", change, error, "Hz", 1.0),
-            ("damping", ratio, ratio_error, "%", 100.0),
+        for row, name, moved, spread, unit, size in (
+            (0, "frequency", change, error, "Hz", 1 / _HERTZ),
+            (1, "damping", ratio, ratio_error, "%", 100.0),
         ):
             if abs(moved) > _CERTAIN * spread:
+                added[row, k] = abs(moved) * rest
                 notes.append(
-                    f"the {name} of {place} depends on the amplitude: {size * moved:+.3g} {unit} "
-                    f"from {low:.3g} to {high:.3g} m/s, where the errors allow "
-                    f"{size * _CERTAIN * spread:.2g} {unit}; at the lowest level some "
-                    f"{size * abs(moved * rest):.2g} {unit} may be left, which is not in its error"
+                    f"the {name} of mode {k + 1} ({omega / _HERTZ:.6g} Hz) depends on the "
+                    f"amplitude: {size * moved:+.3g} {unit} from {low:.3g} to {high:.3g} m/s, "
+                    f"where the errors allow {size * _CERTAIN * spread:.2g} {unit}; at the lowest "
+                    f"level some {size * added[row, k]:.2g} {unit} may be left, which is added to "
+                    "its error (1σ)"
                 )
     if not notes:
         notes.append(
             "the two lowest levels agree within their errors: no amplitude dependence shows"
         )
-    return tuple(notes)
+    return AmplitudeDependence(added[0], added[1], tuple(notes))
+
+
+def widened(fit: LinearModalFit, by: AmplitudeDependence) -> LinearModalFit:
+    """The fit with the errors that an amplitude dependence adds."""
+    covariance = fit.mode_covariance.copy()
+    covariance[:, 0, 0] += by.frequency**2
+    covariance[:, 1, 1] += by.damping_ratio**2
+    return dataclasses.replace(fit, mode_covariance=covariance)

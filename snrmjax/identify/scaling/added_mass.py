@@ -28,7 +28,8 @@ def squared_shapes(
 
     The mass answers with the force Δm Ω² x: Σ_k φ_k²/(ω₀k² − ω₁r²) = 1/(Δm ω₁r²) for every mode r
     with the mass. One mode alone: φ² = (ω₀²/ω₁² − 1)/Δm, exact as long as the mass does not
-    change the shape. To first order φ² = 2(ω₀ − ω₁)/(ω₀Δm), too small by the share 3/2 (ω₀ − ω₁)/ω₀.
+    change the shape. To first order φ² = 2(ω₀ − ω₁)/(ω₀Δm), too small by about the share
+    3/2 (ω₀ − ω₁)/ω₀.
     Errors of both frequencies and of the mass are carried.
 
     Raises `ValueError` for a mass that is not positive, another number of modes, and frequencies
@@ -56,17 +57,17 @@ def squared_shapes(
             "mass."
         )
     variance = (squared / mass * mass_std) ** 2
-    for values, errors, first in ((before, own_std, True), (after, after_std, False)):
+    for values, errors, is_before in ((before, own_std, True), (after, after_std, False)):
         for k, error in enumerate(errors):
             moved = values.copy()
             moved[k] *= 1 + _STEP
-            other = _solved(moved, after, mass) if first else _solved(before, moved, mass)
+            other = _solved(moved, after, mass) if is_before else _solved(before, moved, mass)
             variance = variance + ((other - squared) / (_STEP * values[k]) * error) ** 2
+    first = 2 * shift / before / mass / squared - 1
     notes = [
         f"mode {k + 1}: the mass of {mass:.4g} kg lowers the frequency by "
         f"{shift[k] / _HERTZ:.4g} ± {1.96 * spread[k] / _HERTZ:.2g} Hz; the first-order formula "
-        f"would give a squared shape {100 * (2 * shift[k] / before[k] / mass / squared[k] - 1):+.2g} "
-        "% from this one"
+        f"would give a squared shape {100 * first[k]:+.2g} % from this one"
         for k in range(len(before))
     ]
     if np.any(shift > _LARGE * before):

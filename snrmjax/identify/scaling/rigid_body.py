@@ -37,8 +37,8 @@ def rigid_body_mode(
     if free is None:
         note = (
             f"the low residual at the drive point is that of a free mass of {-1 / own:.4g} kg or "
-            "of modes below the band: it is written as a rigid-body mode where the structure is said "
-            "to be free"
+            "of modes below the band: it is written as a rigid-body mode where the structure is "
+            "said to be free"
         )
         return None, 0.0, (note,) if shows else ()
     if free < 0 or not np.isfinite(free):

@@ -78,9 +78,8 @@ class ScaledModes(AbstractResult):
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`; 95 % bands."""
-        lines = [
-            f"ScaledModes: {self.n_modes} modes at {', '.join(self.sensors)}, {self.scaled_by}"
-        ]
+        names = ", ".join(self.sensors)
+        lines = [f"ScaledModes: {self.n_modes} modes at {names}, {self.scaled_by}"]
         for k in range(self.n_modes):
             top = int(np.argmax(np.abs(self.shape[:, k])))
             lines.append(
@@ -88,7 +87,8 @@ class ScaledModes(AbstractResult):
                 f"{_WIDE * self.natural_frequency_std[k] / _HERTZ:.2g} Hz, damping "
                 f"{100 * self.damping_ratio[k]:.4g} ± "
                 f"{_WIDE * 100 * self.damping_ratio_std[k]:.2g} %, shape "
-                f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation {self.participation[k]:.5g} per {self.per}"
+                f"{self.shape[top, k]:.5g} at {self.sensors[top]}, participation "
+                f"{self.participation[k]:.5g} per {self.per}"
             )
         return (*lines, *(f"note: {note}" for note in self.notes))
 
