@@ -62,7 +62,7 @@ from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
 from .scaling.request import ModesRequest, find_modes, scale_of
 from .scaling.scale import (
-    AddedMass,
+    AddedMassTest,
     Calibration,
     DrivePoint,
     Free,
@@ -75,7 +75,7 @@ from .scaling.scaled_modes import ScaledModes
 
 __all__ = [
     "FAMILIES",
-    "AddedMass",
+    "AddedMassTest",
     "AdviceStatus",
     "AmplitudeDependence",
     "Backbone",

@@ -429,4 +429,4 @@ def _result(
         data.source,
         fit.status,
     )
-    return found.with_notes((*data.notes, *fit_notes(found, data, settings)))
+    return found.with_notes((*data.notes, *fit_notes(found, data, settings, fit, rank)))

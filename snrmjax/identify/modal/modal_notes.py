@@ -24,7 +24,6 @@ _REAL = 0.9  # phase collinearity below which a mode is called complex
 _TURNED = np.radians(5.0)  # mean phase that is worth a note
 _CERTAIN = 3.0  # standard errors
 _MISFIT = 1.5  # rms residual over stated σ that is worth a note
-_AROUND = 30  # lines on both sides, for the leakage of one mode
 
 
 def complex_residues(
@@ -78,33 +77,53 @@ def lines_in_half_power(
     return 2 * ratio * natural / spacing
 
 
-def leakage_bias(natural: float, ratio: float, spacing: float) -> tuple[float, float]:
-    """Relative errors of frequency and damping of a mode under Hann's window, if not modelled.
+def leakage_bias(
+    data: ResponseData,
+    settings: BasisSettings,
+    fit: SeparableFit,
+    std: Float[np.ndarray, "channel line"],
+) -> Float[np.ndarray, " mode"]:
+    """Relative errors of the damping ratios under Hann's window where leakage is not modelled.
 
-    Of averages of stationary random excitation, `spacing` (rad/s) one over the window's length.
+    The fitted modes are seen through a window of one over the line spacing, and fitted with the
+    same weights without it. Of averages of stationary random excitation.
     """
-    omega = natural + spacing * np.arange(-_AROUND, _AROUND + 1)
-    omega = omega[omega > 0]
-    truth = np.array([natural, ratio])
-    leaked = BasisSettings(False, False, window_time=2 * np.pi / spacing)
-    values = receptance_bases(omega, truth, leaked, (1,))[0].columns[:, :1].T
-    plain = BasisSettings(False, True)
-    size = np.full(values.shape, 1e3 / np.abs(values).max())
-    low, high = np.array([0.9 * natural, -0.5]), np.array([1.1 * natural, 0.9])
+    spacing = float(np.median(np.diff(data.omega)))
+    through = settings._replace(window_time=2 * np.pi / spacing)
+    powers = tuple(dict.fromkeys(data.powers))
+    groups = [powers.index(p) for p in data.powers]
+    bases = receptance_bases(data.omega, fit.unknowns, through, powers)
+    values = np.stack(
+        [bases[g].columns @ row for g, row in zip(groups, fit.coefficients, strict=True)]
+    )
+    weights = np.where(np.isfinite(data.receptance), 1 / std, 0.0)
+    n = len(unpacked(fit.unknowns, settings)[0])
+    low, high = fit.unknowns.copy(), fit.unknowns.copy()
+    low[:n], high[:n] = 0.9 * low[:n], 1.1 * high[:n]
+    low[n:], high[n:] = low[n:] - 0.5, high[n:] + 0.5
     found = fit_separable(
-        lambda point: receptance_bases(omega, point, plain),
-        ChannelRows(values, size, np.zeros(1, dtype=int), 2),
-        np.array([natural, ratio + 0.3 * spacing / natural]),
+        lambda point: receptance_bases(data.omega, point, settings),
+        ChannelRows(values, np.tile(weights, (1, 2)), np.zeros(len(values), dtype=int), 2),
+        fit.unknowns,
         (low, high),
     )
-    return found.unknowns[0] / natural - 1, found.unknowns[1] / ratio - 1
+    return found.unknowns[n : 2 * n] / fit.unknowns[n : 2 * n] - 1
 
 
 def fit_notes(
-    found: "LinearModalFit", data: ResponseData, settings: BasisSettings
+    found: "LinearModalFit",
+    data: ResponseData,
+    settings: BasisSettings,
+    fit: SeparableFit,
+    rank: Int[np.ndarray, " mode"],
 ) -> tuple[str, ...]:
     """Sentences on what the fit assumes and the data do not keep."""
-    notes = [*_leakage(found, data, settings), *_complexity(found), *_misfits(found)]
+    notes = [*_complexity(found), *_misfits(found)]
+    averaged = data.source == "coherence" or data.averages is not None
+    few = found.lines_in_band < _FEW_LINES
+    if settings.window_time is None and averaged and few.any():
+        bias = leakage_bias(data, settings, fit, found.curves.std)[rank]
+        notes = [*_leakage(found, np.where(few, bias, 0.0)), *notes]
     if not found.status.found_minimum:
         notes.append("the least-squares fit had not settled after its last step")
     if settings.window_time is not None:
@@ -115,26 +134,14 @@ def fit_notes(
     return tuple(notes)
 
 
-def _leakage(found: "LinearModalFit", data: ResponseData, settings: BasisSettings) -> list[str]:
-    averaged = data.source == "coherence" or data.averages is not None
-    if settings.window_time is not None or not averaged:
-        return []
-    notes = []
-    for k in range(found.n_modes):
-        lines = found.lines_in_band[k]
-        if lines >= _FEW_LINES:
-            continue
-        natural, ratio = found.natural_frequency[k], found.damping_ratio[k]
-        spacing = 2 * ratio * natural / lines
-        shift = leakage_bias(float(natural), float(ratio), float(spacing))[1]
-        if abs(shift) > _BIASED:
-            notes.append(
-                f"the half-power band of mode {k + 1} ({natural / _HERTZ:.6g} Hz) has "
-                f"{lines:.1f} lines: if these are averages of random excitation under Hann's "
-                f"window, leakage makes its damping some {100 * shift:.2g} % too high, which is "
-                "not in the error; model it (window hann), or measure with finer lines"
-            )
-    return notes
+def _leakage(found: "LinearModalFit", bias: np.ndarray) -> list[str]:
+    return [
+        f"the half-power band of mode {k + 1} ({found.natural_frequency[k] / _HERTZ:.6g} Hz) has "
+        f"{found.lines_in_band[k]:.1f} lines: if these are averages of random excitation under "
+        f"Hann's window, leakage makes its damping some {100 * bias[k]:.2g} % too high, which is "
+        "not in the error; model it (window hann), or measure with finer lines"
+        for k in np.flatnonzero(np.abs(bias) > _BIASED)
+    ]
 
 
 def _complexity(found: "LinearModalFit") -> list[str]:

@@ -119,8 +119,10 @@ def clusters(orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)) -> P
         decay = np.abs(rest.real)
         reach = np.maximum(_NEAR * 0.5 * (decay[:, None] + decay), _FLOOR * np.abs(rest))
         near = (np.abs(rest[:, None] - rest) < reach) & (rest.real[:, None] * rest.real > 0)
-        # The pole with most neighbours, and its neighbours, are the next cluster.
-        members = near[np.argmax(near.sum(axis=1))]
+        # The pole with most neighbours, and the nearest of each order, are the next cluster: two
+        # poles of one order are two modes, however near.
+        seed = int(np.argmax(near.sum(axis=1)))
+        members = _nearest_of_each(at, np.abs(rest - rest[seed]), near[seed])
         count, first = len(np.unique(at[members])), at[members].min()
         if count >= max(_FEWEST_ORDERS, _SHARE * (orders.highest - first + 1)):
             mine = rest[members]
@@ -129,3 +131,12 @@ def clusters(orders: PoleOrders, band: tuple[float, float] = (0.0, np.inf)) -> P
         left[np.flatnonzero(left)[members]] = False
     rank = np.argsort([mean.imag for mean in means], kind="stable")
     return PoleClusters(np.array(means, dtype=complex)[rank], np.array(counts, dtype=int)[rank])
+
+
+def _nearest_of_each(order: np.ndarray, distance: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Mask of the nearest pole of every order."""
+    chosen = np.zeros(len(order), dtype=bool)
+    for one in np.unique(order[among]):
+        rows = np.flatnonzero(among & (order == one))
+        chosen[rows[np.argmin(distance[rows])]] = True
+    return chosen

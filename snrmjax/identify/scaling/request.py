@@ -14,7 +14,7 @@ from snrmjax.identify.modal.state_responses import (
     widened,
 )
 from snrmjax.identify.scaling.scale import (
-    AddedMass,
+    AddedMassTest,
     Calibration,
     DrivePoint,
     Free,
@@ -165,7 +165,7 @@ def _scale(request: ModesRequest, with_mass: LinearModalFit | DecayModes | None)
                 "an added mass needs its kilograms, the sensor where it is, and frequency "
                 "responses of a second test with it."
             )
-        return AddedMass(with_mass, request.mass_at, request.added_mass)
+        return AddedMassTest(with_mass, request.mass_at, request.added_mass)
     if request.sensor_mass or request.fixture_mass is not None:
         if not request.sensor_mass:
             raise ValueError("a fixture's mass scales only with the masses at the sensors.")

@@ -32,7 +32,7 @@ class DrivePoint(NamedTuple):
     turned: bool = False
 
 
-class AddedMass(NamedTuple):
+class AddedMassTest(NamedTuple):
     """Scale by a second test of the same structure with a small mass at a sensor."""
 
     with_mass: LinearModalFit
@@ -60,7 +60,7 @@ class KnownShape(NamedTuple):
     std: float = 0.0
 
 
-Scale = DrivePoint | AddedMass | SensorMasses | KnownShape
+Scale = DrivePoint | AddedMassTest | SensorMasses | KnownShape
 
 
 class Free(NamedTuple):
@@ -142,7 +142,7 @@ def scale_modes(
         return _relative(fit)
     if isinstance(by, DrivePoint):
         scaled = _by_drive_point(fit, residue, by)
-    elif isinstance(by, AddedMass):
+    elif isinstance(by, AddedMassTest):
         scaled = _by_added_mass(fit, residue, by)
     elif isinstance(by, SensorMasses):
         scaled = _by_masses(fit, residue, by)
@@ -274,7 +274,7 @@ def _by_drive_point(fit: LinearModalFit, residue: np.ndarray, by: DrivePoint) ->
     return _Scaled(participation, np.zeros(len(own)), slopes, keep, by_name, notes)
 
 
-def _by_added_mass(fit: LinearModalFit, residue: np.ndarray, by: AddedMass) -> _Scaled:
+def _by_added_mass(fit: LinearModalFit, residue: np.ndarray, by: AddedMassTest) -> _Scaled:
     place = fit.sensor_number(by.sensor)
     found = squared_shapes(fit, by.with_mass, by.mass, by.mass_std)
     shape = np.sqrt(found.squared)

@@ -1,0 +1,192 @@
+"""The command `modes` as a user runs it: files of a laboratory in, a model and a report out."""
+
+import io
+import sys
+from contextlib import redirect_stderr
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from truths.modal_structures import HERTZ, chain, integrated, receptance
+
+import snrmjax as sj
+from snrmjax.cli import main
+from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.frequency_responses import frequency_responses
+from snrmjax.measure.recordings.time_recording import time_recording
+
+RATIOS = [0.01, 0.008, 0.006]
+STRUCTURE = chain([1.0, 1.2, 0.8], [8e4, 9e4, 1.1e5], RATIOS)
+HEAVIER = chain([1.0, 1.25, 0.8], [8e4, 9e4, 1.1e5], RATIOS)
+SHAPES = STRUCTURE.shapes * np.sign(STRUCTURE.shapes[0])
+LINES = np.arange(8, 120, 0.5) * HERTZ
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def run(*arguments):
+    """A command in this process: its exit code and what it said."""
+    with (
+        redirect_stderr(io.StringIO()) as stderr,
+        mock.patch.object(sys, "argv", ["snrmjax", "modes", *map(str, arguments)]),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return ended.value.code or 0, stderr.getvalue()
+
+
+def accelerance(structure=STRUCTURE, points="123", **more):
+    force = Channel("F1", "force", "N", point="1", direction="+z")
+    sensors = [
+        Channel(f"A{k + 1}", "acceleration", "m/s^2", point=p, direction="+z")
+        for k, p in enumerate(points)
+    ]
+    rng = np.random.default_rng(0)
+    values = -(LINES**2) * receptance(structure, LINES, 0)
+    noise = 1e-3 * (rng.normal(size=values.shape) + 1j * rng.normal(size=values.shape))
+    made = more.pop("values", values + noise)
+    return frequency_responses(LINES, made[:, None], sensors, [force], **more)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Files of a laboratory."""
+    path = tmp_path_factory.mktemp("laboratory")
+    write_uff(path / "frf.uff", responses=[accelerance()])
+    write_uff(path / "heavier.uff", responses=[accelerance(HEAVIER)])
+    write_uff(path / "elsewhere.uff", responses=[accelerance(points="456")])
+    good = accelerance()
+    write_uff(path / "conjugated.uff", responses=[accelerance(values=good.values[:, 0].conj())])
+    force = [Channel("F1", "force", "N", point="1", direction="+z")]
+    both = [*force, Channel("F2", "force", "N", point="2", direction="+z")]
+    pair = np.concatenate([good.values, good.values], axis=1)
+    write_uff(path / "two.uff", responses=[frequency_responses(LINES, pair, good.responses, both)])
+    line = frequency_responses(LINES[:4], good.values[:, :, :4], good.responses, force)
+    write_uff(path / "line.uff", responses=[line])
+    short = frequency_responses(LINES[2:], good.values[:, :, 2:], good.responses, force)
+    write_uff(path / "short.uff", responses=[short])
+    start = np.concatenate([np.zeros(3), np.linalg.inv(STRUCTURE.mass)[0]])
+    velocity = integrated(STRUCTURE, np.zeros((1024, 3)), 512.0, start=start)[1].T
+    channels = [Channel(f"V{k}", "velocity", "m/s", point=str(k), direction="+z") for k in "123"]
+    write_uff(path / "decay.uff", recordings=[time_recording(velocity, channels, 512.0)])
+    pushed = [Channel("F", "force", "N", point="1", direction="+z"), *channels[1:]]
+    write_uff(path / "pushed.uff", recordings=[time_recording(velocity, pushed, 512.0)])
+    return path
+
+
+def test_responses_become_a_model_and_a_report(folder, tmp_path):
+    out = tmp_path / "new" / "model.toml"
+    code, said = run(folder / "frf.uff", "--interest", 2, "--out", out)
+    assert code == 0, said
+    modes = sj.read_model(out).modes
+    assert modes.mode_of_interest == 1
+    assert np.allclose(modes.natural_frequency, STRUCTURE.natural_frequency, rtol=2e-4)
+    assert np.allclose(modes.damping_ratio, RATIOS, rtol=0.02)
+    assert np.allclose(modes.mode_shape, SHAPES, rtol=0.02, atol=2e-3)
+    assert np.allclose(modes.participation, SHAPES[0], rtol=0.02)
+    assert np.all(modes.natural_frequency_std > 0)
+    assert np.all((modes.modal_mass_std > 0) & (modes.modal_mass_std < 0.02))
+    report = (out.parent / "report.html").read_text(encoding="utf-8")
+    assert "Poles over the model order" in report or "Poles of every model order" in report
+    assert "phase collinearity" in report
+    table = (out.parent / "modes.csv").read_text(encoding="utf-8").splitlines()
+    assert table[0].startswith("mode,sensor,frequency_hz,frequency_std_hz")
+    assert len(table) == 1 + 3 * 3
+
+
+def test_poles_by_hand_and_an_added_mass(folder, tmp_path):
+    out = tmp_path / "model.toml"
+    scale = ("--added-mass", 0.05, "--with-mass", folder / "heavier.uff")
+    names = [
+        c.name
+        for c in sj.io.laboratory.read_laboratory_file(folder / "frf.uff").responses[0].responses
+    ]
+    code, said = run(folder / "elsewhere.uff", *scale, "--mass-at", "nowhere", "--out", out)
+    assert code == 2
+    assert "there is no sensor 'nowhere'" in said
+    code, said = run(folder / "frf.uff", *scale, "--mass-at", names[1], "--out", out)
+    assert code == 0, said
+    modes = sj.read_model(out).modes
+    assert np.allclose(np.abs(modes.mode_shape), np.abs(SHAPES), rtol=0.02, atol=5e-3)
+
+
+def test_a_decay_gives_frequency_and_damping(folder, tmp_path):
+    out = tmp_path / "model.toml"
+    code, said = run(folder / "decay.uff", "--unscaled", "--highest-order", 10, "--out", out)
+    assert code == 0, said
+    modes = sj.read_model(out).modes
+    assert np.allclose(modes.natural_frequency, STRUCTURE.natural_frequency, rtol=1e-4)
+    assert np.allclose(modes.damping_ratio, RATIOS, rtol=1e-3)
+    assert "not mass-normalised" in said
+
+
+BAD = [
+    (("elsewhere.uff",), "no sensor is at the force"),
+    (("conjugated.uff",), "negative damping"),
+    (("two.uff",), "over one reference, but there are 2"),
+    (("line.uff",), "modes need 6 lines"),
+    (("frf.uff", "frf.uff"), "comes 2 times"),
+    (("frf.uff", "short.uff"), "must share their frequencies"),
+    (("frf.uff", "decay.uff"), "of one kind"),
+    (("missing.uff",), "does not exist"),
+    (("pushed.uff",), "time records with a force"),
+    (("decay.uff",), "a free decay has no force"),
+    (("frf.uff", "--poles", "21,x"), "--poles must be frequencies"),
+    (("frf.uff", "--poles", "500"), "a pole must lie in the band"),
+    (("frf.uff", "--from-hz", "300"), "modes need 6 lines"),
+    (("frf.uff", "--from-hz", "50", "--to-hz", "20"), "the band must rise"),
+    (("frf.uff", "--order", "99"), "`order` must be from 1"),
+    (("frf.uff", "--interest", "7"), "mode of interest must be from 1 to 3"),
+    (("frf.uff", "--drive-point", "tip"), "there is no sensor 'tip'"),
+    (("frf.uff", "--turned"), "are negative"),
+    (("frf.uff", "--reference", "tip"), "there is no reference 'tip'"),
+    (("frf.uff", "--residuals", "some"), "`residual_terms` must be one of"),
+    (("frf.uff", "--window", "flat"), "`window` must be"),
+    (("frf.uff", "--sensor-mass", "tip"), "as tip=0.2"),
+    (("frf.uff", "--fixture-mass", "2"), "only with the masses at the sensors"),
+    (("frf.uff", "--added-mass", "0.1"), "needs its kilograms"),
+    (("frf.uff", "--newtons-per-volt", "2"), "for a drive voltage"),
+    (("frf.uff", "--unscaled", "--known-shape", "tip=2"), "one scale of the shapes"),
+    (("frf.uff", "--free"), "low residual"),
+    (("frf.uff", "--base", "both"), "must be 'absolute' or 'relative'"),
+    (("frf.uff", "--base", "relative"), "needs one reference that is a displacement"),
+]
+
+
+@pytest.mark.parametrize(("words", "wanted"), BAD, ids=[f"{k} {b[1]}" for k, b in enumerate(BAD)])
+def test_wrong_input_ends_with_one_sentence(folder, tmp_path, words, wanted):
+    out = tmp_path / "out" / "model.toml"
+    code, said = run(
+        *(folder / word if word.endswith((".uff", ".csv")) else word for word in words),
+        "--out",
+        out,
+    )
+    assert code == 2
+    assert wanted in said
+    errors = [line for line in said.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1
+    assert not out.parent.exists()
+
+
+def test_the_model_must_be_a_toml(folder, tmp_path):
+    code, said = run(folder / "frf.uff", "--out", tmp_path / "results")
+    assert code == 2
+    assert "must be a model to write (.toml)" in said
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="measured data are not beside the project")
+def test_the_measured_beam_has_the_modes_that_its_source_states(tmp_path):
+    beam = SHARED / "brake_reuss_beam"
+    out = tmp_path / "model.toml"
+    code, said = run(beam / "response_controlled.csv", "--drive-point", "sensor 1", "--out", out)
+    assert code == 0, said
+    found, stated = sj.read_model(out).modes, sj.read_model(beam / "model.toml").modes
+    # The source states 80.37 ± 0.05 Hz, 0.15 ± 0.02 %, 1.89 kg.
+    spread = np.hypot(found.natural_frequency_std, stated.natural_frequency_std)
+    assert abs(found.natural_frequency - stated.natural_frequency)[0] < 2 * spread[0]
+    spread = np.hypot(found.damping_ratio_std, stated.damping_ratio_std)
+    assert abs(found.damping_ratio - stated.damping_ratio)[0] < 2 * spread[0]
+    mass = 1 / float(found.mode_shape[0, 0] * found.participation[0])
+    assert mass == pytest.approx(1.89, rel=0.01)
+    assert "depends on the amplitude" in said
