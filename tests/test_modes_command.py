@@ -95,7 +95,8 @@ def test_responses_become_a_model_and_a_report(folder, tmp_path):
     assert len(table) == 1 + 3 * 3
 
 
-def test_poles_by_hand_and_an_added_mass(folder, tmp_path):
+@pytest.mark.long
+def test_an_added_mass(folder, tmp_path):
     out = tmp_path / "model.toml"
     scale = ("--added-mass", 0.05, "--with-mass", folder / "heavier.uff")
     names = [
@@ -131,22 +132,17 @@ BAD = [
     (("frf.uff", "decay.uff"), "of one kind"),
     (("missing.uff",), "does not exist"),
     (("pushed.uff",), "time records with a force"),
-    (("decay.uff",), "a free decay has no force"),
+    (("decay.uff", "--highest-order", "6"), "a free decay has no force"),
     (("frf.uff", "--poles", "21,x"), "--poles must be frequencies"),
     (("frf.uff", "--poles", "500"), "a pole must lie in the band"),
     (("frf.uff", "--from-hz", "300"), "modes need 6 lines"),
-    (("frf.uff", "--from-hz", "50", "--to-hz", "20"), "the band must rise"),
-    (("frf.uff", "--order", "99"), "`order` must be from 1"),
     (("frf.uff", "--interest", "7"), "mode of interest must be from 1 to 3"),
     (("frf.uff", "--drive-point", "tip"), "there is no sensor 'tip'"),
     (("frf.uff", "--turned"), "are negative"),
     (("frf.uff", "--reference", "tip"), "there is no reference 'tip'"),
-    (("frf.uff", "--residuals", "some"), "`residual_terms` must be one of"),
-    (("frf.uff", "--window", "flat"), "`window` must be"),
     (("frf.uff", "--sensor-mass", "tip"), "as tip=0.2"),
     (("frf.uff", "--fixture-mass", "2"), "only with the masses at the sensors"),
     (("frf.uff", "--added-mass", "0.1"), "needs its kilograms"),
-    (("frf.uff", "--newtons-per-volt", "2"), "for a drive voltage"),
     (("frf.uff", "--unscaled", "--known-shape", "tip=2"), "one scale of the shapes"),
     (("frf.uff", "--free"), "low residual"),
     (("frf.uff", "--base", "both"), "must be 'absolute' or 'relative'"),

@@ -75,7 +75,7 @@ def test_units_and_quantities_do_not_matter():
 
 def test_noise_by_coherence_stays_in_the_band():
     errors = []
-    for seed in range(8):
+    for seed in range(4):
         found = fit_linear_modes(noisy(seed))
         assert found.n_modes == 3
         residue = STRUCTURE.shapes * STRUCTURE.shapes[0]
@@ -87,7 +87,7 @@ def test_noise_by_coherence_stays_in_the_band():
         # The residuals are those of the stated coherence.
         assert np.all(np.abs(found.misfit - 1) < 0.1)
     size = np.sqrt(np.mean(np.concatenate(errors) ** 2))
-    # 120 normalised errors, correlated within a fit: their rms is 1 within some 20 %.
+    # 60 normalised errors, correlated within a fit: their rms is 1 within some 25 %.
     assert 0.75 < size < 1.3
 
 
@@ -121,7 +121,8 @@ def test_modes_by_hand_and_by_order():
     two = STRUCTURE.natural_frequency[:2]
     by_hand = fit_linear_modes(data, poles=list(two * 1.005), to_frequency=75 * HERTZ)
     assert np.allclose(by_hand.natural_frequency, two, rtol=2e-4)
-    by_order = fit_linear_modes(data, order=12)
+    # Most poles of a high order are of noise: they are left out by their residues.
+    by_order = fit_linear_modes(data, order=30)
     assert np.allclose(by_order.natural_frequency, STRUCTURE.natural_frequency, rtol=1e-4)
 
 
@@ -183,6 +184,9 @@ def test_leakage_of_a_window_is_modelled_or_stated():
     random = plain.damping_ratio_std / light.damping_ratio
     assert np.all(np.abs(away - said) < 4 * random)
     assert np.max(away / random) > 4
+    # Residues of an accelerance under the window, whose impulse response begins with an impulse.
+    residue = STRUCTURE.shapes * STRUCTURE.shapes[0]
+    assert np.all(np.abs(modelled.residue - residue) < 5 * modelled.residue_std + 1e-3)
 
 
 def decay(seed=0, noise=0.02):
@@ -211,10 +215,14 @@ def test_a_free_decay_gives_frequency_damping_and_shape():
     assert np.allclose(ratio, np.sqrt(0.5), rtol=0.15)
 
 
-def test_results_are_labelled():
-    data = fit_linear_modes(noisy()).to_xarray()
+def test_results_are_labelled_and_drawn():
+    found = fit_linear_modes(responses(exact()), poles=[400.0], to_frequency=75 * HERTZ)
+    data = found.to_xarray()
     assert data.natural_frequency_hz.attrs["units"] == "Hz"
     assert data.residue.dims == ("sensor", "mode")
+    measured = found.plot(sensors=["a2"]).axes[0].lines[0]
+    assert np.allclose(measured.get_xdata(), found.curves.omega / HERTZ)
+    assert np.allclose(measured.get_ydata(), np.abs(found.curves.measured[1]))
 
 
 BAD = [
