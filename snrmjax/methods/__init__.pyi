@@ -34,6 +34,7 @@ from .bench.programmes import (
 from .comparison import METHODS, Comparison, compare_methods, snrm
 from .records.resonant_decay import resonant_decay
 from .records.restoring_force import RestoringForce, fit_restoring_force, restoring_force
+from .records.ring_down_decays import ring_down_decays
 from .records.ssm import SpectralSubmanifold, fit_submanifold, ssm
 from .result import MethodResult, MethodStatus
 from .steady.arslan_ozguven import arslan_ozguven, describing_function
@@ -87,6 +88,7 @@ __all__ = [
     "rct",
     "resonant_decay",
     "restoring_force",
+    "ring_down_decays",
     "run_test",
     "s_curve",
     "sine_sweep_test",

@@ -62,16 +62,18 @@ def resonant_decay(
     Returns a `MethodResult` with a point every half window: the velocity is that of the peak, by
     *hilbert* and with a `band` without harmonics that of the fundamental; 1σ from how far the
     windows scatter about one another, growing as the amplitude falls. Where a line rises (the
-    mode gains energy) the point is `NOT_A_MODE`.
+    mode gains energy) the point is `NOT_A_MODE`. What a filter does to frequency and damping is
+    estimated by filtering the decay that was read once more; a note states it, and 1σ holds it.
     Raises `ValueError` for uneven times, a rate below eight samples a cycle, fewer than twelve
     cycles, a clipped record and numbers that are not finite.
-    Validity: one mode, light damping, nothing driving; a filter narrower than the frequency moves
-    within its memory smooths both curves.
+    Validity: one mode, light damping, nothing driving; a filter as narrow as the frequency moves
+    within its memory smooths both curves more than the note says.
     """
     times, signal = checked_record(time, velocity, "resonant_decay")
     if reading not in get_args(Reading):
         raise ValueError(f"`reading` must be one of {get_args(Reading)}, but is {reading!r}.")
     step = float(np.mean(np.diff(times)))
+    every, settled = times, slice(None)
     if band is not None:
         signal, settled = _filtered(signal, step, band)
         times, signal = times[settled], signal[settled]
@@ -79,8 +81,19 @@ def resonant_decay(
     kept = trace.log_amplitude >= np.log(max(least_amplitude, np.finfo(float).tiny))
     # The first time that it falls below: what comes after is noise.
     end = len(kept) if kept.all() else int(np.argmin(kept))
-    points = _local_lines(trace, end, window)
-    return method_result("resonant_decay", points, 0, (f"read by {reading}",))
+    lines = _local_lines(trace, end, window)
+    bias = np.zeros_like(lines)
+    notes = [f"read by {reading}"]
+    if band is not None:
+        # The decay that was read, read with and without the filter: nothing else differs.
+        decay = _fitted_decay(lines, every)
+        with_filter, without = (
+            _at_times(_local_lines(_TRACES[reading](times, one[settled]), None, window), lines)
+            for one in (_filtered(decay, step, band)[0], decay)
+        )
+        bias = with_filter - without
+        notes.append(_in_words(bias, lines))
+    return method_result("resonant_decay", _points(lines, bias), 0, notes)
 
 
 def checked_record(
@@ -206,18 +219,48 @@ def _by_hilbert(time: np.ndarray, signal: np.ndarray) -> _Trace:
 _TRACES = {"peaks": _by_peaks, "zero_crossings": _by_zero_crossings, "hilbert": _by_hilbert}
 
 
-def _local_lines(trace: _Trace, end: int, window: float) -> list[MethodPoint]:
-    """A straight line of phase and of log amplitude over every half window."""
+# Columns of local lines.
+_TIME, _PHASE, _LEVEL, _OMEGA, _SLOPE = range(5)
+_SWING = 5  # lines over which a filter's error swings
+_ENDS = (slice(0, 4), slice(-4, None))
+
+
+def _local_lines(trace: _Trace, end: int | None, window: float) -> Float[np.ndarray, "line 5"]:
+    """A straight line of phase and of log amplitude over every half window.
+
+    Columns: time of the middle, phase and log amplitude there, and their slopes.
+    """
     width = max(4, round(window * trace.per_cycle))
+    end = len(trace.time) if end is None else end
     if end < width:
         raise ValueError(
             f"resonant_decay needs {window:g} cycles above the least amplitude, but the record has "
             f"{end / trace.per_cycle:.3g}."
         )
     starts = np.arange(0, end - width + 1, max(1, width // 2))
-    lines = np.array([_line(trace, slice(start, start + width)) for start in starts])
-    speed, omega, decay = np.exp(lines[:, 0]), lines[:, 1], lines[:, 2]
-    omega_std, decay_std = (_scatter(one, speed) for one in (omega, decay))
+    return np.array([_line(trace, slice(start, start + width)) for start in starts])
+
+
+def _line(trace: _Trace, part: slice) -> tuple[float, float, float, float, float]:
+    """One local line; a curvature is fitted beside each slope, which it does not move."""
+    middle = float(trace.time[part].mean())
+    away = trace.time[part] - middle
+    _, omega, phase = np.polyfit(away, trace.phase[part], 2)
+    decay = np.polyfit(away, trace.log_amplitude[part], 2)[1]
+    level = trace.log_amplitude[part].mean()
+    return middle, float(phase), float(level), float(omega), float(decay)
+
+
+def _points(
+    lines: Float[np.ndarray, "line 5"], bias: Float[np.ndarray, "line 5"]
+) -> list[MethodPoint]:
+    from scipy.ndimage import maximum_filter1d
+
+    speed, omega, decay = np.exp(lines[:, _LEVEL]), lines[:, _OMEGA], lines[:, _SLOPE]
+    # At the ends a filter's error swings from line to line: its size around each counts.
+    bias = maximum_filter1d(np.abs(bias), _SWING, axis=0)
+    omega_std = np.hypot(_scatter(omega, speed), bias[:, _OMEGA])
+    decay_std = np.hypot(_scatter(decay, speed), bias[:, _SLOPE])
     return [
         MethodPoint(MethodStatus.FOUND, -1, *(float(value) for value in row))
         if row[3] > 0
@@ -226,15 +269,46 @@ def _local_lines(trace: _Trace, end: int, window: float) -> list[MethodPoint]:
     ]
 
 
-def _line(trace: _Trace, part: slice) -> tuple[float, float, float]:
-    """Mean log amplitude, slope of phase and of log amplitude of one window.
+def _fitted_decay(
+    lines: Float[np.ndarray, "line 5"], time: Float[np.ndarray, " sample"]
+) -> Float[np.ndarray, " sample"]:
+    """The decay that local lines say; beyond the first and last their slopes go on as there."""
+    from scipy.interpolate import CubicHermiteSpline
 
-    A curvature is fitted beside each slope, which it does not move.
-    """
-    away = trace.time[part] - trace.time[part].mean()
-    phase = np.polyfit(away, trace.phase[part], 2)[1]
-    decay = np.polyfit(away, trace.log_amplitude[part], 2)[1]
-    return float(trace.log_amplitude[part].mean()), float(phase), float(decay)
+    if len(lines) < 2:
+        away = time - lines[0, _TIME]
+        level = lines[0, _LEVEL] + lines[0, _SLOPE] * away
+        return np.exp(level) * np.cos(lines[0, _PHASE] + lines[0, _OMEGA] * away)
+    ends = lines[0, _TIME], lines[-1, _TIME]
+    inside = np.clip(time, *ends)
+    beyond = time - inside
+    late = beyond > 0
+
+    def along(value: int, slope: int) -> Float[np.ndarray, " sample"]:
+        curve = CubicHermiteSpline(lines[:, _TIME], lines[:, value], lines[:, slope])
+        near = [np.polyfit(lines[rows, _TIME], lines[rows, slope], 1)[0] for rows in _ENDS]
+        rate = np.where(late, lines[-1, slope], lines[0, slope])
+        return curve(inside) + beyond * rate + beyond**2 / 2 * np.where(late, near[1], near[0])
+
+    return np.exp(along(_LEVEL, _SLOPE)) * np.cos(along(_PHASE, _OMEGA))
+
+
+def _at_times(
+    lines: Float[np.ndarray, "line 5"], wanted: Float[np.ndarray, "line 5"]
+) -> Float[np.ndarray, "line 5"]:
+    """Lines of another reading at the times of `wanted`."""
+    return np.stack(
+        [np.interp(wanted[:, _TIME], lines[:, _TIME], column) for column in lines.T], axis=1
+    )
+
+
+def _in_words(bias: Float[np.ndarray, "line 5"], lines: Float[np.ndarray, "line 5"]) -> str:
+    omega = np.abs(bias[:, _OMEGA] / lines[:, _OMEGA]).max()
+    decay = np.abs(bias[:, _SLOPE] / lines[:, _SLOPE]).max()
+    return (
+        f"bias of the filter, estimated: up to {100 * omega:.2g} % of the frequency and "
+        f"{100 * decay:.2g} % of the damping"
+    )
 
 
 def _scatter(values: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
