@@ -20,6 +20,7 @@ _HERTZ = 2 * np.pi
 _POWER = {"displacement": 1, "velocity": 0, "acceleration": -1}
 _MOST_SAMPLES = 2**22  # of all channels: the decay itself is held in memory
 _LEADS = 1.0  # cycles after the drive's last sample that are left out
+_SETTLED = 8.0  # over a filter's width: what it needs at an end
 _ABOVE_NOISE = 4.0  # standard deviations of noise down to which a decay is read
 
 
@@ -72,10 +73,12 @@ def ring_down_decays(
             raise ValueError(f"ring-down {k} has samples that are not finite.")
         signal, share = _one_motion(values - values.mean(axis=1, keepdims=True))
         width = None if band is None else (band[1] - band[0]) / recording.sampling_rate
-        floor = _ABOVE_NOISE * _noise(signal, width)
+        noise = _noise(signal)
+        floor = _ABOVE_NOISE * noise * (1.0 if width is None else float(np.sqrt(2 * width)))
         least = floor if least_amplitude is None else least_amplitude
+        signal = _above(signal, max(least, _ABOVE_NOISE * noise), lead, width)
         found = resonant_decay(
-            recording.time(start, stop),
+            recording.time(start, start + len(signal)),
             signal,
             reading=reading,
             band=band,
@@ -103,14 +106,25 @@ def _one_motion(
     return shape[0] * (shape @ values), share
 
 
-def _noise(signal: Float[np.ndarray, " sample"], width: float | None) -> float:
-    """1σ of white noise by the quiet half of the spectrum, within a filter's width if any."""
+def _noise(signal: Float[np.ndarray, " sample"]) -> float:
+    """1σ of white noise by the median of the spectrum."""
     from scipy.signal import welch
 
-    length = min(len(signal), 4096)
-    density = welch(signal, nperseg=length)[1]
-    sigma = float(np.sqrt(np.median(density) / np.log(2) / 2))
-    return sigma if width is None else sigma * float(np.sqrt(2 * width))
+    density = welch(signal, nperseg=min(len(signal), 4096))[1]
+    return float(np.sqrt(np.median(density) / np.log(2) / 2))
+
+
+def _above(
+    signal: Float[np.ndarray, " sample"], least: float, cycle: int, width: float | None
+) -> Float[np.ndarray, " sample"]:
+    """The decay as long as it is above noise, and what a filter needs beyond that."""
+    count = len(signal) // cycle
+    sizes = np.abs(signal[: count * cycle]).reshape(count, cycle).max(axis=1)
+    quiet = np.flatnonzero(sizes < least)
+    if not quiet.size:
+        return signal
+    beyond = 0 if width is None else int(np.ceil(_SETTLED / width))
+    return signal[: (int(quiet[0]) + 1) * cycle + beyond]
 
 
 def _as_velocity(found: MethodResult, power: int, notes: Sequence[str]) -> MethodResult:
