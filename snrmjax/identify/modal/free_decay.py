@@ -34,6 +34,7 @@ _FEWEST_SAMPLES = 40
 _SAMPLES_PER_CYCLE = 5  # kept of the highest frequency asked for
 _SIGNIFICANT = 4.0  # standard errors of a mode's largest amplitude, without which it is none
 _MOST_DAMPED = 0.5
+_MOST_GROWTH = 3.0  # of a mode's logarithm over the record
 
 
 class DecayCurves(NamedTuple):
@@ -296,8 +297,10 @@ def _fitted(
     scale = np.sqrt(np.mean(values**2, axis=1)) * 0.1
     while True:
         n = len(unknowns) // 2
-        low = np.concatenate([0.5 * unknowns[:n], np.full(n, -_MOST_DAMPED)])
-        high = np.concatenate([2.0 * unknowns[:n], np.full(n, _MOST_DAMPED)])
+        # A mode may grow a little over the record: it is then left out for that.
+        growth = -np.minimum(_MOST_GROWTH / (unknowns[:n] * time[-1]), _MOST_DAMPED)
+        low = np.concatenate([0.8 * unknowns[:n], growth])
+        high = np.concatenate([1.25 * unknowns[:n], np.full(n, _MOST_DAMPED)])
         for _ in range(3):
             weights = np.broadcast_to(1 / scale[:, None], values.shape)
             rows = ChannelRows(values, weights, np.zeros(len(values), dtype=int), 1)

@@ -123,6 +123,9 @@ def _projected(basis: TermColumns, values: np.ndarray, weights: np.ndarray) -> _
 
 def _compressed(bases: Sequence[TermColumns], measured: ChannelRows) -> _Compressed:
     parts = []
+    if not all(np.isfinite(one.columns).all() for one in bases):
+        unknowns = bases[0].derivatives.shape[0]
+        return _Compressed(np.array([np.inf]), np.zeros((1, unknowns)))
     for values, weights, group in zip(*measured[:3], strict=True):
         one = _projected(bases[group], values, weights)
         parts.append(np.linalg.qr(np.column_stack([-one.outside, one.residuals]), mode="r"))

@@ -198,7 +198,8 @@ def decay(seed=0, noise=0.02):
 
 
 def test_a_free_decay_gives_frequency_damping_and_shape():
-    found = fit_free_decay(decay(), highest_order=12)
+    # Clusters of noise among the thirty orders are left out by their amplitudes.
+    found = fit_free_decay(decay(), highest_order=30)
     assert found.n_modes == 3
     for value, std, truth in (
         (found.natural_frequency, found.natural_frequency_std, STRUCTURE.natural_frequency),
