@@ -31,7 +31,7 @@ from snrmjax.measure.sweeps.swept_table import (
     Moment,
     averaged_table,
     held_force,
-    motion_of,
+    swept_motion,
     pairs_of,
     reference_response,
     swept_moment,
@@ -284,7 +284,7 @@ def _result(
     if moments:
         every = _moments(reader.chosen, grids)[0] or moments
         reference = reference_response(every)
-        balance = modal_balance(motion_of(every, reference))
+        balance = modal_balance(swept_motion(every, reference))
         corrected = correct and bool(np.isfinite(balance.constant))
         held, held_std = held_force(moments, reference, balance, corrected)
         share = 1 - held / np.array([one.found.series[0, 0] for one in moments])

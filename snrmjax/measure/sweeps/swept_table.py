@@ -39,7 +39,7 @@ def reference_response(moments: list[Moment]) -> int:
     return int(np.argmax(np.median(ratio, axis=0)))
 
 
-def motion_of(moments: list[Moment], reference: int) -> SweptMotion:
+def swept_motion(moments: list[Moment], reference: int) -> SweptMotion:
     """Force and displacement of one response, with how the displacement changes."""
     series = np.array([one.motion[reference] for one in moments])
     return SweptMotion(
@@ -57,7 +57,7 @@ def held_force(
     moments: list[Moment], reference: int, balance: ModalBalance, corrected: bool
 ) -> tuple[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]]:
     """Force that would hold each state, and the rms of its complex error."""
-    motion = motion_of(moments, reference)
+    motion = swept_motion(moments, reference)
     std = np.array([one.found.std[0, 0] for one in moments])
     if not corrected:
         return motion.force, std

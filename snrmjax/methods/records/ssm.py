@@ -161,7 +161,7 @@ def fit_submanifold(
 def _main_frequency(signal: np.ndarray, step: float) -> float:
     """Frequency in Hz of the record's largest spectral line, its mean left out."""
     spectrum = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(len(signal))))
-    return float(max(1, np.argmax(spectrum)) / (len(signal) * step))
+    return max(1, int(np.argmax(spectrum))) / (len(signal) * step)
 
 
 def _on_the_plane(signal: np.ndarray, lag: int) -> tuple[Complex[np.ndarray, " k"], float]:

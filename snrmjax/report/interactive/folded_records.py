@@ -37,9 +37,11 @@ def folded_records(
         phasors = phasors * np.exp(-1j * lead * np.array(_ORDERS))[:, None]
         phase = np.mod(angle + lead, 2 * np.pi)
         made[int(found.state[step])] = FoldedRecord(
-            phase,
-            *both,
-            *phasors.T,
+            phase=phase,
+            force=both[0],
+            response=both[1],
+            force_harmonics=phasors[:, 0],
+            response_harmonics=phasors[:, 1],
             orders=_ORDERS,
             quantity=channel.quantity,
             unit=channel.si_unit,
