@@ -89,5 +89,5 @@ def _elements(stated: BeamDescription) -> Beam:
         elements=stated.elements,
         left=left,
         right=right,
-        point_masses=[PointMass(*one) for one in stated.point_masses],
+        point_masses=tuple(PointMass(*one) for one in stated.point_masses),
     )
