@@ -40,6 +40,7 @@ from .result import MethodResult, MethodStatus
 from .steady.arslan_ozguven import arslan_ozguven, describing_function
 from .steady.concerto import concerto
 from .steady.harmonic_force_surface import ForceSurface, force_surface, harmonic_force_surface
+from .steady.mode_synthesis import backbone_of, synthesised_response
 from .steady.phase_resonance import phase_resonance
 from .steady.rct import rct
 
@@ -71,6 +72,7 @@ __all__ = [
     "TestRecord",
     "TestSteps",
     "arslan_ozguven",
+    "backbone_of",
     "compare_methods",
     "concerto",
     "control_based_continuation",
@@ -98,4 +100,5 @@ __all__ = [
     "standard_gains",
     "steady_states_of",
     "stepped_sine_test",
+    "synthesised_response",
 ]
