@@ -48,10 +48,8 @@ def test_duffing_decays_along_its_backbone(decay, reading):
     true = np.interp(result.velocity, velocity, omega)
     assert true.max() / true.min() > 1.08
     np.testing.assert_allclose(result.natural_frequency, true, rtol=1e-3)
-    low = result.velocity < 0.25  # where the motion is a cosine and D = −2 d ln v / dt holds
-    assert low.sum() > 5
     modal = 2 * result.damping_ratio * result.natural_frequency
-    np.testing.assert_allclose(modal[low], DAMPING, rtol=ACCURACY[reading][1])
+    np.testing.assert_allclose(modal, DAMPING, rtol=ACCURACY[reading][1])
 
 
 @pytest.mark.parametrize("reading", READINGS)
@@ -82,7 +80,9 @@ def test_the_bias_of_a_filter_is_estimated_and_within_the_error(softening, width
         r"([\d.e-]+) % of the frequency and ([\d.e-]+) % of the damping", repr(result)
     )
     modal = 2 * result.damping_ratio * result.natural_frequency
-    error = np.abs(modal / DAMPING - 1)
+    # The action a²/ω decays by D + d(ln ω)/dt.
+    squared = softening * result.velocity**2
+    error = np.abs(modal / (DAMPING * (1 - squared / (1 + squared))) - 1)
     assert 0.4 < float(stated[2]) / 100 / error.max() < 2.5
     # Beyond the filter's, lines over windows err by their curvature: a few 1e-4.
     assert np.all(error < 3 * result.damping_ratio_std / result.damping_ratio + 1e-3)

@@ -80,11 +80,12 @@ def block_phasors(
         last = min(count, first + at_once)
         values = recording.values(names, start + first * length, start + last * length)
         largest, flat = _flat_places(values, largest, flat, 2 * np.pi / step)
-        values = values.reshape(len(names), last - first, length)
-        coefficients = values @ solver.T
-        residual = values - coefficients @ design
-        found.append(coefficients)
-        noise.append(np.einsum("cbl,cbl->cb", residual, residual) / (length - len(design)))
+        rows = values.reshape(-1, length)  # blocks of all channels one below the other
+        coefficients = rows @ solver.T
+        rest = rows - coefficients @ design
+        shape = (len(names), last - first)
+        found.append(coefficients.reshape(*shape, -1))
+        noise.append(np.einsum("bl,bl->b", rest, rest).reshape(shape) / (length - len(design)))
     coefficient = np.concatenate(found, axis=1)
     middle = start + length * np.arange(count) + (length - 1) / 2
     order = np.arange(1, highest + 1)

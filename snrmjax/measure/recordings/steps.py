@@ -25,6 +25,7 @@ _GAP = 1.6  # hops between frames, above which something was missing
 _SAME_PHASE = 0.01  # cycles over the shorter of two pieces that are one step
 _CONTINUOUS = 0.25  # rad, largest jump of phase within a step
 _NEAR = 4  # frames at an end that say how the amplitude moves there
+_AROUND = 41  # frames whose scatter is taken together
 _NORMAL = 0.6745
 
 
@@ -87,15 +88,15 @@ def recognise_steps(
 
 def _deviations(values: np.ndarray, middle: np.ndarray, floor: float) -> np.ndarray:
     """1σ of values about straight lines of three neighbours, as the middle of its surroundings."""
+    from scipy.ndimage import median_filter
+
     if len(values) < 5:
         return np.full(len(values), floor)
     share = (middle[1:-1] - middle[:-2]) / (middle[2:] - middle[:-2])
     bend = values[1:-1] - (1 - share) * values[:-2] - share * values[2:]
-    width = min(41, len(bend) // 2 * 2 - 1)
     # Frames overlap by half: neighbours of a white noise are correlated by one sixth.
-    padded = np.pad(np.abs(bend), width // 2 + 1, mode="reflect" if len(bend) > width else "edge")
-    around = np.lib.stride_tricks.sliding_window_view(padded, width)
-    middle_of = np.median(around, axis=1)[: len(values)]
+    around = median_filter(np.abs(bend), size=_AROUND, mode="nearest")
+    middle_of = np.concatenate([around[:1], around, around[-1:]])
     return np.maximum(floor, middle_of / (_NORMAL * np.sqrt(1.5)))
 
 

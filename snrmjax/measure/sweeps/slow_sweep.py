@@ -31,10 +31,10 @@ from snrmjax.measure.sweeps.swept_table import (
     Moment,
     averaged_table,
     held_force,
-    swept_motion,
     pairs_of,
     reference_response,
     swept_moment,
+    swept_motion,
     table_of,
 )
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -146,8 +146,9 @@ def sweep_states(
     Arguments: `force`, `responses`, `harmonic_order`, `level`, `sensors` and `drive` as in
     `stepped_sine_states`; `frequencies` in rad/s at which states are wanted (by default a grid
     that is finer where the response changes); `cycles` is the width of the window; `correct` takes
-    the bias of the sweep out; `average` makes one state of those that an upward and a downward
-    sweep have at one of the `frequencies`, unless they differ by more than a fifth.
+    the bias of the sweep out (without it, and where it cannot be told, 1σ holds the bias);
+    `average` makes one state of those that an upward and a downward sweep have at one of the
+    `frequencies`, unless they differ by more than a fifth.
     Returns `SweptStates` with the bias that each sweep has at resonance without correction.
     Raises `ValueError` for channels that do not fit, a record in which no sweep is found, windows
     of fewer than six cycles, fewer than four samples a cycle, frequencies outside every sweep and
@@ -312,7 +313,7 @@ def _result(
     if correct and not corrected:
         notes.append(
             "the modal constant cannot be told from these sweeps (too few states near resonance): "
-            "the bias of the sweep is not taken out"
+            "the bias of the sweep is not taken out, but held by the stated errors"
         )
     states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
     rate, begin = reader.recording.sampling_rate, reader.recording.start_time

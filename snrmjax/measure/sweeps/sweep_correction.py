@@ -26,6 +26,7 @@ _KNOTS = 25  # amplitudes at which both are given
 _SURE = 0.25  # relative 1σ of the modal constant up to which it is believed
 _ROUNDS = 3
 _BLURRED = 0.01  # of the force: error by the phasor's change up to which a state is used
+_OUTLYING = 3.0  # or so many times the usual error
 _PARTS = 8  # of the states, left out one after the other
 
 
@@ -74,7 +75,7 @@ def modal_balance(motion: SweptMotion) -> ModalBalance:
     if np.isfinite(found.constant):
         # Once more without states that are blurred: at a jump, where a sweep begins.
         blur = 2 * used.frequency * used.first_std / np.abs(found.constant * used.force)
-        used = used.part(blur < _BLURRED)
+        used = used.part(blur < max(_BLURRED, _OUTLYING * float(np.median(blur))))
         found = _solved(used, knots) if used.frequency.size else _unknown(knots)
     if not np.isfinite(found.constant):
         return found
@@ -85,6 +86,15 @@ def modal_balance(motion: SweptMotion) -> ModalBalance:
     if not std < _SURE * abs(found.constant):
         return _unknown(knots)
     return found._replace(constant_std=std)
+
+
+def share_of_bias(motion: SweptMotion) -> Float[np.ndarray, " state"]:
+    """About how much of each phasor is the sweep's doing, where nothing is known of the mode.
+
+    To first order a sweep answers with H − (i/2) dΩ/dt d²H/dΩ² in place of H, at most all of it.
+    """
+    rate = np.where(motion.rate == 0, np.inf, motion.rate)
+    return np.minimum(1.0, np.abs(motion.second / (2 * rate * motion.displacement)))
 
 
 def _range(motion: SweptMotion) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.measure.recordings.velocity_states import ChosenChannels, PhasorTable
-from snrmjax.measure.sweeps.sweep_correction import ModalBalance, SweptMotion
+from snrmjax.measure.sweeps.sweep_correction import ModalBalance, SweptMotion, share_of_bias
 from snrmjax.measure.sweeps.swept_phasors import SweptPhasors, displacement_series
 
 _INTEGRATIONS = {"displacement": 0, "velocity": 1, "acceleration": 2}
@@ -56,11 +56,14 @@ def swept_motion(moments: list[Moment], reference: int) -> SweptMotion:
 def held_force(
     moments: list[Moment], reference: int, balance: ModalBalance, corrected: bool
 ) -> tuple[Complex[np.ndarray, " state"], Float[np.ndarray, " state"]]:
-    """Force that would hold each state, and the rms of its complex error."""
+    """Force that would hold each state, and the rms of its complex error.
+
+    Without correction the error holds what the sweep may have done.
+    """
     motion = swept_motion(moments, reference)
     std = np.array([one.found.std[0, 0] for one in moments])
     if not corrected:
-        return motion.force, std
+        return motion.force, np.hypot(std, np.abs(motion.force) * share_of_bias(motion))
     moving = balance.force_to_move(motion)
     of_slope = 2 * motion.frequency * motion.first_std / abs(balance.constant)
     of_constant = np.abs(moving) * balance.constant_std / abs(balance.constant)

@@ -5,7 +5,8 @@ readings of the record are offered. *peaks* fits a parabola to every extreme of 
 takes times and sizes of extremes; *zero_crossings* takes times from the zeros and sizes from the
 extremes between them; *hilbert* takes phase and envelope of the analytic signal, whose ends are
 wrong for some cycles and are cut. Local straight lines of phase and of the logarithm of the
-envelope, over a window of cycles, then give ω̃ and 2ζ̃ω̃ = −2 d(ln v)/dt.
+envelope, over a window of cycles, then give ω̃ and 2ζ̃ω̃ = −2 d(ln v)/dt + d(ln ω̃)/dt, v the
+velocity of the fundamental (half the last term for that of the peak).
 
 References: J. M. Londoño, S. A. Neild & J. E. Cooper, J. Sound Vib. 348 (2015) 224,
 doi:10.1016/j.jsv.2015.03.015 (zero crossings); M. Jin, W. Chen, M. R. W. Brake & H. Song,
@@ -93,7 +94,8 @@ def resonant_decay(
         )
         bias = with_filter - without
         notes.append(_in_words(bias, lines))
-    return method_result("resonant_decay", _points(lines, bias), 0, notes)
+    fundamental = band is not None or reading == "hilbert"
+    return method_result("resonant_decay", _points(lines, bias, fundamental), 0, notes)
 
 
 def checked_record(
@@ -238,7 +240,22 @@ def _local_lines(trace: _Trace, end: int | None, window: float) -> Float[np.ndar
             f"{end / trace.per_cycle:.3g}."
         )
     starts = np.arange(0, end - width + 1, max(1, width // 2))
-    return np.array([_line(trace, slice(start, start + width)) for start in starts])
+    return _straightened(np.array([_line(trace, slice(start, start + width)) for start in starts]))
+
+
+def _straightened(lines: Float[np.ndarray, "line 5"]) -> Float[np.ndarray, "line 5"]:
+    """Without what a third derivative does to slopes: h²/10 of it, h half the window.
+
+    Lines are h apart, so that their second differences are h² times it.
+    """
+    if len(lines) < 3:
+        return lines
+    bend = np.diff(lines, 2, axis=0)
+    bend = np.concatenate([bend[:1], bend, bend[-1:]])
+    straight = lines.copy()
+    for slope in (_OMEGA, _SLOPE):
+        straight[:, slope] -= bend[:, slope] / 10
+    return straight
 
 
 def _line(trace: _Trace, part: slice) -> tuple[float, float, float, float, float]:
@@ -252,11 +269,19 @@ def _line(trace: _Trace, part: slice) -> tuple[float, float, float, float, float
 
 
 def _points(
-    lines: Float[np.ndarray, "line 5"], bias: Float[np.ndarray, "line 5"]
+    lines: Float[np.ndarray, "line 5"], bias: Float[np.ndarray, "line 5"], fundamental: bool
 ) -> list[MethodPoint]:
+    """Points of local lines.
+
+    The action v²/ω̃ of a mode decays by 2ζ̃ω̃, v the velocity of its fundamental; a peak has the
+    energy ½v², which is the integral of ω̃ over the action.
+    """
     from scipy.ndimage import maximum_filter1d
 
     speed, omega, decay = np.exp(lines[:, _LEVEL]), lines[:, _OMEGA], lines[:, _SLOPE]
+    if len(lines) > 1:
+        moves = np.gradient(np.log(omega), lines[:, _TIME])
+        decay = decay - moves * (0.5 if fundamental else 0.25)
     # At the ends a filter's error swings from line to line: its size around each counts.
     bias = maximum_filter1d(np.abs(bias), _SWING, axis=0)
     omega_std = np.hypot(_scatter(omega, speed), bias[:, _OMEGA])
