@@ -15,6 +15,9 @@ resonances (`phase_controlled`), and the force at a velocity and a frequency
   frequency and force, and how many of its states lie where neither stepped sine has been;
 - s_curve: force over velocity at one frequency, two sets of gains: error of the force relative to
   the largest, and how many points lie where the force falls;
+- synthesis: whole responses drawn from the loop's backbone (nonlinear mode synthesis) against those
+  by harmonic balance: relative errors of peak and of both folds' frequencies, largest distance of
+  the stable parts above a tenth of the peak, in velocity over the peak's;
 - badly_tuned: statuses of a loop whose gains are wrong.
 """
 
@@ -52,6 +55,7 @@ class Case(NamedTuple):
     targets: np.ndarray  # m/s, of the backbone by continuation
     frequency: float  # Hz, of the S-curve
     amplitudes: np.ndarray  # m/s, of its targets
+    forces: tuple[float, ...]  # N, of the responses that are drawn from the backbone
 
 
 def stop() -> Case:
@@ -75,6 +79,7 @@ def stop() -> Case:
         np.array([0.04, 0.06, 0.08, 0.1, 0.13]),
         56.0,
         np.linspace(0.01, 0.12, 14),
+        (0.3, 0.6),
     )
 
 
@@ -98,6 +103,7 @@ def flat() -> Case:
         np.array([0.2, 0.4, 0.6, 0.8]),
         94.0,
         np.linspace(0.05, 0.95, 14),
+        (0.006, 0.012),
     )
 
 
@@ -195,6 +201,67 @@ def held_velocity(case: Case, speed: float, omega: float) -> Held:
     raise RuntimeError(f"no truth at {speed:.4g} m/s: {curve.status.name}.")
 
 
+def synthesise(case: Case, result, axis, tell) -> None:
+    """Responses from a backbone beside those by harmonic balance."""
+    ends = (0.9 * HERTZ * case.ends[0], 1.1 * HERTZ * case.ends[1])
+    for number, force in enumerate(case.forces):
+        began = time.time()
+        (exact,) = sj.forced_response(case.model, [force], *ends)
+        (found,) = sj.methods.synthesised_response(
+            result, case.model.modes, force, from_frequency=ends[0], to_frequency=ends[1]
+        )
+        speed, seen = np.abs(exact.velocity[:, 1, 0]), np.abs(found.velocity)
+        folds = np.sort(exact.frequency[exact.at_events("fold")])
+        turns = found.frequency[np.flatnonzero(np.diff(np.sign(np.diff(found.frequency)))) + 1]
+        # The upper branch up to the peak, and the lower one from its fold on.
+        last = [np.flatnonzero(~one) for one in (exact.is_stable, found.stable)]
+        last = [int(one[-1]) if one.size else 0 for one in last]
+        tops = int(np.argmax(speed)), int(np.argmax(seen))
+        pairs = [
+            (slice(0, tops[0]), slice(0, tops[1])),
+            (slice(max(last[0], tops[0]) + 1, None), slice(max(last[1], tops[1]) + 1, None)),
+        ]
+        misses = []
+        for part, other in pairs:
+            there = np.interp(
+                exact.frequency[part], found.frequency[other], seen[other], np.nan, np.nan
+            )
+            large = speed[part] > 0.1 * speed.max()
+            misses.append(np.nanmax(np.abs(there - speed[part])[large]) / speed.max())
+        tell(
+            *("synthesis", began),
+            force_n=force,
+            peak_velocity_error=float(seen.max() / speed.max() - 1),
+            peak_frequency_error=float(
+                found.frequency[np.argmax(seen)] / exact.frequency[np.argmax(speed)] - 1
+            ),
+            fold_frequency_errors=[float(e) for e in np.sort(turns) / folds - 1]
+            if len(turns) == len(folds)
+            else f"{len(turns)} turns, {len(folds)} folds",
+            stable_distance_max=[float(miss) for miss in misses],
+        )
+        first = number == 0
+        axis.plot(
+            *(exact.frequency / HERTZ, speed, "k--"),
+            **{"lw": 1, "label": "harmonic balance" if first else None},
+        )
+        for stable, style in ((True, "-"), (False, ":")):
+            axis.plot(
+                *(found.frequency / HERTZ, np.where(found.stable == stable, seen, np.nan), style),
+                color=COLOURS[0],
+                label=f"from the loop's backbone{'' if stable else ', unstable'}"
+                if first
+                else None,
+            )
+    good = result.found
+    axis.plot(
+        *(result.natural_frequency[good] / HERTZ, result.velocity[good], "s"),
+        **{"color": COLOURS[1], "ms": 5, "mfc": "none"},
+    )
+    axis.set(xlabel="frequency (Hz)", ylabel="velocity (m/s)")
+    axis.set_title(" and ".join(f"{force:g}" for force in case.forces) + " N", fontsize=10)
+
+
 def run(name: str, case: Case, axes) -> None:
     """All tests of one structure, a line each, and its column of the figure."""
 
@@ -203,7 +270,7 @@ def run(name: str, case: Case, axes) -> None:
         print(json.dumps({**line, **numbers, "seconds": round(time.time() - began, 1)}), flush=True)
 
     truth = backbone(case)
-    response, section = axes
+    response, section, drawn = axes
     response.plot(truth[1] / HERTZ, truth[0], "k--", lw=1, label="resonances, harmonic balance")
 
     began = time.time()
@@ -329,6 +396,7 @@ def run(name: str, case: Case, axes) -> None:
     section.set(xlabel="velocity (m/s)", ylabel="force (N)")
     section.set_title(f"held at {case.frequency:g} Hz", fontsize=10)
 
+    synthesise(case, loops[0], drawn, tell)
     began = time.time()
     lost = sj.methods.phase_locked_loop(
         case.laboratory, case.voltages[-2:], gains=case.wild, settle_cycles=case.settle
@@ -354,8 +422,8 @@ def main() -> None:
     given = parser.parse_args()
     names = [given.structure] if given.structure else ["stop", "flat"]
     figure, axes = plt.subplots(
-        *(2, len(names)),
-        **{"figsize": (5.2 * len(names), 8), "squeeze": False, "layout": "constrained"},
+        *(3, len(names)),
+        **{"figsize": (5.2 * len(names), 11), "squeeze": False, "layout": "constrained"},
     )
     for name, column in zip(names, axes.T, strict=True):
         run(name, {"stop": stop, "flat": flat}[name](), column)
@@ -363,6 +431,7 @@ def main() -> None:
         column[0].set_title(title, fontsize=10)
     axes[0, 0].legend(fontsize=8, frameon=False, loc="upper left")
     axes[1, 0].legend(fontsize=8, frameon=False)
+    axes[2, 0].legend(fontsize=8, frameon=False)
     given.out.mkdir(parents=True, exist_ok=True)
     figure.savefig(given.out / "methods_controllers.png", dpi=150)
 

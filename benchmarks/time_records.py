@@ -9,7 +9,7 @@ force and motion, as a share of each channel's largest value.
 JSON lines:
 - `decay_and_steps`, one a law: backbone and damping from a record of stepped sines (three levels)
   against those of a free decay at equal velocity: largest and median difference of frequency,
-  median of damping, and the share of differences within the 95 % bands of both (states within 60° of
+  median of damping, share of differences within the 95 % bands of both (states within 60° of
   resonance, velocities that both records hold).
 - `sweep`, one a law, rate and direction: the normalised rate; median and largest error of mobility
   over states above 0.3 of the peak, before and after the correction, against steady motion
@@ -126,7 +126,7 @@ def decay_against_steps(name, noise):
             points.damping_ratio_std,
         )
     ]
-    record = decay_test(law, 1.15 * float(steps[0].max()), noise)
+    record = decay_test(law, 3.0 * float(steps[0].max()), noise)
     decay = sj.methods.ring_down_decays(record, "drive", ["motion"], band=(6.0, 16.0))[0]
     good = decay.found
     order = np.argsort(decay.velocity[good])

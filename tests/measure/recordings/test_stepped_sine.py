@@ -90,7 +90,9 @@ def test_every_kind_of_motion_gives_the_velocity():
     assert np.isnan(np.asarray(states.force)).all()
 
 
-@pytest.mark.parametrize(("colour", "dwell"), [(0.0, 2.0), (0.95, 4.0)])
+@pytest.mark.parametrize(
+    ("colour", "dwell"), [(0.0, 2.0), pytest.param(0.95, 4.0, marks=pytest.mark.long)]
+)
 def test_stated_errors_cover_the_truth(colour, dwell):
     """Share of 95 % intervals that hold the truth, over 60 seeds of white and coloured noise."""
     frequencies, forces = FREQUENCIES[::3], np.ones(2)
@@ -209,7 +211,8 @@ def test_bad_input_is_refused_in_one_sentence(signal, settings, words):
 @pytest.mark.parametrize(
     ("hertz", "dwell", "noise"),
     [
-        (np.linspace(20, 100, 41), 1.0, 0.05),  # two octaves and more
+        # Two octaves and more.
+        pytest.param(np.linspace(20, 100, 41), 1.0, 0.05, marks=pytest.mark.long),
         (np.linspace(70, 90, 41), 0.3, 0.02),  # twenty cycles each
         (np.arange(78, 79.5, 0.05), 1.25, 0.05),  # a sixteenth of the line spacing of a dwell
     ],
