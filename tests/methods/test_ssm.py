@@ -100,7 +100,6 @@ def test_bands_cover(decay, noise, seeds):
     within, independent = np.array(shares), 5 * seeds  # five coefficients a curve
     for size, share in ((1.0, 0.683), (1.96, 0.95)):
         found = np.mean(within < size, axis=(0, 2))
-        print(f"noise {noise:g}: within {size:g} sigma {found.round(3)}, expected {share}")
         assert np.all(np.abs(found - share) < 3 * np.sqrt(share * (1 - share) / independent))
 
 
