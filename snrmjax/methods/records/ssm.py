@@ -29,7 +29,7 @@ from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 _DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
 _FEWEST_CYCLES = 12
 _FEWEST_SAMPLES = 8  # a cycle
-_MOST_TERMS = 6  # of α and ω: polynomials of degree 11 in ρ e^{iθ}
+_MOST_TERMS = 7  # of α and ω: polynomials of degree 13 in ρ e^{iθ}
 _ORDERS = (2, 3, 4, 5)  # harmonics in the record
 _START = 0.1  # of the largest amplitude: what the start is fitted to
 _MOST_SAMPLES = 2**18
@@ -114,7 +114,7 @@ def fit_submanifold(
     """The spectral submanifold and its normal form from one velocity in free decay.
 
     Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the
-    force was gone; `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 6,
+    force was gone; `terms` of the polynomials α and ω in ρ² (1 for a linear mode), from 1 to 7,
     by default one more than Schwarz' criterion asks for; the record is read down to
     `least_amplitude` (m/s).
     Returns a `SpectralSubmanifold`. Raises `ValueError` for a record as in `resonant_decay` and
