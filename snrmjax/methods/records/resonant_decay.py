@@ -274,14 +274,18 @@ def _points(
     """Points of local lines.
 
     The action v²/ω̃ of a mode decays by 2ζ̃ω̃, v the velocity of its fundamental; a peak has the
-    energy ½v², which is the integral of ω̃ over the action.
+    energy ½v², which is the integral of ω̃ over the action. A displacement e^{∫(−δ + iω)dt} obeys
+    the equation of motion with ω̃² = ω² + δ² + dδ/dt − δ (dω/dt)/ω.
     """
     from scipy.ndimage import maximum_filter1d
 
     speed, omega, decay = np.exp(lines[:, _LEVEL]), lines[:, _OMEGA], lines[:, _SLOPE]
     if len(lines) > 1:
         moves = np.gradient(np.log(omega), lines[:, _TIME])
+        shrinks = moves - decay
+        squared = shrinks**2 + np.gradient(shrinks, lines[:, _TIME]) - shrinks * moves
         decay = decay - moves * (0.5 if fundamental else 0.25)
+        omega = np.sqrt(np.maximum(omega**2 + squared, 0.0))
     # At the ends a filter's error swings from line to line: its size around each counts.
     bias = maximum_filter1d(np.abs(bias), _SWING, axis=0)
     omega_std = np.hypot(_scatter(omega, speed), bias[:, _OMEGA])
