@@ -1,0 +1,315 @@
+"""Each method against its own source: data, claims or formulas that its authors published.
+
+Run: python benchmarks/methods_sources.py [--pff FOLDER]
+
+`FOLDER` is a copy of github.com/JustinPorter88/pff-analysis, whose measured decay and 600-point
+result of the authors' MATLAB program are read where they lie (they are not part of this project).
+One JSON line a method, `kind` says what it was held against:
+
+- own_result: the authors' own numbers for the authors' own record (their Python program, run
+  beside, and the stored result of their MATLAB program, which are also held against each other);
+- own_claim: a figure that the source's text states, in the virtual laboratory;
+- public_example: an example with numbers that others published for the method;
+- own_formula: the source's formula, written out here a second time, on the same data;
+- physics_only: no numbers of the source could be had; the method's central claim against harmonic
+  balance, which it does not use.
+"""
+
+import argparse
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+
+import snrmjax as sj
+
+HERTZ = 2 * np.pi
+REST, RATIO, MASS, CUBIC = 40 * HERTZ, 0.01, 0.8, 3e9  # cubic per modal mass, 1/(m² s²)
+
+
+def tell(method: str, kind: str, source: str, **numbers) -> None:
+    """One line."""
+    line = {"benchmark": "methods_sources", "method": method, "kind": kind, "source": source}
+    print(json.dumps({**line, **numbers}), flush=True)
+
+
+def duffing() -> sj.model.Structure:
+    """An oscillator with a cubic spring."""
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
+    potential = sj.model.polynomial_potential({"1111": CUBIC * shape**2 / 4}, 1)
+    return sj.model.structure(modes, potential)
+
+
+def resonant_decay(folder: Path | None) -> None:
+    """The authors' record of a bolted beam, band of their settings, against their result."""
+    source = "Jin et al., J. Vib. Acoust. 142 (2020) 051111, doi:10.1115/1.4047416"
+    if folder is None:
+        tell("resonant_decay", "own_result", source, not_run="--pff FOLDER is missing")
+        return
+    from scipy.io import loadmat
+
+    beside = importlib.util.spec_from_file_location("pff", folder / "pff.py")
+    pff = importlib.util.module_from_spec(beside)
+    beside.loader.exec_module(pff)
+    record = loadmat(folder / "data" / "Sample_LMS_Data.mat")
+    stored = loadmat(folder / "data" / "Sample_LMS_Results.mat")
+    time, signal = record["t"][:, 0], record["x"][:, 0]
+    # Their settings: 153.9 Hz ± 10 Hz, from 0.05 s behind the largest sample to 2 s.
+    start = time[np.argmax(signal)] + 0.05
+    part = (time >= start) & (time <= 2.0)
+    run = pff.pff_analysis(time, record["x"], 153.9, start, 2.0, 10 / 153.9, remove_end=20)
+    laws = {
+        "their_python": (np.abs(run[3][0]), run[0][0] / HERTZ, run[1][0]),
+        "their_matlab": tuple(stored[name][:, 0] for name in ("Amp", "Freq", "Damp")),
+    }
+    largest = stored["Amp"].max()
+    answers = {
+        reading: _answer(
+            sj.methods.resonant_decay(
+                time[part], signal[part], reading=reading, band=(143.9, 163.9), window=8
+            )
+        )
+        for reading in ("peaks", "zero_crossings", "hilbert")
+    }
+    for name, answer in {**answers, "their_python": laws["their_python"]}.items():
+        numbers = {}
+        for other, law in laws.items():
+            if other == name:
+                continue
+            order = np.argsort(law[0])
+            inside = (answer[0] < 0.4 * largest) & (answer[0] > 0.05 * largest)
+            for quantity, k in (("frequency", 1), ("damping", 2)):
+                expected = np.interp(answer[0][inside], law[0][order], law[k][order])
+                off = np.abs(answer[k][inside] / expected - 1)
+                numbers[f"{quantity}_from_{other}_median"] = float(np.median(off))
+                numbers[f"{quantity}_from_{other}_90"] = float(np.percentile(off, 90))
+        tell("resonant_decay", "own_result", source, reading=name, **numbers)
+
+
+def _answer(result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Amplitude, frequency (Hz) and damping ratio where there is an answer."""
+    good = result.found
+    return (
+        np.asarray(result.velocity)[good],
+        np.asarray(result.natural_frequency)[good] / HERTZ,
+        np.asarray(result.damping_ratio)[good],
+    )
+
+
+def phase_locked_loop() -> None:
+    """A clamped beam, 20 % up from its linear frequency with gains of the linear regime."""
+    model = sj.model.flat_beam()
+    shaker = sj.methods.Shaker(3.0, 0.005, mass=1e-7, damping=1e-7, stiffness=1e-3)
+    laboratory = sj.methods.Laboratory(
+        model, shaker, sj.methods.Instruments(velocity_noise=1e-4), 10000.0, substeps=4
+    )
+    voltages = np.linspace(0.5, 8.5, 15)
+    found = sj.methods.phase_locked_loop(
+        *(laboratory, voltages),
+        gains=sj.methods.LoopGains(100.0, 40.0),
+        settle_cycles=70,
+        record_cycles=30,
+    )
+    truth = sj.simulate.phase_controlled(model, 1.7e-2)
+    speed = np.abs(truth.velocity[:, 1, 0])
+    order = np.argsort(speed)
+    good = found.found
+    true = np.interp(found.velocity[good], speed[order], truth.frequency[order])
+    omega = np.asarray(found.natural_frequency)[good]
+    tell(
+        *("pll", "own_claim"),
+        "Hippold et al., Mech. Syst. Signal Process. 220 (2024) 111670, arXiv:2403.06639: fixed "
+        "gains of the linear regime, a shift of 20 %, about 100 periods a point",
+        locked=int(good.sum()),
+        of=len(voltages),
+        periods_a_point=100,
+        shift=float(omega.max() / float(model.modes.natural_frequency[0]) - 1),
+        frequency_error_max=float(np.abs(omega / true - 1).max()),
+    )
+
+
+def continuation() -> None:
+    """x'' + 0.1 x' + x + 0.04 x³ = cos ωt, tracked through its unstable branch."""
+    modes = sj.model.linear_modes([1.0], [0.05], [[1.0]], [1.0])
+    model = sj.model.structure(modes, sj.model.polynomial_potential({"1111": 0.01}, 1))
+    shaker = sj.methods.Shaker(1.0, 1e-3)
+    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 40.0)
+    settings = sj.methods.FeedbackSettings(1500.0)
+    errors, exact, falling = [], [], 0
+    for omega in (1.3, 1.5, 1.7):
+        curve = sj.methods.s_curve(laboratory, omega, omega * np.linspace(0.5, 7.5, 15), settings)
+        held = np.isfinite(curve.force)
+        size = curve.velocity[held] / omega
+        needed = size * np.hypot(1 + 0.03 * size**2 - omega**2, 0.1 * omega)
+        errors += list(np.abs(curve.force[held] - needed) / needed.max())
+        falling += int(np.sum(np.diff(curve.force[held]) < 0))
+        for speed, force in zip(curve.velocity[held], curve.force[held], strict=True):
+            law = sj.simulate.response_controlled(model, speed, 0.9 * omega, 1.1 * omega)
+            true = np.interp(omega, law.frequency, np.abs(law.force))
+            exact.append(abs(force - true) / needed.max())
+    tell(
+        *("cbc", "public_example"),
+        "a public script of control-based continuation: forced Duffing equation with α = γ = 1, "
+        "β = 0.04, δ = 0.1 and its one-term amplitudes; method of Sieber & Krauskopf 2008",
+        points=len(errors),
+        on_falling_force=falling,
+        force_from_one_term_median=float(np.median(errors)),
+        force_from_one_term_max=float(np.max(errors)),
+        force_from_nine_harmonics_max=float(np.max(exact)),
+    )
+
+
+def held_displacements(model, sizes, frequencies=None):
+    """Response-controlled stepped sines in the laboratory, one level a displacement."""
+    shaker = sj.methods.Shaker(30.0, 8.0, mass=0.05, damping=1.0, stiffness=500.0)
+    laboratory = sj.methods.Laboratory(model, shaker, sj.methods.Instruments(), 4000.0)
+    tables = []
+    for level, size in enumerate(sizes, 1):
+        middle = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
+        test = sj.methods.stepped_sine_test(
+            *(laboratory, size),
+            middle * np.linspace(0.975, 1.025, 13) if frequencies is None else frequencies,
+            held="displacement",
+        )
+        tables.append(sj.methods.steady_states_of(laboratory, test, level=level))
+    return sj.measure.join_steady_states(tables)
+
+
+def response_controlled() -> None:
+    """Modal analysis of held levels: the line of inverse receptance beside a circle fit."""
+    model, sizes = duffing(), np.array([4e-4, 8e-4, 1.2e-3, 1.6e-3])
+    data = held_displacements(model, sizes)
+    found = sj.methods.rct(data, model.modes)
+    good = found.found
+    size = np.asarray(found.velocity)[good] / np.asarray(found.natural_frequency)[good]
+    true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
+    ratios = np.array([_circle(data, level) for level in np.asarray(found.level)[good]])
+    ours = np.asarray(found.damping_ratio)[good]
+    tell(
+        *("rct", "own_formula"),
+        "Karaağaçlı & Özgüven, Vibration 3 (2020) 266, doi:10.3390/vibration3030019; circle fit of "
+        "Maia & Silva (1997), which NLtest uses for such tests, written out here",
+        levels=int(good.sum()),
+        frequency_error_max=float(
+            np.abs(np.asarray(found.natural_frequency)[good] / true - 1).max()
+        ),
+        damping_error_max=float(np.abs(ours * true / (RATIO * REST) - 1).max()),
+        circle_damping_error_max=float(np.abs(ratios * true / (RATIO * REST) - 1).max()),
+        damping_difference_max=float(np.abs(ours / ratios - 1).max()),
+    )
+
+
+def harmonic_force_surface() -> None:
+    """The surface of held levels cut at one force, against the response of that force."""
+    model, force = duffing(), 1.5
+    frequencies = HERTZ * np.linspace(39.4, 42.2, 29)
+    data = held_displacements(model, np.linspace(2e-4, 1.6e-3, 9), frequencies)
+    omega, cut = sj.methods.force_surface(data, model.modes).cut(force)
+    (exact,) = sj.forced_response(model, [force], 38 * HERTZ, 43 * HERTZ)
+    height = np.abs(exact.velocity[:, 1, 0]) / exact.frequency
+    # The exact curve at each point's frequency: the branch that is nearest.
+    distance, unstable = [], 0
+    for at, one in zip(omega, cut, strict=True):
+        k = np.flatnonzero((exact.frequency[:-1] - at) * (exact.frequency[1:] - at) <= 0)
+        share = (at - exact.frequency[k]) / (exact.frequency[k + 1] - exact.frequency[k])
+        each = height[k] + share * (height[k + 1] - height[k])
+        nearest = int(np.argmin(np.abs(each - one)))
+        distance.append(abs(each[nearest] - one) / height.max())
+        unstable += bool(exact.is_unstable[k[nearest]])
+    tell(
+        *("harmonic_force_surface", "physics_only"),
+        "Karaağaçlı & Özgüven, Vibration 3 (2020) 266: unstable branches are ordinary points of "
+        "the surface (no table of their structures was found)",
+        points=len(cut),
+        on_unstable_branch=unstable,
+        amplitude_error_median=float(np.median(distance)),
+        amplitude_error_max=float(np.max(distance)),
+    )
+
+
+def _circle(data, level: int) -> float:
+    """Damping ratio of a level by the angles of a fitted circle, hysteretic as in the source."""
+    rows = np.flatnonzero(np.asarray(data.level) == level)
+    omega = np.asarray(data.frequency)[rows]
+    velocity = np.asarray(data.velocity)[rows, 0]
+    receptance = velocity / (1j * omega) / np.asarray(data.force)[rows]
+    x, y = receptance.real, receptance.imag
+    scale = np.abs(receptance).max()
+    design = np.stack([x, y, np.full_like(x, scale)], axis=1) / scale
+    solved = np.linalg.lstsq(design, -(x**2 + y**2) / scale**2, rcond=None)[0] * scale
+    turned = receptance + (solved[0] + 1j * solved[1]) / 2
+    angle = np.unwrap(np.angle(turned)) + np.pi / 2  # zero at resonance, falling
+    natural = np.interp(0.0, -angle, omega)
+    above, below = omega > natural, omega < natural
+    each = [
+        (a**2 - b**2) / (2 * natural**2) / (np.tan(abs(p) / 2) + np.tan(abs(q) / 2))
+        for a, p in zip(omega[above], angle[above], strict=True)
+        for b, q in zip(omega[below], angle[below], strict=True)
+    ]
+    return float(np.median(each))
+
+
+def concerto() -> None:
+    """Real formulas of the source for pairs of equal amplitude, on a whole exact response."""
+    model = duffing()
+    test = sj.phase_resonance_test(
+        *(model, [1.5], 37 * HERTZ, 44 * HERTZ), appropriation=(0.05, 1.0), points_per_level=24
+    )
+    data = test.steady_states
+    found = sj.methods.concerto(data, model.modes)
+    good = found.found
+    size = np.asarray(found.velocity)[good] / np.asarray(found.natural_frequency)[good]
+    omega = np.asarray(data.frequency)
+    alpha = np.asarray(data.velocity)[:, 0] / (1j * omega) / np.asarray(data.force)
+    high = np.abs(alpha) * np.asarray(data.force)
+    lead = np.angle(np.asarray(data.velocity)[:, 0]) >= 0
+    theirs = []
+    for one in size:
+        pair = []
+        for rows in (np.flatnonzero(lead), np.flatnonzero(~lead)):
+            rows = rows[np.argsort(high[rows])]
+            pair.append(
+                (
+                    np.interp(one, high[rows], omega[rows] ** 2),
+                    np.interp(one, high[rows], alpha[rows].real),
+                    np.interp(one, high[rows], alpha[rows].imag),
+                )
+            )
+        (w1, r1, i1), (w2, r2, i2) = pair
+        bottom = (r2 - r1) ** 2 + (i2 - i1) ** 2
+        square = ((r2 - r1) * (r2 * w2 - r1 * w1) + (i2 - i1) * (i2 * w2 - i1 * w1)) / bottom
+        lost = ((r2 - r1) * (i2 * w2 - i1 * w1) - (i2 - i1) * (r2 * w2 - r1 * w1)) / bottom
+        theirs.append((np.sqrt(square), lost / square / 2))
+    theirs = np.array(theirs)
+    true = np.sqrt(REST**2 + 0.75 * CUBIC * size**2)
+    ours = np.asarray(found.natural_frequency)[good], np.asarray(found.damping_ratio)[good]
+    tell(
+        *("concerto", "own_formula"),
+        "Carrella & Ewins, Mech. Syst. Signal Process. 25 (2011) 1011, "
+        "doi:10.1016/j.ymssp.2010.09.011: their real formulas, written out here (their example's "
+        "numbers were not found)",
+        points=int(good.sum()),
+        frequency_difference_max=float(np.abs(ours[0] / theirs[:, 0] - 1).max()),
+        damping_difference_max=float(np.abs(ours[1] / theirs[:, 1] - 1).max()),
+        frequency_error_median=float(np.median(np.abs(ours[0] / true - 1))),
+        damping_error_median=float(np.median(np.abs(ours[1] * true / (RATIO * REST) - 1))),
+    )
+
+
+def main() -> None:
+    """All methods in turn."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--pff", type=Path)
+    given = parser.parse_args()
+    resonant_decay(given.pff)
+    phase_locked_loop()
+    continuation()
+    response_controlled()
+    harmonic_force_surface()
+    concerto()
+
+
+if __name__ == "__main__":
+    main()
