@@ -60,6 +60,18 @@ class MeasuredShapes(NamedTuple):
         return not np.any(self.shapes.imag)
 
 
+class TextFormat(NamedTuple):
+    """How a text is written; what is None is found out.
+
+    `separator` is "comma", "semicolon", "tab" or "space", `decimal` "point" or "comma",
+    `header_row` the row of the columns' names, from 1.
+    """
+
+    separator: str | None = None
+    decimal: str | None = None
+    header_row: int | None = None
+
+
 class LaboratoryFile(NamedTuple):
     """All that a file of a laboratory holds; see `read_laboratory_file`.
 

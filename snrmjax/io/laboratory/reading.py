@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
+from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
 _ROOM = "snrmjax.io.laboratory"
 _READERS: dict[Kind, tuple[str, str]] = {
@@ -13,28 +13,29 @@ _READERS: dict[Kind, tuple[str, str]] = {
     "matlab": ("arrays.matlab_files", "read_matlab"),
     "hdf5": ("arrays.hdf5_files", "read_hdf5"),
     "netcdf": ("arrays.hdf5_files", "read_netcdf"),
+    "tdms": ("tdms_files", "read_tdms"),
+    "csv": ("separated_text", "read_separated_text"),
 }
 _HEAD = 4096
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read_laboratory_file(path: FilePath) -> LaboratoryFile:
+def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
     """All recordings, frequency responses, tables and shapes of a file.
 
     Formats: UFF/UNV (58, 58b, 55, 15, 151, 164), MATLAB v5 to v7.3, HDF5, netCDF 4, TDMS, and
     CSV or other separated text. Long records are not read before they are asked for (HDF5,
     netCDF, MATLAB v7.3, TDMS).
+    Arguments: `text_format` says how a CSV is written where that is not found out by itself.
     Returns `LaboratoryFile`. Raises `ValueError`, in one sentence that names the file, for a file
     that is missing, empty, of another format, damaged, or that states more than it can hold; and
     where the reader needs a package that is not installed.
     """
     kind = _kind(path)
-    if kind not in _READERS:
-        raise ValueError(f"{file_name(path)} is a file of kind {kind}, which cannot be read yet.")
     module, function = _READERS[kind]
-    found: LaboratoryFile = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)(
-        Path(path)
-    )
+    read = getattr(importlib.import_module(f"{_ROOM}.{module}"), function)
+    options = (text_format,) if kind == "csv" else ()
+    found: LaboratoryFile = read(Path(path), *options)
     if found.is_empty:
         why = f": {found.notes[0]}" if found.notes else "."
         raise ValueError(f"{found.name} holds nothing that could be read{why}")
@@ -66,7 +67,7 @@ def _kind(path: FilePath) -> Kind:
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":
         return "uff"
-    if b"\0" in head:
+    if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")):  # text of 16 bits
         raise ValueError(f"{name} is of no known format ({_seen(head)}).")
     return "csv"
 

@@ -1,0 +1,156 @@
+"""TDMS files (LabVIEW, NI): groups of channels with properties, read piece by piece."""
+
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Num
+
+from snrmjax.io.laboratory.arrays.structs import read_struct
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
+from snrmjax.io.laboratory.libraries import Budget, damaged_if_it_fails, library
+from snrmjax.io.laboratory.physical_units import channel_meaning
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.time_recording import (
+    AbstractSamples,
+    TimeRecording,
+    time_recording,
+)
+
+_UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
+_MOST_CHANNELS = 4096
+_ALIKE = 1e-12  # relative, of two steps in the properties of one device
+
+
+class TdmsSamples(AbstractSamples):
+    """Channels of one group. The file is open until this is forgotten."""
+
+    def __init__(self, file: Any, channels: Sequence[Any], n_samples: int, name: str) -> None:
+        self._channels, self._samples, self._name = tuple(channels), n_samples, name
+        weakref.finalize(self, file.close)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """See `AbstractSamples.shape`."""
+        return len(self._channels), self._samples
+
+    def read(
+        self, channels: Sequence[int], start: int, stop: int
+    ) -> Num[np.ndarray, "channel sample"]:
+        """See `AbstractSamples.read`."""
+        rows = []
+        for k in channels:
+            with damaged_if_it_fails(self._name, "a TDMS file"):
+                rows.append(self._channels[k].read_data(start, max(0, stop - start)))
+        if any(len(row) != stop - start for row in rows):
+            raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are not there.")
+        return np.stack(rows)
+
+
+def read_tdms(path: Path) -> LaboratoryFile:
+    """A TDMS file. Raises `ValueError` as `read_laboratory_file` does."""
+    nptdms, size = library("nptdms", "reading TDMS"), path.stat().st_size
+    recordings: list[TimeRecording] = []
+    tables: list[NumberTable] = []
+    notes: list[str] = []
+    budget = Budget(path.name)
+    with damaged_if_it_fails(path.name, "a TDMS file"):
+        source = nptdms.TdmsFile.open(path)
+        with source:
+            groups = [(group.name, list(group.channels())) for group in source.groups()]
+            counted = [
+                (one, len(one), dict(one.properties)) for _, channels in groups for one in channels
+            ]
+    _check_sizes(counted, size, path.name)
+    for name, channels in groups:
+        waves: dict[tuple[float, float, int], list[Any]] = {}
+        loose: dict[str, Node] = {}
+        for one in channels:
+            if not len(one) or one.dtype.kind not in "biuf":
+                notes.append(f"channel {one.name} holds no real numbers and is not read.")
+                continue
+            step = _number(one, "wf_increment")
+            start = _number(one, "wf_start_offset") or 0.0
+            if step is not None and step > 0 and len(one) > 1:
+                key = next(
+                    (
+                        key
+                        for key in waves
+                        if abs(key[0] / step - 1) < _ALIKE and key[1:] == (start, len(one))
+                    ),
+                    (step, start, len(one)),
+                )
+                waves.setdefault(key, []).append(one)
+            else:
+                loose[one.name] = _numbers(path, name, one)
+        for (step, start, length), alike in waves.items():
+            recordings.append(_recording(path, name, alike, step, start, length))
+        found = read_struct(name, loose, budget)
+        recordings.extend(found.recordings)
+        tables.extend(table._replace(name=name) for table in found.numbered())
+        notes.extend(found.notes)
+    return LaboratoryFile(
+        path.name, "tdms", tuple(recordings), (), tuple(tables), (), tuple(dict.fromkeys(notes))
+    )
+
+
+def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str) -> None:
+    """Refuse more samples than the file has bytes for, and more channels than a test has."""
+    if len(counted) > _MOST_CHANNELS:
+        raise ValueError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
+    total = sum(
+        length * one.dtype.itemsize for one, length, _ in counted if one.dtype.kind in "biuf"
+    )
+    if total > 8 * size:  # scaled channels give doubles for bytes
+        raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
+
+
+def _recording(
+    path: Path, name: str, channels: Sequence[Any], step: float, start: float, length: int
+) -> TimeRecording:
+    """Channels of one rate as a time record."""
+    nptdms = library("nptdms", "reading TDMS")
+    with damaged_if_it_fails(path.name, "a TDMS file"):
+        file = nptdms.TdmsFile.open(path)
+        opened = [file[name][one.name] for one in channels]
+    samples = TdmsSamples(file, opened, length, path.name)
+    listed = []
+    for one in channels:
+        unit = _unit(one)
+        quantity, calibration = channel_meaning(unit)
+        listed.append(Channel(one.name, quantity, unit, calibration))
+    rate = 1 / step
+    whole = round(rate)
+    rate = float(whole) if whole and abs(rate / whole - 1) < 4e-16 else rate
+    return time_recording(samples, listed, rate, start_time=start, name=name)
+
+
+def _numbers(path: Path, group: str, one: Any) -> Numbers:
+    """A channel without a rate as numbers that are read when asked."""
+    nptdms, name, unit = library("nptdms", "reading TDMS"), one.name, _unit(one)
+
+    def read(at: Selection) -> np.ndarray:
+        with damaged_if_it_fails(path.name, "a TDMS file"), nptdms.TdmsFile.open(path) as file:
+            return file[group][name].read_data(at[0].start, at[0].stop - at[0].start)
+
+    return Numbers((len(one),), read, False, {"unit": unit} if unit else {})
+
+
+def _unit(one: Any) -> str:
+    """The unit that a property states."""
+    for key in _UNITS:
+        value = one.properties.get(key)
+        if isinstance(value, str) and value.strip():
+            return value.strip()
+    return ""
+
+
+def _number(one: Any, key: str) -> float | None:
+    """A finite number among the properties."""
+    value = one.properties.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return None
+    return float(value) if np.isfinite(value) else None
