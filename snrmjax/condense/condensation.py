@@ -39,7 +39,8 @@ class FitQuality(eqx.Module):
 
     `misfit` and `cross_validated` are of all equations together, over the nonlinear force; those
     of `equation_…` are of each modal equation, over the force on that mode. Cross-validated:
-    every case as the fit to all others has it.
+    every case as the fit to all others has it. NaN within `jit` and derivatives, where nothing can
+    be checked.
     """
 
     misfit: float
@@ -73,11 +74,16 @@ class Condensation(AbstractResult):
     def summary(self) -> tuple[str, ...]:
         """What was condensed, how well it fits, and the warnings."""
         numbers = ", ".join(str(number) for number in self.basis.numbers)
-        count, used = len(self.cases.force), int(self.cases.usable.sum())
         q = self.quality
-        return (
+        first = (
             f"Condensation: modes {numbers}, force of degree {self.degree}, "
-            f"{len(self.potential.monomials)} coefficients of one potential",
+            f"{len(self.potential.monomials)} coefficients of one potential"
+        )
+        if np.isnan(q.misfit):
+            return first, "not checked: made within `jit` or a derivative"
+        count, used = len(self.cases.force), int(self.cases.usable.sum())
+        return (
+            first,
             f"{used} of {count} load cases, nonlinear up to {np.nanmax(q.nonlinear_ratio):.3g} of "
             "the linear force",
             f"misfit {q.misfit:.2g} of the nonlinear force, cross-validated "
@@ -124,10 +130,10 @@ class Condensation(AbstractResult):
 
     def structure(
         self,
-        damping_ratio: float | Float[np.ndarray, " mode"] | list[float],
+        damping_ratio: float | Float[np.ndarray | Array, " mode"] | list[float],
         *,
         sensors: Mapping[str, Any],
-        participation: Float[np.ndarray, " mode"] | list[float],
+        participation: Float[np.ndarray | Array, " mode"] | list[float],
         mode_of_interest: int = 0,
         name: str = "reduced model",
     ) -> Structure:
@@ -139,13 +145,12 @@ class Condensation(AbstractResult):
         Raises `ValueError` as `linear_modes` does.
         """
         n = len(self.basis.numbers)
+        ratio = damping_ratio if np.ndim(damping_ratio) else [damping_ratio] * n
         modes = linear_modes(
-            np.asarray(self.basis.frequency),
-            np.broadcast_to(np.asarray(damping_ratio, dtype=float), (n,))
-            if np.ndim(damping_ratio) == 0
-            else np.asarray(damping_ratio, dtype=float),
-            np.array([np.asarray(row, dtype=float) for row in sensors.values()]).reshape(-1, n),
-            np.asarray(participation, dtype=float),
+            self.basis.frequency,
+            ratio,  # type: ignore[arg-type]
+            [row if np.ndim(row) else [row] for row in sensors.values()],
+            participation,
             sensors=tuple(sensors),
             mode_of_interest=mode_of_interest,
         )
@@ -158,9 +163,10 @@ def condense(
     """Fit one potential V to static load cases, f = ω²q + ∂V/∂q, and check both.
 
     Arguments: `degree` of the nonlinear force (3: quadratic and cubic), up to 7; `expand` False
-    leaves the displacements beyond the modes out. For gradients, and under `jit`, `fit_potential`
-    is the same fit without checks.
-    Returns the model with residuals, condition, cross-validated error and warnings. Raises
+    leaves the displacements beyond the modes out.
+    Returns the model with residuals, condition, cross-validated error and warnings. Within
+    `jax.jit` and derivatives it is the same fit without checks, with coefficients of NaN where a
+    load case did not converge. Raises
     `ValueError` where the cases are too few or do not determine every coefficient, naming some.
     Validity: amplitudes up to those of the load cases; motions outside the modes kept must follow
     them statically (their frequencies lie well above the response's harmonics).
@@ -178,6 +184,8 @@ def condense(
         raise ValueError(
             f"the load cases have {cases.force.shape[1]} modes, but the basis has {n_modes}."
         )
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((basis, cases))):
+        return _unchecked(basis, cases, degree)
     used = np.flatnonzero(cases.usable)
     if not used.size:
         raise ValueError(
@@ -206,6 +214,18 @@ def condense(
         warnings=case_warnings(cases, view),
         degree=degree,
     )
+
+
+def _unchecked(basis: ReductionBasis, cases: StaticCases, degree: int) -> Condensation:
+    """The fit alone, of numbers that are not known yet."""
+    found = fit_potential(basis, cases, degree=degree)
+    whole = jnp.where(jnp.all(cases.converged), found.coefficient, jnp.nan)
+    potential = dataclasses.replace(found, coefficient=whole)
+    by_mode, by_case = (np.full(size, np.nan) for size in cases.force.shape[::-1])
+    nothing = FitQuality(
+        *(np.nan, np.nan, by_mode, by_mode, by_case, by_case, by_mode, np.nan), energy_error=None
+    )
+    return Condensation(basis, cases, potential, nothing, None, (), degree)
 
 
 def require_loaded(basis: ReductionBasis, cases: StaticCases) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
+from snrmjax.model.modes import have_values
 
 NONLINEAR_RATIO = 0.02
 """Default size of a load: there, the nonlinear part of the force is 2 % of the linear one.
@@ -51,7 +52,7 @@ def modal_loads(
     Arguments: `displacement` in m, one for all modes or one for each; `degree` of the force that
     is to be fitted, which sets how many modes are combined (as many, since q₁q₂q₃ is only seen
     where three modes move) and how many load levels there are; `most_modes` and `levels`
-    (fractions of the displacement) say it otherwise.
+    (fractions of the displacement) say it otherwise. Differentiable by `basis` and `displacement`.
     Raises `ValueError` for a displacement, number of modes or level that makes no load.
     Reference: Kuether, Deaner, Hollkamp & Allen, AIAA J. 53 (2015) 3273, doi:10.2514/1.J053838
     (constant modal displacement).
@@ -63,8 +64,9 @@ def modal_loads(
     """
     check_degree(degree)
     n = len(basis.numbers)
-    wanted = np.asarray(displacement, dtype=float)
-    if wanted.shape not in ((), (n,)) or not np.all(np.isfinite(wanted) & (wanted > 0)):
+    wanted = jnp.asarray(displacement, dtype=jnp.float64)
+    known = np.asarray(wanted) if have_values(wanted) else np.ones(wanted.shape)
+    if wanted.shape not in ((), (n,)) or not np.all(np.isfinite(known) & (known > 0)):
         raise ValueError(
             f"`displacement` must be positive (m), one number or one for each of the {n} modes, "
             f"but is {displacement}."
@@ -75,7 +77,7 @@ def modal_loads(
     if not fractions or not all(np.isfinite(level) and level > 0 for level in fractions):
         raise ValueError(f"`levels` must be positive fractions, at least one, but is {levels}.")
     signs = _combinations(n, min(n, most_modes or degree))
-    alone = basis.frequency**2 * jnp.asarray(wanted) / basis.largest
+    alone = basis.frequency**2 * wanted / basis.largest
     rows = signs / np.sum(np.abs(signs), axis=1, keepdims=True)
     names = [_name(row, basis.numbers) for row in signs]
     return LoadSet(

@@ -1,5 +1,6 @@
 """Linear modes of a structure and their response to a harmonic force."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -110,7 +111,8 @@ def linear_modes(
     sensors and participations Φᵀb in kg^-1/2; `rigid_body` modes likewise; `std` has the 1σ of
     frequencies and damping ratios, without which they are known exactly, and of modal masses
     (relative), without which they are as `UNSTATED_MODAL_MASS_STD` says.
-    Raises `ValueError` that names the argument whose shape or value is wrong.
+    Raises `ValueError` that names the argument whose shape or value is wrong. Numbers that are
+    traced (within `jax.jit` and derivatives) are taken as they are.
 
     >>> modes = linear_modes([500.0], [0.01], [[2.0]], [3.0])
     >>> modes.n_modes, modes.sensors
@@ -121,12 +123,12 @@ def linear_modes(
     if n_modes == 0:
         raise ValueError("`natural_frequency` must have at least one mode, but is empty.")
     damping = _vector("damping_ratio", damping_ratio, n_modes)
-    shape = np.asarray(mode_shape, dtype=np.float64)
+    shape = _numbers(mode_shape)
     if shape.ndim != 2 or shape.shape[1] != n_modes or shape.shape[0] == 0:
         raise ValueError(
             f"`mode_shape` must have shape (sensors, {n_modes} modes), but has {shape.shape}."
         )
-    _require("mode_shape", shape.reshape(-1), np.isfinite(shape.reshape(-1)), "finite")
+    _require_finite("mode_shape", shape)
     n_sensors = shape.shape[0]
     names = sensors or tuple(f"sensor {k + 1}" for k in range(n_sensors))
     if len(names) != n_sensors:
@@ -135,17 +137,16 @@ def linear_modes(
         raise ValueError(
             f"`mode_of_interest` must lie between 0 and {n_modes - 1}, but is {mode_of_interest}."
         )
-    _require("natural_frequency", frequency, frequency > 0, "positive")
-    _require("damping_ratio", damping, (damping >= 0) & (damping < 1), "from 0 to below 1")
+    _require("natural_frequency", frequency, lambda f: f > 0, "positive")
+    _require("damping_ratio", damping, lambda z: (z >= 0) & (z < 1), "from 0 to below 1")
     shapes, participations = rigid_body or RigidBodyModes(np.zeros((n_sensors, 0)), [])
-    rigid_shape = np.asarray(shapes, dtype=np.float64)
+    rigid_shape = _numbers(shapes)
     if rigid_shape.ndim != 2 or rigid_shape.shape[0] != n_sensors:
         raise ValueError(
             f"`rigid_body.shape` must have shape ({n_sensors} sensors, rigid-body modes), "
             f"but has {rigid_shape.shape}."
         )
-    flat = rigid_shape.reshape(-1)
-    _require("rigid_body.shape", flat, np.isfinite(flat), "finite")
+    _require_finite("rigid_body.shape", rigid_shape)
     numbers: dict[str, Any] = {
         "natural_frequency": frequency,
         "damping_ratio": damping,
@@ -166,19 +167,33 @@ def linear_modes(
     return jax.device_put(modes, may_alias=False)
 
 
-def _vector(name: str, value: object, size: int | None = None) -> np.ndarray:
-    vector = np.asarray(value, dtype=np.float64)
-    _require(name, vector.reshape(-1), np.isfinite(vector.reshape(-1)), "finite")
+def _numbers(value: Any) -> Any:
+    """An array of the host, or a traced one."""
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
+    return jnp.asarray(value, jnp.float64) if traced else np.asarray(value, dtype=np.float64)
+
+
+def _vector(name: str, value: object, size: int | None = None) -> Any:
+    vector = _numbers(value)
+    _require_finite(name, vector)
     if vector.ndim != 1 or (size is not None and vector.size != size):
         wanted = "a vector" if size is None else f"a vector of {size}"
         raise ValueError(f"`{name}` must be {wanted}, but has shape {vector.shape}.")
     return vector
 
 
-def _require(name: str, value: np.ndarray, good: np.ndarray, expected: str) -> None:
+def _require_finite(name: str, value: Any) -> None:
+    _require(name, value.reshape(-1), np.isfinite, "finite")
+
+
+def _require(name: str, value: Any, rule: Callable[[np.ndarray], np.ndarray], text: str) -> None:
+    """Refuse values that break a rule; traced ones have none yet."""
+    if isinstance(value, jax.core.Tracer):
+        return
+    good = rule(value)
     if not np.all(good):
         first = int(np.argmin(good))
-        raise ValueError(f"`{name}` must be {expected}, but entry {first} is {value[first]:g}.")
+        raise ValueError(f"`{name}` must be {text}, but entry {first} is {value[first]:g}.")
 
 
 def residual_velocity(

@@ -17,6 +17,7 @@ from .solutions.forced_response import (
     solve_at_frequency,
 )
 from .solutions.isolated_responses import IsolatedResponses, IsolatedSearch, isolated_responses
+from .solutions.mode_at_velocities import normal_mode_at_velocities
 from .solutions.normal_modes import NormalModeBranch, Tongue, nonlinear_normal_mode
 from .solutions.periodic_motion import (
     PeriodicMotion,
@@ -64,6 +65,7 @@ __all__ = [
     "isolated_responses",
     "motions_at_velocities",
     "nonlinear_normal_mode",
+    "normal_mode_at_velocities",
     "periodic_motion",
     "phase_controlled",
     "phase_controlled_test",

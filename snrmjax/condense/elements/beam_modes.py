@@ -28,7 +28,8 @@ def beam_modes(beam: Beam, modes: Sequence[int]) -> ReductionBasis:
     Shapes have rows for all degrees of freedom (x, y, rotation of each node, zero where held).
     Their sign is positive upwards at midspan; where that is a node, at the first place from the
     left that moves almost as far as any. Frequencies and shapes are differentiable by everything
-    in `beam`, where their frequency differs from that of all other modes.
+    in `beam` (first and second derivatives), where their frequency differs from that of all other
+    modes.
 
     Arguments: `modes` numbers counted from one, in order of frequency (axial modes counted too).
     Raises `ValueError` for modes that the elements do not have or that are too coarsely resolved
@@ -72,14 +73,19 @@ def _linear_modes(beam: Beam, numbers: tuple[int, ...]) -> ReductionBasis:
     shapes = shapes * _sign(beam, shapes) / jnp.sqrt(values[chosen])
 
     def differentiable(value: Array, shape: Array) -> tuple[Array, Array]:
-        # One Newton step on K φ = λ M φ, φᵀMφ = 1: nothing but rounding in value, and the whole
-        # of the derivative (Nelson's, with the shape's own direction made regular).
+        # Newton steps on K φ = λ M φ, φᵀMφ = 1, with a fixed matrix (Nelson's, with the shape's own
+        # direction made regular): nothing but rounding in value, and each makes one more order of
+        # derivatives whole.
         weighted = m @ shape
         regular = k - m / value + jnp.outer(weighted, weighted) / value
-        size = shape @ mass @ shape
-        squared = shape @ stiffness @ shape / size
-        residual = stiffness @ shape - squared * (mass @ shape)
-        return squared, shape - jnp.linalg.solve(regular, residual) - 0.5 * shape * (size - 1)
+        factor = jax.scipy.linalg.lu_factor(regular)
+        for _ in range(2):
+            size = shape @ mass @ shape
+            squared = shape @ stiffness @ shape / size
+            residual = stiffness @ shape - squared * (mass @ shape)
+            change = jax.scipy.linalg.lu_solve(factor, residual)
+            shape = shape - change - 0.5 * shape * (size - 1)
+        return squared, shape
 
     squared, shapes = jax.vmap(differentiable, (0, 1), (0, 1))(values[chosen], shapes)
     whole = jnp.zeros((beam.n_dof, len(numbers))).at[free].set(shapes)

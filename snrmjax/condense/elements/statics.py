@@ -60,7 +60,7 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     The whole load is tried first; a load step that does not converge, ends where the tangent
     stiffness is not positive definite or jumps further than the tangent predicts is halved. The
     answer is differentiable by everything in `beam` and by `load` (implicit function theorem,
-    first derivatives).
+    first and second derivatives).
 
     Arguments: `load` F in N and N m on all degrees of freedom (x, y, rotation of each node); those
     on held ones have no effect. Loads keep their direction.
@@ -74,8 +74,11 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
     )
 
     def polished(u: Array, k: Array, one: Array, good: Array) -> tuple[Array, Array]:
-        # One more Newton step: nothing but rounding in value, the whole of the derivative.
-        u = u - jnp.linalg.solve(k, free_force(beam, u) - one)
+        # Newton steps with a fixed matrix: nothing but rounding in value, and each makes one more
+        # order of derivatives whole.
+        factor = jax.scipy.linalg.lu_factor(k)
+        for _ in range(2):
+            u = u - jax.scipy.linalg.lu_solve(factor, free_force(beam, u) - one)
         whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 

@@ -10,7 +10,7 @@ width_m = 0.0127
 thickness_m = 0.000508
 [geometry]
 length_m = 0.2286
-radius_m = 11.43                     # absent: straight
+radius_m = 11.43                     # or rise_m, height over the chord; neither: straight
 elements = 40
 [supports]
 left = "clamped"                     # "clamped", "pinned", "free" or stiffnesses (inf: held)
@@ -81,9 +81,10 @@ class BeamDescription(NamedTuple):
     load_scale: float | None  # thicknesses
     degree: int
     damping_ratio: tuple[float, ...] | None  # one a mode; None: not stated
-    sensors: dict[str, float]  # fractions of the length
+    sensors: tuple[tuple[str, float], ...]  # names and fractions of the length
     force_at: float | None  # fraction of the length; None: uniform
     point_masses: tuple[PointMassEntry, ...] = ()
+    rise: float = 0.0  # m, of the arc over the chord, where no radius is stated
 
 
 def read_beam_description(path: FilePath) -> BeamDescription:
@@ -100,13 +101,18 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     )
     material.check_keys(("young_pa", "density_kg_m3"), ("poisson",))
     section.check_keys(("width_m", "thickness_m"))
-    geometry.check_keys(("length_m", "elements"), ("radius_m",))
+    geometry.check_keys(("length_m", "elements"), ("radius_m", "rise_m"))
     supports.check_keys(("left", "right"))
     of_modes.check_keys(("modes",), ("load_scale", "degree", "damping_ratio"))
     length = geometry.number("length_m", POSITIVE)
     radius = geometry.number("radius_m", POSITIVE) if "radius_m" in geometry.entries else None
     if radius is not None and not length < 2 * MOST_RISE * radius:
         raise geometry.refusal("radius_m", f"above {length / (2 * MOST_RISE):.4g}", radius)
+    rise = geometry.number("rise_m", NOT_NEGATIVE, default=0.0)
+    if radius is not None and "rise_m" in geometry.entries:
+        raise ValueError(f"{geometry.place} has both `radius_m` and `rise_m`: one is enough.")
+    if not 2 * rise < length:
+        raise geometry.refusal("rise_m", f"below half of the length ({length / 2:.4g})", rise)
     thickness = section.number("thickness_m", POSITIVE)
     if not thickness < length:
         raise section.refusal("thickness_m", f"below the length ({length:g})", thickness)
@@ -118,7 +124,7 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     if degree > 7:
         raise of_modes.refusal("degree", "from 2 to 7", degree)
     scaled = "load_scale" in of_modes.entries
-    places = {name: sensors.number(name, FRACTION) for name in sensors.entries}
+    places = tuple((name, sensors.number(name, FRACTION)) for name in sensors.entries)
     return BeamDescription(
         name=top.text("name", file.removesuffix(".toml")),
         young=material.number("young_pa", POSITIVE),
@@ -134,9 +140,10 @@ def read_beam_description(path: FilePath) -> BeamDescription:
         load_scale=of_modes.number("load_scale", POSITIVE) if scaled else None,
         degree=degree,
         damping_ratio=_damping(of_modes, len(modes)),
-        sensors=places or {"midspan": 0.5},
+        sensors=places or (("midspan", 0.5),),
         force_at=_force(force),
         point_masses=tuple(_point_mass(one) for one in top.tables(_POINT_MASS, file)),
+        rise=rise,
     )
 
 

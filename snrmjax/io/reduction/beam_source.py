@@ -1,16 +1,20 @@
 """A beam file as what a reduced-order model is made from: its finite elements and their modes."""
 
+from typing import NamedTuple
+
+import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from snrmjax.condense.elements.beam import Beam, PointMass, Support, rise_of_radius
+from snrmjax.condense.elements.beam import Beam, PointMass, Support
 from snrmjax.condense.elements.beam_cases import static_cases
 from snrmjax.condense.elements.beam_modes import beam_modes, participation, shape_at
-from snrmjax.condense.load_cases import StaticCases
+from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
+from snrmjax.io.reduction.beam_parameters import rise_of
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 
 _BLOCK = 8  # load cases at once
@@ -24,20 +28,26 @@ def read_beam(path: FilePath) -> ReductionSource:
     Raises `ValueError` as `read_beam_description` does, and where the elements have no such modes
     or a sensor or force is at a place that none of them moves.
     """
-    stated, file = read_beam_description(path), file_name(path)
-    beam = _elements(stated)
+    return beam_source(read_beam_description(path), file_name(path))
+
+
+def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
+    """Prepare finite elements, modes and load cases of a beam; messages name its `file`.
+
+    Beams that differ in numbers alone share their compiled programs. Raises `ValueError` as
+    `read_beam` does.
+    """
+    beam = beam_of(stated)
     try:
         basis = beam_modes(beam, stated.modes)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
-    largest = float(np.max(basis.largest))
-    sensors = {}
-    for name, at in stated.sensors.items():
-        sensors[name] = np.asarray(shape_at(beam, basis, at))
-        if not np.max(np.abs(sensors[name])) > _NOWHERE * largest:
+    seen = jax.tree.map(np.asarray, seen_of(beam, basis, stated.sensors, stated.force_at))
+    largest = float(np.max(seen.largest))
+    for name, at in stated.sensors:
+        if not np.max(np.abs(seen.sensors[name])) > _NOWHERE * largest:
             raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
-    driven = np.asarray(participation(beam, basis, stated.force_at))
-    if not np.max(np.abs(driven)) > _NOWHERE * largest:
+    if not np.max(np.abs(seen.participation)) > _NOWHERE * largest:
         place = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
         raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
 
@@ -50,19 +60,60 @@ def read_beam(path: FilePath) -> ReductionSource:
         name=stated.name,
         basis=basis,
         damping_ratio=np.array(damping or (ASSUMED_DAMPING,) * len(stated.modes)),
-        sensors=sensors,
-        participation=driven,
+        sensors=seen.sensors,
+        participation=seen.participation,
         solve=solve,
         thickness=stated.thickness,
         load_scale=stated.load_scale,
         degree=stated.degree,
         # Rows of the shapes are x, y and rotation of each node.
         lines=ShapeLines(
-            np.asarray(beam.nodes)[:, 0],
-            np.asarray(basis.shapes)[1::3],
-            "Position along the chord (m)",
+            seen.position, np.asarray(basis.shapes)[1::3], "Position along the chord (m)"
         ),
         notes=() if damping is not None else (note,),
+    )
+
+
+class SeenModes(NamedTuple):
+    """What sensors and the force see of the modes."""
+
+    sensors: dict[str, Float[Array, " mode"]]  # kg^-1/2
+    participation: Float[Array, " mode"]  # per newton, kg^-1/2
+    largest: Float[Array, " mode"]  # kg^-1/2
+    position: Float[Array, " node"]  # along the chord, m
+
+
+@eqx.filter_jit
+def seen_of(
+    beam: Beam,
+    basis: ReductionBasis,
+    sensors: tuple[tuple[str, float], ...],
+    force_at: float | None,
+) -> SeenModes:
+    """Shapes at the sensors and participation of the force; places are fractions of the length."""
+    return SeenModes(
+        {name: shape_at(beam, basis, at) for name, at in sensors},
+        participation(beam, basis, force_at),
+        basis.largest,
+        beam.nodes[:, 0],
+    )
+
+
+def beam_of(stated: BeamDescription) -> Beam:
+    """The finite elements of a beam."""
+    left, right = (Support(*one) for one in stated.supports)
+    return Beam(
+        stated.length,
+        stated.width,
+        stated.thickness,
+        rise=rise_of(stated),
+        young=stated.young,
+        density=stated.density,
+        poisson=stated.poisson,
+        elements=stated.elements,
+        left=left,
+        right=right,
+        point_masses=tuple(PointMass(*one) for one in stated.point_masses),
     )
 
 
@@ -73,21 +124,3 @@ def _in_blocks(solve: StaticSolver, force: Float[np.ndarray, "case mode"]) -> St
     blocks = [solve(np.asarray(force)[part]) for part in rows.reshape(-1, _BLOCK)]
     found: StaticCases = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)
     return found
-
-
-def _elements(stated: BeamDescription) -> Beam:
-    left, right = (Support(*one) for one in stated.supports)
-    rise = 0.0 if stated.radius is None else rise_of_radius(stated.length, stated.radius)
-    return Beam(
-        stated.length,
-        stated.width,
-        stated.thickness,
-        rise=rise,
-        young=stated.young,
-        density=stated.density,
-        poisson=stated.poisson,
-        elements=stated.elements,
-        left=left,
-        right=right,
-        point_masses=tuple(PointMass(*one) for one in stated.point_masses),
-    )

@@ -1,5 +1,6 @@
 """What a reduced-order model is made from, wherever it comes from, and what is written of it."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ from jaxtyping import Float
 
 from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
-from snrmjax.condense.load_set import StaticSolver
+from snrmjax.condense.load_set import StaticSolver, displacement_for_ratio, modal_loads
 from snrmjax.condense.scale_study import SCALES
 from snrmjax.io.files import FilePath
 from snrmjax.io.tables import write_table
@@ -56,6 +57,26 @@ class ReductionSource(NamedTuple):
         return found.structure(
             self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
         )
+
+
+def run_load_cases(source: ReductionSource) -> tuple[Float[np.ndarray, " mode"], StaticCases]:
+    """Run the load cases of the stated load scale, or of the default one.
+
+    Returns the displacements (m) that the loads of single modes would cause in the linear
+    structure, and the cases. Raises `ValueError` where nothing can run them and as
+    `displacement_for_ratio` does.
+    """
+    if source.solve is None:
+        raise ValueError(f"{source.name} has neither load cases nor a way to run them.")
+    n = len(source.basis.numbers)
+    if source.load_scale is not None:
+        displacement = np.full(n, source.load_scale * (source.thickness or 1.0))
+    else:
+        start = 0.1 * (source.thickness or 1e-3)
+        displacement = displacement_for_ratio(source.basis, source.solve, start=start)
+    loads = modal_loads(source.basis, displacement, degree=source.degree)
+    cases = source.solve(np.asarray(loads.force))
+    return displacement, dataclasses.replace(cases, names=loads.names)
 
 
 def write_load_cases(path: FilePath, cases: StaticCases) -> None:

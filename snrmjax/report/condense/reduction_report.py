@@ -1,6 +1,5 @@
 """A reduced-order model from its source: model.toml, load_cases.csv, summary.json, report.html."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,11 +10,11 @@ from matplotlib.figure import Figure
 from snrmjax.condense.case_checks import case_names
 from snrmjax.condense.condensation import Condensation, condense
 from snrmjax.condense.load_cases import StaticCases
-from snrmjax.condense.load_set import NONLINEAR_RATIO, displacement_for_ratio, modal_loads
+from snrmjax.condense.load_set import NONLINEAR_RATIO, modal_loads
 from snrmjax.condense.scale_study import TOLERANCE, LoadScaleStudy, load_scale_study
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
-from snrmjax.io.reduction.source import ReductionSource, write_load_cases
+from snrmjax.io.reduction.source import ReductionSource, run_load_cases, write_load_cases
 from snrmjax.io.units import HERTZ
 from snrmjax.model.potential import monomial_key
 from snrmjax.model.structures import Structure, equilibria
@@ -99,7 +98,7 @@ def reduce(
     """
     displacement, cases = None, source.cases
     if cases is None:
-        displacement, cases = _run(source)
+        displacement, cases = run_load_cases(source)
     found = condense(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
     scales = sweep = None
@@ -126,21 +125,6 @@ def reduce(
             "one than rest"
         )
     return Reduction(source, found, structure, displacement, scales, sweep, tuple(notes))
-
-
-def _run(source: ReductionSource) -> tuple[np.ndarray, StaticCases]:
-    """The load cases of the stated load scale, or of the default one."""
-    if source.solve is None:
-        raise ValueError(f"{source.name} has neither load cases nor a way to run them.")
-    n = len(source.basis.numbers)
-    if source.load_scale is not None:
-        displacement = np.full(n, source.load_scale * (source.thickness or 1.0))
-    else:
-        start = 0.1 * (source.thickness or 1e-3)
-        displacement = displacement_for_ratio(source.basis, source.solve, start=start)
-    loads = modal_loads(source.basis, displacement, degree=source.degree)
-    cases = source.solve(np.asarray(loads.force))
-    return displacement, dataclasses.replace(cases, names=loads.names)
 
 
 def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None:

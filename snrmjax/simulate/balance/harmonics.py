@@ -142,3 +142,13 @@ def velocity_along(
     mean, pairs = coefficients[:, :1] + 0j, coefficients[:, 1::2] - 1j * coefficients[:, 2::2]
     phasors = np.concatenate([mean, pairs], axis=1) @ mode_shape.T
     return 1j * np.arange(phasors.shape[1])[:, None] * frequency[:, None, None] * phasors
+
+
+def with_sines(
+    cosines: Float[Array, "point order mode"],
+) -> Float[Array, "point coefficient mode"]:
+    """Mean and cosines with zero sines in between."""
+    pairs = jnp.stack([cosines[:, 1:], jnp.zeros_like(cosines[:, 1:])], axis=2)
+    n_points, n_coefficients, n_modes = cosines.shape
+    flat = pairs.reshape(n_points, 2 * (n_coefficients - 1), n_modes)
+    return jnp.concatenate([cosines[:, :1], flat], axis=1)

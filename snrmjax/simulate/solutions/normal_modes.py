@@ -14,7 +14,7 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
-from snrmjax.simulate.balance.harmonics import velocity_phasors
+from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
 from snrmjax.simulate.balance.labelled import HERTZ, motion_variables, range_text
 from snrmjax.simulate.continuation.continuation import (
     STATUS_MESSAGE,
@@ -227,17 +227,7 @@ def _motion(balance: HarmonicBalance, points: Array) -> tuple[Array, Array, Arra
     model = balance.model
     coefficients = jax.vmap(balance.coefficients)(points)
     frequency = points[:, -1] * balance.frequency_scale
-    full = _with_sines(coefficients)
+    full = with_sines(coefficients)
     velocity = velocity_phasors(full, frequency, model.modes.mode_shape)
     at_rest = jnp.sum(coefficients, axis=1)  # q(0), where the velocity vanishes
     return frequency, coefficients, velocity, model.potential_energy(at_rest)
-
-
-def _with_sines(
-    cosines: Float[Array, "point order mode"],
-) -> Float[Array, "point coefficient mode"]:
-    """Mean and cosines with zero sines in between."""
-    pairs = jnp.stack([cosines[:, 1:], jnp.zeros_like(cosines[:, 1:])], axis=2)
-    n_points, n_coefficients, n_modes = cosines.shape
-    flat = pairs.reshape(n_points, 2 * (n_coefficients - 1), n_modes)
-    return jnp.concatenate([cosines[:, :1], flat], axis=1)

@@ -223,10 +223,7 @@ def _crossings(
 def _solved(
     balance: HarmonicBalance, guess: Point, condition: Condition, target: Array, iterations: int
 ) -> tuple[Point, Array]:
-    """The root of the balance and the condition, and whether it was found.
-
-    Where it was not found the point is the guess, and the derivatives are zero.
-    """
+    """The root of the balance and the condition, and whether it was found: see `root_of`."""
     harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     border = _tangent_near(balance.linearised, harmless, _generic(guess.shape[0]))
     border = jax.lax.stop_gradient(border)
@@ -234,6 +231,22 @@ def _solved(
     def test(balance: HarmonicBalance, target: Array, point: Point) -> Array:
         return _test(balance, condition, target, border, point)
 
+    return root_of(balance, test, target, guess, iterations)
+
+
+def root_of(
+    balance: HarmonicBalance,
+    test: Callable[[HarmonicBalance, Array, Point], Array],
+    target: Array,
+    guess: Point,
+    iterations: int,
+) -> tuple[Point, Array]:
+    """The root of the balance and of `test(balance, target, point)`, and whether it was found.
+
+    Differentiable by `balance` and `target`. Where it was not found the point is the guess, and the
+    derivatives are zero.
+    """
+    harmless = jnp.where(jnp.isfinite(guess), guess, 1.0)
     fixed, aim = jax.lax.stop_gradient((balance, target))
 
     def body(state: tuple) -> tuple:

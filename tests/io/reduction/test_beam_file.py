@@ -48,7 +48,7 @@ def test_a_beam_file_says_what_the_description_has(tmp_path):
     assert beam.supports == (held, held)
     assert (beam.name, beam.young, beam.thickness) == ("flat beam", 204.8e9, 0.000508)
     assert (beam.radius, beam.load_scale, beam.force_at, beam.damping_ratio) == (None,) * 4
-    assert (beam.modes, beam.degree, beam.sensors) == ((1, 3), 3, {"midspan": 0.5})
+    assert (beam.modes, beam.degree, beam.sensors) == ((1, 3), 3, (("midspan", 0.5),))
     text = BEAM.replace("elements", "radius_m = 11.43\nelements").replace(
         'right = "clamped"', f"right = {SPRINGS}"
     )
@@ -64,7 +64,7 @@ def test_a_beam_file_says_what_the_description_has(tmp_path):
     beam = read_beam_description(path)
     assert beam.supports == (SupportStiffness(np.inf, 0, 50), SupportStiffness(1e6, 1e7, 0.0))
     assert beam.point_masses == (PointMassEntry(0.5, 1e-3, 2e-8), PointMassEntry(0.5, 1e-3, 0.0))
-    assert beam.sensors == {"midspan": 0.5, "quarter": 0.25}
+    assert beam.sensors == (("midspan", 0.5), ("quarter", 0.25))
     assert (beam.radius, beam.load_scale, beam.degree) == (11.43, 0.3, 5)
     assert (beam.force_at, beam.damping_ratio) == (0.25, (0.05, 0.001))
 

@@ -1,0 +1,144 @@
+"""The nonlinear normal mode at given amplitudes, as a differentiable function of the model."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from snrmjax.model.effect_base import AbstractHysteresis
+from snrmjax.model.modes import have_values
+from snrmjax.model.structures import Structure, simulated_structure
+from snrmjax.numerics.blocks import mapped
+from snrmjax.numerics.compiled import jitted
+from snrmjax.simulate.balance.harmonic_balance import HarmonicBalance, harmonic_balance
+from snrmjax.simulate.balance.harmonics import velocity_phasors, with_sines
+from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, root_of
+
+_ITERATIONS = 12  # of Newton's method, which starts from a prediction
+_LATE = 0.5  # correction over step beyond which the step may have gone to another motion
+_TURN = 0.2  # of the frequency, likewise
+
+
+def normal_mode_at_velocities(
+    model: Structure,
+    velocities: float | Float[ArrayLike, " velocity"],
+    *,
+    harmonic_order: int = 9,
+    steps: int = 8,
+) -> PeriodicMotion:
+    """The nonlinear normal mode of interest at given velocity amplitudes, differentiable.
+
+    Solves m q̈ + k q + ∂V/∂q = 0 (damping, friction, and forces that depend on velocity, left out)
+    with |V₁| = the velocity at the first sensor: the backbone, natural frequency against
+    amplitude. The linear mode is followed through rising amplitudes, so that no start is needed;
+    the result is a differentiable function of `model` and `velocities` by the implicit function
+    theorem, in forward and in reverse mode and again. Made for residuals of a fit: with
+    `snrmjax.condense` the backbone by the dimensions of a structure.
+
+    Arguments: `velocities` in m/s, in any order; `steps` between one amplitude and the next.
+    Returns a `PeriodicMotion` with one motion a velocity; NaN, with derivatives of zero, where the
+    mode was not found, and at all larger velocities then. Raises `ValueError` for a velocity that
+    is not positive, fewer than one step, and a first sensor that does not see the mode.
+    Validity: where the mode turns back in amplitude (at the tip of an internal resonance) it is not
+    found, or a narrow tongue is stepped over; `nonlinear_normal_mode` traces such curves.
+    Reference: Kerschen et al., Mech. Syst. Signal Process. 23 (2009) 170,
+    doi:10.1016/j.ymssp.2008.04.002.
+
+    >>> from snrmjax.model import linear_modes, polynomial_potential, structure
+    >>> modes = linear_modes([1.0], [0.01], [[1.0]], [1.0])
+    >>> duffing = structure(modes, polynomial_potential({"1111": 0.25}, 1))
+    >>> found = normal_mode_at_velocities(duffing, [1.0], harmonic_order=1)
+    >>> (found.frequency**2 - 0.75 / found.frequency**2).round(9)  # Ω² = 1 + 3/4 (v/Ω)²
+    Array([1.], dtype=float64)
+    """
+    wanted = jnp.atleast_1d(jnp.asarray(velocities, dtype=jnp.float64))
+    if have_values(wanted) and not np.all(np.isfinite(wanted) & (wanted > 0)):
+        worst = float(wanted[np.argmin(np.isfinite(wanted) & (wanted > 0))])
+        raise ValueError(f"`velocities` must be positive and finite, but one is {worst:g} m/s.")
+    if steps < 1:
+        raise ValueError(f"`steps` must be at least 1, but is {steps}.")
+    shape = model.modes.mode_shape[0, model.modes.mode_of_interest]
+    if have_values(shape) and float(shape) == 0.0:
+        raise ValueError("the first sensor does not see the mode of interest.")
+    return _at_velocities(model, wanted, harmonic_order, steps)
+
+
+@jitted
+def _at_velocities(
+    model: Structure, velocities: Float[Array, " velocity"], harmonic_order: int, steps: int
+) -> PeriodicMotion:
+    model = simulated_structure(model)
+    kept = tuple(e for e in model.effects if not isinstance(e, AbstractHysteresis))
+    model = dataclasses.replace(model, effects=kept)
+    modes, j = model.modes, model.modes.mode_of_interest
+    unit = jnp.abs(modes.natural_frequency[j] * modes.mode_shape[0, j])
+    sizes = jax.lax.stop_gradient(velocities / unit)
+    balance = harmonic_balance(
+        model, 0.0, jnp.max(sizes), harmonic_order=harmonic_order, cosine_only=True
+    )
+    order = jnp.argsort(velocities)
+    guesses, found = _followed(*jax.lax.stop_gradient((balance, velocities[order])), steps)
+
+    def one(guess: Array, known: Array, velocity: Array, size: Array) -> PeriodicMotion:
+        # With a scale of its own a small motion has all its digits beside a large one.
+        own = dataclasses.replace(balance, displacement_scale=size)
+        guess = guess.at[:-1].multiply(balance.displacement_scale / size)
+        start = jnp.where(known, guess, jnp.nan)
+        point, converged = root_of(own, _velocity_test, velocity, start, _ITERATIONS)
+        cosines, omega = own.coefficients(point), point[-1] * balance.frequency_scale
+        whole = with_sines(cosines[None])[0]
+        phasors = velocity_phasors(whole, omega, modes.mode_shape)
+        return PeriodicMotion(
+            frequency=jnp.where(converged, omega, jnp.nan),
+            coefficients=jnp.where(converged, whole, jnp.nan),
+            velocity=jnp.where(converged, phasors, jnp.nan),
+            converged=converged,
+        )
+
+    motions = mapped(one, guesses, found, velocities[order], sizes[order])
+    back = jnp.argsort(order)
+    return jax.tree.map(lambda part: part[back], motions)
+
+
+def _velocity_test(balance: HarmonicBalance, velocity: Array, point: Array) -> Array:
+    """What vanishes at the wanted velocity: of the first sensor, towards the linear mode's side."""
+    model = balance.model
+    shape, own = model.modes.mode_shape[0], model.modes.mode_of_interest
+    cosine = point[:-1].reshape(balance.n_coefficients, -1)[1]
+    unit = balance.displacement_scale * balance.frequency_scale * jnp.abs(shape[own])
+    return point[-1] * (cosine @ shape) * jnp.sign(shape[own]) / jnp.abs(shape[own]) - (
+        velocity / unit
+    )
+
+
+def _followed(
+    balance: HarmonicBalance, velocities: Float[Array, " velocity"], steps: int
+) -> tuple[Float[Array, "velocity unknown"], Array]:
+    """Points of the mode at rising velocities, and which of them were found."""
+    model = balance.model
+    n, own = model.n_modes, model.modes.mode_of_interest
+    shape = jnp.abs(model.modes.mode_shape[0, own])
+    before = jnp.concatenate([jnp.zeros(1), velocities[:-1]])
+    share = jnp.arange(1, steps + 1) / steps
+    levels = (before[:, None] + (velocities - before)[:, None] * share).reshape(-1)
+    rest = jnp.zeros(balance.size + 1).at[-1].set(1.0)
+    unit = balance.displacement_scale * balance.frequency_scale * shape
+    slope = jnp.zeros(balance.size + 1).at[n + own].set(1 / unit)
+
+    def step(carry: tuple, level: Array) -> tuple[tuple, tuple]:
+        point, slope, last, good = carry
+        ahead = point + slope * (level - last)
+        new, converged = root_of(balance, _velocity_test, level, ahead, _ITERATIONS)
+        far, off = (jnp.max(jnp.abs((new - p)[:-1])) for p in (point, ahead))
+        near = (off <= _LATE * far) & (jnp.abs(new[-1] - ahead[-1]) <= _TURN * ahead[-1])
+        # Equal velocities have equal motions.
+        moved = level > last
+        good = good & converged & (near | ~moved)
+        slope = jnp.where(moved, (new - point) / jnp.where(moved, level - last, 1.0), slope)
+        return (new, slope, level, good), (new, good)
+
+    start = rest, slope, jnp.zeros(()), jnp.array(True)
+    _, (points, good) = jax.lax.scan(step, start, levels)
+    return points[steps - 1 :: steps], good[steps - 1 :: steps]
