@@ -62,6 +62,9 @@ SUB_ROOMS = {
     "diagnose.laws": {"diagnose.misfit", "diagnose.search", "diagnose.checks"},
     "io.calculix": {"io.files", "io.reduction"},
     "io.laboratory": {"io.files", "io.units"},
+    "io.exchange": {
+        *("io.files", "io.units", "io.columns", "io.tables", "io.toml_table", "io.laboratory"),
+    },
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},

@@ -5,7 +5,8 @@ import json
 import math
 import os
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 FilePath = str | os.PathLike[str]
@@ -51,6 +52,26 @@ def write_atomically(path: FilePath, content: str | bytes) -> None:
         raise ValueError(
             f"{os.fspath(path)} cannot be written: its folder does not exist."
         ) from error
+    except OSError as error:
+        raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
+    finally:
+        if temporary.exists():
+            temporary.unlink()
+
+
+@contextmanager
+def written_whole(path: FilePath) -> Iterator[Path]:
+    """A temporary file beside `path` to write into, which then takes its name, or nothing is left.
+
+    Raises `ValueError` when the folder does not exist or cannot be written.
+    """
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{uuid.uuid4().hex}.tmp")
+    if not target.parent.is_dir():
+        raise ValueError(f"{os.fspath(path)} cannot be written: its folder does not exist.")
+    try:
+        yield temporary
+        os.replace(temporary, target)
     except OSError as error:
         raise ValueError(f"{os.fspath(path)} cannot be written: {error.strerror}.") from error
     finally:

@@ -252,8 +252,16 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
     force is known. Voltages beside known forces are left out: a file has one of both.
     Raises `ValueError` when a file could not hold the data: the rules of the reader apply.
     """
+    write_atomically(path, _table_text(steady_state_fields(data, file_name(path))))
+
+
+def steady_state_fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
+    """The fields of a table of steady states by column, as text; see `write_steady_states`.
+
+    Arguments: `file` as messages name what they are written to.
+    Raises `ValueError` as `write_steady_states` does.
+    """
     host: SteadyStates = jax.tree.map(np.asarray, data)
-    file = file_name(path)
     if not np.all(np.any(host.measured, axis=1)):
         raise ValueError("each steady state must be measured by a sensor, but one is by none.")
     state, sensor = np.nonzero(host.measured)
@@ -292,14 +300,21 @@ def write_steady_states(path: FilePath, data: SteadyStates) -> None:
             raise ValueError("harmonic 0 is a mean and must be real, but has an imaginary part.")
         for name, part in zip(harmonic_columns(order), ("real", "imag"), strict=False):
             columns[name] = _texts(getattr(harmonic, part))
-    text = _table_text(columns)
-    back = _read(text, file, host.sensors)
+    back = _read(_table_text(columns), file, host.sensors)
     if back.n_states != data.n_states or not np.array_equal(back.measured, host.measured):
         raise ValueError(
             f"{file} could not tell some steady states apart that have the same level, "
             "frequency and force, but different sensors: give each its own `order`."
         )
-    write_atomically(path, text)
+    return columns
+
+
+def steady_states_of_fields(columns: Mapping[str, Sequence[str]], file: str) -> SteadyStates:
+    """Steady states of a table's fields: text by column, under the rules of the CSV.
+
+    Raises `ValueError` as `read_steady_states` does; rows are counted from the header on.
+    """
+    return _read(_table_text(columns), file, None)
 
 
 def _texts(values: Iterable[SupportsFloat]) -> list[str]:

@@ -17,13 +17,15 @@ class NumberTable(NamedTuple):
 
     One row may be a steady state (frequency, force, amplitude, phase), a step of a record or a
     line of a spectrum. Numbers are as they stand in the file, real or complex; NaN where a field is
-    empty. `units` has the file's own word for each column that states one.
+    empty. `units` has the file's own word for each column that states one, `words` the columns of
+    text (a sensor's name, a condition), "" where a field is empty.
     """
 
     name: str
     columns: Mapping[str, Num[np.ndarray, " row"]]
     units: Mapping[str, str] = {}
     notes: tuple[str, ...] = ()
+    words: Mapping[str, tuple[str, ...]] = {}
 
     @property
     def n_rows(self) -> int:
@@ -99,6 +101,7 @@ def number_table(
     columns: Mapping[str, Num[np.ndarray, " row"]],
     units: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
+    words: Mapping[str, Sequence[str]] | None = None,
 ) -> NumberTable:
     """A table of numbers, checked.
 
@@ -125,7 +128,12 @@ def number_table(
     for key in known:
         if key not in held:
             raise ValueError(f"table {name} states a unit of {key!r}, which is no column.")
-    return NumberTable(name, held, known, tuple(notes))
+    texts = {key: tuple(map(str, column)) for key, column in (words or {}).items()}
+    n_rows = next(iter(held.values())).size
+    for key, column in texts.items():
+        if len(column) != n_rows or key in held:
+            raise ValueError(f"column {key} of table {name} must have {n_rows} texts of its own.")
+    return NumberTable(name, held, known, tuple(notes), texts)
 
 
 def measured_shapes(

@@ -52,8 +52,11 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
     values = _numbers(rows, separator, decimal, names, file)
     tree: dict[str, Node] = {}
     for name, column in zip(names, values, strict=True):
+        if isinstance(column, list):
+            tree[name] = list[Node](column)
+            continue
         if column is None:
-            notes.append(f"column {name} is text and is not read.")
+            notes.append(f"column {name} is empty and is not read.")
             continue
         missing = int(np.isnan(column).sum())
         if missing:
@@ -61,8 +64,7 @@ def read_separated_text(path: Path, text_format: TextFormat | None = None) -> La
         tree[name] = held(column, {"unit": units[name]} if units.get(name) else {})
     marks = {mark: word for word, mark in _SEPARATORS.items()}
     notes.append(f"separator {marks[separator]}, decimal {decimal}, numbers from row {first + 1}.")
-    single = {key: one for key, one in tree.items() if not isinstance(one, str)}
-    found = read_struct("", single, Budget(file), entry=len(rows) == 1)
+    found = read_struct("", tree, Budget(file), entry=len(rows) == 1)
     stem = path.stem or "table"
     tables = tuple(table._replace(name=stem) for table in found.numbered())
     records = tuple(found.recordings)
@@ -221,8 +223,8 @@ def _all_units(fields: list[str]) -> bool:
 
 def _numbers(
     rows: list[tuple[int, str]], separator: str, decimal: str, names: list[str], file: str
-) -> list[np.ndarray | None]:
-    """Columns of numbers; None for a column of text."""
+) -> list[np.ndarray | list[str] | None]:
+    """Columns of numbers or of text; None for an empty one."""
     width = len(names)
     for k, line in rows:
         count = len(line.split()) if separator == " " else line.count(separator) + 1
@@ -246,7 +248,7 @@ def _numbers(
     except (ValueError, OverflowError) as error:  # pandas' own errors are among them
         said = " ".join(str(error).split())[:160]
         raise ValueError(f"{file} is damaged or no table of text ({said}).") from error
-    found: list[np.ndarray | None] = []
+    found: list[np.ndarray | list[str] | None] = []
     for name in names:
         column = table[name]
         if column.dtype.kind in "biuf":
@@ -261,5 +263,10 @@ def _numbers(
                 f"column {name} must be numbers, but row {rows[k][0]} of {file} has "
                 f"{shown(str(column.iloc[k]))}."
             )
-        found.append(None)
+        found.append(
+            [
+                "" if missing else str(word)
+                for word, missing in zip(column, column.isna(), strict=True)
+            ]
+        )
     return found

@@ -149,7 +149,7 @@ def test_a_record_of_text_and_a_column_of_words(tmp_path):
     (record,) = found.recordings
     assert record.sampling_rate == 1024
     np.testing.assert_allclose(record.values()[0], np.arange(100) % 7 * 1e-3, rtol=1e-15)
-    assert any("state is text" in note for note in found.notes)
+    assert [one.name for one in record.channels] == ["CH1"]
 
 
 def test_told_formats_win(tmp_path):

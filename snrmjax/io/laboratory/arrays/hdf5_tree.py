@@ -13,7 +13,7 @@ from snrmjax.io.laboratory.names import role_of
 
 _MOST_OBJECTS = 20_000
 _DEEPEST = 24
-_LONGEST_TEXT = 4096
+_LONGEST_TEXT = 2**17  # letters, or texts of a list
 _INFLATES = 1100  # deflate cannot shrink by more
 _LARGEST_CHUNK = 2**26  # bytes
 _HIDDEN = ("#refs#", "#subsystem#")
@@ -104,6 +104,9 @@ def _object(walk: _Walk, one: Any, name: str) -> Node | None:
     if reference:
         return _references(walk, one, name)
     if walk.h5py.check_string_dtype(one.dtype) is not None or kind == "char":
+        if one.size > _LONGEST_TEXT:
+            walk.notes.append(f"{name} has more than {_LONGEST_TEXT} texts and is not read.")
+            return None
         return _text(one, is_matlab=kind == "char")
     why = _cannot_hold(walk, one)
     if why:
@@ -159,8 +162,6 @@ def _references(walk: _Walk, one: Any, name: str) -> Node | None:
 
 def _text(one: Any, *, is_matlab: bool) -> Node | None:
     """Text, or a list of texts."""
-    if one.size > _LONGEST_TEXT:
-        return None
     value = one[()]
     if is_matlab:
         codes = np.asarray(value).T.reshape(-1)

@@ -7,10 +7,10 @@ import numpy as np
 
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
 from snrmjax.io.laboratory.arrays.matlab_headers import walk_variables
-from snrmjax.io.laboratory.arrays.structs import read_struct
+from snrmjax.io.laboratory.arrays.tree_contents import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
-from snrmjax.io.laboratory.libraries import Budget, damaged_if_it_fails
+from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 
 _LARGEST = 2**29  # bytes of a v5 file, which is read whole
 
@@ -23,17 +23,7 @@ def read_matlab(path: Path) -> LaboratoryFile:
         tree, notes = _tree_of_v5(path)
     else:
         tree, notes = open_tree(path)
-    found = read_struct("", tree, Budget(path.name))
-    return LaboratoryFile(
-        path.name,
-        "matlab",
-        tuple(found.recordings),
-        tuple(found.responses),
-        found.numbered(),
-        (),
-        tuple(dict.fromkeys((*notes, *found.notes))),
-        (np.nan,) * len(found.responses),
-    )
+    return file_of_tree(path.name, "matlab", tree, notes)
 
 
 def _tree_of_v5(path: Path) -> tuple[dict[str, Node], list[str]]:
@@ -87,7 +77,7 @@ def _node(value: Any, name: str, notes: list[str]) -> Node | None:
         return _cells(value, name, notes)
     if value.dtype.kind in "US":
         texts = [str(text).rstrip() for text in value.reshape(-1)]
-        return texts[0] if len(texts) == 1 else list(texts)
+        return list(texts) if len(texts) > 1 else "".join(texts)
     if value.dtype.kind not in "biufc":
         notes.append(f"{name} is of type {value.dtype}, which is not read.")
         return None

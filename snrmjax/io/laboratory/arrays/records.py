@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Node, Numbers, PlacedSamples
+from snrmjax.io.laboratory.arrays.value_tree import ChannelPlace, Numbers, PlacedSamples
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.io.laboratory.physical_units import channel_meaning
 from snrmjax.measure.recordings.channels import Channel, Quantity
@@ -21,6 +21,15 @@ _QUANTITIES: dict[str, Quantity] = {
     "velocity": "velocity",
     "acceleration": "acceleration",
     "voltage": "voltage",
+}
+
+
+_NAMES = frozenset({"channel", "channels", "channel_names", "names", "labels", "chan"})
+_SAID = {"unit": "unit", "units": "unit", "quantity": "quantity", "quantities": "quantity"} | {
+    "point": "point",
+    "points": "point",
+    "direction": "direction",
+    "directions": "direction",
 }
 
 
@@ -41,11 +50,12 @@ class _Axis(NamedTuple):
 
 
 def recording_of(
-    name: str, numbers: Mapping[str, Numbers], words: Sequence[Sequence[Node]]
+    name: str, numbers: Mapping[str, Numbers], words: Mapping[str, Sequence[str]]
 ) -> FewRecordings:
     """The time record of a struct, if it has one.
 
-    Arguments: `words` are lists of text beside the arrays, in which names of channels may stand.
+    Arguments: `words` are lists of text beside the arrays: names of channels, and lists called
+    unit, quantity, point and direction.
     """
     axis = _time_axis(numbers)
     if axis is None:
@@ -69,11 +79,12 @@ def recording_of(
     for key, one in alike.items():
         side = one.shape.index(long)
         others = 1 if one.length is not None else one.size // long
-        labels = next((list(map(str, word)) for word in words if len(word) == others > 1), None)
+        labels = _labels(words, others)
+        told = _told(words, others) if labels else [{} for _ in range(others)]
         for k in range(others):
-            label = key if others == 1 else labels[k] if labels else f"{key}_{k + 1}"
+            alone = key if others == 1 else f"{key}_{k + 1}"
             places.append(ChannelPlace(one, side, k))
-            channels.append(_channel(label, one))
+            channels.append(_channel(labels[k] if labels else alone, one, told[k]))
     names = [one.name for one in channels]
     if not channels or len(channels) > _MOST_CHANNELS:
         return FewRecordings((), frozenset(), ())
@@ -90,17 +101,40 @@ def recording_of(
     return FewRecordings((record,), frozenset((*alike, *axis.used)), ())
 
 
-def _channel(name: str, one: Numbers) -> Channel:
+def _labels(words: Mapping[str, Sequence[str]], count: int) -> Sequence[str] | None:
+    """Names of the columns of a matrix among lists of text, or None."""
+    for key, word in words.items():
+        if key.lower() in _NAMES and len(word) == count:
+            return word
+    alike = [
+        word for key, word in words.items() if len(word) == count > 1 and key.lower() not in _SAID
+    ]
+    return alike[0] if alike else None
+
+
+def _told(words: Mapping[str, Sequence[str]], count: int) -> list[dict[str, str]]:
+    """What lists of text say of each column of a matrix."""
+    told: list[dict[str, str]] = [{} for _ in range(count)]
+    for key, word in words.items():
+        if key.lower() in _SAID and len(word) == count:
+            for k, one in enumerate(word):
+                told[k][_SAID[key.lower()]] = one
+    return told
+
+
+def _channel(name: str, one: Numbers, told: Mapping[str, str]) -> Channel:
     """A channel with what the file says of it."""
-    quantity, calibration = channel_meaning(one.unit)
-    told = _QUANTITIES.get(one.attributes.get("quantity", ""))
+    said = {**one.attributes, **told}
+    unit = said.get("unit", "")
+    quantity, calibration = channel_meaning(unit)
+    stated = _QUANTITIES.get(said.get("quantity", ""))
     return Channel(
         name,
-        quantity if quantity != "unknown" or told is None else told,
-        one.unit,
+        quantity if quantity != "unknown" or stated is None else stated,
+        unit,
         calibration,
-        one.attributes.get("point", ""),
-        one.attributes.get("direction", ""),
+        said.get("point", ""),
+        said.get("direction", ""),
     )
 
 

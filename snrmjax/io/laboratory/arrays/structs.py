@@ -24,6 +24,7 @@ class Columns(NamedTuple):
 
     values: dict[str, np.ndarray]
     units: dict[str, str]
+    words: dict[str, tuple[str, ...]]
 
 
 class Struct(NamedTuple):
@@ -37,7 +38,7 @@ class Struct(NamedTuple):
     def numbered(self) -> tuple[NumberTable, ...]:
         """The tables, checked."""
         return tuple(
-            number_table(name or "table", columns.values, columns.units)
+            number_table(name or "table", columns.values, columns.units, (), columns.words)
             for name, columns in self.tables.items()
         )
 
@@ -52,11 +53,12 @@ def read_struct(
     """
     found = Struct([], [], {}, [])
     numbers = {key: node for key, node in fields.items() if isinstance(node, Numbers)}
-    words = [
-        node
-        for node in fields.values()
-        if isinstance(node, list) and node and all(isinstance(one, str) for one in node)
-    ]
+    words = {
+        key: [node] if isinstance(node, str) else [one for one in node if isinstance(one, str)]
+        for key, node in fields.items()
+        if isinstance(node, str)
+        or (isinstance(node, list) and node and all(isinstance(one, str) for one in node))
+    }
     _read_numbers(name, numbers, words, budget, found, entry=entry)
     cells: dict[int, dict[str, list[Node]]] = {}
     for key, node in fields.items():
@@ -129,13 +131,21 @@ def _joined(parts: Sequence[tuple[int, Columns]]) -> Columns:
         )
         stated = [one.units[key] for _, one in parts if key in one.units]
         units |= {key: stated[0]} if stated else {}
-    return Columns(values, units)
+    texts = {
+        key: tuple(
+            word
+            for n, (_, one) in zip(lengths, parts, strict=True)
+            for word in one.words.get(key, ("",) * n)
+        )
+        for key in dict.fromkeys(key for _, one in parts for key in one.words)
+    }
+    return Columns(values, units, {k: one for k, one in texts.items() if k not in values})
 
 
 def _read_numbers(
     name: str,
     numbers: Mapping[str, Numbers],
-    words: Sequence[Sequence[Node]],
+    words: Mapping[str, Sequence[str]],
     budget: Budget,
     found: Struct,
     *,
@@ -159,24 +169,29 @@ def _read_numbers(
     for key, one in rest.items():
         if one.length is None and one.size:
             _spread(key, one, groups, words, budget, found.notes)
-    if not groups and entry and single:
+    if not groups and single and (entry or any(role_of(key) == "frequency" for key in single)):
         groups[1] = {}
     for n, group in groups.items():
         columns = {key: one.vector(budget, key) for key, one in group.items()}
         units = {key: one.unit for key, one in group.items() if one.unit}
-        if entry:
+        if entry or n == 1:
             for key, one in single.items():
                 columns.setdefault(key, np.repeat(one.vector(budget, key), n))
                 units |= {key: one.unit} if one.unit else {}
         place = "" if len(groups) == 1 else f"rows{n}"
-        found.tables[place] = Columns(columns, units)
+        texts = {
+            key: tuple(word) if len(word) == n else tuple(word) * n
+            for key, word in words.items()
+            if (len(word) == n or (entry and len(word) == 1)) and key not in columns
+        }
+        found.tables[place] = Columns(columns, units, texts)
 
 
 def _spread(
     key: str,
     one: Numbers,
     groups: dict[int, dict[str, Numbers]],
-    words: Sequence[Sequence[Node]],
+    words: Mapping[str, Sequence[str]],
     budget: Budget,
     notes: list[str],
 ) -> None:
@@ -192,7 +207,7 @@ def _spread(
         return
     values = one.all(budget, key).reshape(sides)
     values = values if axis == 0 else values.T
-    labels = next((list(map(str, word)) for word in words if len(word) == width), None)
+    labels = next((word for word in words.values() if len(word) == width), None)
     for k in range(width):
         label = f"{key}.{labels[k]}" if labels else f"{key}_{k + 1}"
         groups.setdefault(n, {})[label] = held(values[:, k], one.attributes)

@@ -1,0 +1,30 @@
+"""What a tree of named arrays holds, whichever format it is from."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from snrmjax.io.laboratory.arrays.own_responses import take_responses
+from snrmjax.io.laboratory.arrays.structs import read_struct
+from snrmjax.io.laboratory.arrays.value_tree import Node
+from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
+from snrmjax.io.laboratory.libraries import Budget
+
+
+def file_of_tree(
+    name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[str]
+) -> LaboratoryFile:
+    """All that is found in a tree; `notes` say what of the file is not in it."""
+    budget = Budget(name)
+    own, rest = take_responses(tree, budget)
+    found = read_struct("", rest, budget)
+    return LaboratoryFile(
+        name,
+        kind,
+        tuple(found.recordings),
+        (*(one for one, _ in own), *found.responses),
+        found.numbered(),
+        (),
+        tuple(dict.fromkeys((*notes, *found.notes))),
+        (*(level for _, level in own), *(np.nan for _ in found.responses)),
+    )
