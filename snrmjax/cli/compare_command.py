@@ -1,4 +1,4 @@
-"""The command `compare`: several methods on the same measured steady states."""
+"""The command `compare`: several methods on the same measured tests."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,17 +6,20 @@ from typing import Annotated
 import typer
 
 from snrmjax.cli.console import say, staged, warn
+from snrmjax.cli.measured_tests import read_measured_test
 from snrmjax.cli.options import FILES, Out
 from snrmjax.io.models import read_model
-from snrmjax.io.tables import read_steady_states
 
 
 def compare(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="Measured steady states (CSV), as for identify; several files of one structure "
-            "are one test.",
+            help="Measured steady states (CSV), as for identify, and time records: CSV with "
+            "time_s, force_n or drive_v (neither for a free decay) and velocity_m_s, "
+            "acceleration_m_s2 or displacement_m (of several sensors tip.velocity_m_s, …), or "
+            "a laboratory's file (UFF, MATLAB, HDF5, TDMS). Several files of one structure are one "
+            "test.",
             metavar="DATA…",
             show_default=False,
         ),
@@ -35,7 +38,8 @@ def compare(
         list[str] | None,
         typer.Option(
             help="A method to run (repeatable): snrm, concerto, arslan_ozguven, rct, "
-            "harmonic_force_surface, phase_resonance. Default: all of them.",
+            "harmonic_force_surface, phase_resonance (steady states), resonant_decay, "
+            "restoring_force, ssm (free decays). Default: all of them.",
             metavar="NAME",
             show_default=False,
         ),
@@ -43,24 +47,21 @@ def compare(
 ) -> None:
     """Run other methods beside the inverse SNRM on the same data.
 
+    A time record is sorted by what it is: free decay, stepped sine, slow sweep or broadband; the
+    rule that decided is printed. Stepped sines and sweeps become steady states.
+
     A method that the data do not allow is named with the reason, and the others still run.
 
     Writes compare.csv, summary.json, compare.png and report.html.
     """
-    from snrmjax.measure.states import join_steady_states
     from snrmjax.report.methods import comparison_report
 
     with staged(out) as folder:
         structure = read_model(model)
-        tests, offset = [], 0
-        for path in data:
-            one = read_steady_states(path, structure).renumbered(offset)
-            offset = int(one.level.max())
-            tests.append(one)
-        measured = tests[0] if len(tests) == 1 else join_steady_states(tests)
-        found = comparison_report.run_methods(
-            measured, structure, tuple(method) if method else None
-        )
+        tests = [one for path in data for one in read_measured_test(path, structure)]
+        found = comparison_report.run_methods(tests, structure, tuple(method) if method else None)
+        for line in found.comparison.records:
+            say(line)
         for why in found.comparison.stopped.values():
             warn(f"did not run: {why}")
         name = ", ".join(path.stem.replace("_", " ") for path in data)

@@ -73,10 +73,10 @@ def ring_down_decays(
             raise ValueError(f"ring-down {k} has samples that are not finite.")
         signal, share = _one_motion(values - values.mean(axis=1, keepdims=True))
         width = None if band is None else (band[1] - band[0]) / recording.sampling_rate
-        noise = _noise(signal)
+        noise = white_noise(signal)
         floor = _ABOVE_NOISE * noise * (1.0 if width is None else float(np.sqrt(2 * width)))
         least = floor if least_amplitude is None else least_amplitude
-        signal = _above(signal, max(least, _ABOVE_NOISE * noise), lead, width)
+        signal = above_noise(signal, max(least, _ABOVE_NOISE * noise), lead, width)
         found = resonant_decay(
             recording.time(start, start + len(signal)),
             signal,
@@ -106,7 +106,7 @@ def _one_motion(
     return shape[0] * (shape @ values), share
 
 
-def _noise(signal: Float[np.ndarray, " sample"]) -> float:
+def white_noise(signal: Float[np.ndarray, " sample"]) -> float:
     """1σ of white noise by the median of the spectrum."""
     from scipy.signal import welch
 
@@ -114,8 +114,8 @@ def _noise(signal: Float[np.ndarray, " sample"]) -> float:
     return float(np.sqrt(np.median(density) / np.log(2) / 2))
 
 
-def _above(
-    signal: Float[np.ndarray, " sample"], least: float, cycle: int, width: float | None
+def above_noise(
+    signal: Float[np.ndarray, " sample"], least: float, cycle: int, width: float | None = None
 ) -> Float[np.ndarray, " sample"]:
     """The decay as long as it is above noise, and what a filter needs beyond that."""
     count = len(signal) // cycle

@@ -1,5 +1,6 @@
-"""Several methods on the same steady states: compare.csv, summary.json, a figure, report.html."""
+"""Several methods on the same tests: compare.csv, summary.json, a figure, report.html."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,8 +10,10 @@ from matplotlib.figure import Figure
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
+from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.methods.comparison import METHODS, Comparison, compare_methods
+from snrmjax.methods.record_comparison import RECORD_METHODS
 from snrmjax.methods.result import METHOD_MESSAGE, MethodResult, MethodStatus
 from snrmjax.model.structures import Structure, modes_of
 from snrmjax.report.html import Report, ReportFigure, ReportTable, Section, number, write_report
@@ -18,6 +21,7 @@ from snrmjax.report.style import (
     COLUMN,
     LINE,
     SERIES,
+    Style,
     fit_axis,
     legend,
     name_axes,
@@ -33,29 +37,38 @@ _NAMES = {
     "rct": "response-controlled modal fit",
     "harmonic_force_surface": "harmonic force surface",
     "phase_resonance": "phase resonance",
+    "resonant_decay": "resonant decay",
+    "restoring_force": "restoring-force surface",
+    "ssm": "spectral submanifold",
+    "pnlss": "nonlinear state space",
 }
-_MARKERS = ("", "o", ".", "s", "D", "^")
+_EVERY = (*METHODS, *RECORD_METHODS)
+# Curves at amplitudes of their own choice are lines, answers state by state are points.
+_LINES = {"snrm": "-", "restoring_force": "--", "ssm": "-.", "pnlss": ":"}
+_MARKERS = ("o", ".", "s", "D", "^", "v", "x")
 _FEW = 40  # points that are drawn large
 _CAPTION = (
     "Natural frequency and damping against the velocity amplitude at resonance, by each method "
-    "from the same steady states. The line with its 95 % band is the inverse SNRM; methods that "
-    "answer state by state or level by level are points. Far outliers are counted at the edge."
+    "from the same tests. Lines with 95 % bands are methods that give curves (the restoring-force "
+    "surface gives no band); methods that answer state by state, level by level or cycle by cycle "
+    "are points. Far outliers are counted at the edge."
 )
 
 
 class MethodComparison(NamedTuple):
-    """What the methods found, and the inverse SNRM's distance to each."""
+    """What the methods found, and of which structure."""
 
-    data: SteadyStates
     structure: Structure
     comparison: Comparison
 
 
 def run_methods(
-    data: SteadyStates, structure: Structure, methods: tuple[str, ...] | None = None
+    data: SteadyStates | Sequence[SteadyStates | TimeRecording],
+    structure: Structure,
+    methods: tuple[str, ...] | None = None,
 ) -> MethodComparison:
     """Run the methods. Raises `ValueError` as `compare_methods` does."""
-    return MethodComparison(data, structure, compare_methods(data, modes_of(structure), methods))
+    return MethodComparison(structure, compare_methods(data, modes_of(structure), methods))
 
 
 def write_comparison(folder: Path, found: MethodComparison, name: str) -> None:
@@ -76,16 +89,24 @@ def write_comparison(folder: Path, found: MethodComparison, name: str) -> None:
         folder / "report.html",
         Report(
             title=f"Methods compared: {name}",
-            done=[
-                ("model", found.structure.name),
-                ("steady states", str(found.data.n_states)),
-                ("levels", str(len(np.unique(np.asarray(found.data.level))))),
-            ],
+            done=_done(found),
             result=comparison_sentence(found),
             notes=_notes(found),
             sections=[Section(heading, (), [ReportFigure(drawn, _CAPTION)], [_table(found)])],
         ),
     )
+
+
+def _done(found: MethodComparison) -> list[tuple[str, str]]:
+    """What was given, in the line under the title."""
+    rows = [("model", found.structure.name)]
+    data, records = found.comparison.data, found.comparison.records
+    if data is not None:
+        rows.append(("steady states", str(data.n_states)))
+        rows.append(("levels", str(len(np.unique(np.asarray(data.level))))))
+    if records:
+        rows.append(("time records", str(len(records))))
+    return rows
 
 
 def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
@@ -107,46 +128,63 @@ def methods_figure(results: tuple[MethodResult, ...]) -> Figure:
             y, spread = (np.asarray(part)[at] for part in (value, std))
             colour, label = SERIES[k % len(SERIES)], _NAMES.get(one.method, one.method)
             kept.append(y)
-            if one.method == "snrm":
-                axes.plot(x, y, color=colour, linewidth=LINE, label=label)
+            if one.method in _LINES:
+                style: Style = {"linestyle": _LINES[one.method], "linewidth": LINE}
                 band = 1.96 * np.nan_to_num(spread)
-                axes.fill_between(x, y - band, y + band, color=colour, alpha=0.2, linewidth=0)
+                level = np.asarray(one.level)[at]
+                for count, run in enumerate(np.unique(level)):  # a curve for each record
+                    own = level == run
+                    name = label if count == 0 else None
+                    axes.plot(x[own], y[own], color=colour, label=name, **style)
+                    low, high = (y - band)[own], (y + band)[own]
+                    axes.fill_between(x[own], low, high, color=colour, alpha=0.15, linewidth=0)
             else:
-                marker = _MARKERS[k % len(_MARKERS)] or "x"
                 size = 4.0 if len(x) <= _FEW else 2.0
                 style = {"markersize": size, "linestyle": "none", "zorder": 3 - 0.01 * len(x)}
-                axes.plot(x, y, marker, color=colour, label=label, **style)
+                axes.plot(x, y, _MARKERS[k % len(_MARKERS)], color=colour, label=label, **style)
     titles = (("Natural frequency", "Natural frequency (Hz)"), ("Damping", "Damping ratio (%)"))
     for axes, kept, (title, label) in zip(grid[:, 0], values, titles, strict=True):
         name_axes(axes, title, f"Velocity amplitude ({unit.name})", label)
-        fit_axis(axes, "y", np.concatenate(kept), kept[0])
+        fit_axis(axes, "y", np.concatenate([*kept, []]), kept[0] if kept else ())
     legend(figure)
     return figure
 
 
 def comparison_sentence(found: MethodComparison) -> str:
     """The result in a plain sentence."""
-    results, stopped = found.comparison
+    results, stopped = found.comparison.results, found.comparison.stopped
     text = f"{len(results)} of {len(results) + len(stopped)} methods ran"
-    near = [one for one in _distances(found) if one[0] != "snrm"]
-    if not near:
+    own = _reference(found)
+    near = [one for one in _distances(found) if own is not None and one[0] != own.method]
+    if own is None or not near:
         return f"{text}."
     away = ", ".join(
         f"{_NAMES.get(name, name)} {number(hertz, 2)} Hz and {number(100 * ratio, 2)} %"
         for name, hertz, ratio, _ in near
     )
-    return f"{text}. Median distance from the inverse SNRM in frequency and in damping: {away}."
+    return (
+        f"{text}. Median distance from the {_NAMES[own.method]} in frequency and in damping: "
+        f"{away}."
+    )
+
+
+def _reference(found: MethodComparison) -> MethodResult | None:
+    """The result from which distances are taken: the inverse SNRM, else the first with points."""
+    results = [one for one in found.comparison.results if one.found.any()]
+    own = [one for one in results if one.method == "snrm"]
+    return next(iter([*own, *results]), None)
 
 
 def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
-    """Of each method: median distances from the inverse SNRM in Hz and relative damping, points.
+    """Of each method: median distances from the reference in Hz and relative damping, points.
 
-    At amplitudes that the inverse SNRM covers; empty where it did not run.
+    At amplitudes that the reference covers; empty where nothing was found.
     """
-    own = [one for one in found.comparison.results if one.method == "snrm"]
-    if not own:
+    own = _reference(found)
+    if own is None:
         return []
-    at = np.asarray(own[0].velocity)
+    has = own.found
+    at = np.asarray(own.velocity)[has]
     rows = []
     for one in found.comparison.results:
         velocity = np.asarray(one.velocity)
@@ -154,8 +192,8 @@ def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
         if not kept.any():
             continue
         omega, ratio = (
-            np.interp(velocity[kept], at, np.asarray(curve))
-            for curve in (own[0].natural_frequency, own[0].damping_ratio)
+            np.interp(velocity[kept], at, np.asarray(curve)[has])
+            for curve in (own.natural_frequency, own.damping_ratio)
         )
         hertz = np.abs(np.asarray(one.natural_frequency)[kept] - omega) / HERTZ
         damping = np.abs(np.asarray(one.damping_ratio)[kept] / ratio - 1)
@@ -165,20 +203,24 @@ def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
 
 
 def _notes(found: MethodComparison) -> list[str]:
-    results, stopped = found.comparison
+    results, stopped = found.comparison.results, found.comparison.stopped
     own = [f"{_NAMES.get(one.method, one.method)}: {note}" for one in results for note in one.notes]
-    return [*(f"did not run: {why}" for why in stopped.values()), *own]
+    return [*found.comparison.records, *(f"did not run: {why}" for why in stopped.values()), *own]
 
 
 def _summary(found: MethodComparison) -> dict:
-    results, stopped = found.comparison
-    near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found)}
+    results, stopped = found.comparison.results, found.comparison.stopped
+    reference = _reference(found)
+    own = reference is not None and reference.method == "snrm"
+    near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
     return {
+        "records": list(found.comparison.records),
         "methods": {
             one.method: {
                 "points": int(one.found.sum()),
                 "failed": int((~one.found).sum()),
                 "states": one.n_states,
+                "record_s": one.test_seconds,
                 "median_distance_from_snrm_hz": near.get(one.method, (None, None))[0],
                 "median_relative_damping_distance_from_snrm": near.get(one.method, (None, None))[1],
                 "notes": list(one.notes),
@@ -192,7 +234,7 @@ def _summary(found: MethodComparison) -> dict:
 def _table(found: MethodComparison) -> ReportTable:
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found)}
     rows = []
-    for name in METHODS:
+    for name in _EVERY:
         one = next((r for r in found.comparison.results if r.method == name), None)
         if one is None:
             if name in found.comparison.stopped:
@@ -204,10 +246,22 @@ def _table(found: MethodComparison) -> ReportTable:
         gap = ("", "") if away is None else (number(away[0], 2), f"{number(100 * away[1], 2)} %")
         kinds = {MethodStatus(int(k)) for k in np.asarray(one.status)[~one.found]}
         why = "; ".join(METHOD_MESSAGE[kind] for kind in sorted(kinds))
-        counts = (str(one.n_states), str(int(one.found.sum())))
+        used = str(one.n_states)
+        if np.isfinite(one.test_seconds):
+            used = f"{number(one.test_seconds, 3)} s"
+        counts = (used, str(int(one.found.sum())))
         rows.append(
             (_NAMES[name], *counts, *gap, f"{int((~one.found).sum())}: {why}" if why else "")
         )
-    header = ("method", "states", "points", "distance (Hz)", "distance of damping", "failed")
-    caption = "Distances: medians over the method's points, from the inverse SNRM's curves."
+    own = _reference(found)
+    of = "" if own is None else f" of the {_NAMES[own.method]}"
+    header = (
+        "method",
+        "states or record",
+        "points",
+        "distance (Hz)",
+        "distance of damping",
+        "failed",
+    )
+    caption = f"Distances: medians over the method's points, from the curves{of}."
     return ReportTable(header, rows, caption)

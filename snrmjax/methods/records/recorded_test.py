@@ -1,0 +1,282 @@
+"""What a time record is: free decay, stepped sine, slow sweep or broadband, by stated rules.
+
+1. A record without force and drive, or with none that acts, is a free decay if its motion falls
+   from each eighth of the record to the next, from its largest value on.
+2. Where the drive (else the force) stops for 12 cycles or more, and these stretches are a third
+   of the record, they are free decays.
+3. A drive that is one tone with an amplitude that hardly changes from one stretch of 3 to 6 cycles
+   to the next is a stepped sine if steps of 10 cycles or more, within which the frequency moves
+   by less than half of what it does from step to step, cover 30 % of it; and a slow sweep if its
+   frequency moves by 2 % in one direction.
+4. Any other force is broadband; but if the motion falls as in rule 1 the force is noise of its
+   channel, and the record is a free decay.
+"""
+
+import itertools
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.measure.recordings.ring_down import find_ring_downs
+from snrmjax.measure.recordings.steps import Step, recognise_steps
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapped_phase
+from snrmjax.measure.sweeps.sweep_runs import sweep_runs
+from snrmjax.model.modes import LinearModes
+
+_MOTIONS = ("velocity", "acceleration", "displacement")
+_HERTZ = 2 * np.pi
+_PARTS = 8
+_RISE = 0.05  # of the first part's rms, by which the next may be larger: noise, beats
+_FALLEN = 0.95  # of the first part's rms that the last must be below
+_FREE = 1 / 3  # of a record, that stretches without drive hold
+_TONE_COVERS = 0.5  # of the record
+_TONE_AMPLITUDE = 0.05  # median change of log amplitude from frame to frame
+_TONE_FREQUENCY = 0.02  # median relative change of frequency
+_STEP_CYCLES = 10
+_STEPS_COVER = 0.3
+_MOVES = 0.5
+_FAR = 2.0  # times the mode's frequency, or one over it: another mode, or wrong times
+_BAND = (0.01, 0.99)  # of the force's power: what a broadband test excites
+_LOOKED_AT = 2**20  # samples whose spectrum is taken
+
+
+class RecordKind(StrEnum):
+    """What a time record is a record of."""
+
+    FREE_DECAY = "free decay"
+    STEPPED_SINE = "stepped sine"
+    SLOW_SWEEP = "slow sweep"
+    BROADBAND = "broadband"
+
+
+class RecordChannels(NamedTuple):
+    """Channels of a record by their part in a test; motions in the order of `sensors`."""
+
+    force: str | None
+    drive: str | None
+    motions: tuple[str, ...]
+    sensors: tuple[str, ...]  # of the model
+    reference: str  # motion at the sensor where the mode moves most
+
+
+class RecordedTest(NamedTuple):
+    """A time record, what it is, and by which rule."""
+
+    recording: TimeRecording
+    channels: RecordChannels
+    kind: RecordKind
+    why: str
+    free: tuple[tuple[int, int], ...] = ()  # samples of free decays, start and stop
+    frequency: float = np.nan  # rad/s, strongest of the motion
+
+
+def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
+    """Sort a time record by what it is; the rules stand at the top of this module.
+
+    Arguments: `recording` has at most one force and at most one voltage that drives, and motions
+    whose channels are named after sensors of `modes` (by `point` or by name); a single motion
+    without such a name is that of the sensor where the mode of interest moves most.
+    Returns a `RecordedTest`. Raises `ValueError` that names the record for channels that do not
+    fit, samples that are not finite, a motion or drive far from the mode's frequency (times that
+    are no seconds, another structure), a single tone, and a record of no known kind.
+    """
+    channels = _channels(recording, modes)
+    rest = float(modes.natural_frequency[modes.mode_of_interest])
+    motion = recording.values([channels.reference], 0, _LOOKED_AT)[0]
+    if not np.isfinite(motion).all():
+        raise ValueError(
+            f"{recording.name}: channel {channels.reference} has samples that are not finite."
+        )
+    if not np.ptp(motion) > 0:
+        raise ValueError(f"{recording.name}: channel {channels.reference} does not move.")
+    frequency = _strongest(motion, recording.sampling_rate)
+    guide = channels.drive or channels.force
+    acting = guide is not None and bool(np.ptp(recording.values([guide], 0, _LOOKED_AT)[0]) > 0)
+    fall = _fall(motion)
+    if guide is None or not acting:
+        return _undriven(recording, channels, frequency, rest, fall, len(motion))
+    free = _free_stretches(recording, guide, channels.reference)
+    if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
+        _near_the_mode(recording, frequency, frequency, rest)
+        why = f"{guide} stops for {len(free)} stretch{'es' if len(free) > 1 else ''} of 12 cycles"
+        return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
+    track = _tone(recording, guide)
+    if track is not None:
+        omega = track.frequency * recording.sampling_rate
+        _near_the_mode(recording, float(omega.min()), float(omega.max()), rest)
+        kind, why = _of_tone(recording, guide, track)
+        return RecordedTest(recording, channels, kind, why, (), frequency)
+    if fall.decays:
+        why = f"the motion decays, and {guide} is noise"
+        parts = ((fall.start, len(motion)),)
+        return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
+    low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
+    _near_the_mode(recording, low, high, rest)
+    why = f"{guide} is no tone: it holds {low / _HERTZ:.4g} to {high / _HERTZ:.4g} Hz"
+    return RecordedTest(recording, channels, RecordKind.BROADBAND, why, (), frequency)
+
+
+def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
+    """Channels by quantity, and the sensors that they are of."""
+    kept = {
+        kind: [one for one in recording.channels if one.quantity == kind]
+        for kind in ("force", "voltage")
+    }
+    for kind, found in kept.items():
+        if len(found) > 1:
+            raise ValueError(
+                f"{recording.name} has several channels of {kind} "
+                f"({', '.join(one.name for one in found)}): keep the one that drives the mode."
+            )
+    motions = [one for one in recording.channels if one.quantity in _MOTIONS]
+    if not motions:
+        listed = ", ".join(map(str, recording.channels))
+        raise ValueError(f"{recording.name} has no channel of motion, but {listed}.")
+    at: dict[str, str] = {}
+    for one in motions:
+        for sensor in modes.sensors:
+            if sensor in (one.point, one.name, f"{one.point}{one.direction}"):
+                at.setdefault(sensor, one.name)
+    reference = modes.sensors[reference_sensor(modes)]
+    if not at and len(motions) == 1 and not motions[0].point:
+        at = {reference: motions[0].name}
+    if reference not in at:
+        raise ValueError(
+            f"{recording.name} has no motion of the sensor {reference}, where the mode moves most, "
+            f"but {', '.join(one.name for one in motions)}."
+        )
+    names = [found[0].name if found else None for found in kept.values()]
+    return RecordChannels(names[0], names[1], tuple(at.values()), tuple(at), at[reference])
+
+
+class _Fall(NamedTuple):
+    start: int  # of the largest value
+    decays: bool
+    last: float  # rms of the last part over that of the first
+
+
+def _fall(motion: Float[np.ndarray, " sample"]) -> _Fall:
+    """Whether a motion falls from each eighth to the next, from its largest value on."""
+    centred = motion - motion.mean()
+    start = int(np.argmax(np.abs(centred)))
+    length = (len(motion) - start) // _PARTS
+    if start > len(motion) // 2 or not length:
+        return _Fall(start, False, 1.0)
+    parts = centred[start : start + _PARTS * length].reshape(_PARTS, length)
+    size = np.sqrt(np.mean(parts**2, axis=1))
+    falls = bool(np.all(np.diff(size) < _RISE * size[0])) and bool(size[-1] < _FALLEN * size[0])
+    return _Fall(start, falls, float(size[-1] / size[0]))
+
+
+def _undriven(
+    recording: TimeRecording,
+    channels: RecordChannels,
+    frequency: float,
+    rest: float,
+    fall: _Fall,
+    count: int,
+) -> RecordedTest:
+    if not fall.decays:
+        raise ValueError(
+            f"{recording.name} has no force or drive that acts, and its motion does not decay "
+            f"(its last eighth has {100 * fall.last:.3g} % of the first): it is neither a free "
+            "decay nor a forced test."
+        )
+    _near_the_mode(recording, frequency, frequency, rest)
+    why = "no force or drive acts, and the motion falls"
+    free = ((fall.start, recording.n_samples if count < _LOOKED_AT else count),)
+    return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, free, frequency)
+
+
+def _free_stretches(
+    recording: TimeRecording, guide: str, motion: str
+) -> tuple[tuple[int, int], ...]:
+    """Stretches without drive, a cycle after it has stopped; none where it never stops."""
+    try:
+        found = find_ring_downs(recording, guide, motion)
+    except ValueError:  # the drive never stops: its only other reasons were looked at before
+        return ()
+    return tuple(
+        (one.start + int(np.ceil(_HERTZ * recording.sampling_rate / one.frequency)), one.stop)
+        for one in found
+    )
+
+
+def _tone(recording: TimeRecording, guide: str) -> ToneTrack | None:
+    """The track of a drive that is one slowly changing tone, or None."""
+    try:
+        track = track_tone(recording, guide)
+    except ValueError:  # no frame holds a tone
+        return None
+    if len(track.middle) < 3 or np.sum(track.length) / 2 < _TONE_COVERS * recording.n_samples:
+        return None
+    amplitude = np.median(np.abs(np.diff(np.log(track.amplitude))))
+    frequency = np.median(np.abs(np.diff(np.log(track.frequency))))
+    return track if amplitude < _TONE_AMPLITUDE and frequency < _TONE_FREQUENCY else None
+
+
+def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[RecordKind, str]:
+    rate = recording.sampling_rate
+    steps = [
+        one
+        for one in recognise_steps(track, rate, least_amplitude_step=0.05, least_step=0.0)
+        if (one.stop - one.start) * one.frequency / _HERTZ / rate >= _STEP_CYCLES
+    ]
+    covered = sum(one.stop - one.start for one in steps) / max(float(np.ptp(track.middle)), 1.0)
+    if len(steps) > 1 and covered >= _STEPS_COVER and _moves_within(steps, track) < _MOVES:
+        return RecordKind.STEPPED_SINE, f"{guide} is a tone of {len(steps)} steps"
+    runs = sweep_runs(track, unwrapped_phase(track))
+    if runs:
+        return RecordKind.SLOW_SWEEP, f"{guide} is a tone whose frequency moves, {len(runs)} times"
+    raise ValueError(
+        f"{recording.name}: {guide} is a single tone of "
+        f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, of which no method makes a backbone."
+    )
+
+
+def _moves_within(steps: list[Step], track: ToneTrack) -> float:
+    """Median over steps of the frequency's move within one over that to the next.
+
+    A sweep passes for steps where straight lines of phase fit its short pieces: there it is one.
+    """
+    moves = [0.0]
+    for one, after in itertools.pairwise(steps):
+        rows = (track.middle >= one.start) & (track.middle <= one.stop)
+        if np.count_nonzero(rows) > 2 and after.frequency != one.frequency:
+            slope = np.polyfit(track.middle[rows], track.frequency[rows], 1)[0]
+            between = abs(after.frequency - one.frequency) / one.frequency
+            within = abs(slope) * (one.stop - one.start) / float(np.mean(track.frequency[rows]))
+            moves.append(within / between)
+    return float(np.median(moves))
+
+
+def _spectrum(values: Float[np.ndarray, " sample"], rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies in rad/s and power."""
+    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values)))) ** 2
+    return _HERTZ * np.fft.rfftfreq(len(values), 1 / rate), power
+
+
+def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
+    omega, power = _spectrum(motion, rate)
+    return float(omega[1 + int(np.argmax(power[1:]))])
+
+
+def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:
+    omega, power = _spectrum(force, rate)
+    share = np.cumsum(power) / np.sum(power)
+    low, high = (float(omega[np.searchsorted(share, one)]) for one in _BAND)
+    return low, high
+
+
+def _near_the_mode(recording: TimeRecording, low: float, high: float, rest: float) -> None:
+    if low / _FAR <= rest <= high * _FAR:
+        return
+    where = f"{low / _HERTZ:.4g}" if high == low else f"{low / _HERTZ:.4g} to {high / _HERTZ:.4g}"
+    raise ValueError(
+        f"{recording.name} is at {where} Hz, but the mode of interest is at "
+        f"{rest / _HERTZ:.4g} Hz: is its time in seconds, and is it a test of this mode?"
+    )

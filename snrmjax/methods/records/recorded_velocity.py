@@ -1,0 +1,81 @@
+"""The velocity of a record's motion, whatever was measured, down to the record's noise."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.measure.recordings.channels import channel_number
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.methods.records.resonant_decay import even_record
+from snrmjax.methods.records.ring_down_decays import above_noise, white_noise
+
+_HERTZ = 2 * np.pi
+_ABOVE_NOISE = 4.0  # standard deviations of noise down to which a motion is read
+_CORNER = 0.25  # of the motion's frequency: what is slower is drift of an integrated signal
+_ORDER = 4  # at the motion's frequency the filter is then 1 within 2e-5
+_ENDS = 8.0  # cycles at both ends in which it has not settled
+_SPLINE = 5
+
+
+class RecordedVelocity(NamedTuple):
+    """A stretch of a record as velocity."""
+
+    time: Float[np.ndarray, " sample"]  # s
+    velocity: Float[np.ndarray, " sample"]  # m/s
+    start: int  # sample of the record at which it begins
+    floor: float  # m/s: smaller amplitudes are noise
+    notes: tuple[str, ...] = ()
+
+
+def recorded_velocity(
+    recording: TimeRecording,
+    name: str,
+    frequency: float,
+    part: tuple[int, int],
+    *,
+    forced: bool = False,
+) -> RecordedVelocity:
+    """The velocity of a motion over `part` of a record; of a decay until it is lost in noise.
+
+    Arguments: `name` of a channel of velocity, acceleration or displacement; `frequency` of the
+    motion (rad/s); `part` in samples; a `forced` motion is kept to its end. Accelerations are
+    integrated and displacements derived by a spline of degree 5; of an integral what is slower
+    than a quarter of the frequency is drift and is filtered out forwards and backwards, and the
+    filter's ends, eight cycles, are left out.
+    Returns a `RecordedVelocity`. Raises `ValueError` as `even_record` does (a clipped record, one
+    that is not finite).
+    """
+    quantity = recording.channels[channel_number(recording.channels, name)].quantity
+    start, stop = part
+    values = recording.values([name], start, stop)[0]
+    time, signal = even_record(
+        recording.time(start, stop), values - values.mean(), f"channel {name}"
+    )
+    notes: tuple[str, ...] = ()
+    cycle = max(1, int(np.ceil(_HERTZ * recording.sampling_rate / frequency)))
+    if quantity != "velocity":
+        from scipy.interpolate import make_interp_spline
+
+        curve = make_interp_spline(time, signal, k=_SPLINE)
+        change = curve.derivative() if quantity == "displacement" else curve.antiderivative()
+        signal = np.asarray(change(time))
+        notes = (f"velocity of {quantity} by a spline",)
+    if quantity == "acceleration":
+        from scipy.signal import butter, sosfiltfilt
+
+        ends = int(_ENDS * cycle)
+        if len(signal) < 4 * ends:
+            raise ValueError(
+                f"an acceleration needs {4 * _ENDS:g} cycles to be integrated, but the record has "
+                f"{len(signal) / cycle:.3g}."
+            )
+        sections = butter(
+            _ORDER, _CORNER * frequency, "highpass", fs=_HERTZ * recording.sampling_rate,
+            output="sos",
+        )  # fmt: skip
+        signal = sosfiltfilt(sections, signal)[ends:-ends]
+        time, start = time[ends:-ends], start + ends
+    floor = _ABOVE_NOISE * white_noise(signal)
+    kept = signal if forced else above_noise(signal, floor, cycle)
+    return RecordedVelocity(time[: len(kept)], kept, start, floor, notes)
