@@ -1,4 +1,4 @@
-"""The commands: demo, simulate, nnm, identify, compare, diagnose, modes, study, rom.
+"""The commands: demo, import, simulate, nnm, identify, compare, diagnose, modes, study, rom.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -14,6 +14,7 @@ from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
+from snrmjax.cli.import_command import import_
 from snrmjax.cli.modes_command import modes
 from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
@@ -32,6 +33,10 @@ app = typer.Typer(
 
 _EXAMPLES: dict[Callable[..., None], str] = {
     demo: "Example: snrmjax demo --out demo, then open demo/report.html.",
+    import_: "Examples: snrmjax import test.uff\n\n"
+    "snrmjax import test.mat --force CH1 --force-unit N --response CH2:acceleration --unit g "
+    "--out imported\n\n"
+    "snrmjax import next.mat --map imported/map.toml --out next",
     simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
     "--out result",
     nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
@@ -56,7 +61,11 @@ def _unwrapped(text: str) -> str:
 
 
 for _command, _examples in _EXAMPLES.items():
-    app.command(help=_unwrapped(inspect.getdoc(_command) or ""), epilog=_examples)(_command)
+    app.command(
+        _command.__name__.rstrip("_"),
+        help=_unwrapped(inspect.getdoc(_command) or ""),
+        epilog=_examples,
+    )(_command)
 
 app.add_typer(study_app)
 

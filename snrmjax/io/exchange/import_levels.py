@@ -1,0 +1,55 @@
+"""What number of level each imported state gets."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.io.exchange.import_units import Assumptions
+from snrmjax.measure.recordings.velocity_states import number_levels
+
+
+class MeasuredPart(NamedTuple):
+    """Steady states of one file, before they have levels; phasors relative to the force."""
+
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N or V
+    velocity: Complex[np.ndarray, "state sensor"]  # m/s
+    key: Float[np.ndarray, " state"] | None = None  # what a column or the order says of levels
+
+
+def numbered_levels(
+    parts: list[MeasuredPart], level: str, assumed: Assumptions
+) -> tuple[np.ndarray, str]:
+    """The level of every state of all parts, and the rule that was used, for the map.
+
+    Arguments: `level` is the rule that was stated; without one, a column or the order that the
+    file has, then one level a file, then groups of the force.
+    Raises `ValueError` for a rule that the data do not have.
+    """
+    lengths = [len(one.frequency) for one in parts]
+    files = np.repeat(np.arange(1, len(parts) + 1), lengths)
+    force = np.concatenate([one.force for one in parts])
+    frequency = np.concatenate([one.frequency for one in parts])
+    keyed = all(one.key is not None for one in parts)
+    if level not in ("", "file", "force", "runs") or (not level and keyed):
+        keys = np.concatenate([np.full(0, 0.0) if p.key is None else p.key for p in parts])
+        if not keyed:
+            raise ValueError(
+                f"--level {level} is nothing that this file has: force, runs, file, or a column."
+            )
+        if len(parts) > 1:  # a key of each file for itself
+            keys = np.unique(np.stack([files, keys]), axis=1, return_inverse=True)[1] + 1.0
+        whole = np.all(keys == np.round(keys)) and np.all(np.abs(keys) < 1e9)
+        if whole:
+            return keys.astype(int), level
+        return np.unique(keys, return_inverse=True)[1] + 1, level
+    if level == "file" or (not level and len(parts) > 1):
+        if not level:
+            assumed["level"] = "one level a file, in the order in which they were named"
+        return files, "file"
+    chosen = level or "auto"
+    number, note = number_levels(chosen, force, None, frequency)  # type: ignore[arg-type]
+    if not level:
+        assumed["level"] = f"{len(np.unique(number))} found, {note}"
+    return number, level or ("force" if "amplitude" in note else "runs")

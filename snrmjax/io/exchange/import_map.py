@@ -1,0 +1,193 @@
+"""The map of an import: which channel or column is what, as options and as `map.toml`."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import tomli_w
+
+from snrmjax.io.files import FilePath, file_name, read_text, shown
+from snrmjax.io.laboratory.contents import TextFormat
+from snrmjax.io.toml_table import TomlTable, parsed_toml
+
+RECORD_KINDS = ("steps", "sweep", "decay", "broadband")
+"""What a time record may be: the last two are written as records, not as steady states."""
+
+_MOTIONS = ("displacement", "velocity", "acceleration")
+CHOICES: dict[str, tuple[str, ...]] = {
+    "record": ("", *RECORD_KINDS),
+    "phase_unit": ("", "deg", "rad"),
+    "phase_sign": ("", "lead", "lag"),
+    "amplitude": ("", "peak", "rms", "peak_to_peak"),
+    "separator": ("", "comma", "semicolon", "tab", "space"),
+    "decimal": ("", "point", "comma"),
+}
+"""What words some keys may have."""
+
+_MEANING = {
+    "dataset": "which of the file's datasets",
+    "record": f"what a time record is: {', '.join(RECORD_KINDS)}",
+    "frequency": "column of the forcing frequency",
+    "frequency_unit": "its unit",
+    "force": "channel or column of the force (or of the voltage that drives it)",
+    "force_unit": "its unit; V: the force is known as a drive voltage only",
+    "force_phase": "column of the force's own phase; empty: phases are relative to the force",
+    "force_amplitude": "N, one for all or one a set of frequency responses; z: the z axis has it",
+    "over_force": "whether responses are divided by the force",
+    "phase_unit": "deg or rad",
+    "phase_sign": "lead: a positive phase is ahead of the force; lag: behind it",
+    "amplitude": "peak, rms or peak_to_peak: what amplitudes are",
+    "level": "column, or file, force, drive, runs, z, order: what numbers the levels",
+    "drive": "channel of the generator's voltage, by which steps are recognised",
+    "separator": "of a text's columns; empty: found",
+    "decimal": "mark of a text's numbers; empty: found",
+    "header_row": "row of a text's names, from 1; 0: found",
+}
+
+
+class ResponseMap(NamedTuple):
+    """One response: its channel or column, what it is, and where its phase stands."""
+
+    channel: str
+    quantity: str = ""
+    unit: str = ""
+    sensor: str = ""
+    phase: str = ""
+    imaginary: str = ""
+
+
+class ImportMap(NamedTuple):
+    """All that an import is told; what is empty is found or assumed; see `map_text`."""
+
+    responses: tuple[ResponseMap, ...] = ()
+    dataset: str = ""
+    record: str = ""
+    frequency: str = ""
+    frequency_unit: str = ""
+    force: str = ""
+    force_unit: str = ""
+    force_phase: str = ""
+    force_amplitude: tuple[str, ...] = ()
+    over_force: bool = False
+    phase_unit: str = ""
+    phase_sign: str = ""
+    amplitude: str = ""
+    level: str = ""
+    drive: str = ""
+    separator: str = ""
+    decimal: str = ""
+    header_row: int = 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is said of channels."""
+        return self._replace(separator="", decimal="", header_row=0, dataset="") == ImportMap()
+
+    @property
+    def text_format(self) -> TextFormat:
+        """How texts are written."""
+        return TextFormat(self.separator or None, self.decimal or None, self.header_row or None)
+
+    def over(self, base: "ImportMap") -> "ImportMap":
+        """This map where it says something, else the other one: options win over a file."""
+        empty = ImportMap()
+        said = {key: value for key, value in self._asdict().items() if value != getattr(empty, key)}
+        return base._replace(**said)
+
+
+def response_word(word: str, unit: str = "") -> ResponseMap:
+    """A response of an option: "CH2:acceleration", "CH2:acceleration:g", or "CH2".
+
+    Raises `ValueError` for a quantity that is no motion.
+
+    >>> response_word("CH2:acceleration", "g")[:3]
+    ('CH2', 'acceleration', 'g')
+    """
+    parts = word.split(":")
+    if len(parts) > 1 and parts[-1] in _MOTIONS:
+        return ResponseMap(":".join(parts[:-1]), parts[-1], unit)
+    if len(parts) > 2 and parts[-2] in _MOTIONS:
+        return ResponseMap(":".join(parts[:-2]), parts[-2], parts[-1])
+    if len(parts) > 1 and parts[-1].isalpha():
+        raise ValueError(
+            f"--response must be a channel and one of {', '.join(_MOTIONS)}, as "
+            f"CH2:acceleration, but is {shown(word)}."
+        )
+    return ResponseMap(word, "", unit)
+
+
+def read_import_map(path: FilePath) -> ImportMap:
+    """A map from its TOML. Raises `ValueError` that names file, key and what was expected."""
+    file = file_name(path)
+    table = parsed_toml(read_text(path), file)
+    table.check_keys((), (*_MEANING, "response"))
+    found: dict[str, Any] = {}
+    for key in _MEANING:
+        if key not in table.entries:
+            continue
+        if key == "over_force":
+            if not isinstance(table.entries[key], bool):
+                raise table.refusal(key, "true or false", table.entries[key])
+            found[key] = table.entries[key]
+        elif key == "header_row":
+            found[key] = table.whole(key, 0)
+        elif key == "force_amplitude":
+            found[key] = _amplitudes(table)
+        elif key in CHOICES:
+            found[key] = table.choice(key, CHOICES[key])
+        else:
+            found[key] = table.text(key)
+    responses = []
+    for one in table.tables("response", file):
+        one.check_keys(("channel",), ResponseMap._fields[1:])
+        if "quantity" in one.entries:
+            one.choice("quantity", ("", *_MOTIONS))
+        responses.append(
+            ResponseMap(**{key: one.text(key) for key in ResponseMap._fields if key in one.entries})
+        )
+    return ImportMap(tuple(responses), **found)
+
+
+def _amplitudes(table: TomlTable) -> tuple[str, ...]:
+    value = table.entries["force_amplitude"]
+    if value == "z":
+        return ("z",)
+    if isinstance(value, list) and not value:
+        return ()
+    return tuple(map(repr, table.numbers("force_amplitude", each="entry")))
+
+
+def map_text(used: ImportMap, assumed: Mapping[str, str], notes: tuple[str, ...] = ()) -> str:
+    """`map.toml`: every key with its meaning, and what was assumed with the reason.
+
+    Arguments: `assumed` has the reason of each key that nobody stated; keys of the k-th response
+    (from 1) as "response 1.unit".
+    """
+    lines = [
+        "# How the laboratory's files were read. Take it for the next test: snrmjax import "
+        "FILE --map map.toml --out DIR",
+        *(f"# note: {' '.join(note.split())}" for note in notes),
+    ]
+    for key, meaning in _MEANING.items():
+        value = getattr(used, key)
+        if key == "force_amplitude":
+            value = "z" if value == ("z",) else [float(one) for one in value]
+        lines.append(f"{_line(key, value)}  # {_comment(key, meaning, assumed)}")
+    for k, one in enumerate(used.responses):
+        lines += ["", "[[response]]"]
+        for key, value in one._asdict().items():
+            why = assumed.get(f"response {k + 1}.{key}")
+            lines.append(_line(key, value) + (f"  # assumed: {_flat(why)}" if why else ""))
+    return "\n".join(lines) + "\n"
+
+
+def _comment(key: str, meaning: str, assumed: Mapping[str, str]) -> str:
+    return f"assumed: {_flat(assumed[key])} ({meaning})" if key in assumed else meaning
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _line(key: str, value: object) -> str:
+    """One key on one line."""
+    return " ".join(tomli_w.dumps({key: value}).split("\n")).strip().replace(",  ]", "]")

@@ -1,0 +1,165 @@
+"""Units and quantities of an import: stated by the map, by the file, or asked for."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.io.exchange.import_map import ImportMap
+from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
+from snrmjax.measure.recordings.channels import SI_UNIT
+
+_SIZES = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
+_HERTZ = 2 * np.pi
+
+
+class Assumptions(dict[str, str]):
+    """The reason of every key of the map that nobody stated."""
+
+
+class Force(NamedTuple):
+    """What the numbers of a force are multiplied with."""
+
+    factor: float
+    is_voltage: bool
+    unit: str
+
+
+def force_meaning(told: ImportMap, file_unit: str, what: str) -> Force:
+    """The unit of the force. Raises `ValueError` with a question where nobody states it."""
+    unit = told.force_unit or file_unit
+    if not unit:
+        raise ValueError(
+            f"in which unit is {what}? State it: --force-unit N (or lbf, V for a drive voltage)."
+        )
+    meaning = _understood(unit, "--force-unit")
+    if meaning.dimension not in ("force", "voltage"):
+        raise ValueError(
+            f"{what} must be a force or a voltage, but its unit {unit} is of {meaning.dimension}: "
+            "--force names another channel, --force-unit another unit."
+        )
+    return Force(meaning.factor, meaning.dimension == "voltage", unit)
+
+
+def motion_meaning(
+    quantity: str, unit: str, file_unit: str, channel: str, *, is_ratio: bool = False
+) -> tuple[str, float, str]:
+    """Quantity, factor into SI and unit of a response.
+
+    Raises `ValueError` with a question where they are not stated or contradict one another.
+    """
+    stated = unit or file_unit
+    if not stated:
+        example = f"{channel}:{quantity or 'velocity'}:{SI_UNIT.get(quantity or 'velocity', '')}"  # type: ignore[call-overload]
+        raise ValueError(
+            f"in which unit is {channel}? State it: --response {example}, or --unit for all "
+            "responses."
+        )
+    if is_ratio and not unit and "/" in stated:
+        numerator, _, below = stated.rpartition("/")
+        try:
+            divides_force = unit_meaning(below.strip("() ")).dimension == "force"
+        except ValueError:
+            divides_force = False
+        stated = numerator.strip("() ") if divides_force else stated
+    meaning = _understood(stated, "--unit")
+    if meaning.per_volt:
+        raise ValueError(
+            f"{stated} of {channel} is a sensitivity: give the unit of the channel's numbers, as "
+            "--unit g, or for volts the motion of a volt, as --unit '9.8 m/s^2'."
+        )
+    if meaning.dimension not in ("displacement", "velocity", "acceleration"):
+        raise ValueError(
+            f"{channel} must be a displacement, velocity or acceleration, but its unit {stated} is "
+            f"of {meaning.dimension}: --unit states what one of its numbers is (a sensor of "
+            "100 mV/g: --unit '10 g' per volt)."
+        )
+    if quantity and quantity != meaning.dimension:
+        raise ValueError(
+            f"{channel} is called {quantity} (--response), but its unit {stated} is of "
+            f"{meaning.dimension}: which of both is right?"
+        )
+    return meaning.dimension, meaning.factor, stated
+
+
+def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumptions) -> float:
+    """What turns amplitudes into peak amplitudes: stated, said by a unit, else peak is assumed."""
+    said = {unit_meaning(unit).size for unit in units.values() if unit}
+    sizes = said - {""}
+    if told.amplitude:
+        return float(_SIZES[told.amplitude])
+    if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
+        raise ValueError(
+            f"units say {' and '.join(sorted(sizes))} of some columns and not of others: which "
+            "holds for all? --amplitude peak, rms or peak_to_peak."
+        )
+    size = next(iter(sizes), "peak")
+    assumed["amplitude"] = "the units say so" if sizes else "peak amplitudes, as nothing is said"
+    return float(_SIZES[size])
+
+
+def frequency_in_rad(
+    values: Float[np.ndarray, " row"], told: ImportMap, file_unit: str, assumed: Assumptions
+) -> tuple[Float[np.ndarray, " row"], str]:
+    """Frequencies in rad/s and their unit; hertz where nothing is said."""
+    unit = told.frequency_unit or file_unit
+    if not unit:
+        if told.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
+            raise ValueError(
+                f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
+            )
+        assumed["frequency_unit"] = "Hz, as nothing is said"
+        return values * _HERTZ, "Hz"
+    meaning = _understood(unit, "--frequency-unit")
+    if meaning.dimension != "frequency":
+        raise ValueError(
+            f"{told.frequency} must be a frequency, but its unit {unit} is of {meaning.dimension}: "
+            "--frequency names another column."
+        )
+    if abs(meaning.factor / _HERTZ - 1) < 1e-14:
+        return values * _HERTZ, unit
+    return values * meaning.factor, unit
+
+
+def phase_in_rad(
+    values: Float[np.ndarray, "*row"],
+    column: str,
+    told: ImportMap,
+    file_unit: str,
+    assumed: Assumptions,
+) -> Float[np.ndarray, "*row"]:
+    """Phases in rad, positive where the response leads.
+
+    Raises `ValueError` with a question where degrees and radians are both possible.
+    """
+    unit, why = told.phase_unit, ""
+    if not unit and file_unit:
+        meaning = unit_meaning(file_unit)
+        if meaning.dimension != "angle":
+            raise ValueError(
+                f"{column} must be an angle, but its unit is {file_unit}: --phase names another "
+                "column, --phase-unit its unit."
+            )
+        unit, why = ("rad" if meaning.factor == 1 else "deg"), "the file says so"
+    if not unit:
+        ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
+        if ends:
+            unit, why = ends[0], f"{column} says so"
+        elif np.nanmax(np.abs(values), initial=0.0) > 2 * _HERTZ:
+            unit, why = "deg", f"{column} reaches beyond two turns in radians"
+        else:
+            raise ValueError(f"is {column} in degrees or in radians? --phase-unit deg or rad.")
+    if why:
+        assumed["phase_unit"] = f"{unit}: {why}"
+    if not told.phase_sign:
+        assumed["phase_sign"] = "lead, as in e^(+iwt): a positive phase is ahead of the force"
+    sign = -1.0 if told.phase_sign == "lag" else 1.0
+    return sign * (np.radians(values) if unit == "deg" else values)
+
+
+def _understood(unit: str, option: str) -> UnitMeaning:
+    try:
+        return unit_meaning(unit)
+    except ValueError as error:
+        raise ValueError(f"{str(error).rstrip('.')}: {option} states it.") from error

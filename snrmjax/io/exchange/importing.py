@@ -1,0 +1,178 @@
+"""An import: files and a map to steady states, or to records of decays."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
+from snrmjax.io.exchange.import_map import ImportMap
+from snrmjax.io.exchange.import_units import Assumptions, Force
+from snrmjax.io.exchange.layouts import is_own_table, states_of_own_table
+from snrmjax.io.exchange.record_import import import_record, told_record
+from snrmjax.io.exchange.response_import import import_responses
+from snrmjax.io.exchange.table_import import import_table
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
+from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.states import SteadyStates, join_steady_states, steady_states
+
+
+class Imported(NamedTuple):
+    """What an import gave: steady states, or records that stay records.
+
+    `used` is the map with all that was found, `assumed` the reason of each key that nobody stated.
+    """
+
+    states: SteadyStates | None
+    records: tuple[TimeRecording, ...]
+    used: ImportMap
+    assumed: Assumptions
+    notes: tuple[str, ...]
+
+
+class _Dataset(NamedTuple):
+    """One thing of a file that can be imported."""
+
+    name: str
+    file: str
+    content: TimeRecording | NumberTable | tuple[FrequencyResponses, ...]
+    z: tuple[float, ...] = ()
+
+
+def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
+    """Import the files of one test.
+
+    Arguments: `told` says which channel or column is what; the same for all files.
+    Returns `Imported`. Raises `ValueError`: as `read_laboratory_file` does, and with a question
+    that names the option where something cannot be told.
+    """
+    assumed, notes = Assumptions(), list[str]()
+    chosen: list[_Dataset] = []
+    for path in paths:
+        held = read_laboratory_file(path, told.text_format)
+        chosen += _datasets(held, told)
+        notes += [f"{held.name}: {note}" for note in held.notes]
+    kinds = {type(one.content) for one in chosen}
+    if len(kinds) > 1:
+        listed = ", ".join(f"{one.file}: {one.name}" for one in chosen)
+        raise ValueError(f"files of one test must hold things of one kind, but have {listed}.")
+    if told.dataset == "" and len(chosen) == 1:
+        told = told._replace(dataset=chosen[0].name)
+    if isinstance(chosen[0].content, TimeRecording):
+        return _records(chosen, told, assumed, notes)
+    own = [
+        one for one in chosen if isinstance(one.content, NumberTable) and is_own_table(one.content)
+    ]
+    if own and not told.responses:
+        parts = [
+            states_of_own_table(one.content, one.file)
+            for one in own
+            if isinstance(one.content, NumberTable)
+        ]
+        notes.append("the columns are those of our table: taken as they are.")
+        return Imported(_joined(parts), (), told, assumed, tuple(notes))
+    return _phasors(chosen, told, assumed, notes)
+
+
+def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
+    """What of a file is imported. Raises `ValueError` with a question where that is not one."""
+    every = [_Dataset(one.name or "record", held.name, one) for one in held.recordings]
+    every += [_Dataset(one.name, held.name, one) for one in held.tables]
+    if held.responses:
+        every.append(_Dataset("responses", held.name, held.responses, held.levels))
+    if not every:
+        raise ValueError(
+            f"{held.name} holds mode shapes only: a model is made of them by hand, or of frequency "
+            "responses by `snrmjax modes`."
+        )
+    names = [one.name for one in every]
+    if told.dataset:
+        alike = [one for one in every if one.name == told.dataset]
+        if alike:
+            return alike
+        if len(every) > 1:
+            raise ValueError(
+                f"--dataset names {told.dataset!r}, but {held.name} has {', '.join(names)}."
+            )
+    if len(every) > 1 and all(isinstance(one.content, TimeRecording) for one in every):
+        return every
+    if len(every) > 1:
+        raise ValueError(
+            f"which part of {held.name} is meant? --dataset names it, of {', '.join(names)}."
+        )
+    return every
+
+
+def _records(
+    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+) -> Imported:
+    parts: list[SteadyStates] = []
+    kept: list[TimeRecording] = []
+    used = told
+    for one in chosen:
+        if isinstance(one.content, TimeRecording):
+            record, used = told_record(one.content, told, one.file, assumed)
+            states, used, more = import_record(record, used, one.file, assumed)
+            notes += [f"{one.file}: {note}" for note in more]
+            if states is None:
+                kept.append(record)
+            else:
+                parts.append(states)
+    if not parts:
+        return Imported(None, tuple(kept), used, assumed, tuple(notes))
+    if told.level == "file" or (len(parts) > 1 and not told.level):
+        if not told.level:
+            assumed["level"] = "one level a record, in the order in which they were named"
+        used = used._replace(level="file")
+        parts = [
+            dataclasses.replace(one, level=jnp.full(one.n_states, k + 1))
+            for k, one in enumerate(parts)
+        ]
+    return Imported(_joined(parts), (), used, assumed, tuple(notes))
+
+
+def _phasors(
+    chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
+) -> Imported:
+    """Tables and frequency responses."""
+    parts: list[MeasuredPart] = []
+    used, force = told, Force(1.0, False, "N")
+    for one in chosen:
+        if isinstance(one.content, NumberTable):
+            part, used, force, more = import_table(one.content, told, one.file, assumed)
+        elif isinstance(one.content, TimeRecording):
+            continue
+        else:
+            part, used, force, more = import_responses(one.content, one.z, told, one.file, assumed)
+        parts.append(part)
+        notes += more
+    level, rule = numbered_levels(parts, told.level or _rule(used, parts), assumed)
+    every = np.concatenate([one.force for one in parts])
+    velocity = np.concatenate([one.velocity for one in parts])
+    missing = np.full(len(every), np.nan)
+    states = steady_states(
+        level,
+        np.concatenate([one.frequency for one in parts]),
+        missing if force.is_voltage else every,
+        np.where(np.isfinite(velocity), velocity, 0.0),
+        measured=np.isfinite(velocity),
+        sensors=[one.sensor for one in used.responses],
+        drive=every if force.is_voltage else missing,
+    )
+    if not np.any(np.abs(velocity) > 0):
+        raise ValueError(f"{chosen[0].file} has nothing but zero responses.")
+    return Imported(states, (), used._replace(level=rule), assumed, tuple(notes))
+
+
+def _rule(used: ImportMap, parts: Sequence[MeasuredPart]) -> str:
+    """The rule that a file's own column or order gives, if all parts have one."""
+    return used.level if all(one.key is not None for one in parts) else ""
+
+
+def _joined(parts: Sequence[SteadyStates]) -> SteadyStates:
+    return parts[0] if len(parts) == 1 else join_steady_states(list(parts))

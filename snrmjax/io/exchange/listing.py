@@ -1,0 +1,179 @@
+"""What a laboratory's file holds, in words, and the command that would import it."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from snrmjax.io.exchange.layouts import is_own_table
+from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
+from snrmjax.io.laboratory.names import role_of
+from snrmjax.measure.recordings.channels import SI_UNIT, Channel
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.velocity_states import number_levels
+
+_HERTZ = 2 * np.pi
+_MOST = 40  # lines of one kind
+_MOTIONS = ("velocity", "acceleration", "displacement")
+
+
+def listed_contents(held: LaboratoryFile) -> list[str]:
+    """The datasets of a file: channels, rates, lengths, units, places, levels found."""
+    lines = [f"{held.name}: {held.kind}"]
+    for record in held.recordings:
+        lines += [
+            f"  record {record.name or 'record'}: {len(record.channels)} channels of "
+            f"{record.n_samples} samples at {record.sampling_rate:.6g} Hz "
+            f"({record.duration:.4g} s)",
+            *_short([f"    {one}" for one in record.channels]),
+        ]
+    for table in held.tables:
+        lines += [f"  table {table.name}: {table.n_rows} rows", *_columns(table)]
+    for one, z in zip(held.responses[:_MOST], held.levels, strict=False):
+        hertz = one.frequency / _HERTZ
+        level = f", z axis {z:g}" if np.isfinite(z) else ""
+        lines.append(
+            f"  responses {one.name}: {len(one.responses)} over {len(one.references)} at "
+            f"{len(hertz)} frequencies, {hertz[0]:.6g} to {hertz[-1]:.6g} Hz{level}"
+        )
+        lines += _short([f"    response {channel}" for channel in one.responses])
+        lines += _short([f"    reference {channel}" for channel in one.references])
+    if len(held.responses) > _MOST:
+        lines.append(f"  … {len(held.responses) - _MOST} further sets of responses")
+    for shapes in held.shapes:
+        lines.append(
+            f"  mode shapes {shapes.name}: {len(shapes.frequency)} modes at "
+            f"{len(shapes.points)} places"
+        )
+    return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
+
+
+def _short(lines: Sequence[str]) -> list[str]:
+    further = len(lines) - _MOST
+    return [*lines[:_MOST], *([f"    … {further} further"] if further > 0 else [])]
+
+
+def _columns(table: NumberTable) -> list[str]:
+    lines = []
+    for name, values in table.columns.items():
+        size = np.abs(values) if np.iscomplexobj(values) else values.astype(float)
+        finite = size[np.isfinite(size)]
+        span = f"{finite.min():.5g} to {finite.max():.5g}" if finite.size else "empty"
+        role = role_of(name)
+        count = len(np.unique(finite))
+        levels = f", {count} values" if role in ("level", "force", "drive") and count < 50 else ""
+        unit = f" in {table.units[name]}" if name in table.units else ""
+        kind = ", complex" if np.iscomplexobj(values) else ""
+        lines.append(f"    {name}{unit}: {span}{kind}{levels}{f' ({role}?)' if role else ''}")
+    frequency = _first(table, ("frequency",))
+    force = _first(table, ("force", "drive"))
+    if frequency and force and not _first(table, ("level",)):
+        size = np.abs(table.columns[force])
+        if np.all(size > 0) and np.isfinite(size).all():
+            number, note = number_levels("auto", size, None, np.real(table.columns[frequency]))
+            lines.append(f"    {len(np.unique(number))} levels found: {note}")
+    lines += [
+        f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
+        for name, words in table.words.items()
+    ]
+    return _short(lines)
+
+
+def _first(table: NumberTable, roles: Sequence[str]) -> str:
+    """The first column with one of these roles, the earlier role first."""
+    for role in roles:
+        for name in table.columns:
+            if role_of(name) == role:
+                return name
+    return ""
+
+
+def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
+    """A command line that imports the file, with what is guessed, and how to change it."""
+    files = " ".join(shlex.quote(str(path)) for path in paths)
+    several = len(held.recordings) + len(held.tables) + bool(held.responses) > 1
+    words: list[str] = []
+    if held.tables:
+        table = max(held.tables, key=lambda one: (bool(_first(one, ("frequency",))), one.n_rows))
+        words = _of_table(table)
+        mixed = bool(held.recordings or held.responses) or len(held.tables) > 1
+        words = (["--dataset", table.name] if mixed else []) + words
+    if held.recordings and not any(_first(one, ("frequency",)) for one in held.tables):
+        words = _of_record(held.recordings[0])
+        mixed = bool(held.tables or held.responses)
+        words = (["--dataset", held.recordings[0].name or "record"] if mixed else []) + words
+    if held.responses and not held.recordings:
+        words = _of_responses(held.responses[0], held.levels)
+        words = (["--dataset", "responses"] if several else []) + words
+    if not words and not (held.tables and is_own_table(held.tables[0])):
+        return []
+    line = " ".join(word if word.isupper() else shlex.quote(word) for word in words)
+    return [
+        "import it (put in what is written in capitals, and check the guesses):",
+        " ".join(f"  snrmjax import {files} {line} --out imported".split("  ")).strip(),
+    ]
+
+
+def _of_record(record: TimeRecording) -> list[str]:
+    force = _guess(record.channels, ("force", "voltage"), ("force", "drive"))
+    others = [one for one in record.channels if one.name != (force.name if force else "")]
+    response = _guess(others, _MOTIONS, (*_MOTIONS, "amplitude"))
+    words = ["--force", force.name] if force else ["--force", "CHANNEL"]
+    if force is None or force.quantity == "unknown":
+        words += ["--force-unit", "UNIT"]
+    return words + _response_words(response or Channel("CHANNEL"))
+
+
+def _of_responses(one: FrequencyResponses, z: Sequence[float]) -> list[str]:
+    amplitude = "z" if z and np.isfinite(z[0]) and z[0] > 0 else "NEWTONS"
+    response = _guess(one.responses, _MOTIONS, (*_MOTIONS, "amplitude")) or one.responses[0]
+    words = ["--force", one.references[0].name] if len(one.references) > 1 else []
+    return [*words, "--force-amplitude", amplitude, *_response_words(response)]
+
+
+def _of_table(table: NumberTable) -> list[str]:
+    if is_own_table(table):
+        return []
+    force = _first(table, ("force", "drive"))
+    response = _first(table, (*_MOTIONS, "amplitude", "real"))
+    unit = table.units.get(response, "UNIT")
+    role = role_of(response)
+    kind = role if role in _MOTIONS else "QUANTITY"
+    words = ["--force", force or "COLUMN"]
+    if force not in table.units:
+        words += ["--force-unit", "UNIT"]
+    stated = response in table.units and kind == "QUANTITY"
+    words += ["--response", (response or "COLUMN") + ("" if stated else f":{kind}")]
+    words += [] if response in table.units else ["--unit", unit]
+    phase = _first(table, ("phase",))
+    if phase and role != "real":
+        words += ["--phase", phase]
+        if phase not in table.units and not phase.lower().endswith(("deg", "rad")):
+            words += ["--phase-unit", "deg"]
+    return words
+
+
+def _response_words(one: Channel) -> list[str]:
+    if one.quantity in _MOTIONS:
+        unit = [] if one.unit else ["--unit", SI_UNIT[one.quantity]]
+        return ["--response", f"{one.name}:{one.quantity}", *unit]
+    role = role_of(one.name)
+    quantity = role if role in _MOTIONS else "QUANTITY"
+    return ["--response", f"{one.name}:{quantity}", "--unit", "UNIT"]
+
+
+def _guess(
+    channels: Sequence[Channel], quantities: Sequence[str], roles: Sequence[str]
+) -> Channel | None:
+    """The channel of one of these quantities or, by its name, of one of these roles."""
+    for quantity in quantities:
+        for one in channels:
+            if one.quantity == quantity:
+                return one
+    for role in roles:
+        for one in channels:
+            if one.quantity == "unknown" and role_of(one.name) == role:
+                return one
+    return None

@@ -1,0 +1,152 @@
+"""Steady states, or records of a decay, of a laboratory's time records."""
+
+import dataclasses
+
+import numpy as np
+
+from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
+from snrmjax.io.exchange.import_units import Assumptions, force_meaning, motion_meaning
+from snrmjax.measure.recordings.channels import Channel, channel_number
+from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.velocity_states import Levels
+from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.sweeps.slow_sweep import sweep_states
+
+_DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
+
+
+def told_record(
+    record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
+) -> tuple[TimeRecording, ImportMap]:
+    """The channels of a map with their quantities and units, and the map with what was found.
+
+    Raises `ValueError` with a question that names the option for what cannot be told.
+    """
+    if not told.responses:
+        names = ", ".join(record.channel_names)
+        raise ValueError(
+            f"which channel of {file} is the response? --response CHANNEL:acceleration (or "
+            f"velocity, displacement) names it, of {names}."
+        )
+    channels = list(record.channels)
+    if told.force:
+        k = _number(record, told.force, file, "--force")
+        old = channels[k]
+        unit = told.force_unit or (old.unit if old.quantity in ("force", "voltage") else "")
+        if not told.force_unit and not unit and old.quantity in ("force", "voltage"):
+            unit = old.si_unit
+        force = force_meaning(told, unit, f"{told.force} of {file}")
+        channels[k] = old._replace(
+            quantity="voltage" if force.is_voltage else "force",
+            unit=force.unit,
+            calibration=force.factor,
+        )
+        told = told._replace(force_unit=force.unit)
+    filled = []
+    for number, one in enumerate(told.responses):
+        k = _number(record, one.channel, file, "--response")
+        old = channels[k]
+        quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
+        channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
+        sensor = one.sensor or ("sensor 1" if len(told.responses) == 1 else one.channel)
+        if not one.sensor:
+            assumed[f"response {number + 1}.sensor"] = "nobody names the sensor: --sensor does"
+        filled.append(ResponseMap(one.channel, quantity, unit, sensor))
+    if told.drive:
+        k = _number(record, told.drive, file, "--drive")
+        if channels[k].quantity == "unknown":
+            channels[k] = channels[k]._replace(quantity="voltage", unit="V", calibration=1.0)
+    return (
+        dataclasses.replace(record, channels=tuple(channels)),
+        told._replace(responses=tuple(filled)),
+    )
+
+
+def import_record(
+    record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
+) -> tuple[SteadyStates | None, ImportMap, list[str]]:
+    """Steady states of a record of steps or of sweeps, or None for one that stays a record.
+
+    Raises `ValueError` with a question that names the option for what cannot be told.
+    """
+    if told.record in ("decay", "broadband"):
+        return None, told, []
+    if not told.force:
+        raise ValueError(
+            f"which channel of {file} is the force? --force CHANNEL names it, of "
+            f"{', '.join(record.channel_names)}; --record decay says that there is none."
+        )
+    if told.level and told.level not in (*_DIRECT, "auto", "file"):
+        raise ValueError(
+            f"--level must be one of force, drive, runs or file for time records, but is "
+            f"{told.level!r}."
+        )
+    responses = [one.channel for one in told.responses]
+    level = _DIRECT.get(told.level, "auto")
+    sensors = [one.sensor for one in told.responses]
+    drive = told.drive or None
+    failed = []
+    for kind in (told.record,) if told.record else ("steps", "sweep"):
+        try:
+            if kind == "steps":
+                found = stepped_sine_states(
+                    record,
+                    told.force,
+                    responses,
+                    level=level,
+                    sensors=sensors,
+                    drive=drive,
+                )
+                states, notes = found.states, list(found.summary()[1:])
+            else:
+                swept = sweep_states(
+                    record,
+                    told.force,
+                    responses,
+                    level=level,
+                    sensors=sensors,
+                    drive=drive,
+                )
+                states, notes = swept.states, list(swept.summary()[1:])
+        except ValueError as error:
+            failed.append(f"{kind}: {error}")
+            continue
+        if not told.record:
+            assumed["record"] = f"{kind} were recognised"
+        if not told.level:
+            assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} found" + "".join(
+                f", {note}" for note in states.notes if note.startswith("levels")
+            )
+        return states, told._replace(record=kind, level=told.level or level), notes
+    if told.record:
+        raise ValueError(f"{file} does not read as {failed[0]}")
+    raise ValueError(
+        f"what is the record of {file}: --record steps, sweep, decay or broadband? It was read "
+        f"neither as {' Nor as '.join(failed)}"
+    )
+
+
+def record_columns(record: TimeRecording, told: ImportMap) -> dict[str, Channel]:
+    """Names of the columns of a record's table, with the channels that they hold, in SI."""
+    columns: dict[str, Channel] = {}
+    by_name = {one.name: one for one in record.channels}
+    if told.force:
+        force = by_name[told.force]
+        columns["drive_v" if force.quantity == "voltage" else "force_n"] = force
+    endings = {
+        "velocity": "velocity_m_s",
+        "acceleration": "acceleration_m_s2",
+        "displacement": "displacement_m",
+    }
+    for one in told.responses:
+        lead = "" if len(told.responses) == 1 else f"{one.sensor}."
+        columns[f"{lead}{endings[by_name[one.channel].quantity]}"] = by_name[one.channel]
+    return columns
+
+
+def _number(record: TimeRecording, name: str, file: str, option: str) -> int:
+    try:
+        return channel_number(record.channels, name)
+    except ValueError as error:
+        raise ValueError(f"{option}: in {file} {error}") from error

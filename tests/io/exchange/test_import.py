@@ -1,0 +1,284 @@
+"""`snrmjax import`: raw files of laboratories to the numbers that they were made of."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from typer.testing import CliRunner
+
+from snrmjax.cli import app
+from snrmjax.io import read_steady_states
+from snrmjax.io.exchange.exports import write_netcdf
+from snrmjax.io.exchange.import_map import read_import_map
+from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.measure import Channel, time_recording
+from snrmjax.measure.recordings.frequency_responses import frequency_responses
+
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+HERTZ = 2 * np.pi
+F = np.array([79.0, 79.5, 80.0, 79.0, 79.5, 80.0])  # Hz
+LEVEL = np.array([1, 1, 1, 2, 2, 2])
+FORCE = np.array([0.1, 0.11, 0.12, 0.4, 0.41, 0.42])  # N
+VELOCITY = np.array([0.1 + 0.2j, 0.3, 0.2 - 0.2j, 0.4 + 0.8j, 1.2, 0.8 - 0.8j])  # m/s
+
+
+def run(*words):
+    """The command's exit code, what it says, and the error of one sentence if any."""
+    result = CliRunner().invoke(app, ["import", *map(str, words)])
+    if isinstance(result.exception, ValueError):
+        return 2, str(result.exception)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+def imported(tmp_path, *words):
+    code, said = run(*words, "--out", tmp_path / "out")
+    assert code == 0, said
+    return read_steady_states(tmp_path / "out" / "measured.csv")
+
+
+def same(states, rtol):
+    """The states are those of the table above: `rtol` is the rounding of the unit conversions."""
+    np.testing.assert_array_equal(states.level, LEVEL)
+    np.testing.assert_allclose(states.frequency, F * HERTZ, rtol=1e-15)
+    np.testing.assert_allclose(states.force, FORCE, rtol=rtol)
+    np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], VELOCITY, rtol=rtol)
+
+
+def amplitude_and_phase():
+    """An acceleration in g rms, with the phase that lags, as some programs have it."""
+    acceleration = VELOCITY * 1j * HERTZ * F / 9.80665 / np.sqrt(2)
+    return np.abs(acceleration), -np.degrees(np.angle(acceleration))
+
+
+@pytest.fixture
+def mat(tmp_path):
+    size, phase = amplitude_and_phase()
+    kinds = [(key, object) for key in ("frequency", "force", "amplitude", "phase")]
+    rows = [
+        (F[at], FORCE[at] / np.sqrt(2), size[at], phase[at]) for at in (slice(0, 3), slice(3, 6))
+    ]
+    path = tmp_path / "test.mat"
+    scipy.io.savemat(path, {"data": np.array(rows, dtype=kinds)})
+    return path
+
+
+MAT = (
+    *("--force", "force", "--force-unit", "N", "--response", "amplitude:acceleration"),
+    *("--unit", "g", "--phase-unit", "deg", "--phase-sign", "lag", "--amplitude", "rms"),
+)
+
+
+def test_a_struct_of_matlab_with_one_entry_a_level(tmp_path, mat):
+    same(imported(tmp_path, mat, *MAT, "--sensor", "tip"), 1e-14)
+    assert imported(tmp_path, mat, *MAT, "--sensor", "tip").sensors == ("tip",)
+
+
+def test_the_map_takes_the_next_test(tmp_path, mat):
+    imported(tmp_path, mat, *MAT)
+    first = (tmp_path / "out" / "measured.csv").read_bytes()
+    told = tmp_path / "out" / "map.toml"
+    text = told.read_text()
+    assert 'level = "entry"  # assumed: the column\'s name says so' in text
+    assert read_import_map(told).level == "entry"
+    code, said = run(mat, "--map", told, "--out", tmp_path / "next")
+    assert code == 0, said
+    assert (tmp_path / "next" / "measured.csv").read_bytes() == first
+    assert read_import_map(tmp_path / "next" / "map.toml") == read_import_map(told)
+    code, said = run(mat, "--map", told, "--unit", "m/s^2", "--out", tmp_path / "other")
+    assert code == 0, said
+    other = read_steady_states(tmp_path / "other" / "measured.csv")
+    np.testing.assert_allclose(np.asarray(other.velocity)[:, 0] * 9.80665, VELOCITY, rtol=1e-14)
+
+
+def test_a_lock_in_of_another_country(tmp_path):
+    path = tmp_path / "lockin.csv"
+    rows = zip(F, FORCE * 1e3, VELOCITY.real * 1e3, VELOCITY.imag * 1e3, strict=True)
+    lines = [";".join(f"{value!r}".replace(".", ",") for value in map(float, row)) for row in rows]
+    path.write_text("\n".join(["Frequenz;Kraft;X;Y", "Hz;mN;mm/s;mm/s", *lines]), "cp1252")
+    same(imported(tmp_path, path, "--force", "Kraft", "--response", "X:velocity"), 1e-14)
+
+
+def test_responses_over_the_force_and_a_force_of_its_own_phase(tmp_path):
+    path = tmp_path / "over.csv"
+    ratio = VELOCITY / FORCE * np.exp(1j * 0.0)
+    rows = np.column_stack([F, FORCE, ratio.real, ratio.imag])
+    lines = "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+    path.write_text(f"f (Hz),F (N),re (m/s/N),im (m/s/N)\n{lines}\n")
+    words = ("--force", "F", "--response", "re", "--over-force")
+    same(imported(tmp_path, path, *words, "--imaginary", "im"), 1e-14)
+    turned = np.exp(1j * np.radians(100 + 3 * np.arange(6)))
+    rows = np.column_stack(
+        [
+            *(F, FORCE, np.degrees(np.angle(turned)), np.abs(VELOCITY)),
+            np.degrees(np.angle(VELOCITY * turned)),
+        ]
+    )
+    lines = "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+    path.write_text(f"f (Hz),F (N),fp (deg),v (m/s),vp (deg)\n{lines}\n")
+    words = ("--force", "F", "--force-phase", "fp", "--response", "v", "--phase", "vp")
+    states = imported(tmp_path, path, *words)
+    np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], VELOCITY, rtol=0, atol=2e-15)
+
+
+def sets():
+    """Spectra of force and acceleration over a generator, one set a level."""
+    found = []
+    for at in (slice(0, 3), slice(3, 6)):
+        turn = np.exp(0.7j)  # of the amplifier
+        values = np.stack([FORCE[at] * turn, VELOCITY[at] * 1j * HERTZ * F[at] * turn])
+        found.append(
+            frequency_responses(
+                HERTZ * F[at],
+                values[:, None, :],
+                [
+                    Channel("CH1", "force", "N", 1.0, "1", "+z"),
+                    Channel("CH2", "acceleration", "m/s^2", 1.0, "2", "+z"),
+                ],
+                [Channel("out", "voltage", "V", 1.0, "3", "+z")],
+            )
+        )
+    return found
+
+
+def test_spectra_of_uff(tmp_path):
+    path = tmp_path / "test.uff"
+    write_uff(path, responses=sets(), levels=[1.0, 2.0])
+    code, said = run(path)
+    assert code == 0
+    assert "z axis 2" in said
+    from snrmjax.io.laboratory import read_laboratory_file
+
+    names = [c.name for c in read_laboratory_file(path).responses[0].responses]
+    # 1/(iΩ) and the division by the force's phase: three roundings.
+    same(imported(tmp_path, path, "--force", names[0], "--response", names[1]), 1e-14)
+
+
+def test_responses_of_uff_with_the_force_on_the_z_axis(tmp_path):
+    path = tmp_path / "frf.uff"
+    one = frequency_responses(
+        HERTZ * F[:3],
+        (VELOCITY[:3] / 0.1)[None, None],
+        [Channel("v", "velocity")],
+        [Channel("f", "force")],
+    )
+    write_uff(path, responses=[one, one], levels=[0.1, 0.2])
+    words = ("--response", "1", "--force-amplitude")
+    from snrmjax.io.laboratory import read_laboratory_file
+
+    name = read_laboratory_file(path).responses[0].responses[0].name
+    states = imported(tmp_path, path, "--response", name, "--force-amplitude", "z")
+    np.testing.assert_array_equal(states.force, np.repeat([0.1, 0.2], 3))
+    expected = np.concatenate([VELOCITY[:3], 2 * VELOCITY[:3]])
+    np.testing.assert_allclose(np.asarray(states.velocity)[:, 0], expected, rtol=1e-15)
+    del words
+
+
+def stepped(n_steps=4):
+    """A record of steps, in volts of a load cell and of an accelerometer of 100 mV/g."""
+    rate, dwell = 1000, 2.0
+    t = np.arange(int(n_steps * dwell * rate)) / rate
+    step = (t / dwell).astype(int)
+    hertz = 20.0 + step
+    turn = np.cumsum(HERTZ * hertz / rate)
+    force = 2 * np.cos(turn)
+    acceleration = 0.1 * HERTZ * hertz * np.cos(turn + 0.2 + np.pi / 2)  # velocity of 0.1 m/s
+    return time_recording(
+        np.stack([force / 50, acceleration / 98.0665]),
+        [Channel("CH1", "voltage", "V"), Channel("CH2", "voltage", "V")],
+        rate,
+    )
+
+
+def test_a_record_of_steps_in_volts(tmp_path):
+    path = tmp_path / "steps.nc"
+    write_netcdf(path, recordings=[stepped()])
+    words = ("--force", "CH1", "--force-unit", "50 N", "--response", "CH2:acceleration")
+    states = imported(tmp_path, path, *words, "--unit", "10 g", "--level", "force")
+    np.testing.assert_allclose(states.frequency, HERTZ * np.arange(20, 24), rtol=1e-5)
+    np.testing.assert_allclose(states.force, 2.0, rtol=1e-4)
+    velocity = np.asarray(states.velocity)[:, 0]
+    np.testing.assert_allclose(velocity, 0.1 * np.exp(0.2j), rtol=1e-3)
+    assert read_import_map(tmp_path / "out" / "map.toml").record == "steps"
+
+
+def test_a_decay_becomes_a_record(tmp_path):
+    path = tmp_path / "decay.mat"
+    t = np.arange(500) / 1000
+    decay = np.exp(-3 * t) * np.cos(HERTZ * 40 * t)
+    scipy.io.savemat(path, {"fs": 1000.0, "laser": decay})
+    words = ("--response", "laser:velocity", "--unit", "mm/s", "--record", "decay")
+    code, said = run(path, *words, "--out", tmp_path / "out")
+    assert code == 0, said
+    lines = (tmp_path / "out" / "record.csv").read_text().splitlines()
+    assert lines[0] == "time_s,velocity_m_s"
+    values = np.array([line.split(",") for line in lines[1:]], dtype=float)
+    np.testing.assert_array_equal(values[:, 0], t)
+    np.testing.assert_array_equal(values[:, 1], decay * 1e-3)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are not beside the clone")
+@pytest.mark.parametrize("name", ["brake_reuss_beam/force_controlled.csv"])
+def test_measured_tables_by_uff_and_by_matlab(tmp_path, name):
+    states = read_steady_states(DATA / name)
+    level, omega = np.asarray(states.level), np.asarray(states.frequency)
+    velocity, force = np.asarray(states.velocity)[:, 0], np.asarray(states.force)
+    curves = []
+    for k in np.unique(level):
+        at = np.flatnonzero(level == k)
+        at = at[np.argsort(omega[at], kind="stable")]
+        at = at[np.concatenate([[True], np.diff(omega[at]) > 0])]
+        curves.append((at, k))
+    kept = np.concatenate([at for at, _ in curves])
+    responses = [
+        frequency_responses(
+            omega[at],
+            np.stack([force[at] + 0j, velocity[at] * 1j * omega[at]])[:, None],
+            [
+                Channel("F", "force", "N", 1.0, "1", "+z"),
+                Channel("A", "acceleration", "m/s^2", 1.0, "2", "+z"),
+            ],
+            [Channel("out", "voltage", "V", 1.0, "3", "+z")],
+        )
+        for at, _ in curves
+    ]
+    write_uff(tmp_path / "raw.uff", responses=responses, levels=[float(k) for _, k in curves])
+    from snrmjax.io.laboratory import read_laboratory_file
+
+    names = [c.name for c in read_laboratory_file(tmp_path / "raw.uff").responses[0].responses]
+    back = imported(
+        tmp_path, tmp_path / "raw.uff", "--force", names[0], "--response", names[1], "--level", "z"
+    )
+    entries = [
+        (
+            omega[at] / HERTZ,
+            force[at],
+            np.abs(velocity[at]) * omega[at] / 9.80665,
+            np.degrees(np.angle(velocity[at])) + 90,
+        )
+        for at, _ in curves
+    ]
+    kinds = [(key, object) for key in ("freq", "force", "acc", "phase")]
+    scipy.io.savemat(tmp_path / "raw.mat", {"d": np.array(entries, dtype=kinds)})
+    also = imported(
+        tmp_path,
+        tmp_path / "raw.mat",
+        "--force",
+        "force",
+        "--force-unit",
+        "N",
+        "--response",
+        "acc:acceleration:g",
+        "--phase-unit",
+        "deg",
+    )
+    for found in (back, also):
+        np.testing.assert_array_equal(found.level, level[kept])
+        np.testing.assert_array_equal(found.force, force[kept])
+        np.testing.assert_allclose(found.frequency, omega[kept], rtol=1e-15)
+        # Magnitude and degrees and back: a few roundings of the number's size.
+        np.testing.assert_allclose(
+            np.asarray(found.velocity)[:, 0], velocity[kept], rtol=2e-15 * 8, atol=0
+        )
