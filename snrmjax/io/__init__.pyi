@@ -1,6 +1,7 @@
 from . import calculix
 from .joint_results import read_joint_fit, write_fitted_backbone, write_joint_fit, write_next
 from .models import read_model, write_model
+from .reduction.beam_models import BeamModels, read_beam_models
 from .reduction.beam_source import read_beam
 from .reduction.load_tables import read_load_tables
 from .reduction.source import write_load_cases
@@ -14,8 +15,10 @@ from .results import (
 from .tables import read_steady_states, write_steady_states, write_table
 
 __all__ = [
+    "BeamModels",
     "calculix",
     "read_beam",
+    "read_beam_models",
     "read_joint_fit",
     "read_load_tables",
     "read_model",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from snrmjax.study.chunks import StudyFolder, chunk_identity
-from snrmjax.study.computations.base import MEMBER, blank_rows, joined
+from snrmjax.study.computations.base import joined, with_refused
 from snrmjax.study.study import PlannedStudy
 from snrmjax.study.tasks import LOST, Receipt, compute_chunk, computed_rows, stored
 from snrmjax.study.workers import AbstractWorkers, WorkerDied
@@ -80,9 +80,7 @@ def _rescued(job: Job, workers: AbstractWorkers, numbers: range) -> dict[str, np
         middle = len(numbers) // 2
         halves = numbers[:middle], numbers[middle:]
         return joined([_rescued(job, workers, half) for half in halves])
-    computation = job.planned.study.computation
-    sizes = {name: len(axis.values) for name, axis in computation.axes().items()}
-    return blank_rows(computation.outputs(), {MEMBER: 1, **sizes}, LOST)
+    return with_refused(job.planned.study.computation, None, {0: LOST})
 
 
 class Progress(NamedTuple):

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from snrmjax.io.files import shown
+from snrmjax.io.reduction.beam_models import BeamModels
 from snrmjax.study.study import Study
 
 _LONGEST = 64  # numbers of an array that are written out; longer ones are known by their hash
@@ -33,10 +34,12 @@ class Difference(NamedTuple):
 
 def description(study: Study) -> dict[str, Any]:
     """The study, its model and the versions behind it as plain text and numbers."""
+    # What is computed from a beam has other last digits on other machines: its file is the model.
+    made = ("members_a_chunk", *(("model",) if isinstance(study.model_of, BeamModels) else ()))
     parts = {
         field.name: _plain(getattr(study, field.name))
         for field in dataclasses.fields(study)
-        if field.name != "members_a_chunk"
+        if field.name not in made
     }
     return {
         "study": {**parts, "members_a_chunk": study.chunk_size},
@@ -52,7 +55,8 @@ def fingerprint(described: Mapping[str, Any]) -> str:
 
 def model_hash(study: Study) -> str:
     """A hash of the base model alone."""
-    return fingerprint({"model": _plain(study.model)})
+    beam = isinstance(study.model_of, BeamModels)
+    return fingerprint({"model": _plain(study.model_of if beam else study.model)})
 
 
 def differences(here: Any, there: Any, place: str = "") -> list[Difference]:
@@ -72,6 +76,8 @@ def differences(here: Any, there: Any, place: str = "") -> list[Difference]:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, BeamModels):
+        return {"kind": "beam", **_plain(value.stated)}
     if isinstance(value, eqx.Module):
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": getattr(value, "kind", type(value).__name__), **fields}

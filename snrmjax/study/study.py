@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from snrmjax.io.reduction.beam_models import BeamModels
+from snrmjax.io.reduction.beam_parameters import RADIUS, RISE, beam_rules, check_beam_name
 from snrmjax.model.parameters import (
     parameter_names,
     parameter_rules,
@@ -20,7 +22,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import taken
 from snrmjax.numerics.rules import POSITIVE, Rule
 from snrmjax.simulate.balance.labelled import HERTZ
-from snrmjax.study.computations.base import FORCE, AbstractComputation, Members
+from snrmjax.study.computations.base import FORCE, AbstractComputation, Members, with_refused
 from snrmjax.study.sampling import Sampling, drawn_members, member_seed, number_of_members
 from snrmjax.study.variations import AbstractVariation
 
@@ -34,7 +36,9 @@ class Study(eqx.Module):
     `variations` name numbers of the model as `parameter_names` does ("mode_1.damping_ratio";
     natural frequencies in rad/s, or as "mode_1.frequency_hz" in Hz), and `force_n`. With
     `model_of`, a function of the varied values by name, they may name anything: it makes the
-    model of a member. `members_a_chunk` is how many are computed and stored together.
+    model of a member, and where it raises `ValueError` the member has a status that says so.
+    `BeamModels` make it from the numbers of a beam file ("section.thickness_m"), beside those of
+    the model. `members_a_chunk` is how many are computed and stored together.
     """
 
     name: str = eqx.field(static=True)
@@ -78,12 +82,17 @@ class PlannedStudy(NamedTuple):
         size = self.study.chunk_size
         return range(chunk * size, min((chunk + 1) * size, len(self.table)))
 
-    def members(self, numbers: Sequence[int]) -> Members:
-        """Some members with their models, forces and seeds."""
+    def rows(self, numbers: Sequence[int]) -> dict[str, np.ndarray]:
+        """The outputs of some members; one without a model has its status and nothing else."""
         study, rows = self.study, self.table[list(numbers)]
-        seeds = [member_seed(study.seed, k) for k in numbers]
-        forces = rows[:, [study.names.index(FORCE)]] if FORCE in study.names else None
-        return Members(models_of(study, rows), forces, seeds)
+        models = models_of(study, rows)
+        there = [k for k, model in enumerate(models) if isinstance(model, Structure)]
+        missing = {k: model for k, model in enumerate(models) if isinstance(model, str)}
+        forces = rows[there][:, [study.names.index(FORCE)]] if FORCE in study.names else None
+        seeds = [member_seed(study.seed, numbers[k]) for k in there]
+        members = Members([models[k] for k in there], forces, seeds)  # type: ignore[misc]
+        found = study.computation.rows(members) if there else None
+        return found if found and not missing else with_refused(study.computation, found, missing)
 
 
 def planned(study: Study) -> PlannedStudy:
@@ -104,17 +113,29 @@ def planned(study: Study) -> PlannedStudy:
     return PlannedStudy(study, table)
 
 
-def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure]:
-    """The models of members with these values of the varied quantities."""
+def models_of(study: Study, rows: Float[np.ndarray, "member name"]) -> list[Structure | str]:
+    """The models of members with these values of the varied quantities, or why there is none."""
     named = [k for k, name in enumerate(study.names) if name != FORCE]
     if study.model_of is not None:
         each = [dict(zip(study.names, row, strict=True)) for row in rows.tolist()]
-        return [study.model_of(values) for values in each]
+        return [_made(study.model_of, values) for values in each]
     if not named:
         return [study.model] * len(rows)
     own, units = zip(*(_own_name(study.names[k]) for k in named), strict=True)
     together = _varied(study.model, own, rows[:, named] * np.array(units))
     return [taken(together, k) for k in range(len(rows))]
+
+
+def _made(
+    model_of: Callable[[dict[str, float]], Structure], values: dict[str, float]
+) -> Structure | str:
+    if isinstance(model_of, BeamModels):
+        own = {name: _own_name(name) for name in values}
+        values = {own[name][0]: value * own[name][1] for name, value in values.items()}
+    try:
+        return model_of(values)
+    except ValueError as error:
+        return f"refused: {str(error).splitlines()[0]}"
 
 
 @eqx.filter_jit
@@ -149,6 +170,13 @@ def _check_names(study: Study) -> None:
                     f"the model does not have the parameter {name!r}; similar ones are "
                     f"{', '.join(near)}."
                 )
+    if isinstance(study.model_of, BeamModels):
+        beam, further = study.model_of, (*parameter_names(study.model), FORCE)
+        for name in of_model:
+            check_beam_name(beam.stated, _own_name(name)[0], beam.file, further)
+        if {RADIUS, RISE} <= set(of_model):
+            raise ValueError(f"{RADIUS} and {RISE} cannot both vary: one follows from the other.")
+    if _of_model(study):
         own = [_own_name(name)[0] for name in of_model]
         for name in own:
             if own.count(name) > 1:
@@ -179,13 +207,20 @@ def _check_values(study: Study, table: Float[np.ndarray, "member name"]) -> None
 def _rules(study: Study, name: str) -> tuple[Rule, ...]:
     if name == FORCE:
         return (POSITIVE,)
-    return () if study.model_of is not None else parameter_rules(study.model, _own_name(name)[0])
+    if isinstance(study.model_of, BeamModels) and name in study.model_of.parameters:
+        return beam_rules(study.model_of.stated, name, study.names)
+    return parameter_rules(study.model, _own_name(name)[0]) if _of_model(study) else ()
+
+
+def _of_model(study: Study) -> bool:
+    """Whether names that are no beam's are the model's."""
+    return study.model_of is None or isinstance(study.model_of, BeamModels)
 
 
 def _check_unit(study: Study, name: str, values: np.ndarray) -> None:
     """Refuse natural frequencies in Hz where rad/s are expected, and the other way round."""
     own, unit = _own_name(name)
-    if study.model_of is not None or not own.endswith(".natural_frequency"):
+    if not _of_model(study) or not own.endswith(".natural_frequency"):
         return
     given = float(np.asarray(parameter_value(study.model, own))) / unit
     middle = float(np.median(values))

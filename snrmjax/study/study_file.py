@@ -7,6 +7,8 @@ import numpy as np
 
 from snrmjax.io.files import FilePath, file_name, read_text
 from snrmjax.io.models import read_model
+from snrmjax.io.reduction.beam_file import is_beam_file
+from snrmjax.io.reduction.beam_models import read_beam_models
 from snrmjax.io.tables import read_steady_states
 from snrmjax.io.toml_table import TomlTable, parsed_toml
 from snrmjax.io.units import DEGREE, HERTZ
@@ -48,7 +50,8 @@ _EVERY = ("vary", "sample", "seed", "name", "members_a_chunk")
 def read_study(path: FilePath) -> Study:
     """Read a study from a TOML: its model, what varies and what is computed.
 
-    The model's path (and that of data) is relative to the study's folder.
+    The model's path (and that of data) is relative to the study's folder. It may be that of a beam
+    file: every member is then condensed from the finite elements of its own beam.
     Returns the study. Raises `ValueError` that names file, table, key, value and what was expected;
     the members are drawn and checked too.
     """
@@ -61,7 +64,9 @@ def read_study(path: FilePath) -> Study:
     # A key that another computation has is a mistake worth its own words.
     top.check_keys(("model", "compute", *needed), (*possible, *_EVERY))
     folder = Path(path).parent
-    model = read_model(folder / top.text("model"))
+    path_of_model = folder / top.text("model")
+    beam = read_beam_models(path_of_model) if is_beam_file(path_of_model) else None
+    model = read_model(path_of_model) if beam is None else beam({})
     variations = tuple(_variation(one) for one in top.tables("vary", file))
     study = Study(
         name=top.text("name", Path(path).stem),
@@ -71,6 +76,7 @@ def read_study(path: FilePath) -> Study:
         sampling=_sampling(top, file, variations),
         seed=top.whole("seed", 0, 0),
         members_a_chunk=top.whole("members_a_chunk", 0, 0) or None,
+        model_of=beam,
     )
     try:
         planned(study)

@@ -57,7 +57,7 @@ def computed_rows(planned: PlannedStudy, numbers: range) -> dict[str, np.ndarray
     """The rows of some members."""
     os.environ.update({k: v for k, v in ENVIRONMENT.items() if k not in os.environ})
     with threadpool_limits(limits=1, user_api="blas"):
-        return planned.study.computation.rows(planned.members(numbers))
+        return planned.rows(numbers)
 
 
 def compute_chunk(

@@ -74,8 +74,8 @@ def test_noise_belongs_to_the_member(linear_model):
     sampling = sj.study.Sampling("random", 3)
     study = sj.study.Study("noise", linear_model, computation, (), sampling, seed=2)
     plan = sj.study.planned(study)
-    together = computation.rows(plan.members(range(3)))["damping_ratio"]
-    alone = computation.rows(plan.members([2]))["damping_ratio"]
+    together = plan.rows(range(3))["damping_ratio"]
+    alone = plan.rows([2])["damping_ratio"]
     np.testing.assert_array_equal(together[2], alone[0])
     assert len({float(row[0]) for row in together}) == 3
 

@@ -16,6 +16,7 @@ from snrmjax.io.files import FilePath, file_name
 from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
 from snrmjax.io.reduction.beam_parameters import rise_of
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
+from snrmjax.model.modes import have_values
 
 _BLOCK = 8  # load cases at once
 _NOWHERE = 1e-9  # of the largest shape: a sensor that no mode moves
@@ -34,24 +35,24 @@ def read_beam(path: FilePath) -> ReductionSource:
 def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
     """Prepare finite elements, modes and load cases of a beam; messages name its `file`.
 
-    Beams that differ in numbers alone share their compiled programs. Raises `ValueError` as
-    `read_beam` does.
+    Beams that differ in numbers alone share their compiled programs. Numbers that are traced
+    (within `jax.jit` and derivatives) are taken as they are. Raises `ValueError` as `read_beam`
+    does.
     """
     beam = beam_of(stated)
     try:
         basis = beam_modes(beam, stated.modes)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
-    seen = jax.tree.map(np.asarray, seen_of(beam, basis, stated.sensors, stated.force_at))
-    largest = float(np.max(seen.largest))
-    for name, at in stated.sensors:
-        if not np.max(np.abs(seen.sensors[name])) > _NOWHERE * largest:
-            raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
-    if not np.max(np.abs(seen.participation)) > _NOWHERE * largest:
-        place = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
-        raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
+    seen = seen_of(beam, basis, stated.sensors, stated.force_at)
+    known = have_values((basis, seen))
+    if known:
+        seen = jax.tree.map(np.asarray, seen)
+        _require_moving(stated, seen, file)
 
     def solve(force: Float[np.ndarray, "case mode"]) -> StaticCases:
+        if not known:
+            return static_cases(beam, basis, force)
         return _in_blocks(lambda rows: static_cases(beam, basis, rows), force)
 
     damping = stated.damping_ratio
@@ -67,11 +68,19 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         load_scale=stated.load_scale,
         degree=stated.degree,
         # Rows of the shapes are x, y and rotation of each node.
-        lines=ShapeLines(
-            seen.position, np.asarray(basis.shapes)[1::3], "Position along the chord (m)"
-        ),
+        lines=ShapeLines(seen.position, basis.shapes[1::3], "Position along the chord (m)"),
         notes=() if damping is not None else (note,),
     )
+
+
+def _require_moving(stated: BeamDescription, seen: "SeenModes", file: str) -> None:
+    largest = float(np.max(seen.largest))
+    for name, at in stated.sensors:
+        if not np.max(np.abs(seen.sensors[name])) > _NOWHERE * largest:
+            raise ValueError(f"[sensors] of {file} has `{name}` at {at:g}, where no mode moves.")
+    if not np.max(np.abs(seen.participation)) > _NOWHERE * largest:
+        place = "uniform" if stated.force_at is None else f"at {stated.force_at:g}"
+        raise ValueError(f"[force] of {file} is {place}, where no mode moves.")
 
 
 class SeenModes(NamedTuple):

@@ -2,10 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from snrmjax.condense.condensation import Condensation
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
@@ -24,8 +26,8 @@ _TINY = 1e-12  # of the largest participation: what a model file needs instead o
 class ShapeLines(NamedTuple):
     """Mode shapes along a structure, to be drawn."""
 
-    position: Float[np.ndarray, " point"]  # m along the structure
-    shape: Float[np.ndarray, "point mode"]  # transverse, kg^-1/2
+    position: Float[np.ndarray | Array, " point"]  # m along the structure
+    shape: Float[np.ndarray | Array, "point mode"]  # transverse, kg^-1/2
     axis: str = "Position along the structure (m)"
 
 
@@ -38,8 +40,8 @@ class ReductionSource(NamedTuple):
     name: str
     basis: ReductionBasis
     damping_ratio: Float[np.ndarray, " mode"]
-    sensors: Mapping[str, Float[np.ndarray, " mode"]]  # mode shapes there, kg^-1/2
-    participation: Float[np.ndarray, " mode"]  # Φᵀb per newton, kg^-1/2
+    sensors: Mapping[str, Float[np.ndarray | Array, " mode"]]  # mode shapes there, kg^-1/2
+    participation: Float[np.ndarray | Array, " mode"]  # Φᵀb per newton, kg^-1/2
     cases: StaticCases | None = None
     solve: StaticSolver | None = None
     thickness: float | None = None  # m, the unit of `load_scale`
@@ -51,31 +53,38 @@ class ReductionSource(NamedTuple):
 
     def structure(self, found: Condensation) -> Structure:
         """The reduced model as a structure that a model file can hold."""
-        size = np.abs(self.participation)
+        traced = isinstance(self.participation, jax.core.Tracer)
+        xp: Any = jnp if traced else np
+        size = xp.abs(self.participation)
         # A file has no zeros here; a mode that the force does not drive gets next to nothing.
-        driven = np.where(size > 0, self.participation, _TINY * (size.max() or 1.0))
+        least = _TINY * xp.where(size.max() > 0, size.max(), 1.0)
+        driven = xp.where(size > 0, self.participation, least)
         return found.structure(
             self.damping_ratio, sensors=self.sensors, participation=driven, name=self.name
         )
 
 
-def run_load_cases(source: ReductionSource) -> tuple[Float[np.ndarray, " mode"], StaticCases]:
-    """Run the load cases of the stated load scale, or of the default one.
+def run_load_cases(
+    source: ReductionSource, displacement: Float[np.ndarray | Array, " mode"] | None = None
+) -> tuple[Any, StaticCases]:
+    """Run the load cases of a displacement, of the stated load scale, or of the default one.
 
-    Returns the displacements (m) that the loads of single modes would cause in the linear
-    structure, and the cases. Raises `ValueError` where nothing can run them and as
+    Arguments: `displacement` in m, that the loads of single modes would cause in the linear
+    structure. Returns it, and the cases. Raises `ValueError` where nothing can run them and as
     `displacement_for_ratio` does.
     """
     if source.solve is None:
         raise ValueError(f"{source.name} has neither load cases nor a way to run them.")
     n = len(source.basis.numbers)
-    if source.load_scale is not None:
+    if displacement is None and source.load_scale is not None:
         displacement = np.full(n, source.load_scale * (source.thickness or 1.0))
-    else:
+    elif displacement is None:
         start = 0.1 * (source.thickness or 1e-3)
         displacement = displacement_for_ratio(source.basis, source.solve, start=start)
     loads = modal_loads(source.basis, displacement, degree=source.degree)
-    cases = source.solve(np.asarray(loads.force))
+    traced = isinstance(loads.force, jax.core.Tracer)
+    force: Any = loads.force if traced else np.asarray(loads.force)
+    cases = source.solve(force)
     return displacement, dataclasses.replace(cases, names=loads.names)
 
 

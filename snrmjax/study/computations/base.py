@@ -1,7 +1,7 @@
 """What is computed for every member of a study, and what comes out of it."""
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -108,6 +108,28 @@ def blank_rows(outputs: dict[str, Output], sizes: dict[str, int], status: str) -
         else:
             found[name] = np.zeros(shape, dtype=one.kind)
     return found
+
+
+def with_refused(
+    computation: AbstractComputation,
+    rows: dict[str, np.ndarray] | None,
+    refused: Mapping[int, str],
+) -> dict[str, np.ndarray]:
+    """Rows of members, with those in between that have nothing but a status.
+
+    Arguments: `rows` of the others, in order; None: there are none. `refused` are the statuses of
+    the rest by their place among all.
+    """
+    outputs = computation.outputs()
+    sizes = {name: len(axis.values) for name, axis in computation.axes().items()}
+    blanks = [blank_rows(outputs, {MEMBER: 1, **sizes}, status) for status in refused.values()]
+    whole = joined([*([] if rows is None else [rows]), *blanks])
+    n = len(whole["status"])
+    places = [*(k for k in range(n) if k not in refused), *refused]
+    order = np.argsort(places)
+    # What has any number of rows a member is in order already: these members have none.
+    of_members = {name for name, one in outputs.items() if one.dimensions[0] == MEMBER}
+    return {name: v[order] if name in of_members else v for name, v in whole.items()}
 
 
 def joined(parts: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -1,0 +1,97 @@
+"""The reduced models of one beam by its numbers: for studies, calibrations and derivatives."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.condense.condensation import condense
+from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
+from snrmjax.io.reduction.beam_parameters import (
+    beam_parameters,
+    check_beam_name,
+    require_beam,
+    with_beam_parameters,
+)
+from snrmjax.io.reduction.beam_source import beam_source
+from snrmjax.io.reduction.source import run_load_cases
+from snrmjax.model.parameters import parameter_names, with_parameters
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import compiled
+
+_FORCE = "force_n"  # of a study: it is no number of the beam
+
+
+class BeamModels(eqx.Module):
+    """Reduced models of a beam by its numbers; make it with `read_beam_models`.
+
+    Call it with values by name, as `parameters` has them, to get the model of that beam. The load
+    cases keep their size in thicknesses (`displacement`, one number a mode), so that the model is
+    a smooth function of the numbers.
+    """
+
+    stated: BeamDescription = eqx.field(static=True)
+    file: str = eqx.field(static=True)
+    displacement: tuple[float, ...] = eqx.field(static=True)  # thicknesses
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The numbers that may vary, by name, with the values that the file states (SI units)."""
+        return beam_parameters(self.stated)
+
+    def __call__(self, values: Mapping[str, float | Float[Array, ""]]) -> Structure:
+        """The reduced model of the beam with other numbers.
+
+        Geometry → linear modes → static load cases → one potential. The numbers of the model are
+        differentiable functions of `values`, in forward and in reverse mode and twice.
+
+        Arguments: `values` by the names of `parameters`; what is not named is as in the file. Names
+        of the model (`snrmjax.model.parameter_names`, such as "mode_1.damping_ratio") change the
+        reduced model itself; "force_n" is passed over, since it belongs to a test.
+        Returns the model; within `jax.jit` and derivatives, where nothing can be checked, its
+        coefficients are NaN where a load case has no solution. Raises `ValueError` for a name
+        that neither has, for numbers that no beam has, and where the load cases determine no model.
+        """
+        own = {name: value for name, value in values.items() if name in self.parameters}
+        rest = [name for name in values if name not in own and name != _FORCE]
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(own)):
+            model = _traced_model(self, own)
+        else:
+            require_beam(with_beam_parameters(self.stated, own))
+            model = _model(self, own)
+        if not rest:
+            return model
+        for name in rest:
+            check_beam_name(self.stated, name, self.file, parameter_names(model))
+        return with_parameters(model, rest, jnp.stack([jnp.asarray(values[n]) for n in rest]))
+
+
+def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
+    beam = with_beam_parameters(models.stated, values)
+    source = beam_source(beam, models.file)
+    _, cases = run_load_cases(source, beam.thickness * np.asarray(models.displacement))
+    return source.structure(condense(source.basis, cases, degree=source.degree))
+
+
+# One program: step by step, derivatives would compile each step.
+_traced_model = compiled(_model)
+
+
+def read_beam_models(path: FilePath) -> BeamModels:
+    """Read a beam file as a function from its numbers to reduced models.
+
+    Typical use: `models = sj.io.read_beam_models("beam.toml")`, then
+    `models({"section.thickness_m": 0.6e-3})`, alone, within `jax.grad`, in a study, or in
+    `sj.identify.calibrate_to_backbone`.
+    Returns the models. Raises `ValueError` as `read_beam` does, and where no load scale is stated
+    and none is found for the beam of the file.
+    """
+    stated, file = read_beam_description(path), file_name(path)
+    source = beam_source(stated, file)
+    displacement, _ = run_load_cases(source)
+    return BeamModels(stated, file, tuple((np.asarray(displacement) / stated.thickness).tolist()))
