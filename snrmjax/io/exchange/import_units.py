@@ -15,7 +15,14 @@ _HERTZ = 2 * np.pi
 
 
 class Assumptions(dict[str, str]):
-    """The reason of every key of the map that nobody stated."""
+    """What was taken for each key of the map that nobody stated, and why: "value: reason"."""
+
+    def unit(self, key: str, told: str, file_unit: str) -> None:
+        """Record where a unit comes from: the map wins over the file."""
+        if not told and file_unit:
+            self[key] = f"{file_unit}: the file says so"
+        elif told and file_unit and told != file_unit:
+            self[key] = f"{told}: stated, though the file says {file_unit}"
 
 
 class Force(NamedTuple):
@@ -88,6 +95,10 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
     said = {unit_meaning(unit).size for unit in units.values() if unit}
     sizes = said - {""}
     if told.amplitude:
+        if sizes - {told.amplitude}:
+            raise ValueError(
+                f"--amplitude says {told.amplitude}, but a unit says {min(sizes)}: which is right?"
+            )
         return float(_SIZES[told.amplitude])
     if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
         raise ValueError(
@@ -95,22 +106,23 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
             "holds for all? --amplitude peak, rms or peak_to_peak."
         )
     size = next(iter(sizes), "peak")
-    assumed["amplitude"] = "the units say so" if sizes else "peak amplitudes, as nothing is said"
+    assumed["amplitude"] = f"{size}: {'the units say so' if sizes else 'nothing is said'}"
     return float(_SIZES[size])
 
 
 def frequency_in_rad(
     values: Float[np.ndarray, " row"], told: ImportMap, file_unit: str, assumed: Assumptions
-) -> tuple[Float[np.ndarray, " row"], str]:
-    """Frequencies in rad/s and their unit; hertz where nothing is said."""
+) -> Float[np.ndarray, " row"]:
+    """Frequencies in rad/s; hertz where nothing is said."""
     unit = told.frequency_unit or file_unit
     if not unit:
         if told.frequency.lower().rsplit(".", 1)[-1] in ("w", "omega", "om"):
             raise ValueError(
                 f"is {told.frequency} in Hz or in rad/s? State it: --frequency-unit Hz or rad/s."
             )
-        assumed["frequency_unit"] = "Hz, as nothing is said"
-        return values * _HERTZ, "Hz"
+        assumed["frequency_unit"] = "Hz: nothing is said"
+        return values * _HERTZ
+    assumed.unit("frequency_unit", told.frequency_unit, file_unit)
     meaning = _understood(unit, "--frequency-unit")
     if meaning.dimension != "frequency":
         raise ValueError(
@@ -118,8 +130,8 @@ def frequency_in_rad(
             "--frequency names another column."
         )
     if abs(meaning.factor / _HERTZ - 1) < 1e-14:
-        return values * _HERTZ, unit
-    return values * meaning.factor, unit
+        return values * _HERTZ
+    return values * meaning.factor
 
 
 def phase_in_rad(
@@ -142,6 +154,13 @@ def phase_in_rad(
                 "column, --phase-unit its unit."
             )
         unit, why = ("rad" if meaning.factor == 1 else "deg"), "the file says so"
+    if told.phase_unit and file_unit and unit_meaning(file_unit).dimension == "angle":
+        found = "rad" if unit_meaning(file_unit).factor == 1 else "deg"
+        if found != told.phase_unit:
+            raise ValueError(
+                f"--phase-unit says {told.phase_unit}, but {column} is in {file_unit}: which is "
+                "right?"
+            )
     if not unit:
         ends = [word for word in ("deg", "rad") if column.lower().rstrip("_)]s").endswith(word)]
         if ends:
@@ -153,7 +172,7 @@ def phase_in_rad(
     if why:
         assumed["phase_unit"] = f"{unit}: {why}"
     if not told.phase_sign:
-        assumed["phase_sign"] = "lead, as in e^(+iwt): a positive phase is ahead of the force"
+        assumed["phase_sign"] = "lead: a positive phase is ahead of the force, e^(+iwt)"
     sign = -1.0 if told.phase_sign == "lag" else 1.0
     return sign * (np.radians(values) if unit == "deg" else values)
 

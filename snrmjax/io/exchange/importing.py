@@ -166,7 +166,19 @@ def _phasors(
     )
     if not np.any(np.abs(velocity) > 0):
         raise ValueError(f"{chosen[0].file} has nothing but zero responses.")
-    return Imported(states, (), used._replace(level=rule), assumed, tuple(notes))
+    used = _filled(used._replace(level=rule), assumed)
+    return Imported(states, (), used, assumed, tuple(notes))
+
+
+def _filled(used: ImportMap, assumed: Assumptions) -> ImportMap:
+    """The map with choices that were assumed, so that the next test is read alike."""
+    keys = ("amplitude", "phase_sign", "phase_unit")
+    words = {key: assumed[key].split(":")[0] for key in keys if key in assumed}
+    return used._replace(
+        amplitude=words.get("amplitude", used.amplitude),
+        phase_sign=words.get("phase_sign", used.phase_sign),
+        phase_unit=words.get("phase_unit", used.phase_unit),
+    )
 
 
 def _rule(used: ImportMap, parts: Sequence[MeasuredPart]) -> str:

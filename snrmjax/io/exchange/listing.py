@@ -9,7 +9,7 @@ import numpy as np
 from snrmjax.io.exchange.layouts import is_own_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.names import role_of
-from snrmjax.measure.recordings.channels import SI_UNIT, Channel
+from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import number_levels
@@ -120,6 +120,7 @@ def _of_record(record: TimeRecording) -> list[str]:
     force = _guess(record.channels, ("force", "voltage"), ("force", "drive"))
     others = [one for one in record.channels if one.name != (force.name if force else "")]
     response = _guess(others, _MOTIONS, (*_MOTIONS, "amplitude"))
+    response = response or (others[0] if len(others) == 1 else None)
     words = ["--force", force.name] if force else ["--force", "CHANNEL"]
     if force is None or force.quantity == "unknown":
         words += ["--force-unit", "UNIT"]
@@ -129,6 +130,9 @@ def _of_record(record: TimeRecording) -> list[str]:
 def _of_responses(one: FrequencyResponses, z: Sequence[float]) -> list[str]:
     amplitude = "z" if z and np.isfinite(z[0]) and z[0] > 0 else "NEWTONS"
     response = _guess(one.responses, _MOTIONS, (*_MOTIONS, "amplitude")) or one.responses[0]
+    force = next((c.name for c in one.responses if c.quantity == "force"), "")
+    if force:  # spectra, or responses over a generator
+        return ["--force", force, *_response_words(response)]
     words = ["--force", one.references[0].name] if len(one.references) > 1 else []
     return [*words, "--force-amplitude", amplitude, *_response_words(response)]
 
@@ -157,8 +161,7 @@ def _of_table(table: NumberTable) -> list[str]:
 
 def _response_words(one: Channel) -> list[str]:
     if one.quantity in _MOTIONS:
-        unit = [] if one.unit else ["--unit", SI_UNIT[one.quantity]]
-        return ["--response", f"{one.name}:{one.quantity}", *unit]
+        return ["--response", f"{one.name}:{one.quantity}"]
     role = role_of(one.name)
     quantity = role if role in _MOTIONS else "QUANTITY"
     return ["--response", f"{one.name}:{quantity}", "--unit", "UNIT"]

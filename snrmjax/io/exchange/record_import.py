@@ -42,17 +42,20 @@ def told_record(
             unit=force.unit,
             calibration=force.factor,
         )
-        told = told._replace(force_unit=force.unit)
+        assumed.unit("force_unit", told.force_unit, unit)
     filled = []
     for number, one in enumerate(told.responses):
         k = _number(record, one.channel, file, "--response")
         old = channels[k]
+        if old.quantity == "voltage" and not one.unit:
+            old = old._replace(unit="")
+        assumed.unit(f"response {number + 1}.unit", one.unit, old.unit)
         quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
         sensor = one.sensor or ("sensor 1" if len(told.responses) == 1 else one.channel)
         if not one.sensor:
             assumed[f"response {number + 1}.sensor"] = "nobody names the sensor: --sensor does"
-        filled.append(ResponseMap(one.channel, quantity, unit, sensor))
+        filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
     if told.drive:
         k = _number(record, told.drive, file, "--drive")
         if channels[k].quantity == "unknown":
@@ -113,7 +116,7 @@ def import_record(
             failed.append(f"{kind}: {error}")
             continue
         if not told.record:
-            assumed["record"] = f"{kind} were recognised"
+            assumed["record"] = f"{kind}: recognised in the record"
         if not told.level:
             assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} found" + "".join(
                 f", {note}" for note in states.notes if note.startswith("levels")

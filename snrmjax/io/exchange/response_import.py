@@ -34,6 +34,8 @@ def import_responses(
             f"which channel of {file} is the response? --response CHANNEL names it, of {named}."
         )
     spectra = all(_has(one, told.force) for one in sets) if told.force else False
+    for one in sets:
+        _reference(one, told, file, spectra=spectra)
     amplitude = np.ones(len(sets)) if spectra else _amplitudes(sets, z, told, file)
     parts: list[MeasuredPart] = []
     force, responses, notes = Force(1.0, False, "N"), told.responses, list[str]()
@@ -42,12 +44,19 @@ def import_responses(
         if spectra:
             channel = one.responses[_row(one, told.force, file, "--force")]
             force = force_meaning(told, _si(channel), f"{told.force} of {file}")
-            known = 1.0 if channel.quantity in ("force", "voltage") else force.factor
-            size = one.values[_row(one, told.force, file, "--force"), reference] * known
+            assumed.unit("force_unit", told.force_unit, _si(channel))
+            scale = force.factor / channel.calibration if told.force_unit else 1.0
+            size = one.values[_row(one, told.force, file, "--force"), reference] * scale
         else:
             channel = one.references[reference]
             if not _si(channel) and not told.force_unit:
-                assumed["force_unit"] = "the file states none of the reference"
+                assumed["force_unit"] = "N: the file states none of the reference"
+            if told.force_unit and _si(channel) not in ("", told.force_unit):
+                raise ValueError(
+                    f"--force-unit says {told.force_unit}, but the responses of {file} are over "
+                    f"{channel.name} in {_si(channel)}, in which --force-amplitude is stated too: "
+                    "leave --force-unit out."
+                )
             force = force_meaning(told, _si(channel) or "N", f"{channel.name} of {file}")
             size = np.full(len(one.frequency), amplitude[k], dtype=complex)
         rows, filled = [], []
@@ -84,11 +93,9 @@ def import_responses(
         raise ValueError(f"--level must be order, z, force or file of {file}, not {told.level!r}.")
     if told.level == "z" and not np.isfinite(z).all():
         raise ValueError(f"--level z: {file} states no value on the z axis: --level order.")
-    told = told._replace(
-        responses=responses, level=told.level or "order", force_unit=told.force_unit or force.unit
-    )
+    told = told._replace(responses=responses, level=told.level or "order")
     if spectra and not told.amplitude:
-        assumed["amplitude"] = "peak amplitudes, as nothing is said"
+        assumed["amplitude"] = "peak: nothing is said"
     if spectra:
         factor = _PEAK[told.amplitude]
         parts = [p._replace(force=p.force * factor, velocity=p.velocity * factor) for p in parts]
@@ -144,26 +151,29 @@ def _velocity(
 ) -> tuple[np.ndarray, ResponseMap]:
     row = _row(one, told.channel, file, "--response")
     channel = one.responses[row]
-    unit = told.unit
-    if channel.quantity != "unknown":  # values are in SI already
-        unit = _si(channel)
-        if told.quantity and told.quantity != channel.quantity:
-            raise ValueError(
-                f"{told.channel} of {file} is of {channel.quantity}, but --response calls it "
-                f"{told.quantity}: which of both is right?"
-            )
-    quantity, factor, unit = motion_meaning(told.quantity, unit, "", told.channel)
-    values = one.values[row, reference] * factor
+    known = channel.quantity not in ("unknown", "voltage")
+    assumed.unit(f"response {number}.unit", told.unit, channel.unit if known else "")
+    if known and told.quantity and told.quantity != channel.quantity:
+        raise ValueError(
+            f"{told.channel} of {file} is of {channel.quantity}, but --response calls it "
+            f"{told.quantity}: which of both is right?"
+        )
+    quantity, factor, _ = motion_meaning(
+        told.quantity, told.unit, _si(channel) if known else "", told.channel
+    )
+    # A known channel's values are in SI already: its own unit, or the one that is stated.
+    values = one.values[row, reference]
+    values = values * (factor / channel.calibration if told.unit else 1.0)
     if whole.phase_sign == "lag":
         values = values.conj()
     elif not whole.phase_sign:
-        assumed["phase_sign"] = "lead, as in e^(+iwt)"
+        assumed["phase_sign"] = "lead: phasors are e^(+iwt)"
     sensor = told.sensor or ("sensor 1" if len(whole.responses) == 1 else told.channel)
     if not told.sensor:
         assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
     as_channel = Channel(told.channel, _motion(quantity))
     turn = velocity_factors([as_channel], [1], one.frequency)[:, 0, 0]
-    return values * turn, ResponseMap(told.channel, quantity, unit, sensor)
+    return values * turn, ResponseMap(told.channel, quantity, told.unit, sensor)
 
 
 def _motion(quantity: str) -> Quantity:

@@ -23,7 +23,7 @@ from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
 
 
-def columns_of(table: NumberTable, *roles: str) -> list[str]:
+def columns_by_role(table: NumberTable, *roles: str) -> list[str]:
     """Columns whose names say that they have one of these roles."""
     return [name for name in table.columns if role_of(name) in roles]
 
@@ -39,7 +39,7 @@ def import_table(
         table, ("frequency",), file, "frequency", "--frequency", assumed
     )
     told = told._replace(frequency=frequency_name)
-    omega, frequency_unit = frequency_in_rad(
+    omega = frequency_in_rad(
         _real(table, frequency_name, file, "--frequency"),
         told,
         table.units.get(frequency_name, ""),
@@ -50,6 +50,7 @@ def import_table(
     force_name = told.force
     force = Force(1.0, False, "N")
     if force_name:
+        assumed.unit("force_unit", told.force_unit, table.units.get(force_name, ""))
         force = force_meaning(told, table.units.get(force_name, ""), f"{force_name} of {file}")
         raw = _column(table, force_name, file, "--force")
         if not np.iscomplexobj(raw) and np.nanmin(raw, initial=1.0) < 0:
@@ -79,12 +80,7 @@ def import_table(
         responses.append(filled)
     phasors = np.stack(velocity, axis=1)
     level, key = _level(table, told, file, assumed)
-    told = told._replace(
-        responses=tuple(responses),
-        frequency_unit=frequency_unit,
-        level=level,
-        force_unit=force.unit if force_name else told.force_unit,
-    )
+    told = told._replace(responses=tuple(responses), level=level)
     good = np.isfinite(omega) & np.isfinite(size) & np.isfinite(phasors).any(axis=1)
     notes = []
     if not good.all():
@@ -121,6 +117,7 @@ def _response(
         one.channel,
         is_ratio=told.over_force,
     )
+    assumed.unit(f"response {number}.unit", one.unit, table.units.get(one.channel, ""))
     if not one.quantity:
         assumed[f"response {number}.quantity"] = f"the unit {unit} says so"
     role = role_of(one.channel)
@@ -145,7 +142,7 @@ def _response(
             if told.phase_sign == "lag":
                 phasor = phasor.conj()
             elif not told.phase_sign:
-                assumed["phase_sign"] = "lead, as in e^(+iwt): a positive imaginary part is ahead"
+                assumed["phase_sign"] = "lead: a positive imaginary part is ahead of the force"
         else:
             if np.nanmin(values, initial=0.0) < 0:
                 raise ValueError(
@@ -159,7 +156,7 @@ def _response(
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
     return (
         phasor * factor * turn,
-        ResponseMap(one.channel, quantity, unit, sensor, phase, imaginary),
+        ResponseMap(one.channel, quantity, one.unit, sensor, phase, imaginary),
     )
 
 
@@ -169,9 +166,9 @@ def _partner(table: NumberTable, channel: str, role: str, told: ImportMap) -> tu
         swapped = _swap(channel)
         if swapped in table.columns:
             return swapped, ""
-        others = columns_of(table, "imaginary")
+        others = columns_by_role(table, "imaginary")
         return (others[0] if len(others) == 1 else ""), ""
-    phases = [name for name in columns_of(table, "phase") if name != told.force_phase]
+    phases = [name for name in columns_by_role(table, "phase") if name != told.force_phase]
     return "", (phases[0] if len(phases) == 1 and len(told.responses) == 1 else "")
 
 
@@ -206,7 +203,7 @@ def _level(
             f"({', '.join(table.columns)}), but is {told.level!r}"
             f"{f' (did you mean {near}?)' if near else ''}."
         )
-    columns = columns_of(table, "level")
+    columns = columns_by_role(table, "level")
     if len(columns) == 1 and np.isfinite(_real(table, columns[0], file, "--level")).all():
         assumed["level"] = "the column's name says so"
         return columns[0], _real(table, columns[0], file, "--level")
@@ -251,7 +248,7 @@ def _only(
     assumed: Assumptions,
 ) -> str:
     """The only column with a role. Raises `ValueError` with a question otherwise."""
-    found = columns_of(table, *roles)
+    found = columns_by_role(table, *roles)
     if len(found) != 1:
         listed = ", ".join(found or table.columns)
         raise ValueError(f"which column of {file} is the {what}? {option} names it, of {listed}.")

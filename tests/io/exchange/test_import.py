@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from typer.testing import CliRunner
+from truths.import_runs import run_import as run
 
-from snrmjax.cli import app
 from snrmjax.io import read_steady_states
 from snrmjax.io.exchange.exports import write_netcdf
 from snrmjax.io.exchange.import_map import read_import_map
@@ -21,16 +20,6 @@ F = np.array([79.0, 79.5, 80.0, 79.0, 79.5, 80.0])  # Hz
 LEVEL = np.array([1, 1, 1, 2, 2, 2])
 FORCE = np.array([0.1, 0.11, 0.12, 0.4, 0.41, 0.42])  # N
 VELOCITY = np.array([0.1 + 0.2j, 0.3, 0.2 - 0.2j, 0.4 + 0.8j, 1.2, 0.8 - 0.8j])  # m/s
-
-
-def run(*words):
-    """The command's exit code, what it says, and the error of one sentence if any."""
-    result = CliRunner().invoke(app, ["import", *map(str, words)])
-    if isinstance(result.exception, ValueError):
-        return 2, str(result.exception)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
 
 
 def imported(tmp_path, *words):

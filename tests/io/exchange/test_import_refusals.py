@@ -1,0 +1,107 @@
+"""Wrong and unclear input: exit 2, one sentence with the option that answers, nothing written."""
+
+import gzip
+import re
+
+import numpy as np
+import pytest
+import scipy.io
+from truths.import_runs import run_import as run
+
+from snrmjax.io.laboratory.uff.writing import write_uff
+from snrmjax.measure import Channel
+from snrmjax.measure.recordings.frequency_responses import frequency_responses
+
+TABLE = "f,F,v,ph\n79,0.1,1,10\n80,0.1,2,20\n81,0.1,1,200\n"
+TOLD = "--force F --force-unit N --response v:velocity:m/s"
+OVER = "--force-amplitude 1 --response a:velocity:m/s"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("raw")
+    files = {
+        "t.csv": TABLE,
+        "rad.csv": TABLE.replace("200", "2").replace("10\n", "1\n").replace("20\n", "2\n"),
+        "two.csv": TABLE.replace("ph\n", "phase 2\n").replace("f,F,", "f,freq2,"),
+        "units.csv": TABLE.replace("f,F,v", "f (Hz),F (N),v (mm/s)"),
+        "sizes.csv": TABLE.replace("f,F,v", "f (Hz),F (N),v (mm/s rms)"),
+        "omega.csv": TABLE.replace("f,", "omega,", 1),
+        "negative.csv": TABLE.replace(",2,", ",-2,"),
+        "noforce.csv": TABLE.replace("80,0.1", "80,0"),
+        "zero.csv": "f,F,v,ph\n79,0.1,0,10\n80,0.1,0,200\n",
+        "part.csv": "f,F,v,ph\n79,0.1,1\n",
+        "bad.toml": "forse = 'F'\n",
+        "worse.toml": "phase_unit = 'grad'\n",
+        "no.toml": "x = ",
+    }
+    for name, text in files.items():
+        (path / name).write_text(text)
+    (path / "t.csv.gz").write_bytes(gzip.compress(TABLE.encode()))
+    t = np.arange(400) / 1000
+    noise = np.random.default_rng(0).normal(size=(2, 400))
+    scipy.io.savemat(path / "record.mat", {"fs": 1000.0, "a": noise[0], "b": noise[1]})
+    scipy.io.savemat(path / "mixed.mat", {"fs": 1e3, "a": t, "d": {"freq": t[:9], "F": t[:9]}})
+    one = frequency_responses(
+        np.array([500.0, 510.0]), np.ones((1, 1, 2)) + 0j, [Channel("a")], [Channel("b")]
+    )
+    write_uff(path / "frf.uff", responses=[one, one])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "question"),
+    [
+        ("none.csv " + TOLD, "does not exist"),
+        ("t.csv.gz " + TOLD, "gzip archive: unpack"),
+        ("part.csv " + TOLD, "--frequency names it, of column_1"),
+        ("t.csv --force F", "--response COLUMN:velocity"),
+        ("t.csv --response v:velocity:m/s", "--force COLUMN"),
+        ("t.csv --force G --force-unit N --response v:velocity:m/s", "has the columns f, F, v, ph"),
+        ("t.csv --force F --response v:velocity:m/s", "--force-unit N"),
+        ("t.csv --force F --force-unit m --response v:velocity:m/s", "--force names another"),
+        ("t.csv --force F --force-unit N --response v:velocity", "--response v:velocity:m/s"),
+        ("t.csv --force F --force-unit N --response v:velocity:g", "which of both is right"),
+        ("t.csv --force F --force-unit N --response v:velocity:qq", "not understood"),
+        ("t.csv --force F --force-unit N --response v:speed", "--response must be"),
+        ("t.csv --force F --force-unit N --response w:velocity:m/s", "has the columns"),
+        ("rad.csv " + TOLD, "--phase-unit deg or rad"),
+        ("two.csv --force v --force-unit N --response v:velocity:m/s", "--frequency names it"),
+        ("sizes.csv --force F --response v", "--amplitude peak, rms"),
+        ("sizes.csv --force F --response v --amplitude peak", "which is right"),
+        ("omega.csv " + TOLD, "--frequency-unit Hz or rad/s"),
+        ("negative.csv " + TOLD, "--imaginary COLUMN"),
+        ("noforce.csv " + TOLD, "must be above zero, but row 2"),
+        ("zero.csv " + TOLD, "nothing but zero"),
+        ("t.csv " + TOLD + " --level nothing", "--level must be"),
+        ("t.csv " + TOLD + " --phase-unit grad", "--phase-unit must be one of deg, rad"),
+        ("t.csv " + TOLD + " --sensor a --sensor b", "--sensor must be given once for each"),
+        ("t.csv " + TOLD + " --response v:velocity:m/s", "names 'v' twice"),
+        ("t.csv --map bad.toml", "unknown key 'forse'.*did you mean `force`"),
+        ("t.csv --map worse.toml", "phase_unit"),
+        ("t.csv --map no.toml", "not valid TOML"),
+        ("t.csv --map none.toml", "does not exist"),
+        ("mixed.mat --force F --force-unit N --response v", "--dataset names it"),
+        ("record.mat --response a:velocity:m/s", "--force CHANNEL"),
+        ("record.mat --force a --force-unit N --response b:velocity:m/s", "--record steps, sweep"),
+        ("record.mat --force a --force-unit N --response b", "--response b:velocity:m/s"),
+        ("frf.uff --response a:velocity:m/s", "--force-amplitude .*one a set .2."),
+        ("frf.uff " + OVER + " --force-amplitude 1 --force-amplitude 1", "3 are stated"),
+        ("frf.uff --force-amplitude -1 --response a:velocity:m/s", "must be a positive number"),
+        ("frf.uff --force-amplitude z --response a:velocity:m/s", "needs positive values"),
+    ],
+)
+def test_what_is_wrong_or_unclear_is_asked_for(tmp_path, folder, words, question, monkeypatch):
+    monkeypatch.chdir(folder)
+    code, said = run(*words.split(), "--out", tmp_path / "out")
+    assert code == 2, said
+    assert "\n" not in said.strip()
+
+    assert re.search(question, said), said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_channels_without_a_folder_are_asked_for_one(folder):
+    code, said = run(folder / "t.csv", *TOLD.split())
+    assert code == 2
+    assert "--out DIR" in said
