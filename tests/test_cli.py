@@ -527,6 +527,7 @@ def test_curves_that_nobody_sees_are_not_fitted(fitted):
     assert fitted[2] == []
 
 
+@pytest.mark.long
 def test_notes_on_single_states_reach_the_reader_of_a_joint_fit(files, tmp_path):
     model, data = files
     # Far above resonance a degree of phase makes damping negative: that state has no point.
@@ -542,6 +543,7 @@ def test_notes_on_single_states_reach_the_reader_of_a_joint_fit(files, tmp_path)
         assert "1 of 11 steady states have no point of their own" in text
 
 
+@pytest.mark.long
 def test_a_fit_without_a_state_to_advise_is_written_all_the_same(files, tmp_path):
     model, data = files
     # 80° from resonance on either side: what lies nearer has amplitudes that nobody measured.
@@ -645,7 +647,9 @@ CONJUGATED = (
 )
 
 
-@pytest.mark.parametrize("command", ["identify", "diagnose"])
+@pytest.mark.parametrize(
+    "command", ["identify", pytest.param("diagnose", marks=pytest.mark.long)]
+)
 def test_conjugated_phases_are_named_in_a_note(files, tmp_path, command):
     model, data = files
     phases_changed(data, lambda re, im: (re, -im))

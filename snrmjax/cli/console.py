@@ -42,8 +42,10 @@ def staged(out: Path) -> Iterator[Path]:
     done = False
     try:
         yield staging
-        for file in sorted(staging.iterdir()):
-            os.replace(file, out / file.name)
+        for file in sorted(one for one in staging.rglob("*") if one.is_file()):
+            target = out / file.relative_to(staging)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, target)
         done = True
     finally:
         shutil.rmtree(staging)

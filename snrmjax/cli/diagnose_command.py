@@ -110,7 +110,7 @@ def diagnose(
                 for note in measured.notes:
                     warn(note)
                 simulate = not several if responses is None else responses
-                found = write_diagnosis(
+                found, _ = write_diagnosis(
                     folder, path.stem, structure, measured, simulate=simulate, former=before
                 )
                 if plan is not None:

@@ -98,11 +98,11 @@ def write_diagnosis(
     *,
     simulate: bool,
     former: FormerAnswer | None = None,
-) -> Diagnosis:
+) -> tuple[Diagnosis, Report]:
     """Diagnose, and write everything that the command writes into a folder.
 
     Where no structure can have the parameters found, there is no `model.toml` and nothing is
-    simulated; the notes say so.
+    simulated; the notes say so. Returns the diagnosis and the report on it.
     """
     found = diagnose_model(model, data, former=former)
     predicted: list[LevelResponse] = []
@@ -122,7 +122,7 @@ def write_diagnosis(
         done={"data": f"{title}.csv", "model": model.name},
     )
     write_report(folder / "report.html", report)
-    return found
+    return found, report
 
 
 def with_responses(diagnosis: Diagnosis, model: Structure) -> tuple[list[LevelResponse], Figure]:

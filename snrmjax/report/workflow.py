@@ -394,10 +394,10 @@ def findings_report(
     return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
 
 
-def write_findings(folder: Path, found: Findings, title: str, done: dict[str, str]) -> None:
+def write_findings(folder: Path, found: Findings, title: str, done: dict[str, str]) -> Report:
     """Write what `identify` found into a folder: tables, summary, figures and report.
 
-    Arguments: `done` says with which files.
+    Arguments: `done` says with which files. Returns the report.
     """
     done = done | found.settings
     results.write_points(folder / "points.csv", found.identification)
@@ -424,7 +424,9 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     figures = plot.save_figures(folder, identification_figures(found))
     if found.fitted is not None:
         done = done | {"curves": curves_in_words(found.fitted.fit)}
-    write_report(folder / "report.html", findings_report(found, title, done, figures))
+    report = findings_report(found, title, done, figures)
+    write_report(folder / "report.html", report)
+    return report
 
 
 def _write_fit(folder: Path, found: Findings, fitted: ReportedFit) -> None:

@@ -20,7 +20,7 @@ def fed(velocity):
 def test_a_negative_damping_ratio_is_no_reason_to_lose_the_answer(tmp_path):
     """The model is uncertain of its damping ratio; the data put it below zero."""
     model, data = linear_model(damping_std=3.0), balanced(fed)
-    found = write_diagnosis(tmp_path, "fed", model, data, simulate=True)
+    found, _ = write_diagnosis(tmp_path, "fed", model, data, simulate=True)
     assert "quadratic_damping" in found.effects
     assert found.completed is None
     assert found.answer.completed_status is CompletedStatus.NOT_PHYSICAL

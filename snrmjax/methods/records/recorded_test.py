@@ -78,8 +78,8 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     """Sort a time record by what it is; the rules stand at the top of this module.
 
     Arguments: `recording` has at most one force and at most one voltage that drives, and motions
-    whose channels are named after sensors of `modes` (by `point` or by name); a single motion
-    without such a name is that of the sensor where the mode of interest moves most.
+    whose channels are named after sensors of `modes` (by `point`, by name or by both); a single
+    motion without such a name is that of the sensor where the mode of interest moves most.
     Returns a `RecordedTest`. Raises `ValueError` that names the record for channels that do not
     fit, samples that are not finite, a motion or drive far from the mode's frequency (times that
     are no seconds, another structure), a single tone, and a record of no known kind.
@@ -139,7 +139,8 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     at: dict[str, str] = {}
     for one in motions:
         for sensor in modes.sensors:
-            if sensor in (one.point, one.name, f"{one.point}{one.direction}"):
+            place = f"{one.point}{one.direction}"
+            if sensor in (one.point, one.name, place, f"{one.name}:{place}"):  # as UFF names it
                 at.setdefault(sensor, one.name)
     reference = modes.sensors[reference_sensor(modes)]
     if not at and len(motions) == 1 and not motions[0].point:

@@ -52,10 +52,29 @@ def write_linear_modes(
 
     Arguments: `interest` counts from zero. Raises `ValueError` for a mode that is not there.
     """
+    write_modal_tables(folder, name, modes, interest=interest)
     title = Path(name).stem.replace("_", " ")
+    report = modal_report(title, modes, found, interest=interest, further_notes=further_notes)
+    write_report(folder / "report.html", report)
+
+
+def write_modal_tables(folder: Path, name: str, modes: ScaledModes, *, interest: int = 0) -> None:
+    """Write the model under `name`, and modes.csv; see `write_linear_modes`."""
     linear = modes.linear_modes(interest)
+    title = Path(name).stem.replace("_", " ")
     write_model(folder / name, structure(linear, name=title))
     write_table(folder / "modes.csv", _columns(modes))
+
+
+def modal_report(
+    title: str,
+    modes: ScaledModes,
+    found: LinearModalFit | DecayModes,
+    *,
+    interest: int = 0,
+    further_notes: Sequence[str] = (),
+) -> Report:
+    """The report of linear modes; see `write_linear_modes`."""
     notes = [*further_notes, *modes.notes]
     figures = [ReportFigure(stabilisation_figure(found), _ORDERS)]
     if isinstance(found, LinearModalFit):
@@ -70,19 +89,16 @@ def write_linear_modes(
         figures.append(ReportFigure(decay_figure(found), _DECAY))
         time = found.curves.time
         done = [("decay", f"{len(time)} samples, {time[-1] - time[0]:.4g} s")]
-    write_report(
-        folder / "report.html",
-        Report(
-            title=f"Linear modes: {title}",
-            done=[*done, ("sensors", ", ".join(modes.sensors)), ("scale", modes.scaled_by)],
-            result=modes_sentence(modes),
-            summary=_headline(modes, interest),
-            notes=notes,
-            sections=[
-                Section("Modes", (), (), [_table(modes, found), _shapes(modes)]),
-                Section("Fit", (), figures),
-            ],
-        ),
+    return Report(
+        title=f"Linear modes: {title}",
+        done=[*done, ("sensors", ", ".join(modes.sensors)), ("scale", modes.scaled_by)],
+        result=modes_sentence(modes),
+        summary=_headline(modes, interest),
+        notes=notes,
+        sections=[
+            Section("Modes", (), (), [_table(modes, found), _shapes(modes)]),
+            Section("Fit", (), figures),
+        ],
     )
 
 

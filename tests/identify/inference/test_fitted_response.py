@@ -62,6 +62,7 @@ def test_a_larger_ratio_looks_further(exact_fit):
     assert "beyond the largest measured amplitude, up to 2.5 times it" in far.note
 
 
+@pytest.mark.long
 def test_a_curve_that_falls_beyond_the_data_leaves_what_is_inside(exact_fit):
     # ω̃² = a(1 − 0.4 u): X ω̃ has its largest value at u = 1.25, short of 1.5² times the data.
     vector = np.array(exact_fit.vector()[0])
@@ -186,6 +187,7 @@ def test_advice_narrows_the_band_and_avoids_what_cannot_be_measured(fit):
         assert one.reason
 
 
+@pytest.mark.long
 def test_advice_holds_what_it_promises():
     """The measured ratio of bands after adding the advised state is the expected one."""
     settings = {"level_gain_std": 0.01, "backbone": "polynomial:1@displacement"}

@@ -113,6 +113,7 @@ def test_a_rough_curve_does_not_pass_for_levels_that_differ():
         assert found.level[0] > 0.05 or found.unbounded == (0,)
 
 
+@pytest.mark.long
 def test_levels_that_differ_are_found_beside_a_smooth_curve():
     found = [
         estimated_components(problem, index, bends=[bends]).level[0]

@@ -50,7 +50,14 @@ def fundamental(motion):
 # ------------------------------------------------------------------------------ settled motions
 
 
-@pytest.mark.parametrize("frequency", [300.0, 495.0, 2700.0])
+@pytest.mark.parametrize(
+    "frequency",
+    [
+        pytest.param(300.0, marks=pytest.mark.long),
+        495.0,
+        pytest.param(2700.0, marks=pytest.mark.long),
+    ],
+)
 def test_a_small_motion_is_the_linear_response(frequency):
     beam = flat_beam()
     motion = settled_motion(

@@ -50,6 +50,7 @@ def quadratic(linear, curved):
     return Expansion(np.zeros(1), np.array([[linear]]), np.array([[[curved]]]))
 
 
+@pytest.mark.long
 def test_a_linear_peak_is_lognormal_by_every_method():
     # |V| is largest at Ω = ω, exactly, and there F φ b/(2ζω): a product of lognormal numbers.
     inputs = lognormal_inputs(np.array([0.02, 0.2, 0.1]), correlation=-0.5)
