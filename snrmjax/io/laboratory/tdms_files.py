@@ -1,7 +1,9 @@
 """TDMS files (LabVIEW, NI): groups of channels with properties, read piece by piece."""
 
+import logging
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,36 @@ from snrmjax.measure.recordings.time_recording import (
 
 _UNITS = ("unit_string", "NI_UnitDescription", "Unit", "unit", "Units")
 _MOST_CHANNELS = 4096
+_MOST_NOTES = 8  # of what the library warns of
 _ALIKE = 1e-12  # relative, of two steps in the properties of one device
+
+
+class _Said(logging.Handler):
+    """What the library warns of, once each."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.notes: dict[str, None] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler`."""
+        if len(self.notes) < _MOST_NOTES:
+            self.notes[" ".join(record.getMessage().split())[:200]] = None
+
+
+@contextmanager
+def _quietly(said: _Said) -> Iterator[None]:
+    """The library's warnings go to `said`, not to the terminal."""
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("nptdms")]
+    loggers = [logging.getLogger(name) for name in names]
+    before = [(one.handlers[:], one.propagate) for one in loggers]
+    for one in loggers:
+        one.handlers[:], one.propagate = [said], False
+    try:
+        yield
+    finally:
+        for one, (handlers, propagate) in zip(loggers, before, strict=True):
+            one.handlers[:], one.propagate = handlers, propagate
 
 
 class TdmsSamples(AbstractSamples):
@@ -43,7 +74,7 @@ class TdmsSamples(AbstractSamples):
         """See `AbstractSamples.read`."""
         rows = []
         for k in channels:
-            with damaged_if_it_fails(self._name, "a TDMS file"):
+            with _quietly(_Said()), damaged_if_it_fails(self._name, "a TDMS file"):
                 rows.append(self._channels[k].read_data(start, max(0, stop - start)))
         if any(len(row) != stop - start for row in rows):
             raise ValueError(f"{self._name} is damaged: samples {start} to {stop} are not there.")
@@ -52,6 +83,14 @@ class TdmsSamples(AbstractSamples):
 
 def read_tdms(path: Path) -> LaboratoryFile:
     """A TDMS file. Raises `ValueError` as `read_laboratory_file` does."""
+    library("nptdms", "reading TDMS")
+    said = _Said()
+    with _quietly(said):
+        found = _read(path)
+    return found._replace(notes=(*found.notes, *said.notes))
+
+
+def _read(path: Path) -> LaboratoryFile:
     nptdms, size = library("nptdms", "reading TDMS"), path.stat().st_size
     recordings: list[TimeRecording] = []
     tables: list[NumberTable] = []

@@ -1,0 +1,320 @@
+"""Hostile laboratory files: mutated ones of every format must give data or a clear error.
+
+Run: python benchmarks/hostile_files.py [--runs 20000] [--seed 0] [--only KIND]
+
+Valid files of every format (UFF 58, 58b and 55, MATLAB v5 and v7.3, HDF5, netCDF, TDMS, CSV in two
+dialects) are mutated: cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts
+doubled, text for binary, two formats spliced, gzip and zip around them, one in another. Each is
+listed, and what it holds is read and imported, in a child process whose address space may grow by
+1 GiB, with ten seconds a file; the peak of resident memory above that after the imports is
+measured file by file (Linux). Good is: data, or a `ValueError` of one sentence. Everything else is
+bad and is kept beside the temporary folder for a look.
+
+One JSON line: files, outcomes by kind, worst memory in MB, worst time in s, and the bad ones.
+"""
+
+import argparse
+import collections
+import gzip
+import io
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import tempfile
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+SECONDS, MEGABYTES, GUARD = 10, 200, 2**30
+
+
+def valid_files(folder):
+    """Valid files of every format by name."""
+    import h5py
+    import scipy.io
+    from nptdms import ChannelObject, TdmsWriter
+
+    from snrmjax.io.exchange.exports import write_matlab, write_netcdf
+    from snrmjax.io.laboratory.contents import measured_shapes
+    from snrmjax.io.laboratory.uff.writing import write_uff
+    from snrmjax.measure import Channel, steady_states, time_recording
+    from snrmjax.measure.recordings.frequency_responses import frequency_responses
+
+    rng = np.random.default_rng(1)
+    hertz = np.linspace(79, 81, 40)
+    record = time_recording(
+        rng.normal(size=(2, 300)),
+        [
+            Channel("CH1", "force", "N", 1.0, "1", "+z"),
+            Channel("CH2", "acceleration", "g", 9.8, "2", "+z"),
+        ],
+        1000.0,
+    )
+    curve = frequency_responses(
+        2 * np.pi * hertz,
+        rng.normal(size=(1, 1, 40)) + 1j,
+        [Channel("a", "velocity", "", 1.0, "1", "+z")],
+        [Channel("f", "force", "", 1.0, "1", "+z")],
+    )
+    shapes = measured_shapes([500.0], [0.01], [[1.0, 2.0]], ["1", "2"], ["+z", "+z"])
+    states = steady_states([1, 1], [500.0, 501.0], [0.1, 0.1], [0.1 + 0.1j, 0.2])
+    every = {"recordings": [record], "responses": [curve], "levels": [0.1]}
+    write_uff(folder / "a.uff", **every, shapes=[shapes])
+    write_uff(folder / "b.uff", **every, shapes=[shapes], binary=False)
+    write_matlab(folder / "a.mat", **every, states=states)
+    kinds = [(key, object) for key in ("freq", "force", "amplitude", "phase")]
+    rows = [(hertz, hertz * 0 + 0.1 * k, hertz / 80, hertz) for k in (1, 2)]
+    scipy.io.savemat(folder / "b.mat", {"d": np.array(rows, dtype=kinds)}, do_compression=True)
+    write_netcdf(folder / "a.nc", **every, states=states)
+    with h5py.File(folder / "a.h5", "w") as file:
+        for key, values in zip(("freq", "F", "X", "Y"), rng.normal(size=(4, 200)), strict=True):
+            file.create_dataset(f"test/{key}", data=values, compression="gzip", chunks=(50,))
+        file["test"].create_dataset("signal", data=rng.normal(size=(4, 1000)))
+        file["test"].attrs["fs"] = 100.0
+    with h5py.File(folder / "c.mat", "w", userblock_size=512) as file:
+        for key in ("freq", "force", "v"):
+            one = file.create_dataset(key, data=rng.normal(size=(1, 30)))
+            one.attrs["MATLAB_class"] = np.bytes_(b"double")
+    with open(folder / "c.mat", "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\x00\x02IM")
+    with TdmsWriter(folder / "a.tdms") as writer:
+        for _ in range(3):
+            wave = {"wf_increment": 1e-3, "unit_string": "N"}
+            writer.write_segment(
+                [ChannelObject("g", f"CH{k}", rng.normal(size=90), wave) for k in range(2)]
+            )
+        writer.write_segment([ChannelObject("t", "frequency", hertz, {})])
+    lines = [f"{f!r},{0.1!r},{f / 80!r},{f!r}" for f in hertz.tolist()]
+    (folder / "a.csv").write_text("\n".join(["f (Hz),F (N),v (mm/s),phase (deg)", *lines]))
+    dialect = [line.replace(",", ";").replace(".", ",") for line in lines]
+    (folder / "b.txt").write_text("\n".join(["Titel", "f;F;v;phase", "Hz;N;g;°", *dialect]))
+    return {one.name: one.read_bytes() for one in sorted(folder.iterdir())}
+
+
+def mutated(files, name, rng):
+    """A hostile version of a file, and what was done to it."""
+    data = bytearray(files[name])
+    kinds = [
+        "cut",
+        "flip",
+        "count",
+        "count",
+        "run",
+        "nan",
+        "double",
+        "text",
+        "splice",
+        "pack",
+        "digits",
+        "flip",
+    ]
+    kind = kinds[rng.integers(len(kinds))]
+    size = len(data)
+    for _ in range(int(rng.integers(1, 4))):
+        at = int(rng.integers(max(1, len(data))))
+        near = int(rng.integers(min(len(data), 600)))  # headers are at the start
+        at = at if rng.random() < 0.5 else near
+        if kind == "cut":
+            data = data[: max(1, at)]
+        elif kind == "flip":
+            for _ in range(int(2 ** rng.uniform(0, 5))):
+                k = at if rng.random() < 0.3 else int(rng.integers(len(data)))
+                data[min(k, len(data) - 1)] ^= 1 << int(rng.integers(8))
+        elif kind == "count":
+            value = int(rng.choice([2**31 - 1, 2**32 - 1, 2**62, 2**63 - 1, 2**24, 2**40, 0]))
+            width = 8 if value >= 2**32 or rng.random() < 0.5 else 4
+            at -= at % 4
+            order = "little" if rng.random() < 0.8 else "big"
+            data[at : at + width] = value.to_bytes(width, order)
+        elif kind == "run":
+            length = int(rng.integers(1, 200))
+            data[at : at + length] = bytes([int(rng.choice([0, 255, 32, 57]))]) * length
+        elif kind == "nan":
+            word = rng.choice([b"nan", b"inf", b"-1e999", np.float64(np.nan).tobytes()])
+            data[at : at + len(bytes(word))] = bytes(word)
+        elif kind == "double":
+            length = int(rng.integers(1, size))
+            data[at:at] = data[at : at + length]
+        elif kind == "text":
+            words = "Lorem ipsum, 12; 3,4\t-1e5 \n€".encode() * int(rng.integers(1, 30))
+            data[at : at + len(words)] = words
+        elif kind == "splice":
+            other = files[sorted(files)[rng.integers(len(files))]]
+            data = data[:at] + bytearray(other[int(rng.integers(len(other))) :])
+        elif kind == "digits":
+            places = [k for k, one in enumerate(data[:4000]) if 48 <= one <= 57]
+            for k in rng.choice(places, size=min(len(places), 12)) if places else []:
+                data[int(k)] = 57
+    if kind == "pack":
+        inner = gzip.compress(bytes(data) * int(rng.integers(1, 50)))
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.csv", inner)
+        data = bytearray(inner if rng.random() < 0.5 else buffer.getvalue())
+        if rng.random() < 0.5:
+            data = bytearray(gzip.compress(bytes(data)))
+    return bytes(data), kind
+
+
+def digest(path):
+    """List a file, read what it holds, and import it; returns the outcome."""
+    from snrmjax.io.exchange.import_map import ImportMap, response_word
+    from snrmjax.io.exchange.importing import import_files
+    from snrmjax.io.exchange.listing import listed_contents, suggested_command
+    from snrmjax.io.laboratory.reading import read_laboratory_file
+
+    try:
+        held = read_laboratory_file(path)
+    except ValueError as error:
+        return checked(error, "refused")
+    outcome = "data"
+    listed_contents(held)
+    suggested_command([path], held)
+    for record in held.recordings:
+        try:
+            record.values(stop=min(record.n_samples, 2**16))
+            record.values(start=max(0, record.n_samples - 100))
+        except ValueError as error:
+            outcome = checked(error, "refused late")
+    first = held.recordings[0].channel_names if held.recordings else ()
+    table = list(held.tables[0].columns) if held.tables else []
+    pairs = [(first[0], first[-1])] if first else []
+    pairs += [(table[1], table[2])] if len(table) > 3 else []
+    pairs += [("", held.responses[0].responses[0].name)] if held.responses else []
+    for force, response in pairs:
+        told = ImportMap(
+            (response_word(f"{response}:velocity:m/s"),),
+            force=force,
+            force_unit="N" if force else "",
+            force_amplitude=("1.0",),
+            phase_unit="deg",
+            record="decay",
+            dataset="responses" if not force and len(pairs) > 1 else "",
+        )
+        try:
+            import_files([path], told)
+        except ValueError as error:
+            checked(error, "")
+    return outcome
+
+
+def checked(error, outcome):
+    """The outcome of an error, which must be one sentence of the package's own."""
+    text = str(error)
+    if "\n" in text.strip() or len(text) > 2000 or type(error).__module__ != "builtins":
+        return f"BAD message: {type(error).__name__}: {text[:200]}"
+    return outcome
+
+
+def resident(key):
+    """VmRSS or VmHWM in MB."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(key):
+            return int(line.split()[1]) / 1024
+    raise RuntimeError(f"the system does not state {key}")
+
+
+def work(connection, folder, files):
+    """Read files by number until told to stop."""
+    import warnings
+
+    warnings.simplefilter("ignore")
+    for name in files:  # imports and caches are there before memory is measured
+        path = Path(folder) / f"warm-{name}"
+        path.write_bytes(files[name])
+        if digest(path) != "data":
+            raise RuntimeError(f"{name} must be read as it is")
+        path.unlink()
+    before = resident("VmRSS")
+    space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (space + GUARD, space + GUARD))
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends the process: the parent sees it
+    connection.send(("ready", before))
+    while True:
+        job = connection.recv()
+        if job is None:
+            return
+        path, _ = job
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+        signal.alarm(SECONDS)
+        start = time.perf_counter()
+        try:
+            outcome = digest(Path(path))
+        except BaseException as error:
+            outcome = f"BAD {type(error).__name__}: {str(error)[:200]}"
+        spent = time.perf_counter() - start
+        signal.alarm(0)
+        connection.send((outcome, spent, resident("VmHWM") - before))
+
+
+def start_worker(folder, files):
+    """A fresh child process that is ready."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=work, args=(there, folder, files), daemon=True)
+    process.start()
+    there.close()
+    here.recv()
+    return process, here
+
+
+def main():
+    """All runs and one line of figures."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--runs", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="")
+    told = parser.parse_args()
+    counts, bad = collections.Counter(), []
+    by_format = collections.Counter()
+    worst_time = worst_memory = 0.0
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        (folder / "valid").mkdir()
+        files = valid_files(folder / "valid")
+        names = [name for name in sorted(files) if told.only in name]
+        process, pipe = start_worker(text, files)
+        began = time.perf_counter()
+        for k in range(told.runs):
+            rng = np.random.default_rng([told.seed, k])
+            name = names[k % len(names)]
+            data, kind = mutated(files, name, rng)
+            path = folder / f"hostile-{name}"
+            path.write_bytes(data)
+            pipe.send((str(path), k))
+            try:
+                outcome, spent, memory = pipe.recv()
+            except EOFError:
+                process.join()
+                outcome, spent, memory = f"BAD died with {process.exitcode}", float(SECONDS), 0.0
+                process, pipe = start_worker(text, files)
+            if memory > MEGABYTES:
+                outcome = f"BAD {memory:.0f} MB after {outcome}"
+            by_format[f"{name}: {outcome.split(':')[0].split(' ')[0]}"] += 1
+            counts[outcome if not outcome.startswith("BAD") else "BAD"] += 1
+            worst_time, worst_memory = max(worst_time, spent), max(worst_memory, memory)
+            if outcome.startswith("BAD"):
+                bad.append((k, name, kind, outcome))
+                print(json.dumps(bad[-1]), flush=True)
+        pipe.send(None)
+        figures = {
+            "benchmark": "hostile_files",
+            "files": told.runs,
+            "formats": len(names),
+            "outcomes": dict(counts),
+            "by_format": dict(sorted(by_format.items())),
+            "worst_memory_mb": round(worst_memory, 1),
+            "worst_time_s": round(worst_time, 2),
+            "seconds": round(time.perf_counter() - began),
+            "bad": len(bad),
+            "cores": os.cpu_count(),
+        }
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
