@@ -39,7 +39,7 @@ def compare(
         typer.Option(
             help="A method to run (repeatable): snrm, concerto, arslan_ozguven, rct, "
             "harmonic_force_surface, phase_resonance (steady states), resonant_decay, "
-            "restoring_force, ssm (free decays). Default: all of them.",
+            "restoring_force, ssm (free decays), pnlss (multisines). Default: all of them.",
             metavar="NAME",
             show_default=False,
         ),

@@ -32,10 +32,14 @@ from .bench.programmes import (
     stepped_sine_test,
 )
 from .comparison import METHODS, Comparison, compare_methods, snrm
+from .record_comparison import RECORD_METHODS
+from .records.pnlss import pnlss
+from .records.recorded_test import RecordedTest, RecordKind, recorded_test
 from .records.resonant_decay import resonant_decay
 from .records.restoring_force import RestoringForce, fit_restoring_force, restoring_force
 from .records.ring_down_decays import ring_down_decays
 from .records.ssm import SpectralSubmanifold, fit_submanifold, ssm
+from .records.state_space_fit import StateSpaceFit, fit_state_space
 from .result import MethodResult, MethodStatus
 from .steady.arslan_ozguven import arslan_ozguven, describing_function
 from .steady.concerto import concerto
@@ -46,6 +50,7 @@ from .steady.rct import rct
 
 __all__ = [
     "METHODS",
+    "RECORD_METHODS",
     "AbstractController",
     "AmplitudeGains",
     "Comparison",
@@ -63,10 +68,13 @@ __all__ = [
     "PhaseLockedLoop",
     "PhaseSweep",
     "Playback",
+    "RecordKind",
+    "RecordedTest",
     "RestoringForce",
     "SCurve",
     "Shaker",
     "SpectralSubmanifold",
+    "StateSpaceFit",
     "SteppedSineDrive",
     "TargetFeedback",
     "TestRecord",
@@ -80,6 +88,7 @@ __all__ = [
     "describing_function",
     "detached",
     "fit_restoring_force",
+    "fit_state_space",
     "fit_submanifold",
     "force_surface",
     "harmonic_force_surface",
@@ -87,7 +96,9 @@ __all__ = [
     "phase_locked_loop",
     "phase_resonance",
     "phase_sweep",
+    "pnlss",
     "rct",
+    "recorded_test",
     "resonant_decay",
     "restoring_force",
     "ring_down_decays",

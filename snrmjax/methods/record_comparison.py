@@ -11,6 +11,7 @@ from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
+from snrmjax.methods.records.pnlss import pnlss
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind
 from snrmjax.methods.records.recorded_velocity import RecordedVelocity, recorded_velocity
 from snrmjax.methods.records.resonant_decay import even_record, resonant_decay
@@ -108,12 +109,19 @@ class RecordMethod(NamedTuple):
     kinds: tuple[RecordKind, ...]
 
 
+def _pnlss(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
+    if test.channels.force is None:
+        raise ValueError("the force must be known in N (force_n).")
+    return [pnlss(test.recording, test.channels.force, test.channels.reference, modes)]
+
+
 RECORD_METHODS: dict[str, RecordMethod] = {
     "resonant_decay": RecordMethod(_of_decays(resonant_decay), (RecordKind.FREE_DECAY,)),
     "restoring_force": RecordMethod(
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
     "ssm": RecordMethod(_of_decays(ssm), (RecordKind.FREE_DECAY,)),
+    "pnlss": RecordMethod(_pnlss, (RecordKind.BROADBAND,)),
 }
 """Methods that read time records, by name."""
 

@@ -42,7 +42,7 @@ def run(*arguments):
 def test_all_methods_find_a_linear_oscillator(folder):
     done = run(folder / "measured.csv", "--model", folder / "model.toml", "--out", folder / "out")
     assert done.exit_code == 0, done.output
-    assert "6 of 9 methods ran" in done.output
+    assert "6 of 10 methods ran" in done.output
     with (folder / "out" / "compare.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == [
@@ -57,7 +57,7 @@ def test_all_methods_find_a_linear_oscillator(folder):
     np.testing.assert_allclose([float(row["frequency_hz"]) for row in found], 50, rtol=1e-4)
     np.testing.assert_allclose([float(row["damping_ratio"]) for row in found], 0.005, rtol=0.03)
     summary = json.loads((folder / "out" / "summary.json").read_text())
-    assert set(summary["stopped"]) == {"resonant_decay", "restoring_force", "ssm"}
+    assert set(summary["stopped"]) == {"resonant_decay", "restoring_force", "ssm", "pnlss"}
     assert "ssm needs a time record (free decay), and the data have none." in done.output
     assert (folder / "out" / "report.html").exists()
 

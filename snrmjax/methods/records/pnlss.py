@@ -1,0 +1,107 @@
+"""Polynomial nonlinear state-space model of a multisine test, and the nonlinear mode it implies.
+
+The best linear approximation of the test, with its noise and its scatter from realisation to
+realisation, gives a linear model: poles by a subspace method, then all coefficients by least
+squares weighted by that scatter. From there a model with all monomials of some degrees in its
+state equation is fitted to the mean periods, in the frequency domain, weighted by noise and by
+what the model cannot describe. Phase resonances of the fitted model by harmonic balance give
+natural frequency and, from force over velocity, damping against amplitude.
+
+References: J. Paduart, L. Lauwers, J. Swevers, K. Smolders, J. Schoukens & R. Pintelon, Automatica
+46 (2010) 647, doi:10.1016/j.automatica.2010.01.001; for nonlinear modes of such models,
+arXiv:2011.08520.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.methods.records.state_space import hold, is_balanced, modal_constant, model_resonances
+from snrmjax.methods.records.state_space_fit import StateSpaceFit, fit_state_space
+from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
+from snrmjax.model.modes import LinearModes
+
+_POINTS = 25
+_SMALLEST = 0.04  # of the largest velocity: where the curves begin
+
+
+def pnlss(
+    recordings: TimeRecording | Sequence[TimeRecording],
+    force: str,
+    motion: str,
+    modes: LinearModes | None = None,
+    *,
+    order: int = 2,
+    degrees: tuple[int, ...] = (2, 3),
+    period: float | None = None,
+    skip: int = 1,
+) -> MethodResult:
+    """Natural frequency and damping against amplitude from a state-space model of a multisine test.
+
+    At a phase resonance of the model force F and velocity V are in phase: its frequency is ω̃, and
+    2ζ̃ω̃ = a F/V with the model's own modal constant a.
+
+    Arguments and errors as in `fit_state_space`. Returns a `MethodResult` of 25 amplitudes up to
+    the records' largest velocity, 1σ from the fit's covariance. Amplitudes at which the fitted
+    model has no phase resonance are `NO_RESONANCE`.
+    """
+    fit = fit_state_space(
+        recordings, force, motion, modes,
+        order=order, degrees=degrees, period=period, skip=skip,
+    )  # fmt: skip
+    amplitude = np.linspace(_SMALLEST, 1.0, _POINTS) * fit.largest
+    found = model_resonances(fit.model, amplitude / fit.velocity_unit, fit.exponents, fit.mode)
+    balanced = np.cumprod(np.asarray(is_balanced(found))).astype(bool)
+    points = []
+    values = _curves(fit, np.asarray(found.angle), np.asarray(found.force), found.slopes)
+    for k, speed in enumerate(amplitude):
+        if not balanced[k]:
+            points.append(MethodPoint(MethodStatus.NO_RESONANCE, -1))
+        elif not values[1, k] > 0:
+            points.append(MethodPoint(MethodStatus.NOT_A_MODE, -1))
+        else:
+            omega, ratio, omega_std, ratio_std = (float(one) for one in values[:, k])
+            points.append(
+                MethodPoint(
+                    MethodStatus.FOUND, -1, float(speed), omega, omega_std, ratio, ratio_std
+                )
+            )
+    return method_result("pnlss", points, 0, _notes(fit))
+
+
+def _curves(
+    fit: StateSpaceFit, angle: np.ndarray, force: np.ndarray, slopes: Array
+) -> Float[np.ndarray, "4 amplitude"]:
+    """Natural frequency (rad/s), damping ratio, and 1σ of each."""
+    flat, rebuild = ravel_pytree(fit.model)
+    constant, by_coefficients = jax.value_and_grad(
+        lambda one: modal_constant(rebuild(one), fit.mode)
+    )(flat)
+    ratio = float(constant) * force * hold(angle) / (2 * angle)
+    by_angle, by_force = np.asarray(slopes)
+    relative = (
+        np.asarray(by_coefficients) / float(constant)
+        + by_force / force[:, None]
+        - by_angle / angle[:, None]
+    )
+    angle_std, relative_std = (
+        np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", one, fit.covariance, one), 0))
+        for one in (by_angle, relative)
+    )
+    return np.stack([angle * fit.rate, ratio, angle_std * fit.rate, relative_std * np.abs(ratio)])
+
+
+def _notes(fit: StateSpaceFit) -> tuple[str, ...]:
+    checked = (
+        "no realisation was left to validate it"
+        if np.isnan(fit.validation)
+        else f"{100 * fit.validation:.2g} % of a realisation that was not fitted"
+    )
+    return (
+        f"{len(fit.exponents)} monomials a state; the model leaves {100 * fit.misfit:.2g} % (rms) "
+        f"of the velocity, the linear one {100 * fit.linear_misfit:.2g} %; {checked}",
+    )

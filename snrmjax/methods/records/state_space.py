@@ -1,0 +1,211 @@
+"""Polynomial nonlinear state-space models in discrete time, in modal coordinates.
+
+x(k+1) = A x(k) + B u(k) + E ζ(x(k)), y(k) = C x(k) + D u(k), with ζ all monomials of some degrees.
+A is made of a block [[p, q], [−q, p]] for each oscillating mode and C of (1, 0) for each, which
+every model of such modes can be brought to and which leaves no freedom of coordinates: what is
+fitted is unique.
+
+References: J. Paduart et al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001,
+equation 3; for periodic motions of such models, harmonic balance in discrete time.
+"""
+
+import itertools
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
+
+_HARMONICS = 7
+_ANGLES = 64
+_STEPS = 12  # of Newton's method at an amplitude
+_SOLVED = 1e-9  # largest residual of a balanced motion, in units of its amplitude
+
+
+class StateSpace(NamedTuple):
+    """Coefficients of a model; input, output and states are scaled to be of size one."""
+
+    poles: Float[Array, "mode 2"]  # p and q
+    drive: Float[Array, "mode 2"]  # B
+    feedthrough: Float[Array, ""]  # D
+    nonlinear: Float[Array, "state monomial"]  # E
+
+
+def hold(angle: Float[np.ndarray, "*angle"]) -> Float[np.ndarray, "*angle"]:
+    """sinc²(Ω/2 rate): what straight lines between samples leave of a sine.
+
+    The linear part of a model is exact for a force that is straight between samples; a
+    band-limited force over this factor has such a one for its samples.
+    """
+    return np.sinc(np.asarray(angle) / (2 * np.pi)) ** 2
+
+
+Exponents = tuple[tuple[int, ...], ...]
+
+
+def monomials(states: int, degrees: tuple[int, ...]) -> Exponents:
+    """Exponents of all monomials of some degrees.
+
+    >>> monomials(2, (2,))
+    ((2, 0), (1, 1), (0, 2))
+    """
+    found = []
+    for degree in degrees:
+        for chosen in itertools.combinations_with_replacement(range(states), degree):
+            found.append(tuple(chosen.count(k) for k in range(states)))
+    return tuple(found)
+
+
+def response(model: StateSpace, turn: Complex[Array, " frequency"]) -> Complex[Array, " frequency"]:
+    """Frequency response of the linear part at z = e^{iΩ/rate}."""
+    (p, q), (b1, b2) = model.poles.T, model.drive.T
+    away = turn[:, None] - p
+    return jnp.sum((away * b1 + q * b2) / (away**2 + q**2), axis=1) + model.feedthrough
+
+
+def simulated_output(
+    model: StateSpace,
+    start: Float[Array, " state"],
+    force: Float[Array, " sample"],
+    exponents: Exponents,
+) -> Float[Array, " sample"]:
+    """The output from a state at the first sample on."""
+
+    def step(state: Array, value: Array) -> tuple[Array, Array]:
+        seen = jnp.sum(state[0::2]) + model.feedthrough * value
+        return _next(model, state, value, exponents), seen
+
+    return jax.lax.scan(step, start, force, unroll=4)[1]
+
+
+class Resonances(NamedTuple):
+    """Phase resonances of a model by amplitude, in its own units."""
+
+    angle: Float[Array, " amplitude"]  # Ω/rate, rad a sample
+    force: Float[Array, " amplitude"]
+    residual: Float[Array, " amplitude"]  # over the amplitude: balanced where it is tiny
+    slopes: Float[Array, "2 amplitude coefficient"]  # of angle and force by the coefficients
+
+
+@partial(jax.jit, static_argnames=("exponents", "mode"))
+def model_resonances(
+    model: StateSpace, amplitudes: Float[Array, " amplitude"], exponents: Exponents, mode: int
+) -> Resonances:
+    """Forced motions whose output is in phase with the force, at rising amplitudes of the output.
+
+    Harmonic balance of the discrete model: with u = F cos θ the states have seven harmonics, F and
+    Ω are unknowns, and the output's fundamental is (amplitude) cos θ. Newton's method goes from
+    one amplitude to the next; derivatives by the implicit function theorem. Coefficients are in
+    the order of `ravel_pytree`.
+    """
+    flat, rebuild = ravel_pytree(model)
+    states = 2 * len(model.poles)
+    theta = 2 * jnp.pi * jnp.arange(_ANGLES) / _ANGLES
+    order = jnp.arange(_HARMONICS + 1)
+    waves = jnp.concatenate(
+        [jnp.cos(order * theta[:, None]), jnp.sin(order[1:] * theta[:, None])], 1
+    )
+    project = waves.T * jnp.where(jnp.arange(2 * _HARMONICS + 1) == 0, 1, 2)[:, None] / _ANGLES
+
+    def residual(unknowns: Array, coefficients: Array, amplitude: Array) -> Array:
+        """Balance of the map over an angle of Ω/rate, per unit of the amplitude."""
+        own = rebuild(coefficients)
+        angle, force = unknowns[0], unknowns[1]
+        shapes = unknowns[2:].reshape(states, 2 * _HARMONICS + 1)
+        push = force * jnp.cos(theta)
+        now = amplitude * shapes @ waves.T
+        later = jax.vmap(lambda x, u: _next(own, x, u, exponents), (1, 0), 1)(now, amplitude * push)
+        cosines, sines = shapes[:, 1 : _HARMONICS + 1], shapes[:, _HARMONICS + 1 :]
+        c, s = jnp.cos(order[1:] * angle), jnp.sin(order[1:] * angle)
+        moved = jnp.concatenate(
+            [shapes[:, :1], cosines * c + sines * s, sines * c - cosines * s], axis=1
+        )
+        balance = (later @ project.T) / amplitude - moved
+        seen = jnp.sum(shapes[0::2], axis=0)
+        held = jnp.stack([seen[1] + own.feedthrough * force - 1.0, seen[_HARMONICS + 1]])
+        return jnp.concatenate([balance.ravel(), held])
+
+    by_unknowns = jax.jacfwd(residual)
+
+    def newton(unknowns: Array, amplitude: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        def step(_: int, point: Array) -> Array:
+            matrix = by_unknowns(point, flat, amplitude)
+            return point - jnp.linalg.solve(matrix, residual(point, flat, amplitude))
+
+        point = jax.lax.fori_loop(0, _STEPS, step, unknowns)
+        matrix = by_unknowns(point, flat, amplitude)
+        by_coefficients = jax.jacfwd(residual, argnums=1)(point, flat, amplitude)
+        slopes = -jnp.linalg.solve(matrix, by_coefficients)[:2]
+        left = jnp.max(jnp.abs(residual(point, flat, amplitude)))
+        return point, (point[:2], slopes, left)
+
+    _, (found, slopes, left) = jax.lax.scan(newton, _linear_motion(model, mode), amplitudes)
+    return Resonances(found[:, 0], found[:, 1], left, jnp.moveaxis(slopes, 1, 0))
+
+
+def is_balanced(found: Resonances) -> Array:
+    """Where harmonic balance of `model_resonances` has solved its equations."""
+    return (found.residual < _SOLVED) & (found.force > 0)
+
+
+def modal_constant(model: StateSpace, mode: int) -> Float[Array, ""]:
+    """Shape times participation, times 1/rate: of a velocity over a force, a in a s/(s² + …)."""
+    multiplier = jax.lax.complex(*model.poles[mode])
+    rate = jnp.log(multiplier)  # of the continuous motion, times 1/rate
+    residue = jax.lax.complex(model.drive[mode, 0], -model.drive[mode, 1]) / 2
+    residue = (
+        residue * (rate / (multiplier - 1)) ** 2
+    )  # of a force that is straight between samples
+    return jnp.abs(2 * rate.imag * residue / rate)
+
+
+def _next(model: StateSpace, state: Array, value: Array, exponents: Exponents) -> Array:
+    pairs = state.reshape(-1, 2)
+    (p, q), (x1, x2) = model.poles.T, pairs.T
+    turned = jnp.stack([p * x1 + q * x2, p * x2 - q * x1], axis=1) + model.drive * value
+    powers = [_powers(state[k], max(one[k] for one in exponents)) for k in range(len(state))]
+    terms = []
+    for one in exponents:
+        product = jnp.ones(())
+        for k, power in enumerate(one):
+            product = product * powers[k][power] if power else product
+        terms.append(product)
+    return turned.ravel() + model.nonlinear @ jnp.stack(terms)
+
+
+def _powers(value: Array, most: int) -> list[Array]:
+    found = [jnp.ones(())]
+    for _ in range(most):
+        found.append(found[-1] * value)
+    return found
+
+
+def _linear_motion(model: StateSpace, mode: int) -> Array:
+    """Ω, F and harmonics of the linear model at its phase resonance, amplitude one."""
+    multiplier = jax.lax.complex(*model.poles[mode])
+
+    def phase(angle: Array) -> Array:
+        return jnp.angle(response(model, jnp.exp(1j * angle)[None])[0])
+
+    angle = jnp.angle(multiplier)
+    width = -jnp.log(jnp.abs(multiplier))
+    for _ in range(4):  # near resonance the phase falls as the angle over the half-power width
+        angle = angle + width * jnp.tan(jnp.clip(phase(angle), -1.2, 1.2))
+    turn = jnp.exp(1j * angle)
+    force = 1 / jnp.abs(response(model, turn[None])[0])
+    (p, q), (b1, b2) = model.poles.T, model.drive.T
+    below = (turn - p) ** 2 + q**2
+    states = (
+        jnp.stack(
+            [((turn - p) * b1 + q * b2) / below, ((turn - p) * b2 - q * b1) / below], axis=1
+        ).ravel()
+        * force
+    )
+    none = jnp.zeros((len(states), _HARMONICS - 1))
+    shapes = jnp.concatenate(
+        [jnp.zeros((len(states), 1)), states.real[:, None], none, -states.imag[:, None], none], 1
+    )
+    return jnp.concatenate([jnp.stack([angle, force]), shapes.ravel()])

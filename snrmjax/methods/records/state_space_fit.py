@@ -1,0 +1,403 @@
+"""A polynomial nonlinear state-space model fitted to the mean periods of multisine records.
+
+First over short stretches, each with a state of its own at its start (multiple shooting: a model
+that is wrong cannot run away from the record), then over whole periods, in the frequency domain,
+weighted by noise and by what the model cannot describe.
+
+References: J. Paduart et al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001,
+section 4; for multiple shooting, H. G. Bock & K. J. Plitt, IFAC Proc. 17 (1984) 1603,
+doi:10.1016/S1474-6670(17)61205-9.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.measure.recordings.channels import Channel
+from snrmjax.measure.recordings.multisine import MultisineResponses, multisine_responses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.velocity_states import choose_channels, velocity_factors
+from snrmjax.methods.records.resonant_decay import even_record
+from snrmjax.methods.records.state_space import (
+    Exponents,
+    StateSpace,
+    hold,
+    monomials,
+    simulated_output,
+)
+from snrmjax.methods.records.state_space_start import (
+    HIGHEST,
+    Periods,
+    Start,
+    StateSpaceTrial,
+    as_real,
+    least_squares,
+    linear_model,
+    linear_states,
+    regressed,
+)
+from snrmjax.model.modes import LinearModes
+
+_PER_CYCLE = 32.0  # samples that the model has of a cycle of the mode
+_FEWEST_SAMPLES = 4.5  # a cycle of the mode, that a record must have
+_MOST_SAMPLES = 2**16  # of all realisations that are fitted
+_MOST_RECORDED = 2**22  # samples whose clipping is looked for
+_AWAY = 1e6  # rms velocities of the record: no motion of a model that is of any use
+_MUCH = 0.2  # of the velocity, that a fitted model may leave
+_WIDTH = 31  # lines over which the misfit's power is averaged for the weights
+_ROUNDS = 3  # of fits, each weighted by what the one before left
+_SETTLING = 12  # periods at most until a simulated record repeats itself
+_STRETCHES = 16  # of a period at most
+_CYCLES = 6.0  # of the mode that a stretch has at least
+
+
+class StateSpaceFit(NamedTuple):
+    """A fitted model with its units, errors and checks."""
+
+    model: StateSpace
+    covariance: Float[np.ndarray, "coefficient coefficient"]  # order of `ravel_pytree`
+    exponents: Exponents
+    rate: float  # Hz, of the model's samples
+    force_unit: float  # N
+    velocity_unit: float  # m/s
+    mode: int  # of the model, the one of interest
+    largest: float  # m/s, velocity in the records
+    linear: MultisineResponses
+    misfit: float  # rms of what the model leaves of the fitted records, relative
+    linear_misfit: float  # likewise of the linear model
+    validation: float  # of a realisation that was not fitted; NaN where there was only one
+
+
+def fit_state_space(
+    recordings: TimeRecording | Sequence[TimeRecording],
+    force: str,
+    motion: str,
+    modes: LinearModes | None = None,
+    *,
+    order: int = 2,
+    degrees: tuple[int, ...] = (2, 3),
+    period: float | None = None,
+    skip: int = 1,
+) -> StateSpaceFit:
+    """Fit a polynomial nonlinear state-space model to multisine records.
+
+    Arguments: `recordings`, one a realisation of random phases, of one rate and period; `force`
+    (N) and `motion` (a velocity, or an acceleration or displacement, which are turned into
+    velocities line by line) name their channels; `modes` say where the mode of interest lies, by
+    default at the highest response; `order` is the number of states, two a mode in the excited
+    band; `degrees` of the monomials; `period` in s, found where it is not stated; `skip` periods
+    at the start are left out. With two realisations or more the last is not fitted but predicted.
+    Returns a `StateSpaceFit`. Raises `ValueError` as `multisine_responses` does, for an `order`
+    that is odd or too high, for fewer than 4.5 samples a cycle, a clipped motion, where the
+    records do not hold as many oscillating modes as `order` wants, and where the fitted model
+    leaves more than 20 % of the velocity.
+    Validity: steady periodic records, noise of the force small; the model is of the amplitudes
+    that the records visit: 1σ does not know what a higher degree would say.
+    """
+    if order not in (2, 4, 6):
+        raise ValueError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
+    if not degrees or not all(2 <= one <= 7 for one in degrees):
+        raise ValueError(f"`degrees` must lie between 2 and 7, but are {degrees}.")
+    records = (recordings,) if isinstance(recordings, TimeRecording) else tuple(recordings)
+    channel = choose_channels(records[0], force, [motion]).responses[0]
+    for one in records:
+        if one.n_samples <= _MOST_RECORDED:
+            even_record(one.time(), one.values([motion])[0], "pnlss")
+    linear = _of_velocity(
+        multisine_responses(records, force, [motion], period=period, skip=skip), channel
+    )
+    natural = _mode_frequency(linear, modes)
+    periods = _mean_periods(records, (force, channel), linear, skip, natural)
+    held_out = periods.force.shape[0] > 1
+    fitted = periods._replace(
+        force=periods.force[: -1 if held_out else None],
+        velocity=periods.velocity[: -1 if held_out else None],
+    )
+    exponents = monomials(order, degrees)
+    linear_part = linear_model(linear, periods, order, len(exponents))
+    start = Start(linear_part, linear_states(linear_part, fitted))
+    linear_misfit = _misfit(start, fitted, exponents)
+    near = regressed(fitted, natural, exponents) if order == 2 else None
+    starts = [start] if near is None else [start, near]
+    shot = [_over_stretches(one, fitted, exponents, natural) for one in starts]
+    first = min([*starts, *shot], key=lambda one: _misfit(one, fitted, exponents))
+    model, covariance, states = _fitted(first.model, first.states[:, 0], fitted, exponents, natural)
+    misfit = _relative(_simulated(model, states, fitted, exponents), fitted.velocity)
+    if not misfit < _MUCH:
+        raise ValueError(
+            f"pnlss: the best model of degree {max(degrees)} that was found leaves "
+            f"{100 * misfit:.3g} % of the velocity, more than {100 * _MUCH:g} %: a lower level, "
+            "longer periods, more states or other degrees may help."
+        )
+    angles = np.angle(np.asarray(model.poles) @ [1, 1j])
+    return StateSpaceFit(
+        model,
+        covariance,
+        exponents,
+        periods.rate,
+        *periods.units,
+        int(np.argmin(np.abs(angles * periods.rate - natural))),
+        float(np.abs(periods.velocity).max() * periods.units[1]),
+        linear,
+        misfit,
+        linear_misfit,
+        _validated(model, periods, exponents) if held_out else np.nan,
+    )
+
+
+def _of_velocity(linear: MultisineResponses, channel: Channel) -> MultisineResponses:
+    """The same of the motion's velocity."""
+    found = linear.responses
+    turn = velocity_factors([channel], [1], found.frequency)[:, 0, 0]
+    size = np.abs(turn)
+    return dataclasses.replace(
+        linear,
+        responses=dataclasses.replace(found, values=found.values * turn),
+        noise_std=linear.noise_std * size,
+        total_std=linear.total_std * size,
+    )
+
+
+def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> float:
+    """Frequency of the mode of interest, rad/s, if the test excites it."""
+    frequency = linear.responses.frequency
+    if modes is None:
+        return float(frequency[np.argmax(np.abs(linear.responses.values[0, 0]))])
+    natural = float(modes.natural_frequency[modes.mode_of_interest])
+    if not frequency[0] <= natural <= frequency[-1]:
+        raise ValueError(
+            f"pnlss needs lines around the mode at {natural / (2 * np.pi):.4g} Hz, but the records "
+            f"have them from {frequency[0] / (2 * np.pi):.4g} to "
+            f"{frequency[-1] / (2 * np.pi):.4g} Hz."
+        )
+    return natural
+
+
+def _mean_periods(
+    records: tuple[TimeRecording, ...],
+    channels: tuple[str, Channel],
+    linear: MultisineResponses,
+    skip: int,
+    natural: float,
+) -> Periods:
+    """Mean periods, resampled by their spectra (periodic records: exactly) and scaled."""
+    rate = records[0].sampling_rate
+    samples = round(linear.period * rate)
+    if rate < _FEWEST_SAMPLES * natural / (2 * np.pi):
+        raise ValueError(
+            f"pnlss needs {_FEWEST_SAMPLES:g} samples a cycle of the mode at "
+            f"{natural / (2 * np.pi):.4g} Hz, but the records have {rate:g} Hz: the sampling rate "
+            "is too low."
+        )
+    # A number that a power of two of stretches divides.
+    cycles = linear.period * natural / (2 * np.pi)
+    wanted = _STRETCHES * round(cycles * _PER_CYCLE / _STRETCHES)
+    most = _MOST_SAMPLES // wanted
+    if most < 1:
+        raise ValueError(
+            f"pnlss fits {_MOST_SAMPLES} samples at most, but a period has {wanted} at "
+            f"{_PER_CYCLE:g} a cycle: record shorter periods."
+        )
+    names = (channels[0], channels[1].name)
+    line = 2 * np.pi * np.arange(1, samples // 2 + 1) / linear.period
+    turn = np.concatenate([[0.0], velocity_factors([channels[1]], [1], line)[:, 0, 0]])
+    both = np.stack([np.ones_like(turn), turn])
+    means, noise = [], []
+    for record in records[: max(2, most)]:
+        spectra = []
+        for start in range(skip * samples, record.n_samples - samples + 1, samples):
+            once = record.values(names, start, start + samples)
+            spectra.append(np.fft.rfft(once, axis=1) * 2 / samples * both)
+        means.append(np.mean(spectra, axis=0))
+        scatter = np.var([one[1] for one in spectra], axis=0, ddof=1) / len(spectra)
+        noise.append(scatter)
+    lines = min(samples, wanted) // 2  # the line at half the rate is left out
+    cut = np.zeros((len(means), 2, wanted // 2 + 1), dtype=complex)
+    cut[..., :lines] = np.array(means)[..., :lines]
+    cut[..., 0] = 0.0
+    cut[:, 0] /= hold(2 * np.pi * np.arange(wanted // 2 + 1) / wanted)
+    force, velocity = np.moveaxis(np.fft.irfft(cut * wanted / 2, wanted, axis=2), 1, 0)
+    units = float(np.sqrt(np.mean(force**2))), float(np.sqrt(np.mean(velocity**2)))
+    return Periods(
+        force / units[0],
+        velocity / units[1],
+        np.mean(noise, axis=0)[:lines] / units[1] ** 2,
+        wanted / linear.period,
+        units,
+    )
+
+
+@partial(jax.jit, static_argnames="exponents")
+def _outputs(model: StateSpace, starts: Array, force: Array, exponents: Exponents) -> Array:
+    return jax.vmap(lambda x, u: simulated_output(model, x, u, exponents))(starts, force)
+
+
+@partial(jax.jit, static_argnames="exponents")
+def _output_slopes(
+    model: StateSpace, starts: Array, force: Array, exponents: Exponents
+) -> tuple[Array, Array]:
+    """Outputs, and their derivatives by the coefficients and by their own first state."""
+    flat, rebuild = ravel_pytree(model)
+
+    def of(unknowns: Array, push: Array) -> Array:
+        coefficients, start = unknowns[: len(flat)], unknowns[len(flat) :]
+        return simulated_output(rebuild(coefficients), start, push, exponents)
+
+    def both(start: Array, push: Array) -> tuple[Array, Array]:
+        at = jnp.concatenate([flat, start])
+        return of(at, push), jax.jacfwd(of)(at, push)
+
+    return jax.vmap(both)(starts, force)
+
+
+def _simulated(
+    model: StateSpace, starts: np.ndarray, periods: Periods, exponents: Exponents
+) -> Float[np.ndarray, "realisation sample"]:
+    found = _outputs(model, jnp.asarray(starts), jnp.asarray(periods.force), exponents)
+    return _in_bounds(found, found)[0]
+
+
+def _in_bounds(found: Array, slopes: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Outputs and slopes as they are, or NaN all over where the model runs away."""
+    values, steep = np.asarray(found), np.asarray(slopes)
+    if np.all(np.abs(values) < _AWAY) and np.isfinite(steep).all():
+        return values, steep
+    return np.full_like(values, np.nan), np.full_like(steep, np.nan)
+
+
+def _relative(found: np.ndarray, measured: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((found - measured) ** 2) / np.mean(measured**2)))
+
+
+def _misfit(start: Start, periods: Periods, exponents: Exponents) -> float:
+    """Relative rms error over whole periods; infinite where the model runs away."""
+    found = _relative(
+        _simulated(start.model, start.states[:, 0], periods, exponents), periods.velocity
+    )
+    return found if np.isfinite(found) else np.inf
+
+
+def _over_stretches(start: Start, periods: Periods, exponents: Exponents, natural: float) -> Start:
+    """The model refined over stretches of a few cycles, each from a state of its own."""
+    count, samples = periods.force.shape
+    cycles = samples / periods.rate * natural / (2 * np.pi)
+    pieces = min(_STRETCHES, 2 ** max(0, int(np.log2(max(cycles / _CYCLES, 1.0)))))
+    length, states = samples // pieces, start.states.shape[2]
+    force = jnp.asarray(periods.force.reshape(-1, length))
+    target = periods.velocity.reshape(-1, length)
+    flat, rebuild = ravel_pytree(start.model)
+    own = start.states[:, ::length].reshape(-1, states)
+
+    def evaluate(points: np.ndarray, unit: float) -> list[StateSpaceTrial]:
+        trials = []
+        for one in points:
+            first = jnp.asarray(one[len(flat) :].reshape(-1, states))
+            model = rebuild(jnp.asarray(one[: len(flat)]))
+            found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
+            steep = np.zeros((*found.shape, len(one)))
+            steep[..., : len(flat)] = slopes[..., : len(flat)]
+            for k in range(len(steep)):
+                at = len(flat) + k * states
+                steep[k, :, at : at + states] = slopes[k, :, len(flat) :]
+            trials.append(
+                StateSpaceTrial((found - target).ravel() / unit, steep.reshape(-1, len(one)) / unit)
+            )
+        return trials
+
+    point = np.concatenate([np.asarray(flat), own.ravel()])
+    for _ in range(2):  # the unit is what the fit before left
+        left = evaluate(point[None], 1.0)[0].residuals
+        unit = float(np.sqrt(np.mean(left**2)))
+        if not np.isfinite(unit):
+            return start
+        point = least_squares(partial(evaluate, unit=unit), point).point
+    kept = start.states.copy()
+    kept[:, ::length] = point[len(flat) :].reshape(count, pieces, states)
+    return Start(rebuild(jnp.asarray(point[: len(flat)])), kept)
+
+
+def _fitted(
+    start: StateSpace,
+    starts: np.ndarray,
+    periods: Periods,
+    exponents: Exponents,
+    natural: float,
+) -> tuple[StateSpace, Float[np.ndarray, "coefficient coefficient"], np.ndarray]:
+    """The polynomial model, the covariance of its coefficients and the periods' first states."""
+    flat, rebuild = ravel_pytree(start)
+    count, samples = periods.force.shape
+    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * samples
+    lines = np.arange(1, min(len(periods.noise), int(highest)))
+    target = _spectrum(periods.velocity, lines)
+    force = jnp.asarray(periods.force)
+    point = np.concatenate([np.asarray(flat), starts.ravel()])
+    states = starts.shape[1]
+
+    def evaluate(points: np.ndarray, std: np.ndarray) -> list[StateSpaceTrial]:
+        trials = []
+        for one in points:
+            model = rebuild(jnp.asarray(one[: len(flat)]))
+            first = jnp.asarray(one[len(flat) :].reshape(count, states))
+            found, slopes = _in_bounds(*_output_slopes(model, first, force, exponents))
+            left = (_spectrum(found, lines) - target) / std
+            steep = np.zeros((count, len(lines), len(one)), dtype=complex)
+            steepness = _spectrum(np.moveaxis(slopes, 2, 1), lines) / std
+            for k, part in enumerate(np.moveaxis(steepness, 1, 2)):
+                own = len(flat) + k * states
+                steep[k, :, : len(flat)] = part[:, : len(flat)]
+                steep[k, :, own : own + states] = part[:, len(flat) :]
+            trials.append(
+                StateSpaceTrial(as_real(left.ravel()), as_real(steep.reshape(-1, len(one))))
+            )
+        return trials
+
+    left = _spectrum(_simulated(start, starts, periods, exponents), lines) - target
+    for _ in range(_ROUNDS):
+        std = _error(left, periods.noise[lines])
+        best = least_squares(partial(evaluate, std=std), point)
+        point = best.point
+        linearised = best.linearised
+        size = count * len(lines)
+        left = (linearised.residuals[:size] + 1j * linearised.residuals[size:]).reshape(
+            count, len(lines)
+        ) * std
+    std = _error(left, periods.noise[lines])
+    [last] = evaluate(point[None], std)
+    # A complex error of variance std² has half of it in each part.
+    scale = np.linalg.norm(last.jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    normal = (last.jacobian / scale).T @ (last.jacobian / scale)
+    inverse = np.linalg.pinv(normal, hermitian=True) / np.outer(scale, scale) / 2
+    return (
+        rebuild(jnp.asarray(point[: len(flat)])),
+        inverse[: len(flat), : len(flat)],
+        point[len(flat) :].reshape(count, states),
+    )
+
+
+def _spectrum(signal: np.ndarray, lines: np.ndarray) -> Complex[np.ndarray, "*batch line"]:
+    return np.fft.rfft(signal, axis=-1)[..., lines] * 2 / signal.shape[-1]
+
+
+def _error(left: np.ndarray, noise: np.ndarray) -> Float[np.ndarray, " line"]:
+    """rms complex error of a line: noise, and what a model leaves of lines around it."""
+    window = np.ones(_WIDTH)
+    around = np.convolve(np.ones(len(noise)), window, "same")
+    misfit = np.convolve(np.mean(np.abs(left) ** 2, axis=0), window, "same") / around
+    smooth = np.convolve(noise, window, "same") / around
+    return np.sqrt(np.maximum(misfit, smooth))
+
+
+def _validated(model: StateSpace, periods: Periods, exponents: Exponents) -> float:
+    """Relative error of the last realisation, driven until the motion repeats itself."""
+    once = jnp.asarray(np.tile(periods.force[-1:], (1, _SETTLING)))
+    none = jnp.zeros((1, 2 * len(model.poles)))
+    found = np.asarray(_outputs(model, none, once, exponents)).reshape(_SETTLING, -1)
+    return _relative(found[-1], periods.velocity[-1])

@@ -1,0 +1,138 @@
+"""Nonlinear state-space models of oscillators whose mode is known without them."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete
+
+import snrmjax as sj
+from snrmjax.measure import Channel, time_recording
+from snrmjax.methods.records.state_space import StateSpace, hold, modal_constant, monomials
+from snrmjax.methods.records.state_space import response as model_response
+from snrmjax.methods.records.state_space_start import linear_terms, subspace_poles
+
+REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 6e9, 0.5  # rad/s, 1, 1/(m² s²), kg
+RATE, SAMPLES = 1000.0, 1024
+
+
+def discrete_oscillator():
+    """Multiplier, input and feedthrough of mobility s/(s² + …)/m for a force straight in between.
+
+    By SciPy's first-order hold, brought to the model's coordinates by its frequency response.
+    """
+    matrix = np.array([[0.0, 1.0], [-(REST**2), -2 * RATIO * REST]])
+    found = cont2discrete(
+        (matrix, np.array([[0.0], [1 / MASS]]), np.array([[0.0, 1.0]]), np.zeros((1, 1))),
+        *(1 / RATE, "foh"),
+    )
+    turn = np.exp(1j * np.linspace(0.05, 1.2, 60))
+    a, b, c, d = found[:4]
+    values = np.array([(c @ np.linalg.solve(z * np.eye(2) - a, b) + d)[0, 0] for z in turn])
+    return np.linalg.eigvals(a), turn, values
+
+
+def test_the_linear_part_is_that_of_an_oscillator_for_a_force_straight_between_samples():
+    multipliers, turn, values = discrete_oscillator()
+    weight = np.ones(len(turn))
+    found = subspace_poles(turn, values, weight, 2)
+    # Exact arithmetic would give them exactly: rounding of a least-squares problem.
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(multipliers), rtol=1e-9)
+    upper = multipliers[multipliers.imag > 0]
+    poles = np.stack([upper.real, upper.imag], axis=1)
+    drive, through = linear_terms(turn, values, weight, poles)
+    model = StateSpace(poles, drive, np.array(through), np.zeros((2, 0)))
+    np.testing.assert_allclose(model_response(model, turn), values, rtol=1e-9)
+    assert float(modal_constant(model, 0)) * RATE == pytest.approx(1 / MASS, rel=1e-9)
+    # A band-limited force over the hold: what is left are images beyond the sampling rate.
+    omega = np.angle(turn) * RATE
+    mobility = 1j * omega / MASS / (REST**2 - omega**2 + 2j * RATIO * REST * omega)
+    near = np.abs(omega / REST - 1) < 0.5
+    images = (omega[near] / (2 * np.pi * RATE)) ** 2 / (2 * np.pi * RATE * MASS)
+    off = np.abs(values / hold(np.angle(turn)) - mobility)[near]
+    assert np.all(off < 3 * images + 1e-12)
+
+
+def test_monomials_are_all_of_some_degrees():
+    assert len(monomials(4, (2, 3))) == 10 + 20  # (n + d − 1 over d)
+    assert sorted(monomials(2, (3,))) == [(0, 3), (1, 2), (2, 1), (3, 0)]
+
+
+def multisine(rms, seed, *, periods=5, noise=1e-3, motion="velocity"):
+    """A record of m(q̈ + 2ζω q̇ + ω² q + β q³) = F(t), F a multisine of 18 to 90 Hz."""
+    rng = np.random.default_rng(seed)
+    line = np.arange(int(18 * SAMPLES / RATE), int(90 * SAMPLES / RATE))
+    phase = rng.uniform(0, 2 * np.pi, len(line))
+    size = rms * np.sqrt(2 / len(line))
+    time = np.arange(periods * SAMPLES) / RATE
+
+    def force(t):
+        return size * np.sum(np.cos(2 * np.pi * line * RATE / SAMPLES * t + phase))
+
+    def rate(t, state):
+        q, v = state
+        return v, force(t) / MASS - REST**2 * q - CUBIC * q**3 - 2 * RATIO * REST * v
+
+    found = solve_ivp(
+        rate, (0, time[-1]), (0, 0), t_eval=time, rtol=1e-7, atol=1e-10, method="DOP853"
+    )
+    push = np.array([force(t) for t in time])
+    q, v = found.y
+    acceleration = push / MASS - REST**2 * q - CUBIC * q**3 - 2 * RATIO * REST * v
+    seen = {"velocity": v, "acceleration": acceleration}[motion]
+    seen = seen + noise * seen.std() * rng.standard_normal(len(seen))
+    channels = [Channel("force", "force"), Channel("tip", motion)]
+    return time_recording(np.stack([push, seen]), channels, RATE, name="multisine")
+
+
+def backbone(velocity):
+    """One term of harmonic balance: within 3e-4 of the exact one at the amplitudes here."""
+    half = REST**2 / 2
+    return np.sqrt(half + np.sqrt(half**2 + 0.75 * CUBIC * velocity**2))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("motion", ["velocity", "acceleration"])
+def test_mode_of_a_duffing_oscillator_from_three_realisations(motion):
+    records = [multisine(0.5, seed, motion=motion) for seed in (0, 1, 2)]
+    result = sj.methods.pnlss(records, "force", "tip")
+    assert result.found.all()
+    # Four of the fit's own 1σ, and of frequency what one term of harmonic balance leaves out.
+    off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
+    assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
+    modal = 2 * np.asarray(result.damping_ratio) * np.asarray(result.natural_frequency)
+    away = modal / (2 * RATIO * REST) - 1
+    relative = np.asarray(result.damping_ratio_std) / np.asarray(result.damping_ratio)
+    assert np.all(np.abs(away) < np.maximum(4 * relative, 2e-3))
+    assert "of a realisation that was not fitted" in result.notes[0]
+
+
+@pytest.mark.long
+def test_a_model_that_does_not_fit_is_no_answer():
+    with pytest.raises(ValueError, match=r"pnlss: the best model of degree 3 .* of the velocity"):
+        sj.methods.pnlss(multisine(8.0, 0, periods=3), "force", "tip")
+
+
+def test_what_cannot_be_fitted_is_refused():
+    rng = np.random.default_rng(0)
+    once = np.fft.irfft(np.fft.rfft(rng.standard_normal(256)) * (np.arange(129) < 40), 256)
+    push = np.tile(once, 4)
+    moved = np.roll(push, 3)
+
+    def record(values, rate=RATE):
+        channels = [Channel("force", "force"), Channel("tip", "velocity")]
+        return time_recording(np.stack([push, values]), channels, rate)
+
+    fit = sj.methods.fit_state_space
+    with pytest.raises(ValueError, match="`order` must be 2, 4 or 6"):
+        fit(record(moved), "force", "tip", order=3)
+    with pytest.raises(ValueError, match="`degrees` must lie between 2 and 7"):
+        fit(record(moved), "force", "tip", degrees=(1, 3))
+    with pytest.raises(ValueError, match=r"pnlss: the record stays at its largest value.*clipped"):
+        fit(record(np.clip(moved, -0.3, 0.3)), "force", "tip")
+    far = sj.model.linear_modes([400 * 2 * np.pi], [0.01], [[1.0]], [1.0])
+    with pytest.raises(ValueError, match="pnlss needs lines around the mode at 400 Hz"):
+        fit(record(moved), "force", "tip", far)
+    with pytest.raises(ValueError, match="two periods are needed after the 3 left out"):
+        fit(record(moved), "force", "tip", skip=3)
+    with pytest.raises(ValueError, match="does not have 1 oscillating modes"):
+        fit(record(push), "force", "tip")
