@@ -1,3 +1,8 @@
+from .calibrate.backbone_calibration import (
+    BackboneCalibration,
+    MeasuredBackbone,
+    calibrate_to_backbone,
+)
 from .calibrate.calibrated_model import CalibratedModel
 from .calibrate.calibration import calibrate_model
 from .calibrate.inverse_force import InverseForce, inverse_force
@@ -79,6 +84,7 @@ __all__ = [
     "AdviceStatus",
     "AmplitudeDependence",
     "Backbone",
+    "BackboneCalibration",
     "BackboneFit",
     "BackbonePoints",
     "BackboneValues",
@@ -105,6 +111,7 @@ __all__ = [
     "KnownShape",
     "LinearModalFit",
     "LocatedStatus",
+    "MeasuredBackbone",
     "ModesRequest",
     "NextMeasurement",
     "NextMeasurements",
@@ -123,6 +130,7 @@ __all__ = [
     "amplitude_dependence",
     "bootstrap",
     "calibrate_model",
+    "calibrate_to_backbone",
     "closed_form",
     "compare_bands",
     "contributions",

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from snrmjax.identify.calibrate.backbone_calibration import BackboneCalibration
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.model.parameters import checked_names, parameter_values, stated_stds
 from snrmjax.model.structures import Structure
@@ -191,7 +192,7 @@ def correlated_inputs(
     return UncertainInputs(middle, spread, centre, factor, tuple(names), kinds)
 
 
-def posterior_inputs(calibrated: CalibratedModel) -> UncertainInputs:
+def posterior_inputs(calibrated: CalibratedModel | BackboneCalibration) -> UncertainInputs:
     """The fitted parameters of a calibration with their covariance, normally distributed.
 
     Raises `ValueError` for a calibration that did not converge.

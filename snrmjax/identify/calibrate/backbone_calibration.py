@@ -1,0 +1,294 @@
+"""Numbers of a structure fitted to points of its backbone: dimensions, moduli, supports."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from snrmjax.identify.pointwise.inversion_result import PointStatus
+from snrmjax.identify.pointwise.points_result import BackbonePoints
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.least_squares import inverse_of
+from snrmjax.numerics.levenberg_marquardt import MinimisationStatus, StepRule, minimise
+from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
+
+_FURTHEST = np.log(10.0)  # of a number from its start, either way
+_RULE = StepRule(steps=40, settled=1e-6)
+_ROUNDS = 3  # of fitting, and of weighing the errors of velocity by the slope that was found
+
+ModelOf = Callable[[dict[str, Any]], Structure]
+"""A model by the values of named numbers, differentiable by them."""
+
+
+class MeasuredBackbone(NamedTuple):
+    """Points of a backbone: natural frequencies at amplitudes of velocity at the first sensor."""
+
+    velocity: Float[np.ndarray, " point"]  # m/s
+    frequency: Float[np.ndarray, " point"]  # rad/s
+    frequency_std: Float[np.ndarray, " point"] | None = None  # rad/s; None: not known, all equal
+    velocity_std: Float[np.ndarray, " point"] | None = None  # m/s; None: known exactly
+
+
+class BackboneCalibration(AbstractResult):
+    """Numbers of a structure with which it has a measured backbone, and how well they are known.
+
+    `residuals` are (measured − fitted frequency) over 1σ. `covariance` and `std` are widened by the
+    residuals' size where no error of frequency is stated, or where the residuals contradict it.
+    `fitted_std` is 1σ of the fitted backbone that follows from `covariance`.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("parameter",)
+
+    model: Structure  # with the fitted values
+    values: Float[np.ndarray, " parameter"]  # SI units
+    covariance: Float[np.ndarray, "parameter parameter"]
+    measured: MeasuredBackbone
+    fitted: Float[np.ndarray, " point"]  # rad/s, at the measured velocities
+    fitted_std: Float[np.ndarray, " point"]  # rad/s
+    residuals: Float[np.ndarray, " point"]
+    reduced_chi_square: float
+    names: tuple[str, ...] = eqx.field(static=True)
+    status: MinimisationStatus = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def std(self) -> Float[np.ndarray, " parameter"]:
+        """1σ of the values."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit ended at a minimum."""
+        return self.status.found_minimum
+
+    def summary(self) -> tuple[str, ...]:
+        """Every number with its 1σ, how well the points are met, and what is wrong."""
+        each = zip(self.names, self.values, self.std, strict=True)
+        stated = "stated" if self.measured.frequency_std is not None else "assumed"
+        return (
+            f"BackboneCalibration: {len(self.names)} parameters from {len(self.fitted)} points of "
+            f"a backbone ({self.status})",
+            *(f"{name} = {value:.6g} ± {std:.2g} (1σ)" for name, value, std in each),
+            f"residuals {np.sqrt(self.reduced_chi_square):.3g} times the {stated} errors",
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """Values with 1σ and covariance in SI units, and the backbone, measured and fitted."""
+        across, at = ("parameter", "other_parameter"), ("point",)
+        hertz = "Hz"
+        return {
+            "parameter": Variable(("parameter",), np.array(self.names), "", "parameter"),
+            "value": Variable(("parameter",), self.values, "SI", "fitted value"),
+            "std": Variable(("parameter",), self.std, "SI", "1σ"),
+            "covariance": Variable(across, self.covariance, "SI", "covariance of the values"),
+            "velocity_m_s": Variable(at, self.measured.velocity, "m/s", "velocity amplitude"),
+            "natural_frequency_hz": Variable(
+                at, self.measured.frequency / HERTZ, hertz, "measured natural frequency"
+            ),
+            "fitted_frequency_hz": Variable(at, self.fitted / HERTZ, hertz, "fitted"),
+            "fitted_frequency_std_hz": Variable(at, self.fitted_std / HERTZ, hertz, "its 1σ"),
+            "residual": Variable(at, self.residuals, "1", "residual in units of 1σ"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {"status": str(self.status), "notes": "\n".join(self.notes)}
+
+
+class _Linear(NamedTuple):
+    """The weighted problem at some unknowns."""
+
+    residuals: Float[np.ndarray, " row"]
+    jacobian: Float[np.ndarray, "row unknown"]
+    frequency: Float[np.ndarray, " point"]
+    slope: Float[np.ndarray, " point"]  # of the frequency by the velocity
+
+
+def calibrate_to_backbone(
+    model_of: ModelOf,
+    start: Mapping[str, float],
+    measured: MeasuredBackbone | BackbonePoints,
+    *,
+    prior_std: Mapping[str, float] | None = None,
+    harmonic_order: int = 5,
+    steps: int = 4,
+) -> BackboneCalibration:
+    """Fit numbers of a structure, such as dimensions or support stiffnesses, to its backbone.
+
+    Minimises Σ((ω_k − ω(v_k; p))/σ_k)² + Σ((p − p₀)/σ_p)², where ω(v; p) is the frequency of the
+    nonlinear normal mode of `model_of(p)` at the velocity amplitude v, and σ_k² that of the
+    frequency and of the velocity times dω/dv. Levenberg–Marquardt in log p, with exact derivatives
+    through everything that `model_of` does.
+
+    Arguments: `model_of` makes a model of values by name, in JAX: `sj.io.read_beam_models` does it
+    from a beam file; `start` has the values to begin with (positive, SI units), which also says
+    what is fitted; `measured` points of a backbone, or identified ones; `prior_std` 1σ with which
+    starting values are known beforehand, for those of which the backbone alone says too little.
+    Returns a `BackboneCalibration`; its status and notes say where a fit did not converge.
+    Raises `ValueError` for a start that is not positive, for measured numbers that are no backbone,
+    for fewer data than parameters and for an unknown name in `prior_std`.
+    Validity: the first sensor of the model is the one that was measured. Values stay within a
+    factor of ten of their start. Standard deviations are linearised. A backbone of one mode tells
+    about its linear frequency, hardening and softening: two or three numbers, not more.
+    Reference: for errors of both coordinates ("effective variance") J. Orear, Am. J. Phys. 50
+    (1982) 912, doi:10.1119/1.12972.
+    """
+    names = tuple(start)
+    begin = np.array([float(start[name]) for name in names])
+    for name, value in zip(names, begin, strict=True):
+        if not 0 < value < np.inf:
+            raise ValueError(f"`start` of {name} must be positive, but is {value:g}.")
+    priors = dict(prior_std or {})
+    for name, std in priors.items():
+        if name not in names:
+            raise ValueError(f"`prior_std` names {name!r}, which `start` does not have.")
+        if not 0 < std < np.inf:
+            raise ValueError(f"`prior_std` of {name} must be positive, but is {std:g}.")
+    points = _checked(measured)
+    n, freedom = len(points.velocity), len(points.velocity) + len(priors) - len(names)
+    if not names or freedom < (1 if points.frequency_std is None else 0):
+        raise ValueError(f"{len(names)} parameters need more than the {n} points of a backbone.")
+    prior = np.array([priors.get(name, np.inf) for name in names])
+    settings = names, harmonic_order, steps
+
+    def sizes(slope: np.ndarray) -> np.ndarray:
+        """1σ of every point's frequency."""
+        own = np.ones(n) if points.frequency_std is None else points.frequency_std
+        across = 0.0 if points.velocity_std is None else slope * points.velocity_std
+        return np.hypot(own, across)
+
+    def linear(unknown: np.ndarray, sigma: np.ndarray | None) -> _Linear:
+        values = begin * np.exp(unknown)
+        told = _told(model_of, settings, values, points.velocity)
+        frequency, by_value, slope = (np.asarray(part) for part in told)
+        sigma = sizes(slope) if sigma is None else sigma
+        rows = (frequency - points.frequency) / sigma, (values - begin) / prior
+        slopes = by_value * values / sigma[:, None], np.diag(values / prior)
+        return _Linear(np.concatenate(rows), np.concatenate(slopes), frequency, slope)
+
+    unknown = np.zeros(len(names))
+    limits = np.full(len(names), -_FURTHEST), np.full(len(names), _FURTHEST)
+    for _ in range(_ROUNDS if points.velocity_std is not None else 1):
+        sigma = sizes(linear(unknown, None).slope)
+
+        def evaluate(trials: np.ndarray, sigma: np.ndarray = sigma) -> list[_Linear]:
+            return [linear(trial, sigma) for trial in trials]
+
+        (end,) = minimise(evaluate, unknown[None], evaluate(unknown[None]), limits, _RULE)
+        unknown = end.point
+    return _outcome(model_of, names, points, begin * np.exp(unknown), end, sigma, freedom)
+
+
+@compiled
+def _told(
+    model_of: ModelOf,
+    settings: tuple[tuple[str, ...], int, int],
+    values: Float[Array, " parameter"],
+    velocity: Float[Array, " point"],
+) -> tuple[Array, Array, Array]:
+    """Frequencies of the mode (rad/s), their derivatives by the values and by the velocities."""
+    names, harmonic_order, steps = settings
+
+    def frequency(values: Array, shift: Array) -> tuple[Array, Array]:
+        model = model_of(dict(zip(names, values, strict=True)))
+        found = normal_mode_at_velocities(
+            model, velocity + shift, harmonic_order=harmonic_order, steps=steps
+        )
+        return found.frequency, found.frequency
+
+    # One motion does not feel another's velocity: all may be shifted at once.
+    by, told = jax.jacfwd(frequency, argnums=(0, 1), has_aux=True)(values, jnp.zeros(()))
+    return told, *by
+
+
+def _checked(measured: MeasuredBackbone | BackbonePoints) -> MeasuredBackbone:
+    """Points that are numbers, in the order in which they came."""
+    if isinstance(measured, BackbonePoints):
+        found = np.asarray(measured.status) == int(PointStatus.OK)
+        std = np.asarray(measured.natural_frequency_std)[found]
+        points = MeasuredBackbone(
+            np.asarray(measured.backbone_velocity)[found],
+            np.asarray(measured.natural_frequency)[found],
+            std if np.all(np.isfinite(std)) and std.size else None,
+        )
+    else:
+        own: Any = [None if part is None else _vector(part) for part in measured]
+        points = MeasuredBackbone(*own)
+    n = len(points.velocity)
+    for name, values in points._asdict().items():
+        if values is None:
+            continue
+        if len(values) != n:
+            raise ValueError(f"`{name}` has {len(values)} values for {n} velocities.")
+        least = 0.0 if name == "velocity_std" else np.finfo(float).tiny
+        good: Bool[np.ndarray, " point"] = np.isfinite(values) & (values >= least)
+        if not np.all(good):
+            k = int(np.argmin(good))
+            raise ValueError(f"`{name}` must be positive, but point {k} has {values[k]:g}.")
+    return points
+
+
+def _vector(values: Float[ArrayLike, " point"]) -> Float[np.ndarray, " point"]:
+    return np.atleast_1d(np.asarray(values, dtype=np.float64))
+
+
+def _outcome(
+    model_of: ModelOf,
+    names: tuple[str, ...],
+    points: MeasuredBackbone,
+    values: np.ndarray,
+    end: Any,
+    sigma: np.ndarray,
+    freedom: int,
+) -> BackboneCalibration:
+    linear, n = end.linearised, len(sigma)
+    reduced = end.sum_of_squares / freedom if freedom > 0 else np.nan
+    finite = bool(np.all(np.isfinite(linear.jacobian)))
+    covariance, notes = np.full((len(names),) * 2, np.nan), []
+    if finite:
+        relative = inverse_of(linear.jacobian)
+        margin = 3 * np.sqrt(2 / max(freedom, 1))
+        stated = points.frequency_std is not None
+        if freedom > 0 and (not stated or reduced > 1 + margin):
+            relative = relative * reduced
+        covariance = relative * values * values[:, None]
+        if stated and reduced > 1 + margin:
+            notes.append(
+                f"residuals are {np.sqrt(reduced):.2g} times the stated errors: they are "
+                "understated or the model lacks something; the standard deviations are widened."
+            )
+        vague = [k for k, size in enumerate(np.sqrt(np.diag(relative))) if not size < 1]
+        if vague:
+            listed = ", ".join(names[k] for k in vague)
+            notes.append(f"the backbone says next to nothing about {listed}: state `prior_std`.")
+    if end.status == MinimisationStatus.NOT_FINITE:
+        notes.append("the start has no such mode at some velocities: begin nearer.")
+    elif not end.status.found_minimum:
+        notes.append("the fit did not converge: begin nearer, or fit fewer parameters.")
+    at_limit = np.abs(np.abs(end.point) - _FURTHEST) < 1e-9
+    if at_limit.any():
+        listed = ", ".join(name for name, there in zip(names, at_limit, strict=True) if there)
+        notes.append(f"{listed} ended ten times off the start: begin nearer, or state `prior_std`.")
+    by_value = linear.jacobian[:n] * sigma[:, None] / values
+    variance = np.einsum("ki,ij,kj->k", by_value, covariance, by_value)
+    return BackboneCalibration(
+        model=model_of(dict(zip(names, values.tolist(), strict=True))),
+        values=values,
+        covariance=covariance,
+        measured=points,
+        fitted=linear.frequency,
+        fitted_std=np.sqrt(variance),
+        residuals=-linear.residuals[:n],
+        reduced_chi_square=float(reduced),
+        names=names,
+        status=end.status,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,156 @@
+"""Geometry → modes → load cases → model → backbone and response: derivatives and calibration."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import snrmjax as sj
+from snrmjax.simulate.balance.labelled import HERTZ
+
+pytestmark = pytest.mark.long
+
+ARCH = """name = "arch"
+[material]
+young_pa = 204.8e9
+density_kg_m3 = 7870.0
+[section]
+width_m = 0.0127
+thickness_m = 0.000508
+[geometry]
+length_m = 0.2286
+rise_m = 0.0004
+elements = 20
+[supports]
+left = "clamped"
+right = { axial_n_m = 1e7, transverse_n_m = inf, rotation_nm_rad = 5.0 }
+[condense]
+modes = [1, 3]
+load_scale = 0.3
+damping_ratio = 0.01
+[[point_mass]]
+at = 0.3
+mass_kg = 1e-3
+"""
+STEP = 1e-3  # relative, of the differences: from further away the peak is not found
+VARIED = (
+    *("section.thickness_m", "material.young_pa", "geometry.length_m"),
+    *("supports.right.axial_n_m", "supports.right.rotation_nm_rad", "point_mass_1.mass_kg"),
+)
+
+
+def models_in(folder, text):
+    (folder / "beam.toml").write_text(text)
+    return sj.io.read_beam_models(folder / "beam.toml")
+
+
+def differences(told, size):
+    """Central differences of the whole chain by relative changes, of sixth order."""
+    weights = {1: 45 / 60, 2: -9 / 60, 3: 1 / 60}
+    each = []
+    for one in np.eye(size):
+        parts = [
+            w * (np.asarray(told(k * STEP * one)) - np.asarray(told(-k * STEP * one)))
+            for k, w in weights.items()
+        ]
+        each.append(sum(parts) / STEP)
+    return np.array(each).T
+
+
+@pytest.mark.parametrize("shape", ["geometry.rise_m", "geometry.radius_m"])
+def test_derivatives_of_mode_and_peak_are_differences_of_the_whole_chain(tmp_path, shape):
+    text = ARCH if shape.endswith("rise_m") else ARCH.replace("rise_m = 0.0004", "radius_m = 16.3")
+    models = models_in(tmp_path, text)
+    names = (*VARIED, shape)
+    middle = np.array([models.parameters[name] for name in names])
+    curve = sj.forced_response(models({}), [0.02], 30 * HERTZ, 120 * HERTZ, harmonic_order=5)[0]
+    start = curve.point(curve.at_events("peak")[0])
+
+    def told(change):
+        xp = np if isinstance(change, np.ndarray) else jnp
+        values = xp.asarray(middle) * (1 + change)
+        model = models(dict(zip(names, values.tolist() if xp is np else values, strict=True)))
+        mode = sj.simulate.normal_mode_at_velocities(model, [0.05, 0.2], harmonic_order=5)
+        peak = sj.simulate.periodic_motion(model, 0.02, start, condition="peak")
+        return jnp.stack([*mode.frequency, peak.frequency, peak.amplitude])
+
+    found = np.asarray(jax.jit(jax.jacfwd(told))(jnp.zeros(len(names))))
+    backwards = np.asarray(jax.jit(jax.jacrev(told))(jnp.zeros(len(names))))
+    expected = differences(told, len(names))
+    error = np.abs(found - expected) / np.abs(expected)
+    np.testing.assert_allclose(backwards, found, rtol=1e-6)
+    # Rounding of load cases (1e-10 of a coefficient) over steps of 1e-3; the order of the
+    # differences leaves less.
+    assert np.max(error) < 1e-5
+
+
+SPRUNG = """name = "flat beam"
+[material]
+young_pa = 204.8e9
+density_kg_m3 = 7870.0
+[section]
+width_m = 0.0127
+thickness_m = 0.000787
+[geometry]
+length_m = 0.2286
+elements = 20
+[supports]
+left = { axial_n_m = inf, transverse_n_m = inf, rotation_nm_rad = 20 }
+right = { axial_n_m = inf, transverse_n_m = inf, rotation_nm_rad = 20 }
+[condense]
+modes = [1]
+load_scale = 0.3
+degree = 5
+"""
+TRUTH = {"thickness_m": 0.8e-3, "rotation_nm_rad": 30.0}
+START = {"thickness_m": 0.75e-3, "rotation_nm_rad": 20.0}
+VELOCITY = np.linspace(0.05, 0.8, 12)
+
+
+def test_thickness_and_supports_of_a_beam_come_back_from_its_backbone(tmp_path):
+    """From the traced mode of the true beam with noise: values, and coverage of their bands."""
+    models = models_in(tmp_path, SPRUNG)
+
+    def model_of(values):
+        both = {f"supports.{side}.rotation_nm_rad": values["rotation_nm_rad"] for side in SIDES}
+        return models({"section.thickness_m": values["thickness_m"], **both})
+
+    # The truth by continuation of the mode, which the fit does not use.
+    mode = sj.nonlinear_normal_mode(model_of(TRUTH), 130 * HERTZ, harmonic_order=5)
+    speed = np.abs(mode.velocity[:, 1, 0])
+    clean = np.array([np.interp(v, speed, mode.frequency) for v in VELOCITY])
+    std, noise = 2e-4 * clean, np.random.default_rng(0)
+    inside, scores = np.zeros(2), []
+    truth = np.array(list(TRUTH.values()))
+    for _ in range(SEEDS):
+        points = sj.identify.MeasuredBackbone(VELOCITY, clean + noise.normal(size=12) * std, std)
+        found = sj.identify.calibrate_to_backbone(model_of, START, points)
+        assert found.converged
+        scores.append((found.values - truth) / found.std)
+        inside += np.abs(scores[-1]) < 1.959964
+    # Binomial 95 % ± 3σ of 120 seeds: 0.89 to 1; the mean is within 3/√120 of zero.
+    assert np.all(inside / SEEDS > 0.89)
+    assert np.all(np.abs(np.mean(scores, axis=0)) < 3 / np.sqrt(SEEDS))
+    np.testing.assert_allclose(found.values, truth, rtol=0.05)
+
+
+SIDES, SEEDS = ("left", "right"), 120
+
+
+def test_a_backbone_that_softens_tells_the_rise_too(tmp_path):
+    models = models_in(tmp_path, ARCH.replace("[1, 3]", "[1]\ndegree = 5"))
+    truth = {
+        "material.young_pa": 195e9,
+        "geometry.rise_m": 5e-4,
+        "supports.right.rotation_nm_rad": 8.0,
+    }
+    velocity = np.linspace(0.005, 0.12, 24)
+    clean = sj.simulate.normal_mode_at_velocities(models(truth), velocity, harmonic_order=5)
+    assert clean.converged.all()
+    std = 1e-4 * np.asarray(clean.frequency)
+    noise = np.random.default_rng(1).normal(size=24) * std
+    points = sj.identify.MeasuredBackbone(velocity, np.asarray(clean.frequency) + noise, std)
+    start = {name: models.parameters[name] for name in truth}
+    found = sj.identify.calibrate_to_backbone(models, start, points)
+    assert found.converged
+    assert np.all(np.abs(found.values - list(truth.values())) < 4 * found.std)
