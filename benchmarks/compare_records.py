@@ -69,14 +69,14 @@ def main() -> None:
         f'name = "oscillator on a shaker"\n[[mode]]\nfrequency_hz = 40.0\ndamping_ratio = {RATIO}\n'
         f"shape = {{ tip = {shape} }}\nparticipation = {shape}\n"
     )
-    omega = HERTZ * np.linspace(38.6, 41.6, 16)
+    omega = HERTZ * np.linspace(36.5, 43.0, 24)
     for name, voltage in (("stepped_low", 1.5), ("stepped_high", 5.0)):
         test = sj.methods.stepped_sine_test(bench, voltage, omega, settle_cycles=90)
         recorded(folder / f"{name}.csv", test.record)
     test = sj.methods.decay_test(bench, 8.0, 3.0)
     recorded(folder / "decay.csv", test.record, forced=False)
     lines = np.arange(20, 80)
-    test = sj.methods.multisine_test(bench, 2.0, lines, 2000, 6, seed=1)
+    test = sj.methods.multisine_test(bench, 8.0, lines, 2000, 6, seed=1)
     recorded(folder / "multisine.csv", test.record)
     names = ("stepped_low", "stepped_high", "decay", "multisine")
     begin = time.perf_counter()
