@@ -1,3 +1,4 @@
+from .base_excitation import base_excited_states
 from .equivalent_force import EquivalentForce, ForceStatus, equivalent_force
 from .force_calibration import ForceCalibration, apply_calibration, calibrate_force
 from .harmonic_fit import HarmonicFit, HarmonicFitStatus, fit_harmonics, phasor_relative_to_force
@@ -36,6 +37,7 @@ __all__ = [
     "TimeRecording",
     "apply_calibration",
     "appropriation_of",
+    "base_excited_states",
     "calibrate_force",
     "equivalent_force",
     "find_ring_downs",
