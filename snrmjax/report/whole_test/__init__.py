@@ -1,0 +1,1 @@
+"""A folder of a test from its files to one report."""

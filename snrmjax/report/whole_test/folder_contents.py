@@ -1,0 +1,217 @@
+"""What lies in the folder of a test, by content: model, steady states, responses, records."""
+
+import dataclasses
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.io.exchange.import_map import ImportMap, read_import_map
+from snrmjax.io.exchange.import_units import Assumptions
+from snrmjax.io.exchange.importing import Imported, import_files
+from snrmjax.io.exchange.record_import import told_record
+from snrmjax.io.files import read_text
+from snrmjax.io.laboratory.contents import LaboratoryFile
+from snrmjax.io.laboratory.reading import read_laboratory_file
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import read_steady_states
+from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+
+_MEASURED = (
+    *(".csv", ".uff", ".unv", ".unv58", ".mat", ".h5", ".hdf5", ".nc", ".nc4", ".cdf"),
+    *(".tdms", ".tsv", ".dat", ".asc"),
+)
+_MAP = "map.toml"
+_UNNAMED = ("sensor 1",)
+_OWN_COLUMNS = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
+
+
+class NamedStates(NamedTuple):
+    """Steady states of one file; `table` is where they are read again with a model's sensors."""
+
+    file: str
+    states: SteadyStates
+    table: Path | None = None
+
+    def of_model(self, model: Structure) -> SteadyStates:
+        """The same with the sensors of the model.
+
+        Raises `ValueError` as `read_steady_states` does, and for sensors that the model lacks.
+        """
+        if self.table is not None:
+            return read_steady_states(self.table, model)
+        if self.states.sensors == _UNNAMED and len(model.modes.sensors) == 1:
+            return dataclasses.replace(self.states, sensors=model.modes.sensors)
+        if self.states.sensors != model.modes.sensors:
+            raise ValueError(
+                f"{self.file} has the sensors {', '.join(self.states.sensors)}, but the model "
+                f"{', '.join(model.modes.sensors)}."
+            )
+        return self.states
+
+
+class NamedResponses(NamedTuple):
+    """Frequency responses of one file."""
+
+    file: str
+    responses: FrequencyResponses
+
+
+class NamedRecord(NamedTuple):
+    """A time record of one file."""
+
+    file: str
+    record: TimeRecording
+
+
+class TestFiles(NamedTuple):
+    """All that a folder holds of a test; see `read_test_files`."""
+
+    model: Structure | None
+    model_file: str
+    states: tuple[NamedStates, ...]
+    responses: tuple[NamedResponses, ...]
+    records: tuple[NamedRecord, ...]
+    passed: tuple[tuple[str, str], ...]  # file and why nothing was measured in it
+    notes: tuple[str, ...]  # what was assumed of a file
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Each file, and what was found in it."""
+        if self.model is not None:
+            count = self.model.modes.n_modes
+            yield self.model_file, f"model with {count} mode{'s' if count > 1 else ''}"
+        for file, states, _ in self.states:
+            levels = len(set(states.level.tolist()))
+            many = f"{levels} level{'s' if levels > 1 else ''}"
+            yield file, f"{states.n_states} steady states on {many}"
+        for file, one in self.responses:
+            sides = f"{len(one.responses)} × {len(one.references)}"
+            yield file, f"{sides} frequency responses of {len(one.frequency)} lines"
+        for file, record in self.records:
+            seconds = record.n_samples / record.sampling_rate
+            names = ", ".join(record.channel_names)
+            yield file, f"record of {seconds:.4g} s at {record.sampling_rate:g} Hz: {names}"
+        yield from self.passed
+
+
+def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
+    """Read every file of a folder, by its content; folders inside it are left alone.
+
+    Arguments: `model` is a file with the linear model, in place of the one in the folder.
+    Raises `ValueError` for a folder that is missing or holds nothing measured, for a file of
+    measurements that cannot be read, for several models, and as `import_files` does for a table
+    whose columns neither are understood nor stand in a `map.toml`.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} must be a folder with the files of a test.")
+    files = sorted(one for one in folder.iterdir() if one.is_file() and one.name[0] != ".")
+    models = [] if model is None else [model]
+    told, map_name = _map_in(files)
+    notes: list[str] = []
+    states: list[NamedStates] = []
+    responses: list[NamedResponses] = []
+    records: list[NamedRecord] = []
+    passed: list[tuple[str, str]] = []
+    for path in files:
+        suffix = path.suffix.lower()
+        if suffix == ".toml" and path.name == map_name:
+            passed.append((path.name, "how files are imported"))
+        elif suffix == ".toml":
+            if not _is_model(path):
+                passed.append((path.name, "not used: it has no [[mode]]"))
+            elif model is None:
+                models.append(path)
+            elif path.resolve() != model.resolve():
+                passed.append((path.name, f"not used: the model is {model.name}"))
+        elif suffix not in _MEASURED:
+            passed.append((path.name, "not used: no file of measurements, by its ending"))
+        elif suffix == ".csv" and _is_own(path):
+            states.append(NamedStates(path.name, read_steady_states(path), path))
+        else:
+            held = read_laboratory_file(path, told.text_format)
+            assumed = Assumptions()
+            if held.tables or (held.responses and told.force_amplitude):
+                found = _imported(path, told)
+                assumed.update(found.assumed)
+                if found.states is not None:
+                    states.append(NamedStates(path.name, found.states))
+            else:
+                responses += [NamedResponses(path.name, one) for one in _linear(held)]
+            for one in held.recordings:
+                record = one if told.is_empty else told_record(one, told, path.name, assumed)[0]
+                several = f"{path.name}: {one.name}"
+                records.append(
+                    NamedRecord(several if len(held.recordings) > 1 else path.name, record)
+                )
+            notes += [f"{path.name}: {key}: {why}" for key, why in assumed.items()]
+    if len(models) > 1:
+        listed = " and ".join(one.name for one in models)
+        raise ValueError(
+            f"which is the model of this test, {listed}? Say so by `--model {models[0].name}`."
+        )
+    if not states and not responses and not records:
+        raise ValueError(
+            f"{folder.name} holds nothing measured: steady states (CSV), frequency responses or "
+            "time records."
+        )
+    return TestFiles(
+        read_model(models[0]) if models else None,
+        models[0].name if models else "",
+        *(tuple(states), tuple(responses), tuple(records), tuple(passed), tuple(notes)),
+    )
+
+
+def _is_model(path: Path) -> bool:
+    """Whether a TOML file has modes; one that cannot be read goes on to the reader of models."""
+    try:
+        return "mode" in tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError:
+        return True
+
+
+def _is_own(path: Path) -> bool:
+    header = {word.strip().strip("\ufeff") for word in read_text(path).split("\n", 1)[0].split(",")}
+    return any(columns <= header for columns in _OWN_COLUMNS)
+
+
+def _map_in(files: Sequence[Path]) -> tuple[ImportMap, str]:
+    """The map of an import among the files, and its name; an empty one where there is none."""
+    maps = [one for one in files if one.name == _MAP]
+    return (read_import_map(maps[0]), _MAP) if maps else (ImportMap(), "")
+
+
+def _imported(path: Path, told: ImportMap) -> Imported:
+    try:
+        return import_files([path], told)
+    except ValueError as error:
+        raise ValueError(
+            f"{error} Answer by `snrmjax import {path.name} … --out DIR`, and put its {_MAP} "
+            "beside the file."
+        ) from error
+
+
+def _linear(held: LaboratoryFile) -> tuple[FrequencyResponses, ...]:
+    """Responses of a linear test; several levels are no such test."""
+    levels = {level for level in held.levels if np.isfinite(level)}
+    if len(levels) > 1:
+        raise ValueError(
+            f"are the responses of {held.name}, of {len(levels)} levels, steady states of a "
+            f"stepped sine? Say so by `snrmjax import {held.name} --force-amplitude z --out DIR`, "
+            f"and put its {_MAP} beside the file; for linear modes keep the lowest level alone."
+        )
+    return held.responses
+
+
+def all_states(tables: Sequence[SteadyStates]) -> tuple[SteadyStates, ...]:
+    """The tables with levels of their own, in order."""
+    found, offset = [], 0
+    for states in tables:
+        one = states.renumbered(offset)
+        offset = int(one.level.max())
+        found.append(one)
+    return tuple(found)
