@@ -20,7 +20,7 @@ from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.solutions.mode_at_velocities import normal_mode_at_velocities
 
 _FURTHEST = np.log(10.0)  # of a number from its start, either way
-_RULE = StepRule(steps=40, settled=1e-6)
+_RULE = StepRule(steps=200, settled=1e-6)
 _ROUNDS = 3  # of fitting, and of weighing the errors of velocity by the slope that was found
 
 ModelOf = Callable[[dict[str, Any]], Structure]
@@ -136,8 +136,9 @@ def calibrate_to_backbone(
     Raises `ValueError` for a start that is not positive, for measured numbers that are no backbone,
     for fewer data than parameters and for an unknown name in `prior_std`.
     Validity: the first sensor of the model is the one that was measured. Values stay within a
-    factor of ten of their start. Standard deviations are linearised. A backbone of one mode tells
-    about its linear frequency, hardening and softening: two or three numbers, not more.
+    factor of ten of their start. Standard deviations are linearised: a number that is known to
+    worse than a tenth may lie several of them off. A backbone of one mode tells about its linear
+    frequency, softening and hardening, as far as it was measured: two or three numbers, not more.
     Reference: for errors of both coordinates ("effective variance") J. Orear, Am. J. Phys. 50
     (1982) 912, doi:10.1119/1.12972.
     """

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -44,7 +45,8 @@ def beam_parameters(beam: BeamDescription) -> dict[str, float]:
     Returns values in SI units.
     """
     values = {name: getattr(beam, field) for name, field in _FIELDS.items()}
-    values[RISE] = float(rise_of(beam))
+    with jax.ensure_compile_time_eval():  # what the file states has a value within `jit`, too
+        values[RISE] = float(rise_of(beam))
     for side, support in zip(_SIDES, beam.supports, strict=True):
         own = zip(STIFFNESSES, support, strict=True)
         values |= {f"supports.{side}.{key}": size for key, size in own if size != np.inf}

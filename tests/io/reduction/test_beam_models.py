@@ -32,7 +32,7 @@ damping_ratio = 0.01
 at = 0.3
 mass_kg = 1e-3
 """
-STEP = 1e-3  # relative, of the differences: from further away the peak is not found
+STEP = 1e-3  # relative, of the differences
 VARIED = (
     *("section.thickness_m", "material.young_pa", "geometry.length_m"),
     *("supports.right.axial_n_m", "supports.right.rotation_nm_rad", "point_mass_1.mass_kg"),
@@ -63,14 +63,21 @@ def test_derivatives_of_mode_and_peak_are_differences_of_the_whole_chain(tmp_pat
     models = models_in(tmp_path, text)
     names = (*VARIED, shape)
     middle = np.array([models.parameters[name] for name in names])
-    curve = sj.forced_response(models({}), [0.02], 30 * HERTZ, 120 * HERTZ, harmonic_order=5)[0]
-    start = curve.point(curve.at_events("peak")[0])
+
+    def peak_of(model):
+        curve = sj.forced_response(model, [0.02], 30 * HERTZ, 120 * HERTZ, harmonic_order=5)[0]
+        height = np.abs(curve.velocity[:, 1, 0])
+        return curve.point(max(curve.at_events("peak"), key=lambda k: height[k]))
+
+    nominal = peak_of(models({}))
 
     def told(change):
-        xp = np if isinstance(change, np.ndarray) else jnp
-        values = xp.asarray(middle) * (1 + change)
-        model = models(dict(zip(names, values.tolist() if xp is np else values, strict=True)))
+        traced = isinstance(change, jax.core.Tracer)
+        values = middle * (1 + change)
+        model = models(dict(zip(names, values if traced else values.tolist(), strict=True)))
         mode = sj.simulate.normal_mode_at_velocities(model, [0.05, 0.2], harmonic_order=5)
+        # From its own curve: near the nominal peak another one may be nearer to Newton's method.
+        start = nominal if traced else peak_of(model)
         peak = sj.simulate.periodic_motion(model, 0.02, start, condition="peak")
         return jnp.stack([*mode.frequency, peak.frequency, peak.amplitude])
 
@@ -81,7 +88,7 @@ def test_derivatives_of_mode_and_peak_are_differences_of_the_whole_chain(tmp_pat
     np.testing.assert_allclose(backwards, found, rtol=1e-6)
     # Rounding of load cases (1e-10 of a coefficient) over steps of 1e-3; the order of the
     # differences leaves less.
-    assert np.max(error) < 1e-5
+    assert np.max(error) < 1e-5, error
 
 
 SPRUNG = """name = "flat beam"
@@ -144,7 +151,7 @@ def test_a_backbone_that_softens_tells_the_rise_too(tmp_path):
         "geometry.rise_m": 5e-4,
         "supports.right.rotation_nm_rad": 8.0,
     }
-    velocity = np.linspace(0.005, 0.12, 24)
+    velocity = np.linspace(0.005, 0.6, 24)  # softening to 57 Hz, then hardening to 74 Hz
     clean = sj.simulate.normal_mode_at_velocities(models(truth), velocity, harmonic_order=5)
     assert clean.converged.all()
     std = 1e-4 * np.asarray(clean.frequency)
