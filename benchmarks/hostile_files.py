@@ -75,6 +75,10 @@ def valid_files(folder):
             file.create_dataset(f"test/{key}", data=values, compression="gzip", chunks=(50,))
         file["test"].create_dataset("signal", data=rng.normal(size=(4, 1000)))
         file["test"].attrs["fs"] = 100.0
+        file["test/signal"].attrs["unit"] = "N"  # a text of varying length
+        names = np.array(["a", "b", "c", "d"], dtype=object)
+        kind = h5py.string_dtype()
+        file["test"].create_dataset("names", data=names, dtype=kind, chunks=(2,), compression=4)
     with h5py.File(folder / "c.mat", "w", userblock_size=512) as file:
         for key in ("freq", "force", "v"):
             one = file.create_dataset(key, data=rng.normal(size=(1, 30)))

@@ -56,7 +56,7 @@ def _kind(path: FilePath) -> Kind:
         raise ValueError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
     if not head:
         raise ValueError(f"{name} is empty.")
-    if _HDF5 in (head[:8], head[512:520]):
+    if any(head[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):  # behind a user block
         matlab = head.startswith(b"MATLAB 7.3") or Path(path).suffix.lower() == ".mat"
         netcdf = Path(path).suffix.lower() in (".nc", ".nc4", ".cdf")
         return "matlab" if matlab else "netcdf" if netcdf else "hdf5"

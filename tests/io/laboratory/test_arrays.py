@@ -223,3 +223,21 @@ def test_more_numbers_than_the_file_can_hold(tmp_path):
         file.create_dataset("y", shape=(10**9,), dtype="f8")
     with pytest.raises(ValueError, match="never written"):
         read_laboratory_file(path)
+
+
+def test_texts_of_a_heap_behind_a_user_block_and_of_a_damaged_one(tmp_path):
+    path = tmp_path / "texts.h5"
+    words = ["load cell", "", "µm/s", "x" * 3000]
+    with h5py.File(path, "w", userblock_size=1024) as file:
+        file.create_dataset("channels", data=words, dtype=h5py.string_dtype())
+        file.create_dataset("values", data=np.arange(400.0).reshape(4, 100))
+        file.attrs["fs"] = 100.0
+    found = read_laboratory_file(path)
+    assert list(found.recordings[0].channel_names) == [words[0], "values_2", *words[2:]]
+    good = path.read_bytes()
+    at = good.index(b"GCOL")
+    # The first object without a number that is not taken, but of no size: the library would loop.
+    for where, value in ((at + 24, 2**62), (at + 8, 2**62)):
+        path.write_bytes(good[:where] + value.to_bytes(8, "little") + good[where + 8 :])
+        with pytest.raises(ValueError, match="heap"):
+            read_laboratory_file(path)

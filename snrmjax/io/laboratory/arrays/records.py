@@ -84,7 +84,7 @@ def recording_of(
         for k in range(others):
             alone = key if others == 1 else f"{key}_{k + 1}"
             places.append(ChannelPlace(one, side, k))
-            channels.append(_channel(labels[k] if labels else alone, one, told[k]))
+            channels.append(_channel((labels[k] if labels else "") or alone, one, told[k]))
     names = [one.name for one in channels]
     if not channels or len(channels) > _MOST_CHANNELS:
         return FewRecordings((), frozenset(), ())
