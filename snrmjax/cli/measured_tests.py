@@ -4,7 +4,11 @@ from pathlib import Path
 
 from snrmjax.io.files import file_name, read_text
 from snrmjax.io.laboratory.reading import read_laboratory_file
-from snrmjax.io.laboratory.record_tables import is_record_table, read_record_table
+from snrmjax.io.laboratory.record_tables import (
+    is_record_table,
+    read_record_table,
+    with_named_channels,
+)
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates
@@ -32,7 +36,7 @@ def read_measured_test(path: Path, structure: Structure) -> list[SteadyStates | 
             f"{file_name(path)} holds no time record (a CSV needs the column time_s) and no table "
             "of steady states (level, frequency_hz, …)."
         )
-    return list(held.recordings)
+    return [with_named_channels(one, file_name(path)) for one in held.recordings]
 
 
 def _header(path: Path) -> set[str]:

@@ -9,6 +9,7 @@ import pytest
 
 import snrmjax as sj
 from snrmjax.cli import main
+from snrmjax.cli.measured_tests import read_measured_test
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.records.recorded_test import RecordKind, recorded_test
 from snrmjax.methods.records.recorded_velocity import recorded_velocity
@@ -188,6 +189,22 @@ def test_bad_records_are_refused_in_one_sentence(compare, name):
     assert code == 2, said
     assert sentence in said
     assert not out.exists()
+
+
+def test_a_laboratory_file_is_read_by_units_or_by_names(tmp_path):
+    from scipy.io import savemat
+
+    structure = sj.model.structure(MODES)
+    (tmp_path / "lab.csv").write_text(
+        DECAY.replace(",", ";").replace("time_s;velocity_m_s", "Time [s];tip [m/s]")
+    )
+    savemat(tmp_path / "lab.mat", {"time": TIME, "tip_velocity_m_s": VELOCITY})
+    for name in ("lab.csv", "lab.mat"):
+        (record,) = read_measured_test(tmp_path / name, structure)
+        found = recorded_test(record, MODES)
+        assert found.recording.name == name
+        assert found.kind is RecordKind.FREE_DECAY
+        np.testing.assert_allclose(record.values([found.channels.reference])[0], VELOCITY, 1e-7)
 
 
 def _recording(**columns):

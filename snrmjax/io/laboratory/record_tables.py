@@ -1,6 +1,7 @@
 """Time records as CSV: `time_s`, force or drive, and the motion of one sensor or several."""
 
 import csv
+import dataclasses
 import io
 
 import numpy as np
@@ -62,6 +63,31 @@ def read_record_table(path: FilePath) -> TimeRecording:
         name=file,
         notes=notes,
     )
+
+
+def with_named_channels(recording: TimeRecording, file: str) -> TimeRecording:
+    """A laboratory's record under its file's name, with quantities that names of channels say.
+
+    Where a file states no unit, `force_n`, `tip.velocity_m_s` or `tip_velocity_m_s` do; a quantity
+    that the file states stays.
+    """
+    return dataclasses.replace(
+        recording,
+        channels=tuple(_named(one) for one in recording.channels),
+        name=f"{recording.name} of {file}" if recording.name else file,
+    )
+
+
+def _named(channel: Channel) -> Channel:
+    if channel.quantity != "unknown":
+        return channel
+    for column, quantity in _COLUMNS.items():
+        sensor = channel.name.removesuffix(column)
+        if sensor != channel.name and (not sensor or sensor[-1] in "._"):
+            unit = column.split("_", 1)[1]
+            place = channel.point or sensor[:-1]
+            return channel._replace(quantity=quantity, unit=unit, point=place)
+    return channel
 
 
 def _channels(names: list[str], file: str) -> tuple[list[Channel], list[str]]:

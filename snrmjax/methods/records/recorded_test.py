@@ -135,7 +135,10 @@ def _channels(recording: TimeRecording, modes: LinearModes) -> RecordChannels:
     motions = [one for one in recording.channels if one.quantity in _MOTIONS]
     if not motions:
         listed = ", ".join(map(str, recording.channels))
-        raise ValueError(f"{recording.name} has no channel of motion, but {listed}.")
+        raise ValueError(
+            f"{recording.name} has no channel of motion, but {listed}: state units, or name it "
+            "velocity_m_s, acceleration_m_s2 or displacement_m."
+        )
     at: dict[str, str] = {}
     for one in motions:
         for sensor in modes.sensors:

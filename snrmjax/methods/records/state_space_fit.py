@@ -98,8 +98,10 @@ def fit_state_space(
     that is odd or too high, for fewer than 4.5 samples a cycle, a clipped motion, where the
     records do not hold as many oscillating modes as `order` wants, and where the fitted model
     leaves more than 20 % of the velocity.
-    Validity: steady periodic records, noise of the force small; the model is of the amplitudes
-    that the records visit: 1σ does not know what a higher degree would say.
+    Validity: steady periodic records, noise of the force small, restoring and damping forces that
+    are polynomials of these degrees over the amplitudes that the records visit: 1σ does not know
+    what a higher degree would say, and with damping by v|v| its band on damping is too narrow
+    (`benchmarks/methods_loops_and_decays.py`).
     """
     if order not in (2, 4, 6):
         raise ValueError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
