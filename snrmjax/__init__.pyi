@@ -1,5 +1,17 @@
 # The ten verbs to start with, and the namespaces that hold the rest.
-from . import condense, diagnose, identify, io, measure, methods, model, plot, simulate, study
+from . import (
+    condense,
+    diagnose,
+    doctor,
+    identify,
+    io,
+    measure,
+    methods,
+    model,
+    plot,
+    simulate,
+    study,
+)
 from .diagnose.diagnosis import diagnose_model
 from .identify.calibrate.calibration import calibrate_model
 from .identify.inference.optimal_design import next_measurements
@@ -17,6 +29,7 @@ __all__ = [
     "condense",
     "diagnose",
     "diagnose_model",
+    "doctor",
     "fit_jointly",
     "forced_response",
     "identify",

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import typer
 
+from snrmjax.cli.check_command import check
 from snrmjax.cli.compare_command import compare
 from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
@@ -40,6 +41,7 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
     "--out result",
     nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
+    check: "Example: snrmjax check measured.csv --model model.toml --out checked",
     identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
     "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
     "--next 5 --out result",

@@ -1,0 +1,118 @@
+"""What the doctor finds, and how it says it."""
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import numpy as np
+
+from snrmjax.numerics.result import AbstractResult, Variable
+
+Severity = Literal["error", "warning", "info"]
+
+Kind = Literal[
+    "conjugated_response",
+    "acceleration_as_velocity",
+    "displacement_as_velocity",
+    "volts_as_force",
+    "rms_for_peak",
+    "degrees_for_radians",
+    "clipped_channel",
+    "unsettled_steps",
+    "force_dropout",
+    "force_harmonics",
+    "drift",
+    "different_structures",
+    "shape_not_mass_normalised",
+    "missing_anti_alias",
+]
+
+KINDS: tuple[str, ...] = get_args(Kind)
+"""Everything that a finding may be called."""
+
+FORCE_HARMONICS: Kind = "force_harmonics"
+"""Of the force that was measured; an effect of the model has this name, too."""
+
+
+class Finding(NamedTuple):
+    """One thing that is wrong with a test, or may be.
+
+    `severity`: an "error" makes results wrong, a "warning" widens or bends them, an "info" is to
+    be known. `rows` are states of the table (from 0) that show it, none where a record does.
+    """
+
+    kind: Kind
+    severity: Severity
+    where: str  # file, level, rows or channel
+    evidence: str  # in numbers, with their errors, and what else would explain it
+    mend: str  # the line or option that mends it
+    rows: tuple[int, ...] = ()
+
+    def as_dict(self) -> dict[str, str]:
+        """What `check.json` has of it."""
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "where": self.where,
+            "evidence": self.evidence,
+            "mend": self.mend,
+        }
+
+
+class Checkup(AbstractResult):
+    """The findings of `check_test`, the gravest first; none where all is well.
+
+    `notes` say what could not be looked at, and why.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("finding",)
+
+    findings: tuple[Finding, ...] = eqx.field(static=True, default=())
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        n = len(self.findings)
+        return (
+            f"Checkup: {n} finding{'s' if n != 1 else ''}" if n else "Checkup: nothing found",
+            *(line(one) for one in self.findings),
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; a row a finding."""
+        at = ("finding",)
+        found = {"finding": Variable(at, np.arange(len(self.findings)), "1", "number")}
+        meanings = {
+            "kind": "what is wrong",
+            "severity": "error, warning or info",
+            "where": "file, level, rows or channel",
+            "evidence": "in numbers",
+            "mend": "what mends it",
+        }
+        for name, meaning in meanings.items():
+            values = np.array([getattr(one, name) for one in self.findings], dtype=str)
+            found[name] = Variable(at, values, "", meaning)
+        return found
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of the findings."""
+        return tuple(one.kind for one in self.findings)
+
+
+def line(one: Finding) -> str:
+    """A finding in one line."""
+    return f"{one.severity}: {one.kind} in {one.where}: {one.evidence} Mend: {one.mend}"
+
+
+def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings by severity, otherwise in their order."""
+    ranks = get_args(Severity)
+    return tuple(sorted(findings, key=lambda one: ranks.index(one.severity)))
+
+
+def rows_in_words(rows: Sequence[int], most: int = 6) -> str:
+    """Rows as a table's reader counts them, from 1 below the header."""
+    shown = ", ".join(str(k + 1) for k in rows[:most])
+    return f"rows {shown}{' and others' if len(rows) > most else ''}"

@@ -1,0 +1,262 @@
+"""What a single mode says of a table: readings of phasors, corrections of states, modal mass."""
+
+import numpy as np
+
+from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
+from snrmjax.doctor.corrections import Remedy, corrections
+from snrmjax.doctor.findings import Finding, Kind, rows_in_words
+from snrmjax.doctor.modal_mass import mass_findings
+from snrmjax.doctor.readings import Reading, best_reading, wild_phases
+from snrmjax.model.structures import Structure
+
+_AT_THE_NOISE = 1.12  # times the stated errors: nothing is left to be explained
+_MOST_SCALE, _MOST_MISFIT = 4.0, 0.25  # beyond which a fit says nothing of the modal mass
+_NO_MODE = 0.35  # relative misfit, from which on the phasors are those of no mode
+_EXPLAINED = 2.0  # times the stated errors that a correction may leave
+_EXPLAINED_SHARE = 0.4  # of the misfit as recorded that it may leave otherwise
+_LEAST_GAIN = {"drift": 18.0, "different_structures": 25.0, "clipped_channel": 25.0}
+_LEAST_GAIN_ELSE = 25.0  # of the criterion, for independent states
+_LEAST_FREQUENCY = 0.002  # relative change of natural frequency that is spoken of
+_OF_BANDWIDTH = 0.25  # of the damping ratio: likewise
+_MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
+_OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
+_LEAST_GAIN_CHANGE = 0.05  # relative: of gain or force along a test or between files
+
+_MEANINGS: dict[str, tuple[Kind, str, str]] = {
+    "conjugated": (
+        "conjugated_response",
+        "complex conjugates (phasors e^{-iωt}, or response over force upside down)",
+        "negate `velocity_im_m_s` (conjugate the responses before import)",
+    ),
+    "conjugated_opposite": (
+        "conjugated_response",
+        "complex conjugates of turned sign",
+        "negate `velocity_re_m_s` (conjugate the responses and turn the sensor's sign)",
+    ),
+    "opposite": (
+        "shape_not_mass_normalised",
+        "of turned sign, as against a shape, a sensor or a force of the other sign",
+        "negate this sensor's entry of `shape` in the model, or both velocity columns",
+    ),
+    "acceleration": (
+        "acceleration_as_velocity",
+        "accelerations (m/s²)",
+        "divide by iΩ: `snrmjax import … --response CHANNEL:acceleration`",
+    ),
+    "displacement": (
+        "displacement_as_velocity",
+        "displacements (m)",
+        "multiply by iΩ: `snrmjax import … --response CHANNEL:displacement`",
+    ),
+    "radians_read_as_degrees": (
+        "degrees_for_radians",
+        "phases in radians that were read as degrees",
+        "multiply the phases by 180/π = 57.296 before they are turned into real and imaginary part",
+    ),
+    "degrees_read_as_radians": (
+        "degrees_for_radians",
+        "phases in degrees that were read as radians",
+        "multiply the phases in degrees by π/180 = 0.0174533 before the real and imaginary part",
+    ),
+}
+
+
+def mode_findings(
+    states: ModeStates,
+    model: Structure | None,
+    where: str,
+    groups: tuple[tuple[int, ...], ...],
+    drive: bool,
+) -> list[Finding]:
+    """Findings of one sensor's states; `drive` says that forces are declared to be volts."""
+    natural_frequency = None
+    if model is not None:
+        modes = model.modes
+        natural_frequency = float(modes.natural_frequency[modes.mode_of_interest])
+    recorded, best = best_reading(states, natural_frequency)
+    if best.name != recorded.name and not drive:
+        found = [_misread(recorded, best, where)]
+        if best.name.startswith(("radians", "degrees")):
+            return found
+    elif best.fit.misfit > _NO_MODE and wild_phases(states):
+        return [_wild(best.fit, where)]
+    else:
+        found = []
+    quiet = states.stated and best.fit.scale < _AT_THE_NOISE
+    remedies = [] if quiet else corrections(states, best.corrected, best.fit, groups)
+    remedy = _believed(states, best.fit, remedies, groups)
+    if remedy is not None:
+        found.append(_mended(states, best.fit, remedy, where, groups))
+    fit = best.fit if remedy is None else remedy.fit
+    told = fit.scale < _MOST_SCALE if states.stated else fit.misfit < _MOST_MISFIT
+    if model is not None and not drive and told:
+        found += mass_findings(states, fit, model, where)
+    return found
+
+
+def _misread(recorded: Reading, best: Reading, where: str) -> Finding:
+    kind, meaning, mend = _MEANINGS[best.name]
+    old, new = recorded.fit, best.fit
+    signs = ""
+    if best.name.startswith("conjugated") or best.name == "opposite":
+        size = abs(new.mass) or 1.0
+        ratio = np.median(old.damping[old.used] * old.mass) / size
+        signs = (
+            f" As recorded the modal mass is {old.mass:.3g} ± {old.mass_std:.1g} of the model's and"
+            f" the damping {ratio:.3g} 1/s times it;"
+        )
+    return Finding(
+        kind,
+        "error",
+        where,
+        f"the responses are {meaning}.{signs} a single mode is missed by {100 * old.misfit:.3g} % "
+        f"as recorded and by {100 * new.misfit:.3g} % so read (criterion smaller by "
+        f"{recorded.criterion - best.criterion:.4g}).",
+        mend + ".",
+    )
+
+
+def _wild(fit: BalanceFit, where: str) -> Finding:
+    return Finding(
+        "degrees_for_radians",
+        "error",
+        where,
+        f"phases jump at random from state to state while amplitudes are smooth: no mode is nearer "
+        f"than {100 * fit.misfit:.3g} %, as where phases in degrees were read as radians.",
+        "convert phases by π/180 (or 180/π) before the real and imaginary part are made.",
+    )
+
+
+def _believed(
+    states: ModeStates,
+    base: BalanceFit,
+    remedies: list[Remedy],
+    groups: tuple[tuple[int, ...], ...],
+) -> Remedy | None:
+    """The remedy that explains what the states as recorded do not; None where none does."""
+    for one in remedies:
+        fit = one.fit
+        enough = one.gain > _LEAST_GAIN.get(one.kind, _LEAST_GAIN_ELSE)
+        left = fit.scale < _EXPLAINED if states.stated else fit.misfit < 0.08
+        left = left or fit.scale < _EXPLAINED_SHARE * base.scale
+        if enough and left and _matters(states, one, groups):
+            return one
+        if enough and not _matters(states, one, groups):
+            continue
+        if not enough:
+            return None
+    return None
+
+
+def _matters(states: ModeStates, one: Remedy, groups: tuple[tuple[int, ...], ...]) -> bool:
+    """Whether a correction is large enough to be spoken of."""
+    fit = one.fit
+    used = fit.used
+    ratio = np.median(np.abs(fit.damping[used])) / np.sqrt(
+        np.median(np.abs(fit.stiffness[used])) + 1e-300
+    )
+    least = max(_LEAST_FREQUENCY, _OF_BANDWIDTH * float(ratio) / 2)
+    if one.kind == "drift":
+        bound = least if one.name.startswith("frequency") else _LEAST_GAIN_CHANGE
+        return bool(abs(fit.extra[0]) > max(bound, 4 * fit.extra_std[0]))
+    if one.kind == "different_structures":
+        # Of one file a level of its own is rarely another structure: a misfitting curve looks so.
+        strict = 1.0 if one.levels in groups else 2.0
+        if _overlap(states, one.levels) < _OVERLAP or abs(fit.extra[0]) > _MOST_FREQUENCY:
+            return False
+        return bool(abs(fit.extra[0]) > max(strict * least, 4 * strict * fit.extra_std[0]))
+    if one.name == "gain_of_level":
+        return bool(np.ptp(np.append(fit.extra, 0.0)) > 2 * _LEAST_GAIN_CHANGE)
+    return True
+
+
+def _overlap(states: ModeStates, levels: tuple[int, ...]) -> float:
+    """Share of the states of some levels at amplitudes of the others; of the others if larger.
+
+    Without equal amplitudes a curve's own change and another structure look alike.
+    """
+    amplitude = np.log(np.abs(states.velocity) / states.frequency)
+    some = np.isin(states.level, levels)
+    one, other = amplitude[some], amplitude[~some]
+
+    def within(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.mean((a >= b.min()) & (a <= b.max())))
+
+    return max(within(one, other), within(other, one))
+
+
+def _mended(
+    states: ModeStates,
+    base: BalanceFit,
+    one: Remedy,
+    where: str,
+    groups: tuple[tuple[int, ...], ...],
+) -> Finding:
+    fit = one.fit
+    left = (
+        f"; the misfit of a single mode falls from {100 * base.misfit:.3g} % to "
+        f"{100 * fit.misfit:.3g} % (criterion smaller by {one.gain:.3g})."
+    )
+    value, std = (
+        (float(fit.extra[0]), float(fit.extra_std[0])) if len(fit.extra) else (one.value, np.nan)
+    )
+    if one.kind == "drift":
+        what = {
+            "frequency_trend": "natural frequency",
+            "gain_trend": "gain of the response",
+            "force_trend": "gain of the force",
+        }[one.name]
+        return Finding(
+            *("drift", "warning", where),
+            f"from the first to the last state the {what} changes by {100 * value:.3g} ± "
+            f"{100 * std:.2g} %{left}",
+            "repeat a level at the end of the test, let the temperature settle, or correct along "
+            "`order`; an effect of the model can take a drifting frequency along.",
+        )
+    if one.kind == "different_structures":
+        listed = ", ".join(str(k + 1) for k in one.levels)
+        file = f" (file {groups.index(one.levels) + 1})" if one.levels in groups else ""
+        damping = ""
+        if len(fit.extra) > 1:
+            damping = (
+                f" and the damping by {100 * fit.extra[1]:.3g} ± {100 * fit.extra_std[1]:.2g} %"
+            )
+        return Finding(
+            *("different_structures", "error", where),
+            f"at equal amplitude the natural frequency of level {listed}{file}, counted from "
+            f"the first, differs from the others' by {100 * value:.3g} ± {100 * std:.2g} %"
+            f"{damping}{left}",
+            "identify them apart: one call and one model for each structure or assembly.",
+        )
+    if one.kind == "volts_as_force":
+        gains = ", ".join(f"{np.exp(g):.3g}" for g in fit.extra)
+        return Finding(
+            *("volts_as_force", "error", where),
+            f"the force over that of the first level is off by the factors {gains} at levels 2 and "
+            f"on: a drive voltage or an amplifier's range{left}",
+            "call the column `drive_v` and identify with `--free force_gain,instrument_phase`.",
+        )
+    if one.kind == "unsettled_steps":
+        return Finding(
+            *("unsettled_steps", "error", where),
+            f"about {100 * one.value:.2g} % of the motion of the state before is left at the end "
+            f"of a step{left}",
+            "dwell longer (5/(ζω) per step), or read the record again by "
+            "`sj.measure.stepped_sine_states`, which leaves the transients out.",
+        )
+    return _clipping(states, one, where, left)
+
+
+def _clipping(states: ModeStates, one: Remedy, where: str, left: str) -> Finding:
+    force = one.name == "force"
+    size = states.force if force else np.abs(states.velocity)
+    rows = tuple(int(states.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
+    unit = "N" if force else "m/s"
+    return Finding(
+        *("clipped_channel", "error", where),
+        f"the {'force' if force else 'response'} is cut off at about {one.value:.4g} {unit} in "
+        f"{len(rows)} states ({rows_in_words(rows)}){left}",
+        "lower the channel's gain or range and measure these states again; leave them out until "
+        "then.",
+        rows,
+    )

@@ -1,0 +1,320 @@
+"""Time records: limits, transients, harmonics and drop-outs of the force, folded frequencies."""
+
+import numpy as np
+from jaxtyping import Float
+
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding
+from snrmjax.measure.recordings.steps import Step, recognise_steps
+from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.tone_track import track_tone
+
+_MOST = 2**23  # samples of a channel that are looked at
+_FEWEST_CYCLES = 8.0  # of a step
+_HARMONIC_LIMIT, _HARMONIC_REMARK = 0.04, 0.015  # of the force's fundamental
+_HIGHEST = 12  # harmonic of the force
+_FLAT = 0.26  # of a mean cycle within 3 % of its extremes; of a sine 0.156
+_FLAT_RUNS = 0.003  # of the samples, in runs of equal extremes
+_UNSETTLED = 0.03  # relative change of a phasor over the end of a step
+_DROP = 0.3  # of the force at the strongest response
+_LINE = 2e-3  # of the fundamental, that a folded line has at least
+_ABOVE_NOISE = 12.0  # amplitude of a line over the median about it
+_MAINS = (50.0, 60.0)  # Hz
+_FOLDED = 60  # highest harmonic whose image is looked for
+
+
+def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]:
+    """Findings of one record, and notes on what could not be looked at."""
+    name = recording.name or "record"
+    forces = [c.name for c in recording.channels if c.quantity in ("force", "voltage")]
+    motions = [
+        c.name
+        for c in recording.channels
+        if c.quantity in ("velocity", "acceleration", "displacement")
+    ]
+    stop = min(recording.n_samples, _MOST)
+    values = {c: recording.values([c], 0, stop)[0] for c in (*forces, *motions)}
+    found = [one for c, x in values.items() if (one := _flat_runs(x, f"{name}, channel {c}"))]
+    notes = [f"{name}: only the first {stop} samples were looked at."] * (
+        stop < recording.n_samples
+    )
+    if not forces:
+        return found, [*notes, f"{name}: no channel is a force or a voltage: steps were not found."]
+    force = forces[0]
+    try:
+        track = track_tone(recording, force)
+        steps = recognise_steps(
+            track, recording.sampling_rate, least_amplitude_step=0.05, least_step=0.0
+        )
+    except ValueError as error:
+        return found, [*notes, f"{name}: {error}"]
+    rate = recording.sampling_rate
+    steps = [
+        one
+        for one in steps
+        if one.stop <= stop
+        and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= _FEWEST_CYCLES
+    ]
+    if not steps:
+        return found, [*notes, f"{name}: no step of eight cycles was recognised."]
+    clipped = {one.where for one in found}
+    for c, x in values.items():
+        where = f"{name}, channel {c}"
+        if where not in clipped and (one := _flat_cycles(x, steps, rate, where)):
+            found.append(one)
+    found += _harmonics(values[force], steps, rate, f"{name}, channel {force}")
+    for c in motions:
+        where = f"{name}, channel {c}"
+        found += _unsettled(values[force], values[c], steps, rate, where)
+        found += _dropped(values[force], values[c], steps, rate, where)
+    for c in (force, *motions):
+        if all(
+            one.where != f"{name}, channel {c}" or one.kind != "clipped_channel" for one in found
+        ):
+            found += _folded(values[c], steps, rate, f"{name}, channel {c}")
+    return found, notes
+
+
+def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
+    """Neighbouring samples that all stand at the channel's extreme."""
+    top, bottom = float(x.max()), float(x.min())
+    size = max(abs(top), abs(bottom))
+    if size == 0:
+        return None
+    share = 0.0
+    for limit, sign in ((top, 1.0), (bottom, -1.0)):
+        at = sign * (limit - x) <= 1e-6 * size
+        three = at[2:] & at[1:-1] & at[:-2]
+        share += float(three.mean()) if len(three) else 0.0
+    if share < _FLAT_RUNS:
+        return None
+    return _clipping(
+        where, f"{100 * share:.2g} % of the samples stand in a row at {bottom:.4g} or {top:.4g}"
+    )
+
+
+def _clipping(where: str, evidence: str) -> Finding:
+    return Finding(
+        *("clipped_channel", "error", where),
+        f"{evidence}: the channel is at the end of its range.",
+        "widen the channel's range (or lower the gain) and record again.",
+    )
+
+
+def _middle(step: Step, share: float = 0.5) -> slice:
+    """The last part of a step, without its very end."""
+    length = step.stop - step.start
+    return slice(int(step.stop - share * length), int(step.stop - 0.02 * length))
+
+
+def _demodulated(
+    x: np.ndarray, rows: slice, frequency: float, rate: float, order: int = 1
+) -> tuple[np.ndarray, float]:
+    """Phasors of neighbouring cycles against the record's own clock, and cycles of each."""
+    cycle = 2 * np.pi * rate / frequency
+    n = rows.stop - rows.start
+    blocks = max(1, min(int(n / cycle), 32))
+    edges = rows.start + np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(
+        int
+    )
+    time = np.arange(rows.start, edges[-1]) / rate
+    turn = np.exp(-1j * order * frequency * time)
+    part = x[rows.start : edges[-1]]
+    sums = [
+        2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b])
+        for a, b in zip(edges[:-1] - rows.start, edges[1:] - rows.start, strict=True)
+    ]
+    return np.array(sums), n / cycle / blocks
+
+
+def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> Finding | None:
+    """A mean cycle whose tops are flat, where noise hides the single samples' limit."""
+    sizes = [float(np.std(x[_middle(one)])) for one in steps]
+    best = None
+    for k in np.argsort(sizes)[-3:]:
+        one = steps[int(k)]
+        rows = _middle(one)
+        phase = (one.frequency * np.arange(rows.start, rows.stop) / rate) % (2 * np.pi)
+        bins = 64
+        index = np.minimum((phase / (2 * np.pi) * bins).astype(int), bins - 1)
+        counts = np.bincount(index, minlength=bins)
+        if counts.min() < 3:
+            continue
+        mean = np.bincount(index, x[rows], minlength=bins) / counts
+        mean = mean - 0.5 * (mean.max() + mean.min())
+        flat = float(np.mean(np.abs(mean) > 0.97 * np.abs(mean).max()))
+        if best is None or flat > best:
+            best = flat
+    if best is None or best < _FLAT:
+        return None
+    return _clipping(
+        where, f"{100 * best:.3g} % of a mean cycle lies within 3 % of its extremes, of a sine 16 %"
+    )
+
+
+def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
+    """Harmonics of the force, the median over the steps and the largest."""
+    ratios = []
+    for one in steps:
+        rows = _middle(one)
+        spectrum = _lines(x, rows, one.frequency, rate)
+        ratios.append(spectrum[1:] / max(spectrum[0], 1e-300))
+    table = np.array(ratios)
+    worst = table.max(axis=0)
+    order = int(np.nanargmax(worst)) if np.isfinite(worst).any() else 0
+    largest, median = float(worst[order]), float(np.median(table[:, order]))
+    if not largest > _HARMONIC_REMARK:
+        return []
+    severe = largest > _HARMONIC_LIMIT
+    return [
+        Finding(
+            FORCE_HARMONICS,
+            "warning" if severe else "info",
+            where,
+            f"harmonic {order + 2} of the force is {100 * largest:.3g} % of its fundamental "
+            f"(median over {len(steps)} steps {100 * median:.2g} %; limit "
+            f"{100 * _HARMONIC_LIMIT:.2g} %).",
+            "lower the amplifier's distortion or control the harmonics; else put them into the "
+            "model as an effect on the force's spectrum.",
+        )
+    ]
+
+
+def _lines(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
+    """Amplitudes of the fundamental and its harmonics below half the rate, by least squares."""
+    time = np.arange(rows.start, rows.stop) / rate
+    most = min(_HIGHEST, int(0.95 * np.pi * rate / frequency))
+    if most < 2 or len(time) < 4 * most + 4:
+        return np.array([1.0, 0.0])
+    turns = np.outer(time, frequency * np.arange(1, most + 1))
+    design = np.concatenate([np.ones((len(time), 1)), np.cos(turns), np.sin(turns)], axis=1)
+    theta = np.linalg.lstsq(design, x[rows], rcond=None)[0]
+    size = np.hypot(theta[1 : 1 + most], theta[1 + most :])
+    return np.concatenate([size, np.zeros(_HIGHEST - most)])
+
+
+def _unsettled(
+    force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
+) -> list[Finding]:
+    """Steps whose response still moves at their end, more than its blocks scatter."""
+    moving = []
+    for one in steps:
+        rows = _middle(one, 0.5)
+        v, _ = _demodulated(x, rows, one.frequency, rate)
+        f, _ = _demodulated(force, rows, one.frequency, rate)
+        if len(v) < 5 or not np.all(np.abs(f) > 0):
+            continue
+        z = v / f
+        place = np.linspace(-0.5, 0.5, len(z))
+        slope = np.sum(place * (z - z.mean())) / np.sum(place**2)
+        rest = z - z.mean() - slope * place
+        # A transient bends, too: only what jumps from block to block is noise.
+        jumps = np.diff(rest, 2) if len(rest) > 4 else rest
+        noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
+        change = float(abs(slope) / abs(z[-1]))
+        if change > _UNSETTLED and abs(slope) > 6 * noise:
+            moving.append((change, one))
+    if len(moving) < max(1, 0.15 * len(steps)):
+        return []
+    worst, one = max(moving, key=lambda pair: pair[0])
+    return [
+        Finding(
+            *("unsettled_steps", "error", where),
+            f"in {len(moving)} of {len(steps)} steps the response over the force still moves by up "
+            f"to {100 * worst:.3g} % over the last half of the step (worst at "
+            f"{one.frequency / (2 * np.pi):.5g} Hz, {one.start / rate:.4g} to "
+            f"{one.stop / rate:.4g} s).",
+            "dwell longer (5/(ζω) a step), or read it by `sj.measure.stepped_sine_states`, which "
+            "leaves transients out.",
+        )
+    ]
+
+
+def _dropped(
+    force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
+) -> list[Finding]:
+    """Force that falls where the response over it is strongest."""
+    if len(steps) < 5:
+        return []
+    rows = [_middle(one) for one in steps]
+    f = np.array([np.std(force[r]) for r in rows]) * np.sqrt(2)
+    v = np.array([np.std(x[r]) for r in rows]) * np.sqrt(2)
+    mobility = v / f
+    far = mobility < 0.8 * mobility.max()
+    near = mobility > 0.6 * mobility.max()
+    if not far.any() or np.ptp(np.log(v)) < 0.25:
+        return []
+    # Levels are told by the force: only one level a record is judged.
+    if np.std(np.log(f[far])) > 0.25:
+        return []
+    nominal = float(np.quantile(f[far], 0.85))
+    drop = 1 - float(f[near].min()) / nominal
+    if drop < _DROP or np.corrcoef(np.log(f), np.log(mobility))[0, 1] > -0.6:
+        return []
+    return [
+        Finding(
+            *("force_dropout", "warning", where),
+            f"the force falls from {nominal:.4g} to {f[near].min():.4g} N, by {100 * drop:.3g} %, "
+            "where the response is strongest.",
+            "use the measured force of every step, or control the force.",
+        )
+    ]
+
+
+def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
+    """Lines that are no harmonics of the drive below half the rate, and what they are images of."""
+    images: list[tuple[float, float, int]] = []
+    others: list[tuple[float, float]] = []
+    for one in sorted(steps, key=lambda one: one.start - one.stop)[:12]:
+        rows = _middle(one)
+        n = rows.stop - rows.start
+        if n < 256:
+            continue
+        own = x[rows] - x[rows].mean()
+        window = np.blackman(n)
+        spectrum = np.abs(np.fft.rfft(own * window)) * 2 / window.sum()
+        hertz = np.arange(len(spectrum)) * rate / n
+        f0 = one.frequency / (2 * np.pi)
+        fundamental = float(_lines(x, rows, one.frequency, rate)[0])
+        guard = 4.5 * rate / n
+        away = np.abs(hertz - f0 * np.round(hertz / f0)) > guard
+        width = max(16, len(spectrum) // 64)
+        for k in np.flatnonzero(away[1:-1]) + 1:
+            size = float(spectrum[k])
+            if size < _LINE * fundamental or size < max(spectrum[k - 1], spectrum[k + 1]):
+                continue
+            around = spectrum[max(0, k - width) : k + width][away[max(0, k - width) : k + width]]
+            if size < _ABOVE_NOISE * float(np.median(around)):
+                continue
+            f = float(hertz[k])
+            if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in _MAINS):
+                continue
+            orders = np.arange(int(rate / 2 / f0) + 1, _FOLDED)
+            alias = np.abs(orders * f0 - rate * np.round(orders * f0 / rate))
+            off = np.abs(alias - f)
+            if len(orders) and off.min() < 1.5 * rate / n + 1e-4 * f0 * orders[off.argmin()]:
+                images.append((size / fundamental, f, int(orders[off.argmin()])))
+            else:
+                others.append((size / fundamental, f))
+    if images:
+        size, f, order = max(images)
+        text = (
+            f"a line at {f:.5g} Hz, {100 * size:.2g} % of the fundamental, is no harmonic of the "
+            f"drive but the image of harmonic {order} folded about half the rate of {rate:.6g} Hz"
+        )
+    elif others:
+        size, f = max(others)
+        text = (
+            f"a line at {f:.5g} Hz, {100 * size:.2g} % of the fundamental, is neither a harmonic "
+            f"of the drive nor mains: the likely image of {rate - f:.6g} Hz or more at a rate of "
+            f"{rate:.6g} Hz"
+        )
+    else:
+        return []
+    return [
+        Finding(
+            *("missing_anti_alias", "warning", where),
+            text + ".",
+            "switch on the recorder's anti-alias filter, or sample faster and filter before "
+            "thinning.",
+        )
+    ]

@@ -1,0 +1,221 @@
+"""The import doctor on the exact responses of one mode, each with one thing gone wrong."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+import snrmjax as sj
+from snrmjax.cli import app
+from snrmjax.measure import Channel, steady_states, time_recording
+
+OMEGA, ZETA, SHAPE = 2 * np.pi * 60.0, 0.02, 2.5
+CUBIC = 0.1 * OMEGA**2  # of the displacement over its largest: frequencies rise by 3.7 %
+
+
+def states(*, force_of=None, order=None):
+    """Level, Ω, F, V of ω² + ¾γa², exactly: |F| gives two frequencies at every amplitude."""
+    rows = []
+    for level, top in enumerate((0.3, 0.6, 1.0)):
+        a = top * np.sin(np.linspace(0.25, np.pi - 0.25, 15))
+        side = np.sign(np.linspace(-1, 1, 15) + 1e-9)
+        k = OMEGA**2 + 0.75 * CUBIC * a**2
+        force = 2 * ZETA * OMEGA * np.sqrt(OMEGA**2 + 0.75 * CUBIC * top**2) * top
+        w = np.sqrt(k)
+        for _ in range(40):
+            w = np.sqrt(
+                k + side * np.sqrt(np.maximum((force / a) ** 2 - (2 * ZETA * OMEGA * w) ** 2, 0))
+            )
+        v = 1j * w * force * np.ones(15) / (k - w**2 + 2j * ZETA * OMEGA * w)
+        rows.append((np.full(15, level), w, np.full(15, force), v))
+    level, w, force, v = (np.concatenate(one) for one in zip(*rows, strict=True))
+    return level, w, force / SHAPE, SHAPE * v
+
+
+def noisy(v, seed=0):
+    rng = np.random.default_rng(seed)
+    return v * np.exp(0.003 * (rng.normal(size=len(v)) + 1j * rng.normal(size=len(v))))
+
+
+def table(level, w, force, v, **more):
+    stated = {"velocity_std": 0.003 * np.abs(v), "phase_std": np.full(len(v), 0.003)}
+    return steady_states(level + 1, w, force, v, sensors=("tip",), **(stated | more))
+
+
+def model(shape=SHAPE):
+    modes = sj.model.linear_modes([OMEGA], [ZETA], [[shape]], [shape], sensors=("tip",))
+    return sj.model.structure(modes)
+
+
+def wrapped(v):
+    return np.abs(v) * np.exp(1j * np.degrees(np.angle(v)))
+
+
+def unsettled(level, v, left=0.5):
+    """A share of the state before, as at exact resonance."""
+    out = v.copy()
+    for k in range(1, len(v)):
+        if level[k] == level[k - 1]:
+            out[k] = v[k] + left * (out[k - 1] - v[k])
+    return out
+
+
+def drifting(w):
+    return w * (1 + 0.02 * np.linspace(-0.5, 0.5, len(w)))
+
+
+def clipped(v, limit):
+    """First harmonic of a sine cut off, by its integral over a cycle."""
+    turn = 2 * np.pi * (np.arange(720) + 0.5) / 720
+    wave = np.clip(np.abs(v)[:, None] * np.cos(turn), -limit, limit)
+    return 2 * np.mean(wave * np.cos(turn), axis=1) * np.exp(1j * np.angle(v))
+
+
+def broken(kind):
+    """A table with one error and its model."""
+    level, w, force, exact = states()
+    v, shape = noisy(exact), SHAPE
+    if kind == "conjugated_response":
+        v = v.conj()
+    elif kind == "acceleration_as_velocity":
+        v = 1j * w * v
+    elif kind == "displacement_as_velocity":
+        v = v / (1j * w)
+    elif kind == "volts_as_force":
+        force = force * np.array([1.0, 0.7, 0.5])[level]
+    elif kind == "rms_for_peak":
+        v = v / np.sqrt(2)
+    elif kind == "degrees_for_radians":
+        v = wrapped(v)
+    elif kind == "clipped_channel":
+        v = clipped(v, 0.5 * np.abs(v).max())
+    elif kind == "unsettled_steps":
+        v = noisy(unsettled(level, exact))
+    elif kind == "force_dropout":
+        drop = 1 - 0.6 * np.cos(np.angle(exact)) ** 2
+        level, w, _, _ = states()
+        w = OMEGA * (1 + 0.05 * np.linspace(-1, 1, 15))[np.arange(45) % 15]
+        force = (1.0 + level) * 1.0
+        v = 1j * w * SHAPE**2 * force / (OMEGA**2 - w**2 + 2j * ZETA * OMEGA * w)
+        drop = 1 - 0.6 * np.cos(np.angle(v)) ** 2
+        force, v = force * drop, noisy(v * drop)
+    elif kind == "drift":
+        w = drifting(w)
+    elif kind == "shape_not_mass_normalised":
+        shape = 1.0
+    return table(level, w, force, v), model(shape)
+
+
+KINDS = (
+    *("conjugated_response", "acceleration_as_velocity", "displacement_as_velocity"),
+    *("volts_as_force", "rms_for_peak", "degrees_for_radians", "clipped_channel"),
+    *("unsettled_steps", "force_dropout", "drift", "shape_not_mass_normalised"),
+)
+
+
+def raised(found):
+    return [one.kind for one in found.findings if one.severity != "info"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_error_of_a_table_is_found_and_named_alone(kind):
+    data, structure = broken(kind)
+    found = sj.doctor.check_test(data, structure)
+    assert raised(found) == [kind]
+    one = found.findings[0]
+    assert any(c.isdigit() for c in one.evidence)
+    assert one.mend.endswith(".")
+    assert kind in repr(found)
+
+
+def test_good_tables_are_silent():
+    level, w, force, exact = states()
+    for seed in range(3):
+        assert sj.doctor.check_test(table(level, w, force, noisy(exact, seed)), model()).kinds == ()
+
+
+def test_files_of_two_structures_are_told_apart():
+    level, w, force, exact = states()
+    one, other = (table(level, f * w, force, noisy(exact, k)) for k, f in enumerate((1.0, 1.04)))
+    assert raised(sj.doctor.check_test([one, other], model())) == ["different_structures"]
+    again = table(level, w, force, noisy(exact, 5))
+    assert sj.doctor.check_test([one, again], model()).kinds == ()
+
+
+def harmonic_table(ratio):
+    level, w, force, v = states()
+    w3 = 3 * w
+    of_force = ratio * force * SHAPE**2 * 1j * w3
+    of_force = of_force / (OMEGA**2 - w3**2 + 2j * ZETA * OMEGA * w3)
+    q = np.abs(v) / w / SHAPE  # γq³ gives γa³/4 of order 3, in phase with the displacement's cube
+    own = -CUBIC * q**3 / 4 * (np.exp(1j * np.angle(v)) / 1j) ** 3
+    own = own * SHAPE * 1j * w3 / (OMEGA**2 - w3**2 + 2j * ZETA * OMEGA * w3)
+    rng = np.random.default_rng(1)
+    floor = 1e-4 * np.abs(v).max()
+    noise = floor / np.sqrt(2) * (rng.normal(size=len(v)) + 1j * rng.normal(size=len(v)))
+    h = (of_force + own + noise)[:, None, None]
+    more = {"harmonics": h, "harmonic_order": (3,), "harmonic_std": np.full((len(v), 1), floor)}
+    return table(level, w, force, noisy(v), **more)
+
+
+def test_harmonics_of_the_force_are_told_from_those_of_the_structure():
+    assert raised(sj.doctor.check_test(harmonic_table(0.15), model())) == ["force_harmonics"]
+    assert sj.doctor.check_test(harmonic_table(0.0), model()).kinds == ()
+
+
+def record(kind="", dwell=1.0, rate=1500.0):
+    """Five steps over the resonance of one mode, by scipy's exact step between samples."""
+    frequencies = np.linspace(57, 63, 5)
+    each = int(dwell * rate)
+    turn = 2 * np.pi * np.cumsum(np.repeat(frequencies, each)) / rate
+    time = np.arange(len(turn)) / rate
+    force = np.cos(turn) + (0.1 * np.cos(3 * turn) if kind == "force_harmonics" else 0.0)
+    if kind == "force_dropout":
+        force = force * np.repeat([1.0, 0.9, 0.4, 0.9, 1.0], each)
+    v = lsim(([1, 0], [1, 2 * ZETA * OMEGA, OMEGA**2]), force, time)[1]
+    size = np.abs(v).max()
+    if kind == "missing_anti_alias":
+        v = v + 0.02 * size * np.cos(23 * turn)  # above half the rate: folded by sampling
+    rng = np.random.default_rng(0)
+    v = v + 1e-3 * size * rng.normal(size=len(v))
+    if kind == "clipped_channel":
+        v = np.clip(v, -0.6 * size, 0.6 * size)
+    channels = [Channel("cell", "force", "N"), Channel("tip", "velocity", "m/s")]
+    return time_recording(np.stack([force, v]), channels, rate)
+
+
+RECORDS = ("force_harmonics", "force_dropout", "missing_anti_alias", "clipped_channel")
+
+
+@pytest.mark.parametrize("kind", RECORDS)
+def test_each_error_of_a_record_is_found_and_named_alone(kind):
+    assert set(raised(sj.doctor.check_test([], None, [record(kind)]))) == {kind}
+
+
+def test_steps_that_end_too_soon():
+    # 0.25 s are 1.9 decay times 1/(ζω): 15 % of a change is left.
+    assert raised(sj.doctor.check_test([], None, [record(dwell=0.25)])) == ["unsettled_steps"]
+
+
+def test_a_good_record_is_silent():
+    assert sj.doctor.check_test([], None, [record()]).kinds == ()
+
+
+def test_nothing_to_check():
+    with pytest.raises(ValueError, match="nothing to check"):
+        sj.doctor.check_test([])
+
+
+def test_the_command_writes_the_contracts_list(tmp_path):
+    from typer.testing import CliRunner
+
+    data, structure = broken("conjugated_response")
+    sj.io.write_steady_states(tmp_path / "measured.csv", data)
+    sj.io.write_model(tmp_path / "model.toml", structure)
+    arguments = ["check", str(tmp_path / "measured.csv"), "--model", str(tmp_path / "model.toml")]
+    result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    (one,) = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))
+    assert set(one) == {"kind", "severity", "where", "evidence", "mend"}
+    assert one["kind"] == "conjugated_response"
