@@ -10,7 +10,9 @@ from snrmjax.model.structures import Structure
 _SIGMAS = 4.0
 _LEAST = 0.04  # relative, that is spoken of
 _STEEPLY = 0.13  # relative, from which on it is no error of a linear test
-_ROOT_TWO = 0.05  # relative distance from √2, that is an rms
+_MOST_ERROR = 0.04  # relative 1σ of the modal mass, beyond which the states do not say it
+_BY_FREQUENCY = 0.15  # relative distance from Ω or 1/Ω
+_ROOT_TWO = 0.02  # relative distance from √2, that is an rms
 _LOW, _HIGH = 0.5, 2.0
 
 
@@ -24,7 +26,7 @@ def mass_findings(
     or a shape of another scale; what else disagrees says which, if anything does.
     """
     kappa, std = fit.mass, fit.mass_std
-    if not kappa > 0 or not np.isfinite(kappa):
+    if not kappa > 0 or not np.isfinite(kappa) or std > _MOST_ERROR * kappa:
         return []
     off = float(np.log(kappa))
     own = model.modes.own_modal_mass_std
@@ -52,6 +54,9 @@ def mass_findings(
                 f"multiply the {columns} by √2 = 1.41421 (snrmjax import … --rms).",
             )
         ]
+    by_frequency = _differentiated(off, float(np.log(np.median(states.frequency))), size, where)
+    if by_frequency is not None:
+        return [by_frequency]
     volts, shape = _votes(states, fit, model)
     either = [
         Finding(
@@ -78,6 +83,25 @@ def mass_findings(
         one._replace(evidence=one.evidence.rstrip(".") + other.format(word) + ".")
         for one, word in zip(either, ("mode shape", "force"), strict=True)
     ]
+
+
+def _differentiated(off: float, log_omega: float, size: str, where: str) -> Finding | None:
+    """Amplitudes of an acceleration or displacement whose phases are a velocity's already."""
+    if abs(log_omega) < 10 * _BY_FREQUENCY:
+        return None
+    if abs(off + log_omega) < _BY_FREQUENCY:
+        return Finding(
+            *("acceleration_as_velocity", "error", where),
+            f"{size}, 1/Ω of it: the amplitudes are accelerations, the phases those of velocities.",
+            "divide the amplitudes by Ω: `snrmjax import … --response CHANNEL:acceleration`.",
+        )
+    if abs(off - log_omega) < _BY_FREQUENCY:
+        return Finding(
+            *("displacement_as_velocity", "error", where),
+            f"{size}, Ω of it: the amplitudes are displacements, the phases those of velocities.",
+            "multiply the amplitudes by Ω: `snrmjax import … --response CHANNEL:displacement`.",
+        )
+    return None
 
 
 class _Vote:

@@ -14,13 +14,13 @@ _MOST_SCALE, _MOST_MISFIT = 4.0, 0.25  # beyond which a fit says nothing of the 
 _NO_MODE = 0.35  # relative misfit, from which on the phasors are those of no mode
 _EXPLAINED = 2.0  # times the stated errors that a correction may leave
 _EXPLAINED_SHARE = 0.4  # of the misfit as recorded that it may leave otherwise
-_LEAST_GAIN = {"drift": 18.0, "different_structures": 25.0, "clipped_channel": 25.0}
+_LEAST_GAIN = {"drift": 18.0, "different_structures": 25.0, "clipped_channel": 40.0}
 _LEAST_GAIN_ELSE = 25.0  # of the criterion, for independent states
 _LEAST_FREQUENCY = 0.002  # relative change of natural frequency that is spoken of
 _OF_BANDWIDTH = 0.25  # of the damping ratio: likewise
 _MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
 _OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
-_LEAST_GAIN_CHANGE = 0.05  # relative: of gain or force along a test or between files
+_LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between files
 
 _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "conjugated": (
@@ -162,7 +162,9 @@ def _matters(states: ModeStates, one: Remedy, groups: tuple[tuple[int, ...], ...
     if one.kind == "different_structures":
         # Of one file a level of its own is rarely another structure: a misfitting curve looks so.
         strict = 1.0 if one.levels in groups else 2.0
-        if _overlap(states, one.levels) < _OVERLAP or abs(fit.extra[0]) > _MOST_FREQUENCY:
+        if _overlap(states, one.levels) < _OVERLAP or (
+            strict > 1 and abs(fit.extra[0]) > _MOST_FREQUENCY
+        ):
             return False
         return bool(abs(fit.extra[0]) > max(strict * least, 4 * strict * fit.extra_std[0]))
     if one.name == "gain_of_level":

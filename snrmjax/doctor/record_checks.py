@@ -9,13 +9,15 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 
 _MOST = 2**23  # samples of a channel that are looked at
-_FEWEST_CYCLES = 8.0  # of a step
+_FEWEST_CYCLES = 3.5  # of a step
 _HARMONIC_LIMIT, _HARMONIC_REMARK = 0.04, 0.015  # of the force's fundamental
 _HIGHEST = 12  # harmonic of the force
 _FLAT = 0.26  # of a mean cycle within 3 % of its extremes; of a sine 0.156
 _FLAT_RUNS = 0.003  # of the samples, in runs of equal extremes
+_MOVING_STEPS = 0.3  # of all: a jump or a slow beat may move single ones
+_FEW_BLOCKS, _FEW_UNSETTLED = 4, 0.08  # of a step, with no scatter of their own to compare with
 _UNSETTLED = 0.03  # relative change of a phasor over the end of a step
-_DROP = 0.3  # of the force at the strongest response
+_DROP = 0.5  # of the force at the strongest response
 _LINE = 2e-3  # of the fundamental, that a folded line has at least
 _ABOVE_NOISE = 12.0  # amplitude of a line over the median about it
 _MAINS = (50.0, 60.0)  # Hz
@@ -50,12 +52,12 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
     rate = recording.sampling_rate
     steps = [
         one
-        for one in steps
+        for one in _joined(steps, rate)
         if one.stop <= stop
         and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= _FEWEST_CYCLES
     ]
     if not steps:
-        return found, [*notes, f"{name}: no step of eight cycles was recognised."]
+        return found, [*notes, f"{name}: no step of four cycles was recognised."]
     clipped = {one.where for one in found}
     for c, x in values.items():
         where = f"{name}, channel {c}"
@@ -72,6 +74,23 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
         ):
             found += _folded(values[c], steps, rate, f"{name}, channel {c}")
     return found, notes
+
+
+def _joined(steps: list[Step], rate: float) -> list[Step]:
+    """Steps in which a transient of the force made a cut, whole again."""
+    whole: list[Step] = []
+    for one in steps:
+        if whole:
+            last = whole[-1]
+            shorter = min(one.stop - one.start, last.stop - last.start) / rate
+            near = abs(one.frequency - last.frequency) < np.pi / shorter
+            longer = max(one, last, key=lambda step: step.stop - step.start)
+            settling = shorter * rate < 0.6 * (longer.stop - longer.start)
+            if near and settling and one.stop - one.start > last.stop - last.start:
+                whole[-1] = one._replace(start=last.start)
+                continue
+        whole.append(one)
+    return whole
 
 
 def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
@@ -184,7 +203,7 @@ def _lines(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndar
     time = np.arange(rows.start, rows.stop) / rate
     most = min(_HIGHEST, int(0.95 * np.pi * rate / frequency))
     if most < 2 or len(time) < 4 * most + 4:
-        return np.array([1.0, 0.0])
+        return np.append(1.0, np.zeros(_HIGHEST - 1))  # too short to tell harmonics apart
     turns = np.outer(time, frequency * np.arange(1, most + 1))
     design = np.concatenate([np.ones((len(time), 1)), np.cos(turns), np.sin(turns)], axis=1)
     theta = np.linalg.lstsq(design, x[rows], rcond=None)[0]
@@ -198,10 +217,11 @@ def _unsettled(
     """Steps whose response still moves at their end, more than its blocks scatter."""
     moving = []
     for one in steps:
-        rows = _middle(one, 0.5)
+        cycles = (one.stop - one.start) * one.frequency / (2 * np.pi * rate)
+        rows = _middle(one, min(1.0, max(0.3, 5 / cycles)))
         v, _ = _demodulated(x, rows, one.frequency, rate)
         f, _ = _demodulated(force, rows, one.frequency, rate)
-        if len(v) < 5 or not np.all(np.abs(f) > 0):
+        if len(v) < 3 or not np.all(np.abs(f) > 0):
             continue
         z = v / f
         place = np.linspace(-0.5, 0.5, len(z))
@@ -211,16 +231,18 @@ def _unsettled(
         jumps = np.diff(rest, 2) if len(rest) > 4 else rest
         noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
         change = float(abs(slope) / abs(z[-1]))
-        if change > _UNSETTLED and abs(slope) > 6 * noise:
+        few = len(v) <= _FEW_BLOCKS
+        believed = change > _FEW_UNSETTLED if few else abs(slope) > 6 * noise
+        if change > _UNSETTLED and believed:
             moving.append((change, one))
-    if len(moving) < max(1, 0.15 * len(steps)):
+    if len(moving) < max(1, _MOVING_STEPS * len(steps)):
         return []
     worst, one = max(moving, key=lambda pair: pair[0])
     return [
         Finding(
             *("unsettled_steps", "error", where),
             f"in {len(moving)} of {len(steps)} steps the response over the force still moves by up "
-            f"to {100 * worst:.3g} % over the last half of the step (worst at "
+            f"to {100 * worst:.3g} % at the end of the step (worst at "
             f"{one.frequency / (2 * np.pi):.5g} Hz, {one.start / rate:.4g} to "
             f"{one.stop / rate:.4g} s).",
             "dwell longer (5/(ζω) a step), or read it by `sj.measure.stepped_sine_states`, which "
