@@ -72,10 +72,10 @@ def clipped(v, limit):
     return 2 * np.mean(wave * np.cos(turn), axis=1) * np.exp(1j * np.angle(v))
 
 
-def broken(kind):
+def broken(kind, seed=0):
     """A table with one error and its model."""
     level, w, force, exact = states()
-    v, shape = noisy(exact), SHAPE
+    v, shape = noisy(exact, seed), SHAPE
     if kind == "conjugated_response":
         v = v.conj()
     elif kind == "acceleration_as_velocity":
@@ -91,7 +91,7 @@ def broken(kind):
     elif kind == "clipped_channel":
         v = clipped(v, 0.5 * np.abs(v).max())
     elif kind == "unsettled_steps":
-        v = noisy(unsettled(level, exact))
+        v = noisy(unsettled(level, exact), seed)
     elif kind == "force_dropout":
         drop = 1 - 0.6 * np.cos(np.angle(exact)) ** 2
         level, w, _, _ = states()
@@ -99,7 +99,7 @@ def broken(kind):
         force = (1.0 + level) * 1.0
         v = 1j * w * SHAPE**2 * force / (OMEGA**2 - w**2 + 2j * ZETA * OMEGA * w)
         drop = 1 - 0.6 * np.cos(np.angle(v)) ** 2
-        force, v = force * drop, noisy(v * drop)
+        force, v = force * drop, noisy(v * drop, seed)
     elif kind == "drift":
         w = drifting(w)
     elif kind == "shape_not_mass_normalised":
@@ -118,7 +118,12 @@ def raised(found):
     return [one.kind for one in found.findings if one.severity != "info"]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+SLOW = {"volts_as_force", "clipped_channel", "unsettled_steps", "degrees_for_radians"}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=pytest.mark.long) if k in SLOW else k for k in KINDS]
+)
 def test_each_error_of_a_table_is_found_and_named_alone(kind):
     data, structure = broken(kind)
     found = sj.doctor.check_test(data, structure)
@@ -129,12 +134,27 @@ def test_each_error_of_a_table_is_found_and_named_alone(kind):
     assert kind in repr(found)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_noise_changes_no_answer(kind):
+    for seed in (1, 2, 3):
+        assert raised(sj.doctor.check_test(*broken(kind, seed))) == [kind]
+
+
+@pytest.mark.long
+def test_good_tables_are_silent_whatever_their_noise():
+    level, w, force, exact = states()
+    for seed in range(3, 40):
+        assert sj.doctor.check_test(table(level, w, force, noisy(exact, seed)), model()).kinds == ()
+
+
 def test_good_tables_are_silent():
     level, w, force, exact = states()
     for seed in range(3):
         assert sj.doctor.check_test(table(level, w, force, noisy(exact, seed)), model()).kinds == ()
 
 
+@pytest.mark.long
 def test_files_of_two_structures_are_told_apart():
     level, w, force, exact = states()
     one, other = (table(level, f * w, force, noisy(exact, k)) for k, f in enumerate((1.0, 1.04)))
