@@ -70,6 +70,7 @@ SUB_ROOMS = {
     "io.exchange": {
         *("io.files", "io.units", "io.columns", "io.tables", "io.toml_table", "io.laboratory"),
     },
+    "cli.laboratory": {"cli.console", "cli.options"},
     "report.laws": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},
@@ -77,6 +78,11 @@ SUB_ROOMS = {
     "report.modal": {"report.style", "report.html"},
     "report.interactive": {"report.style", "report.html"},
     "report.study": {"report.style", "report.html"},
+    # One page of the pages of other commands.
+    "report.whole_test": {
+        *("report.html", "report.interactive", "report.modal", "report.workflow"),
+        "report.diagnosis_report",
+    },
     "io.reduction": {
         *("io.columns", "io.files", "io.rows", "io.tables", "io.toml_table", "io.units"),
     },

@@ -1,4 +1,4 @@
-"""The commands: demo, import, simulate, nnm, identify, compare, diagnose, modes, study, rom.
+"""The commands, in the order in which a test needs them.
 
 Each imports what it needs by itself: none waits for the imports of another.
 """
@@ -9,14 +9,15 @@ from collections.abc import Callable
 
 import typer
 
-from snrmjax.cli.check_command import check
 from snrmjax.cli.compare_command import compare
 from snrmjax.cli.console import refuse
 from snrmjax.cli.demo_command import demo
 from snrmjax.cli.diagnose_command import diagnose
 from snrmjax.cli.identify_command import identify
-from snrmjax.cli.import_command import import_
-from snrmjax.cli.modes_command import modes
+from snrmjax.cli.laboratory.check_command import check
+from snrmjax.cli.laboratory.import_command import import_
+from snrmjax.cli.laboratory.modes_command import modes
+from snrmjax.cli.laboratory.whole_test_command import whole_test
 from snrmjax.cli.rom_command import rom
 from snrmjax.cli.simulate_commands import nnm, simulate
 from snrmjax.cli.study_commands import study_app
@@ -34,27 +35,31 @@ app = typer.Typer(
 
 _EXAMPLES: dict[Callable[..., None], str] = {
     demo: "Example: snrmjax demo --out demo, then open demo/report.html.",
+    whole_test: "Example: snrmjax test measurements --out report, then open report/report.html.",
     import_: "Examples: snrmjax import test.uff\n\n"
     "snrmjax import test.mat --force CH1 --force-unit N --response CH2:acceleration --unit g "
     "--out imported\n\n"
     "snrmjax import next.mat --map imported/map.toml --out next",
-    simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
-    "--out result",
-    nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
     check: "Example: snrmjax check measured.csv --model model.toml --out checked",
-    identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
-    "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
-    "--next 5 --out result",
-    compare: "Example: snrmjax compare measured.csv --model model.toml --out compared",
-    diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
-    "snrmjax diagnose sets/*.csv --model model.toml --out results",
     modes: "Examples: snrmjax modes frf.uff --out model.toml\n\n"
     "snrmjax modes low_level.csv --drive-point tip --out model.toml\n\n"
     "snrmjax modes decay.mat --to-hz 200 --unscaled --out model.toml",
+    identify: "Examples: snrmjax identify measured.csv --model model.toml --predict-force 0.5 "
+    "--out result\n\nsnrmjax identify driven.csv --model model.toml --fit auto --free force_gain "
+    "--next 5 --out result",
+    compare: "Examples: snrmjax compare measured.csv --model model.toml --out compared\n\n"
+    "snrmjax compare measured.csv decay.csv --model model.toml --out compared",
+    diagnose: "Examples: snrmjax diagnose measured.csv --model model.toml --out result\n\n"
+    "snrmjax diagnose sets/*.csv --model model.toml --out results",
+    simulate: "Example: snrmjax simulate beam.toml --force 0.5 --force 1 --from-hz 60 --to-hz 110 "
+    "--out result",
+    nnm: "Example: snrmjax nnm beam.toml --to-hz 110 --out result",
     rom: "Examples: snrmjax rom beam.toml --out reduced\n\n"
     "snrmjax rom --tables load_cases --out reduced\n\n"
     "snrmjax rom --calculix deck.inp --modes 1,3,5 --out reduced",
 }
+# What Python has another use for, or pytest.
+_NAMES = {whole_test: "test", import_: "import"}
 
 
 def _unwrapped(text: str) -> str:
@@ -64,7 +69,7 @@ def _unwrapped(text: str) -> str:
 
 for _command, _examples in _EXAMPLES.items():
     app.command(
-        _command.__name__.rstrip("_"),
+        _NAMES.get(_command, _command.__name__),
         help=_unwrapped(inspect.getdoc(_command) or ""),
         epilog=_examples,
     )(_command)

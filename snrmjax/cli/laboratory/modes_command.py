@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from snrmjax.cli.console import say, staged, warn
-from snrmjax.cli.modal_sources import read_modal_sources, sensor_values
+from snrmjax.cli.laboratory.modal_sources import read_modal_sources, sensor_values
 from snrmjax.cli.options import FILES
 from snrmjax.io.units import HERTZ
 

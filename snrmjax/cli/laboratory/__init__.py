@@ -1,0 +1,1 @@
+"""Commands of a laboratory: files, their check, linear modes, the whole test."""

@@ -1,0 +1,69 @@
+"""The command `test`: a folder of a laboratory's files to one report."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from snrmjax.cli.console import say, staged, warn
+from snrmjax.cli.options import FILES, Out
+
+
+def whole_test(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with the files of one test: steady states (CSV), time records and "
+            "frequency responses (UFF, MATLAB, HDF5, netCDF, TDMS, CSV), model.toml if there is "
+            "one.",
+            metavar="FOLDER",
+            show_default=False,
+        ),
+    ],
+    out: Out,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Linear model, in place of the folder's or of frequency responses.",
+            metavar="MODEL",
+            rich_help_panel=FILES,
+            show_default=False,
+        ),
+    ] = None,
+    drive_point: Annotated[
+        str | None,
+        typer.Option(
+            help="Sensor at the force, by which mode shapes are scaled.",
+            metavar="NAME",
+            show_default=False,
+        ),
+    ] = None,
+    go_on: Annotated[
+        bool, typer.Option("--go-on", help="Go on in spite of errors that the check finds.")
+    ] = False,
+    diagnose: Annotated[
+        bool, typer.Option(help="Look for what the model lacks, too (a minute or more).")
+    ] = True,
+) -> None:
+    """From a folder of raw files to one report: check, linear modes, backbone, diagnosis.
+
+    Files are sorted by their content. Where a guess would be needed the command stops with a
+    question and the option that answers it.
+
+    Writes report.html (zoom, hover, linked levels), measured.csv, check.json, model.toml
+    where the linear modes were found here, and the files of identify and diagnose in folders of
+    these names.
+    """
+    from snrmjax.report.whole_test.folder_contents import read_test_files
+    from snrmjax.report.whole_test.stages import TestRequest, run_whole_test
+
+    with staged(out) as target:
+        files = read_test_files(folder, model)
+        request = TestRequest(drive_point=drive_point, go_on=go_on, diagnose=diagnose)
+        name = folder.resolve().name.replace("_", " ")
+        found = run_whole_test(target, files, name, request)
+    for note in found.notes:
+        warn(note)
+    for line in found.lines:
+        say(line)
+    say(f"written to {out}: open {out / 'report.html'}")

@@ -1,0 +1,310 @@
+"""The stages of a test: linear modes, states of records, identification, diagnosis; one report."""
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.doctor.check import check_test
+from snrmjax.doctor.findings import Checkup, Finding
+from snrmjax.identify.modal.free_decay import DecayModes
+from snrmjax.identify.modal.modal_fit import LinearModalFit
+from snrmjax.identify.modal.response_data import joined_responses
+from snrmjax.identify.scaling.request import ModesRequest, find_modes, scale_of
+from snrmjax.identify.scaling.scaled_modes import ScaledModes
+from snrmjax.io.laboratory.checkups import write_checkup
+from snrmjax.io.models import read_model
+from snrmjax.io.tables import write_steady_states
+from snrmjax.io.units import HERTZ
+from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
+from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
+from snrmjax.model.structures import Structure
+from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
+from snrmjax.report.html import (
+    LiveFigures,
+    Report,
+    ReportTable,
+    Section,
+    write_report,
+)
+from snrmjax.report.interactive.folded_records import folded_records
+from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
+from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
+from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
+from snrmjax.report.workflow import (
+    CurveSettings,
+    Findings,
+    JointFitSettings,
+    Loads,
+    headline,
+    identify_by_points,
+    identify_jointly,
+    write_findings,
+)
+
+
+class TestRequest(NamedTuple):
+    """What the user answers beforehand."""
+
+    drive_point: str | None = None
+    go_on: bool = False  # in spite of errors that the check finds
+    diagnose: bool = True
+
+
+class WholeTest(NamedTuple):
+    """What a test gave, stage by stage."""
+
+    model: Structure
+    checkup: Checkup
+    findings: Findings
+    diagnosis: Diagnosis | None
+    notes: tuple[str, ...]
+    lines: tuple[str, ...]  # the results in plain sentences
+
+
+class _Modes(NamedTuple):
+    model: Structure
+    report: Report | None  # None where the folder had a model
+    sentence: str
+
+
+class _Steps(NamedTuple):
+    """States of a record of a stepped sine, and the record folded for each."""
+
+    states: SteadyStates
+    folded: list[FoldedRecord | None]
+    note: str
+
+
+def run_whole_test(folder: Path, files: TestFiles, name: str, request: TestRequest) -> WholeTest:
+    """Check, find linear modes, identify and diagnose a test, and write all of it into a folder.
+
+    Writes model.toml and modes.csv where the linear modes were found here, measured.csv (all
+    steady states), check.json, report.html, and what `identify` and `diagnose` write into folders
+    of these names.
+    Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
+    or whether to go on in spite of what the check found; and as its stages do.
+    """
+    modes = _linear_model(folder, files, request)
+    sorted_records = [_sorted(one, modes.model) for one in files.records]
+    steps = [
+        _steps(named, one)
+        for named, one in zip(files.records, sorted_records, strict=True)
+        if one.kind is RecordKind.STEPPED_SINE
+    ]
+    tables = [one.of_model(modes.model) for one in files.states]
+    parts = all_states([*tables, *(one.states for one in steps)])
+    if not parts:
+        raise ValueError(
+            f"{name} holds no steady states and no record of a stepped sine: the linear modes are "
+            "all that it tells, as `snrmjax modes` writes them."
+        )
+    data = join_steady_states(parts)
+    checkup = check_test(parts, modes.model, [one.record for one in files.records])
+    _stop_at_errors(checkup, request)
+    write_steady_states(folder / "measured.csv", data)
+    write_checkup(folder / "check.json", checkup)
+    findings, why = _identified(data, modes.model)
+    (folder / "identify").mkdir()
+    found = write_findings(
+        folder / "identify",
+        findings,
+        name,
+        {"data": "measured.csv", "model": modes.model.name},
+    )
+    folded: list[FoldedRecord | None] = [None] * sum(one.n_states for one in tables)
+    folded += [shown for one in steps for shown in one.folded]
+    live = state_explorer(data, findings.identification, folded if steps else ())
+    diagnosis, diagnosed = None, None
+    if request.diagnose:
+        (folder / "diagnose").mkdir()
+        diagnosis, diagnosed = write_diagnosis(
+            folder / "diagnose", "measured", modes.model, data, simulate=True
+        )
+    notes = (*files.notes, *(one.note for one in steps), *why)
+    sorted_in_words = [
+        (named.file, f"{one.kind.value}: {one.why}")
+        for named, one in zip(files.records, sorted_records, strict=True)
+    ]
+    lines = (
+        modes.sentence,
+        _check_sentence(checkup),
+        *headline(findings),
+        *(() if diagnosis is None else (readable_verdict(diagnosis),)),
+    )
+    _write_whole_report(
+        folder,
+        name,
+        files,
+        sorted_in_words,
+        checkup,
+        live,
+        [("Linear modes", modes.report), ("Backbone", found), ("Diagnosis", diagnosed)],
+        notes,
+        lines,
+    )
+    return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
+
+
+def _linear_model(folder: Path, files: TestFiles, request: TestRequest) -> _Modes:
+    if files.model is not None:
+        linear = files.model.modes
+        j = linear.mode_of_interest
+        hertz, ratio = float(linear.natural_frequency[j]) / HERTZ, float(linear.damping_ratio[j])
+        return _Modes(
+            files.model,
+            None,
+            f"linear mode of {files.model_file}: {hertz:.5g} Hz, damping {100 * ratio:.3g} %",
+        )
+    if files.responses:
+        source: object = joined_responses([one.responses for one in files.responses])
+    elif files.states:
+        source = join_steady_states(all_states([one.states for one in files.states]))
+    else:
+        raise ValueError(
+            "what are the linear modes? The folder has time records only: put a model.toml or "
+            "frequency responses beside them."
+        )
+    settings = ModesRequest(drive_point=request.drive_point)
+    fitted, further = find_modes(source, settings)  # type: ignore[arg-type]
+    scaled = _scaled(fitted, settings)
+    interest = _nearest_mode(scaled, files)
+    write_modal_tables(folder, "model.toml", scaled, interest=interest)
+    report = modal_report("model", scaled, fitted, interest=interest, further_notes=further)
+    return _Modes(read_model(folder / "model.toml"), report, modes_sentence(scaled))
+
+
+def _scaled(fitted: LinearModalFit | DecayModes, settings: ModesRequest) -> ScaledModes:
+    try:
+        return scale_of(fitted, settings)
+    except ValueError as error:
+        raise ValueError(
+            f"how are the mode shapes scaled? {error} Answer by `--drive-point SENSOR`, or write "
+            "the model by `snrmjax modes`, which knows further ways, into this folder."
+        ) from error
+
+
+def _nearest_mode(scaled: ScaledModes, files: TestFiles) -> int:
+    """The mode at which the steady states are; the first where there are none."""
+    if not files.states:
+        return 0
+    middle = np.median(np.concatenate([np.asarray(one.states.frequency) for one in files.states]))
+    return int(np.argmin(np.abs(np.asarray(scaled.natural_frequency) - middle)))
+
+
+def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
+    try:
+        return recorded_test(named.record, model.modes)
+    except ValueError as error:
+        raise ValueError(f"{named.file}: {error}") from error
+
+
+def _steps(named: NamedRecord, test: RecordedTest) -> _Steps:
+    """Steady states of a stepped sine, by its channels."""
+    channels = test.channels
+    force = channels.force or channels.drive
+    if force is None:
+        raise ValueError(f"{named.file} is a stepped sine, but has no channel of force or drive.")
+    found: SteppedSineStates = stepped_sine_states(
+        named.record,
+        force,
+        channels.motions,
+        sensors=channels.sensors,
+        drive=channels.drive if channels.force else None,
+    )
+    folded = folded_records(named.record, found, force, channels.reference)
+    left = int(np.sum(np.asarray(found.state) < 0))
+    words = f"{named.file}: {found.states.n_states} settled steps"
+    return _Steps(found.states, folded, f"{words}, {left} left out" if left else words)
+
+
+def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
+    errors = [one for one in checkup.findings if one.severity == "error"]
+    if not errors or request.go_on:
+        return
+    first = errors[0]
+    more = f" ({len(errors) - 1} more: `snrmjax check` lists them)" if len(errors) > 1 else ""
+    raise ValueError(
+        f"is this meant? {first.kind.replace('_', ' ')} in {first.where}: {first.evidence} To mend "
+        f"it: {first.mend}{more} To go on nevertheless: `--go-on`."
+    )
+
+
+def _check_sentence(checkup: Checkup) -> str:
+    grave = [one for one in checkup.findings if one.severity != "info"]
+    if not grave:
+        return "check: nothing found"
+    listed = ", ".join(dict.fromkeys(one.kind.replace("_", " ") for one in grave))
+    return f"check: {listed}"
+
+
+def _identified(data: SteadyStates, model: Structure) -> tuple[Findings, tuple[str, ...]]:
+    """A joint fit; curves through the points where the states are too few for one."""
+    drive_only = not np.isfinite(np.asarray(data.force)).any()
+    free = ("instrument_phase",) if drive_only else ()
+    try:
+        return identify_jointly(data, model, JointFitSettings(free=free), Loads()), ()
+    except ValueError as error:
+        if drive_only:
+            raise
+        reason = f"curves go through single points, as a joint fit was not possible: {error}"
+        return identify_by_points(data, model, CurveSettings(), Loads()), (reason,)
+
+
+def _write_whole_report(
+    folder: Path,
+    name: str,
+    files: TestFiles,
+    sorted_records: Sequence[tuple[str, str]],
+    checkup: Checkup,
+    live: LiveFigures,
+    stages: Sequence[tuple[str, Report | None]],
+    notes: Sequence[str],
+    lines: Sequence[str],
+) -> None:
+    """One page: files, check, all states to look at, then the stages' own sections."""
+    told = [(stage, report) for stage, report in stages if report is not None]
+    summary = [row for _, report in told for row in report.summary]
+    sections = [
+        Section(
+            "Files",
+            [f"{file}: {words}." for file, words in sorted_records],
+            tables=[ReportTable(("file", "what was found in it"), list(files.rows()))],
+        ),
+        _check_section(checkup),
+        Section(
+            "States", ["A state that is tapped shows its record, where there is one."], live=live
+        ),
+    ]
+    for stage, report in told:
+        sections += [
+            one._replace(heading=f"{stage}: {one.heading[0].lower()}{one.heading[1:]}")
+            for one in report.sections
+        ]
+    every = [f"{stage}: {note}" for stage, report in told for note in report.notes]
+    write_report(
+        folder / "report.html",
+        Report(
+            title=f"Test: {name}",
+            done=[("program", f"snrmjax {version('snrmjax')}")],
+            result=". ".join(line.rstrip(".") for line in lines) + ".",
+            summary=summary,
+            notes=[*notes, *every],
+            sections=sections,
+        ),
+    )
+
+
+def _check_section(checkup: Checkup) -> Section:
+    header = ("severity", "what", "where", "evidence", "what mends it")
+
+    def row(one: Finding) -> tuple[str, ...]:
+        return (one.severity, one.kind.replace("_", " "), one.where, one.evidence, one.mend)
+
+    rows = [row(one) for one in checkup.findings]
+    text = [_check_sentence(checkup).capitalize() + ".", *checkup.notes]
+    return Section("Check", text, tables=[ReportTable(header, rows)] if rows else ())
