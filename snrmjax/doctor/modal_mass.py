@@ -51,7 +51,7 @@ def mass_findings(
                 *("rms_for_peak", "error", where),
                 f"{size}, √2 = 1.414 {'times too much' if off > 0 else 'too little'}: the {which} "
                 "are rms, not peak amplitudes.",
-                f"multiply the {columns} by √2 = 1.41421 (snrmjax import … --rms).",
+                f"multiply the {columns} by √2 = 1.41421.",
             )
         ]
     by_frequency = _differentiated(off, float(np.log(np.median(states.frequency))), size, where)
