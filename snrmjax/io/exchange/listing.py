@@ -81,6 +81,15 @@ def _columns(table: NumberTable) -> list[str]:
     return _short(lines)
 
 
+_TO_FILL_IN = ("CHANNEL", "COLUMN", "QUANTITY", "UNIT", "NEWTONS")
+# Longer endings first: `_mm_s` ends with `_s` only.
+_UNITS_IN_NAMES = {
+    **{"mm_s2": "mm/s^2", "m_s2": "m/s^2", "mm_s": "mm/s", "m_s": "m/s", "um": "um"},
+    **{"mm": "mm", "mN": "mN", "kN": "kN", "N": "N", "n": "N", "mV": "mV", "V": "V", "v": "V"},
+    **{"mg": "mg", "g": "g", "m": "m"},
+}
+
+
 def _first(table: NumberTable, roles: Sequence[str]) -> str:
     """The first column with one of these roles, the earlier role first."""
     for role in roles:
@@ -110,8 +119,10 @@ def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
     if not words and not (held.tables and is_own_table(held.tables[0])):
         return []
     line = " ".join(word if word.isupper() else shlex.quote(word) for word in words)
+    open_words = [one for one in _TO_FILL_IN if one in line.replace(":", " ").split()]
+    fill_in = f"fill in {', '.join(open_words)}, and " if open_words else ""
     return [
-        "import it (put in what is written in capitals, and check the guesses):",
+        f"import it ({fill_in}check the guesses):",
         " ".join(f"  snrmjax import {files} {line} --out imported".split("  ")).strip(),
     ]
 
@@ -123,7 +134,7 @@ def _of_record(record: TimeRecording) -> list[str]:
     response = response or (others[0] if len(others) == 1 else None)
     words = ["--force", force.name] if force else ["--force", "CHANNEL"]
     if force is None or force.quantity == "unknown":
-        words += ["--force-unit", "UNIT"]
+        words += ["--force-unit", unit_in_name(force.name if force else "")]
     return words + _response_words(response or Channel("CHANNEL"))
 
 
@@ -142,12 +153,12 @@ def _of_table(table: NumberTable) -> list[str]:
         return []
     force = _first(table, ("force", "drive"))
     response = _first(table, (*_MOTIONS, "amplitude", "real"))
-    unit = table.units.get(response, "UNIT")
+    unit = table.units.get(response, unit_in_name(response))
     role = role_of(response)
     kind = role if role in _MOTIONS else "QUANTITY"
     words = ["--force", force or "COLUMN"]
     if force not in table.units:
-        words += ["--force-unit", "UNIT"]
+        words += ["--force-unit", unit_in_name(force)]
     stated = response in table.units and kind == "QUANTITY"
     words += ["--response", (response or "COLUMN") + ("" if stated else f":{kind}")]
     words += [] if response in table.units else ["--unit", unit]
@@ -164,7 +175,19 @@ def _response_words(one: Channel) -> list[str]:
         return ["--response", f"{one.name}:{one.quantity}"]
     role = role_of(one.name)
     quantity = role if role in _MOTIONS else "QUANTITY"
-    return ["--response", f"{one.name}:{quantity}", "--unit", "UNIT"]
+    return ["--response", f"{one.name}:{quantity}", "--unit", unit_in_name(one.name)]
+
+
+def unit_in_name(name: str) -> str:
+    """The unit with which a name ends, as in acc_g or velocity_mm_s; UNIT where there is none.
+
+    >>> unit_in_name("force_N"), unit_in_name("acc_m_s2"), unit_in_name("CH2")
+    ('N', 'm/s^2', 'UNIT')
+    """
+    for ending, unit in _UNITS_IN_NAMES.items():
+        if name.endswith(f"_{ending}"):
+            return unit
+    return "UNIT"
 
 
 def _guess(
