@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.report.study.bands import Band, BandPanel
 from snrmjax.report.study.failures import Failures, failure_share
-from snrmjax.report.study.main_effects import MainEffect
+from snrmjax.report.study.main_effects import FEWEST, MainEffect
 from snrmjax.report.study.scalars import Display, Scalar, display_on_axis
 from snrmjax.report.style import (
     COLUMN,
@@ -122,10 +122,19 @@ def _scatter(
     chosen = _thinned(len(quantity))
     colours = _colours(len(shown.outputs))
     for output, effects, colour in zip(shown.outputs, shown.effects, colours, strict=True):
-        dots: Style = {"linestyle": "none", "marker": ".", "markersize": 2.5, "alpha": _CLOUD}
+        effect, few = effects[name], len(quantity) < FEWEST
+        size, alpha = (8.0, 0.9) if few else (2.5, _CLOUD)
+        dots: Style = {"linestyle": "none", "marker": ".", "markersize": size, "alpha": alpha}
         values = output.values[chosen] / y.size
-        axes.plot(quantity[chosen] / x.size, values, **dots, color=colour, markeredgewidth=0.0)
-        effect = effects[name]
+        # Where no mean is drawn, the dots alone tell the forces apart.
+        named = output.at_force if effect is None else ""
+        axes.plot(
+            *(quantity[chosen] / x.size, values),
+            **dots,
+            color=colour,
+            markeredgewidth=0.0,
+            label=named or None,
+        )
         if effect is None:
             continue
         at, mean, error = effect.at / x.size, effect.mean / y.size, effect.error / y.size

@@ -13,6 +13,7 @@ from snrmjax.cli import app
 from snrmjax.report.study.digest import digest, digest_notes
 from snrmjax.report.study.failures import failure_share, failures_of, most_telling
 from snrmjax.report.study.scalars import Scalar, display_on_axis, readable, scalars
+from snrmjax.report.study.study_figures import main_effects_figure
 from snrmjax.report.study.study_report import study_sentence, write_study_report
 from snrmjax.report.study.summary import summarized
 
@@ -156,6 +157,17 @@ def test_notes_tell_what_the_numbers_are_not():
     assert "a.b and also vary together" in notes
     assert "grid" not in notes
     assert re.search(r"left out: .*Peak velocity at 1 mN \(\d+ of 400\)", notes)
+
+
+def test_dots_of_few_members_are_seen_and_named_by_their_force():
+    found = digest(data_set(3))
+    figure = main_effects_figure(found.effects, {"a.b": found.quantities["a.b"]}, found.units)
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[:2] == ["1 mN", "2 mN"]
+    dots = figure.axes[0].get_lines()[0]
+    # A dot is drawn at half of its marker's size, in points: two at least to be seen on a page.
+    assert dots.get_markersize() / 2 > 2
+    assert dots.get_alpha() > 0.5
 
 
 def test_answers_of_diagnoses_are_counted(tmp_path):
