@@ -40,7 +40,8 @@ def rom(
     calculix: Annotated[
         Path | None,
         typer.Option(
-            help="CalculiX deck of the structure, with its mesh, material and supports.",
+            help="CalculiX deck of the structure, with its mesh, material and supports. Its load "
+            "cases are kept in a folder beside it (deck.jobs for deck.inp), for later runs.",
             metavar="DECK",
             rich_help_panel=FILES,
             show_default=False,
