@@ -428,11 +428,14 @@ for method in ("snrm", "arslan_ozguven", "rct", "concerto"):
         text = " / ".join(f"{100 * min(one):3.0f} to {100 * max(one):3.0f} %" for one in shares)
         print(f"   {NAMES[method]:24s} {noise:7s} {text}")
 
-print("loops, decays and multisines in the laboratory: median error of frequency and damping (%)")
-print("(share of 95 % bands that hold the truth), seconds of test:")
+print("loops, decays and multisines in the laboratory, middle noise: median error of frequency")
+print("and damping in % (share of 95 % bands that hold the truth), seconds of test:")
 for method, name in OF_RECORDS.items():
     for row in every:
-        if row["method"] != method:
+        if row["method"] != method or row["noise"] != "middle":
+            continue
+        if "frequency_error_median" not in row:
+            print(f"   {name:24s} {row['structure']:10s} no answer in any test")
             continue
         parts = []
         for key in ("frequency", "damping"):
