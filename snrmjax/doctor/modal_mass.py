@@ -1,5 +1,7 @@
 """The modal mass that a table asks for over the model's: rms, volts, a shape of another scale."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
@@ -58,19 +60,22 @@ def mass_findings(
     if by_frequency is not None:
         return [by_frequency]
     volts, shape = _votes(states, fit, model)
+    unit = _unit_of(off, max(_ROOT_TWO, 3 * error))
     either = [
         Finding(
             *("volts_as_force", "error", where),
-            f"{size}: the force column is no force in newtons but {kappa:.3g} per newton, as a "
-            f"drive voltage is{volts.why}.",
-            f"divide `force_n` by {kappa:.4g}, or call it `drive_v` and identify with `--free "
-            "force_gain,instrument_phase`.",
+            f"{size}: {unit.evidence}the force column is no force in newtons but {kappa:.3g} per "
+            f"newton, as a drive voltage is{volts.why}.",
+            f"{unit.mend}if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
+            "`drive_v` and identify with `--free force_gain,instrument_phase`; where the response "
+            "is wrong in its place, that would leave all amplitudes wrong.",
         ),
         Finding(
             *("shape_not_mass_normalised", "error", where),
             f"{size}: the shape (or participation) of the model is not mass-normalised{shape.why}.",
-            f"divide `shape` and `participation` by {np.sqrt(kappa):.4g} each (or one by "
-            f"{kappa:.4g}); `snrmjax modes` scales shapes by the drive point.",
+            f"{unit.mend}if it is the shape: divide `shape` and `participation` by "
+            f"{np.sqrt(kappa):.4g} each (or one by {kappa:.4g}); `snrmjax modes` scales shapes by "
+            "the drive point.",
         ),
     ]
     if volts.weight > shape.weight:
@@ -102,6 +107,35 @@ def _differentiated(off: float, log_omega: float, size: str, where: str) -> Find
             "multiply the amplitudes by Ω: `snrmjax import … --response CHANNEL:displacement`.",
         )
     return None
+
+
+class _UnitHint(NamedTuple):
+    """Units that were mixed up, as the factor between them says; empty where it says nothing."""
+
+    evidence: str = ""
+    mend: str = ""
+
+
+# κ is force over response: what it becomes where a number of one unit is read as another's.
+_MIXED_UNITS = (
+    (9.80665, "the response in g, taken for m/s²", "--unit g"),
+    (1e-3, "the response in mm, taken for m, or the force in kN", "--unit mm/s, or its like"),
+    (1e-6, "the response in µm, taken for m", "--unit um/s, or its like"),
+    (1e3, "the force in mN, taken for N", "--force-unit mN"),
+    (1 / 4.4482216, "the force in pounds, taken for N", "--force-unit lbf"),
+    (1 / 39.370079, "the response in inches, taken for m", "--unit in/s, or its like"),
+)
+
+
+def _unit_of(off: float, tolerance: float) -> _UnitHint:
+    """The mix-up of units whose factor is exp(off), if there is one."""
+    for factor, what, option in _MIXED_UNITS:
+        if abs(off - np.log(factor)) < tolerance:
+            return _UnitHint(
+                f"that is {factor:.4g}, as with {what}; otherwise ",
+                f"look at the units first and import again with `{option}`; ",
+            )
+    return _UnitHint()
 
 
 class _Vote:

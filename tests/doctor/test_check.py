@@ -114,6 +114,19 @@ KINDS = (
 )
 
 
+@pytest.mark.parametrize(
+    ("factor", "option"),
+    [(1 / 9.80665, "--unit g"), (1e3, "--unit mm/s"), (0.55, None)],
+)
+def test_units_that_were_mixed_up_are_named_by_their_factor(factor, option):
+    level, w, force, v = states()
+    found = sj.doctor.check_test(table(level, w, force, factor * noisy(v)), model())
+    assert "volts_as_force" in found.kinds
+    for one in found.findings:
+        assert ("import again" in one.mend) == (option is not None)
+        assert option is None or option in one.mend
+
+
 def raised(found):
     return [one.kind for one in found.findings if one.severity != "info"]
 
