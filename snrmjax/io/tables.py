@@ -22,7 +22,7 @@ from snrmjax.io.columns import (
 from snrmjax.io.files import FilePath, file_name, read_text, shown, suggestion, write_atomically
 from snrmjax.io.rows import Cells, split_rows
 from snrmjax.io.units import DEGREE, HERTZ, in_unit
-from snrmjax.measure.states import NO_PHASE, SteadyStates, steady_states
+from snrmjax.measure.states import NO_PHASE, UNNAMED_SENSOR, SteadyStates, steady_states
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of
 
@@ -197,7 +197,7 @@ def _sensors(cells: Cells, sensors: tuple[str, ...] | None) -> tuple[tuple[str, 
                 f"{cells.file} lacks the column `sensor`, which is required because the model "
                 f"has the sensors {listed}."
             )
-        return sensors or ("sensor 1",), [0] * len(cells.rows)
+        return sensors or UNNAMED_SENSOR, [0] * len(cells.rows)
     texts = cells.texts("sensor")
     names = tuple(dict.fromkeys(texts)) if sensors is None else sensors
     index = {name: k for k, name in enumerate(names)}
@@ -270,6 +270,8 @@ def steady_state_fields(data: SteadyStates, file: str) -> dict[str, list[str]]:
         "sensor": [host.sensors[k] for k in sensor],
         "frequency_hz": _texts(in_unit(float(f), HERTZ) for f in host.frequency[state]),
     }
+    if host.sensors == UNNAMED_SENSOR:  # a model's only sensor may have another name
+        del columns["sensor"]
     has_force, has_drive = ~np.isnan(host.force), ~np.isnan(host.drive)
     if np.all(has_force):
         columns["force_n"] = _texts(host.force[state])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Complex, Float, Int, Shaped
 
-from snrmjax.measure.states import SteadyStates, steady_states
+from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates, steady_states
 
 
 def base_excited_states(
@@ -14,7 +14,7 @@ def base_excited_states(
     base_acceleration: Complex[Shaped[np.ndarray, " state"], " state"],
     velocity: Complex[Shaped[np.ndarray, "state sensor"], "state sensor"],
     *,
-    sensors: Sequence[str] = ("sensor 1",),
+    sensors: Sequence[str] = UNNAMED_SENSOR,
     along: Sequence[float] | None = None,
     relative: bool = False,
 ) -> SteadyStates:

@@ -161,13 +161,17 @@ class OptionalColumns(TypedDict, total=False):
     harmonic_order: tuple[int, ...]  # which harmonics `harmonics` has
 
 
+UNNAMED_SENSOR = ("sensor 1",)
+"""The sensors of a test whose only sensor nobody named: a model's only one may be another word."""
+
+
 def steady_states(
     level: Int[np.ndarray, " state"],
     frequency: Float[np.ndarray, " state"],
     force: Float[np.ndarray, " state"],
     velocity: Complex[np.ndarray, "state sensor"],
     *,
-    sensors: Sequence[str] = ("sensor 1",),
+    sensors: Sequence[str] = UNNAMED_SENSOR,
     **columns: Unpack[OptionalColumns],
 ) -> SteadyStates:
     """Build `SteadyStates` from arrays or lists; `velocity` may be a vector for one sensor.

@@ -636,9 +636,10 @@ def test_numbers_of_a_file_stay_as_they_are(tmp_path):
     rows = [f"1,{f},0.1,0.01,0.02,0.7" for f in frequencies]
     data = read(tmp_path, "\n".join([COLUMNS + ",phase_std_deg", *rows]))
     write_steady_states(path, data)
-    lines = path.read_text().splitlines()[1:]
-    assert [line.split(",")[2] for line in lines] == [repr(float(f)) for f in frequencies]
-    assert {line.split(",")[6] for line in lines} == {"0.7"}
+    header, *lines = path.read_text().splitlines()
+    assert header.split(",")[:2] == ["level", "frequency_hz"]  # nobody named the sensor
+    assert [line.split(",")[1] for line in lines] == [repr(float(f)) for f in frequencies]
+    assert {line.split(",")[5] for line in lines} == {"0.7"}
 
 
 def test_a_known_force_is_written_in_place_of_its_drive_voltage(tmp_path):

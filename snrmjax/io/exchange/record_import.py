@@ -10,7 +10,7 @@ from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import Levels
-from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 
 _DIRECT: dict[str, Levels] = {"force": "force", "drive": "drive", "runs": "runs"}
@@ -52,7 +52,7 @@ def told_record(
         assumed.unit(f"response {number + 1}.unit", one.unit, old.unit)
         quantity, factor, unit = motion_meaning(one.quantity, one.unit, old.unit, one.channel)
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
-        sensor = one.sensor or ("sensor 1" if len(told.responses) == 1 else one.channel)
+        sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
         if not one.sensor:
             assumed[f"response {number + 1}.sensor"] = "nobody names the sensor: --sensor does"
         filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))

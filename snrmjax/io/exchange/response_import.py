@@ -11,6 +11,7 @@ from snrmjax.io.files import near_miss
 from snrmjax.measure.recordings.channels import Channel, Quantity
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.velocity_states import velocity_factors
+from snrmjax.measure.states import UNNAMED_SENSOR
 
 _PEAK = {"": 1.0, "peak": 1.0, "rms": float(np.sqrt(2.0)), "peak_to_peak": 0.5}
 
@@ -168,7 +169,7 @@ def _velocity(
         values = values.conj()
     elif not whole.phase_sign:
         assumed["phase_sign"] = "lead: phasors are e^(+iwt)"
-    sensor = told.sensor or ("sensor 1" if len(whole.responses) == 1 else told.channel)
+    sensor = told.sensor or (UNNAMED_SENSOR[0] if len(whole.responses) == 1 else told.channel)
     if not told.sensor:
         assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
     as_channel = Channel(told.channel, _motion(quantity))

@@ -21,6 +21,7 @@ from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.velocity_states import velocity_factors
+from snrmjax.measure.states import UNNAMED_SENSOR
 
 
 def columns_by_role(table: NumberTable, *roles: str) -> list[str]:
@@ -150,7 +151,7 @@ def _response(
                     "--imaginary COLUMN names the other one."
                 )
             phasor = values * np.exp(1j * _phase(table, phase, told, file, assumed, "--phase"))
-    sensor = one.sensor or ("sensor 1" if len(told.responses) == 1 else one.channel)
+    sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
     if not one.sensor:
         assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]

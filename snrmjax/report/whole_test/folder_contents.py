@@ -19,7 +19,7 @@ from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.model.structures import Structure
 
 _MEASURED = (
@@ -27,7 +27,6 @@ _MEASURED = (
     *(".tdms", ".tsv", ".dat", ".asc"),
 )
 _MAP = "map.toml"
-_UNNAMED = ("sensor 1",)
 _OWN_COLUMNS = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
 
 
@@ -45,7 +44,7 @@ class NamedStates(NamedTuple):
         """
         if self.table is not None:
             return read_steady_states(self.table, model)
-        if self.states.sensors == _UNNAMED and len(model.modes.sensors) == 1:
+        if self.states.sensors == UNNAMED_SENSOR and len(model.modes.sensors) == 1:
             return dataclasses.replace(self.states, sensors=model.modes.sensors)
         if self.states.sensors != model.modes.sensors:
             raise ValueError(
@@ -141,7 +140,7 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
                 if found.states is not None:
                     states.append(NamedStates(path.name, found.states))
             else:
-                responses += [NamedResponses(path.name, one) for one in _linear(held)]
+                responses += [NamedResponses(path.name, one) for one in _linear(held, path)]
             for one in held.recordings:
                 record = one if told.is_empty else told_record(one, told, path.name, assumed)[0]
                 several = f"{path.name}: {one.name}"
@@ -190,18 +189,18 @@ def _imported(path: Path, told: ImportMap) -> Imported:
         return import_files([path], told)
     except ValueError as error:
         raise ValueError(
-            f"{error} Answer by `snrmjax import {path.name} … --out DIR`, and put its {_MAP} "
-            "beside the file."
+            f"{error} `snrmjax import {path}` says how; put the {_MAP} that it then writes beside "
+            "the file."
         ) from error
 
 
-def _linear(held: LaboratoryFile) -> tuple[FrequencyResponses, ...]:
+def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:
     """Responses of a linear test; several levels are no such test."""
     levels = {level for level in held.levels if np.isfinite(level)}
     if len(levels) > 1:
         raise ValueError(
             f"are the responses of {held.name}, of {len(levels)} levels, steady states of a "
-            f"stepped sine? Say so by `snrmjax import {held.name} --force-amplitude z --out DIR`, "
+            f"stepped sine? Say so by `snrmjax import {path} --force-amplitude z --out DIR`, "
             f"and put its {_MAP} beside the file; for linear modes keep the lowest level alone."
         )
     return held.responses
