@@ -647,9 +647,7 @@ CONJUGATED = (
 )
 
 
-@pytest.mark.parametrize(
-    "command", ["identify", pytest.param("diagnose", marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("command", ["identify", pytest.param("diagnose", marks=pytest.mark.long)])
 def test_conjugated_phases_are_named_in_a_note(files, tmp_path, command):
     model, data = files
     phases_changed(data, lambda re, im: (re, -im))
