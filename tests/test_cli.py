@@ -605,6 +605,7 @@ def test_with_a_drive_voltage_predictions_and_advice_are_in_volts(beam, tmp_path
 # ------------------------------------------------------------------------------ extrapolation
 
 
+@pytest.mark.long
 def test_predictions_go_as_far_as_asked(files, tmp_path):
     model, data = files
     command = ("identify", data, "--model", model, "--out", tmp_path)

@@ -121,10 +121,9 @@ def test_a_model_file_states_it(tmp_path):
     assert sj.read_model(tmp_path / "model.toml").modes.modal_mass_std is None
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not MEASURED.exists(), reason="measured data are not there: ../shared/data")
-@pytest.mark.parametrize(
-    "free", [(), pytest.param(("force_gain", "instrument_phase"), marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("free", [(), ("force_gain", "instrument_phase")])
 def test_no_gain_moves_the_measured_velocities_of_a_bolted_beam(free):
     """Four levels of constant force, whose own phase resonances are read off without a method."""
     model = sj.read_model(MEASURED / "model.toml")

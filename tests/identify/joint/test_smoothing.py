@@ -102,6 +102,7 @@ def test_the_size_of_bends_is_found_without_bias():
     assert abs(np.mean(np.log(found)) - np.log(0.2)) < 3 * 0.19 / np.sqrt(20)
 
 
+@pytest.mark.long
 def test_a_rough_curve_does_not_pass_for_levels_that_differ():
     for seed in range(8):
         problem, bends, index = drawn(seed, 0.3, 0.02)

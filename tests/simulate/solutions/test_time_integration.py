@@ -172,6 +172,7 @@ def stepped_by_scipy(truth_of, frequencies, cycles):
     return np.array(found)
 
 
+@pytest.mark.long
 def test_a_coarse_sweep_jumps_early_as_scipy_says(stiffening, time_domain):
     model, curve = stiffening
     fold = curve.frequency[curve.at_events("fold")].max()
