@@ -1,13 +1,16 @@
 """Loops, decays and multisines on structures of `methods_table.py`: errors and coverage.
 
 Run: python benchmarks/methods_loops_and_decays.py [--seeds 20] [--structure NAME …]
-[--noise low|middle|high …]
+[--noise low|middle|high …] [--method NAME …]
 
 Every test runs in the virtual laboratory on a shaker that gives about 1 N a volt (little feedback
 on the force; of the two beams, whose forces are small, still less): a phase-locked loop at six
-voltages up to the largest force of `methods_table.py` (`pll`); a free decay from the resonance of
-that force (`resonant_decay`, `restoring_force`, `ssm`); and five periods of 2 s of a multisine
-around the mode whose rms is half of it (`pnlss`). Noise: each sample of force and velocity is off
+voltages up to the largest force of `methods_table.py` (`pll`); control-based continuation at six
+amplitudes between the resonances of the lowest and the largest force (`cbc`: only the fundamental
+is fed back, by a filter of a quarter of the mode's frequency, with a gain of 2.5 times the force
+over velocity that the linear mode has at resonance); a free decay from the resonance of the largest
+force (`resonant_decay`, `restoring_force`, `ssm`); and five periods of 2 s of a multisine around
+the mode whose rms is half of it (`pnlss`). Noise: each sample of force and velocity is off
 by 0.1, 0.5 or 2 % of the channel's largest value. The truth is that of `methods_table.py`, and
 errors count at amplitudes that it covers.
 
@@ -29,7 +32,10 @@ from snrmjax.methods.record_comparison import run_record_method
 from snrmjax.methods.records.recorded_test import recorded_test
 
 NOISE = {"low": 0.001, "middle": 0.005, "high": 0.02}
+METHODS = ("pll", "cbc", "resonant_decay", "restoring_force", "ssm", "pnlss")
 PERIOD = 2.0  # s, of the multisine
+_LEVELS = 6
+_GAIN = 2.5  # of the feedback, times force over velocity of the linear resonance
 
 
 class Bench(NamedTuple):
@@ -38,11 +44,12 @@ class Bench(NamedTuple):
     coil: float = 0.1  # ohm, and N/A: the feedback on the force is this much N s/m
     rate: float = 2000.0
     lines: tuple[int, int] = (60, 160)  # of the multisine, in halves of a hertz
+    substeps: int = 2
 
 
 BENCHES = dict.fromkeys(STRUCTURES, Bench()) | {
-    "flat": Bench(1e-4, 10000.0, (100, 280)),
-    "curved": Bench(1e-5, 2000.0, (80, 200)),
+    "flat": Bench(1e-5, 10000.0, (100, 280), 4),
+    "curved": Bench(1e-7, 2000.0, (80, 200)),
 }
 
 
@@ -56,26 +63,55 @@ def recording(record, rate, *, forced):
     return time_recording(np.stack(values), channels, rate, name="test")
 
 
-def tests(bench, noise, model, forces, velocity, seed):
-    """Results of every method for one seed."""
-    largest = float(forces[-1])
+def resonances(model, true, forces, count):
+    """Velocities between the resonances of the lowest and the largest force, and their forces."""
+    modes = model.modes
+    per_force = float(modes.mode_shape[0, 0] * modes.participation[0])
+    force = 2 * true[2] * true[1] * true[0] / abs(per_force)
+    velocity = np.geomspace(*np.interp([forces[0], forces[-1]], force, true[0]), count)
+    return velocity, np.interp(velocity, true[0], force)
+
+
+def continuation(laboratory, velocity, force, seed):
+    """Control-based continuation through about these motions."""
+    modes = laboratory.structure.modes
+    omega, ratio = float(modes.natural_frequency[0]), float(modes.damping_ratio[0])
+    per_force = abs(float(modes.mode_shape[0, 0] * modes.participation[0]))
+    gain = _GAIN * 2 * ratio * omega / per_force
+    settings = sj.methods.FeedbackSettings(gain, record_cycles=40, filter_rate=omega / 4)
+    return sj.methods.control_based_continuation(
+        laboratory, velocity + force / gain, settings, seed=seed
+    )
+
+
+def tests(bench, noise, model, forces, true, methods, seed):
+    """Results of some methods for one seed."""
+    largest, velocity = float(forces[-1]), float(true[0, -1])
     instruments = sj.methods.Instruments(
         force_noise=noise * largest, velocity_noise=noise * velocity
     )
     shaker = sj.methods.Shaker(bench.coil, bench.coil)
     reach = float(3 * velocity / model.modes.natural_frequency[0])  # of friction's tables, m
     laboratory = sj.methods.Laboratory(
-        model, shaker, instruments, bench.rate, largest_displacement=reach
+        *(model, shaker, instruments, bench.rate, bench.substeps), largest_displacement=reach
     )
-    voltages = np.geomspace(forces[0], largest, 6)
-    yield "pll", lambda: sj.methods.phase_locked_loop(laboratory, voltages, seed=seed)
-    decay = sj.methods.decay_test(laboratory, largest, 3.0, seed=seed)
-    played = sj.methods.multisine_test(
-        laboratory, largest / 2, np.arange(*bench.lines), int(PERIOD * bench.rate), 5, seed=seed
-    )
-    free = recording(decay.record, bench.rate, forced=False)
-    broad = recording(played.record, bench.rate, forced=True)
-    for name in ("resonant_decay", "restoring_force", "ssm", "pnlss"):
+    voltages = np.geomspace(forces[0], largest, _LEVELS)
+    if "pll" in methods:
+        yield "pll", lambda: sj.methods.phase_locked_loop(laboratory, voltages, seed=seed)
+    if "cbc" in methods:
+        motions = resonances(model, true, forces, _LEVELS)
+        yield "cbc", lambda: continuation(laboratory, *motions, seed)
+    recorded = [name for name in ("resonant_decay", "restoring_force", "ssm") if name in methods]
+    if recorded:
+        decay = sj.methods.decay_test(laboratory, largest, 3.0, seed=seed)
+        free = recording(decay.record, bench.rate, forced=False)
+    if "pnlss" in methods:
+        recorded.append("pnlss")
+        played = sj.methods.multisine_test(
+            laboratory, largest / 2, np.arange(*bench.lines), int(PERIOD * bench.rate), 5, seed=seed
+        )
+        broad = recording(played.record, bench.rate, forced=True)
+    for name in recorded:
         own = broad if name == "pnlss" else free
 
         def run(name=name, own=own):
@@ -93,6 +129,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--structure", choices=list(STRUCTURES), nargs="*")
     parser.add_argument("--noise", choices=list(NOISE), nargs="*", default=["middle"])
+    parser.add_argument("--method", choices=METHODS, nargs="*", default=METHODS)
     given = parser.parse_args()
     for name, noise in itertools.product(given.structure or STRUCTURES, given.noise):
         make, forces, *ends = STRUCTURES[name]
@@ -104,7 +141,10 @@ def main() -> None:
         nothing: dict[str, int] = {}
         seconds: dict[str, float] = {}
         for seed in range(given.seeds):
-            for method, run in tests(BENCHES[name], NOISE[noise], model, forces, true[0, -1], seed):
+            each_test = tests(
+                *(BENCHES[name], NOISE[noise], model, forces, true, given.method), seed
+            )
+            for method, run in each_test:
                 rows = found.setdefault(method, [])
                 nothing.setdefault(method, 0)
                 try:
