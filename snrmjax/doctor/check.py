@@ -19,7 +19,7 @@ from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
 
-_FEWEST = 8  # states: fewer say nothing of a mode with curves of its own
+FEWEST = 8  # states: fewer say nothing of a mode with curves of its own
 
 
 def check_test(
@@ -81,10 +81,10 @@ def _of_table(
     rows = usable_rows(data, sensor)
     name = data.sensors[sensor]
     where = f"{len(given_levels(data))} levels at {name}"
-    if rows.sum() < _FEWEST:
+    if rows.sum() < FEWEST:
         notes.append(
             f"{int(rows.sum())} states with force and phase at {name} are too few to look at: "
-            f"{_FEWEST} are needed."
+            f"{FEWEST} are needed."
         )
         return []
     drive = bool(np.all(np.isnan(np.asarray(data.force)[rows])))

@@ -11,7 +11,7 @@ from snrmjax.model.structures import Structure
 
 _SIGMAS = 4.0
 _LEAST = 0.04  # relative, that is spoken of
-_STEEPLY = 0.13  # relative, from which on it is no error of a linear test
+STEEPLY = 0.13  # relative, from which on it is no error of a linear test
 _MOST_ERROR = 0.04  # relative 1σ of the modal mass, beyond which the states do not say it
 _BY_FREQUENCY = 0.15  # relative distance from Ω or 1/Ω
 _ROOT_TWO = 0.02  # relative distance from √2, that is an rms
@@ -34,8 +34,8 @@ def mass_findings(
     own = model.modes.own_modal_mass_std
     allowed = float(UNSTATED_MODAL_MASS_STD if own is None else own)
     error = float(np.hypot(std / kappa, allowed))
-    size = f"the states ask for {kappa:.4g} ± {std:.2g} times the model's modal mass"
-    if abs(off) < max(_STEEPLY, _SIGMAS * std / kappa, 2.5 * error):
+    size = mass_in_words(fit)
+    if abs(off) < max(STEEPLY, _SIGMAS * std / kappa, 2.5 * error):
         if abs(off) < max(_LEAST, _SIGMAS * std / kappa):
             return []
         return [
@@ -60,20 +60,24 @@ def mass_findings(
     if by_frequency is not None:
         return [by_frequency]
     volts, shape = _votes(states, fit, model)
-    unit = _unit_of(off, max(_ROOT_TWO, 3 * error))
+    unit = mixed_unit(fit, model)
+    first, mend = "", ""
+    if unit is not None:
+        first = f"that is {unit.factor:.4g}, as with {unit.what}; otherwise "
+        mend = f"look at the units first and import again with {unit.option}; "
     either = [
         Finding(
             *("volts_as_force", "error", where),
-            f"{size}: {unit.evidence}the force column is no force in newtons but {kappa:.3g} per "
+            f"{size}: {first}the force column is no force in newtons but {kappa:.3g} per "
             f"newton, as a drive voltage is{volts.why}.",
-            f"{unit.mend}if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
+            f"{mend}if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
             "`drive_v` and identify with `--free force_gain,instrument_phase`; where the response "
             "is wrong in its place, that would leave all amplitudes wrong.",
         ),
         Finding(
             *("shape_not_mass_normalised", "error", where),
             f"{size}: the shape (or participation) of the model is not mass-normalised{shape.why}.",
-            f"{unit.mend}if it is the shape: divide `shape` and `participation` by "
+            f"{mend}if it is the shape: divide `shape` and `participation` by "
             f"{np.sqrt(kappa):.4g} each (or one by {kappa:.4g}); `snrmjax modes` scales shapes by "
             "the drive point.",
         ),
@@ -98,44 +102,53 @@ def _differentiated(off: float, log_omega: float, size: str, where: str) -> Find
         return Finding(
             *("acceleration_as_velocity", "error", where),
             f"{size}, 1/Ω of it: the amplitudes are accelerations, the phases those of velocities.",
-            "divide the amplitudes by Ω: `snrmjax import … --response CHANNEL:acceleration`.",
+            "divide the amplitudes by Ω: import again with `--response CHANNEL:acceleration:m/s^2` "
+            "(or `:g`).",
         )
     if abs(off - log_omega) < _BY_FREQUENCY:
         return Finding(
             *("displacement_as_velocity", "error", where),
             f"{size}, Ω of it: the amplitudes are displacements, the phases those of velocities.",
-            "multiply the amplitudes by Ω: `snrmjax import … --response CHANNEL:displacement`.",
+            "multiply the amplitudes by Ω: import again with `--response CHANNEL:displacement:m` "
+            "(or `:mm`).",
         )
     return None
 
 
-class _UnitHint(NamedTuple):
-    """Units that were mixed up, as the factor between them says; empty where it says nothing."""
+class MixedUnit(NamedTuple):
+    """A unit that was taken for another one, as the factor between them says."""
 
-    evidence: str = ""
-    mend: str = ""
+    factor: float
+    what: str
+    option: str
 
 
 # κ is force over response: what it becomes where a number of one unit is read as another's.
 _MIXED_UNITS = (
-    (9.80665, "the response in g, taken for m/s²", "--unit g"),
-    (1e-3, "the response in mm, taken for m, or the force in kN", "--unit mm/s, or its like"),
-    (1e-6, "the response in µm, taken for m", "--unit um/s, or its like"),
-    (1e3, "the force in mN, taken for N", "--force-unit mN"),
-    (1 / 4.4482216, "the force in pounds, taken for N", "--force-unit lbf"),
-    (1 / 39.370079, "the response in inches, taken for m", "--unit in/s, or its like"),
+    MixedUnit(9.80665, "the response in g, taken for m/s²", "`--unit g`"),
+    MixedUnit(
+        *(1e-3, "the response in mm, taken for m, or the force in kN"),
+        "`--unit mm/s` (or its like), or `--force-unit kN`",
+    ),
+    MixedUnit(1e-6, "the response in µm, taken for m", "`--unit um/s` (or its like)"),
+    MixedUnit(1e3, "the force in mN, taken for N", "`--force-unit mN`"),
+    MixedUnit(1 / 4.4482216, "the force in pounds, taken for N", "`--force-unit lbf`"),
+    MixedUnit(1 / 39.370079, "the response in inches, taken for m", "`--unit in/s` (or its like)"),
 )
 
 
-def _unit_of(off: float, tolerance: float) -> _UnitHint:
-    """The mix-up of units whose factor is exp(off), if there is one."""
-    for factor, what, option in _MIXED_UNITS:
-        if abs(off - np.log(factor)) < tolerance:
-            return _UnitHint(
-                f"that is {factor:.4g}, as with {what}; otherwise ",
-                f"look at the units first and import again with `{option}`; ",
-            )
-    return _UnitHint()
+def mixed_unit(fit: BalanceFit, model: Structure) -> MixedUnit | None:
+    """The mix-up of units whose factor is the modal mass over the model's, if there is one."""
+    own = model.modes.own_modal_mass_std
+    allowed = float(UNSTATED_MODAL_MASS_STD if own is None else own)
+    tolerance = max(_ROOT_TWO, 3 * float(np.hypot(fit.mass_std / fit.mass, allowed)))
+    near = [one for one in _MIXED_UNITS if abs(np.log(fit.mass / one.factor)) < tolerance]
+    return near[0] if near else None
+
+
+def mass_in_words(fit: BalanceFit) -> str:
+    """The modal mass that the states ask for."""
+    return f"the states ask for {fit.mass:.4g} ± {fit.mass_std:.2g} times the model's modal mass"
 
 
 class _Vote:

@@ -22,16 +22,20 @@ _MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
 _OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
 _LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between files
 
+_OTHER_SIGN = (
+    "import again with the other phase sign: `--phase-sign lag`, or `--phase-sign lead` where "
+    "`phase_sign` of map.toml says lag"
+)
 _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "conjugated": (
         "conjugated_response",
         "complex conjugates (phasors e^{-iωt}, or response over force upside down)",
-        "negate `velocity_im_m_s` (conjugate the responses before import)",
+        f"{_OTHER_SIGN}, or negate `velocity_im_m_s`",
     ),
     "conjugated_opposite": (
         "conjugated_response",
         "complex conjugates of turned sign",
-        "negate `velocity_re_m_s` (conjugate the responses and turn the sensor's sign)",
+        f"{_OTHER_SIGN}, and turn the sensor's sign; both together negate `velocity_re_m_s`",
     ),
     "opposite": (
         "shape_not_mass_normalised",
@@ -41,12 +45,12 @@ _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "acceleration": (
         "acceleration_as_velocity",
         "accelerations (m/s²)",
-        "divide by iΩ: `snrmjax import … --response CHANNEL:acceleration`",
+        "divide by iΩ: import again with `--response CHANNEL:acceleration:m/s^2` (or `:g`)",
     ),
     "displacement": (
         "displacement_as_velocity",
         "displacements (m)",
-        "multiply by iΩ: `snrmjax import … --response CHANNEL:displacement`",
+        "multiply by iΩ: import again with `--response CHANNEL:displacement:m` (or `:mm`)",
     ),
     "radians_read_as_degrees": (
         "degrees_for_radians",
@@ -75,7 +79,7 @@ def mode_findings(
         natural_frequency = float(modes.natural_frequency[modes.mode_of_interest])
     recorded, best = best_reading(states, natural_frequency)
     if best.name != recorded.name and not drive:
-        found = [_misread(recorded, best, where)]
+        found = [misread(recorded, best, where)]
         if best.name.startswith(("radians", "degrees")):
             return found
     elif best.fit.misfit > _NO_MODE and wild_phases(states):
@@ -94,22 +98,23 @@ def mode_findings(
     return found
 
 
-def _misread(recorded: Reading, best: Reading, where: str) -> Finding:
+def misread(recorded: Reading, best: Reading, where: str) -> Finding:
+    """That phasors are something else than what they are taken for."""
     kind, meaning, mend = _MEANINGS[best.name]
     old, new = recorded.fit, best.fit
-    signs = ""
+    signs = " A"
     if best.name.startswith("conjugated") or best.name == "opposite":
         size = abs(new.mass) or 1.0
         ratio = np.median(old.damping[old.used] * old.mass) / size
         signs = (
             f" As recorded the modal mass is {old.mass:.3g} ± {old.mass_std:.1g} of the model's and"
-            f" the damping {ratio:.3g} 1/s times it;"
+            f" the damping {ratio:.3g} 1/s times it; a"
         )
     return Finding(
         kind,
         "error",
         where,
-        f"the responses are {meaning}.{signs} a single mode is missed by {100 * old.misfit:.3g} % "
+        f"the responses are {meaning}.{signs} single mode is missed by {100 * old.misfit:.3g} % "
         f"as recorded and by {100 * new.misfit:.3g} % so read (criterion smaller by "
         f"{recorded.criterion - best.criterion:.4g}).",
         mend + ".",

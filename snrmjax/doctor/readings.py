@@ -41,7 +41,7 @@ def best_reading(states: ModeStates, natural_frequency: float | None) -> tuple[R
     The signs of inertia and damping tell the first four from one another.
     """
     recorded = _read(states, "as_recorded", lambda v, _: v, natural_frequency)
-    if _agrees(recorded.fit, natural_frequency):
+    if agrees(recorded.fit, natural_frequency):
         return recorded, recorded
     found = [
         recorded,
@@ -60,7 +60,7 @@ def best_reading(states: ModeStates, natural_frequency: float | None) -> tuple[R
     return recorded, best
 
 
-def _agrees(fit: BalanceFit, natural_frequency: float | None) -> bool:
+def agrees(fit: BalanceFit, natural_frequency: float | None) -> bool:
     """Whether the phasors as recorded are beyond doubt those of a velocity."""
     used = fit.used
     if fit.misfit > _RIGHT or fit.mass < _SIGNS * fit.mass_std or np.any(fit.damping[used] <= 0):

@@ -190,7 +190,7 @@ def _in_words(reading: _Reading, size: float, omega: float, positive: bool) -> s
         clauses.append(
             "the phases rise through resonance where those of a velocity relative to the force "
             "fall: the phasors seem to be conjugated (time dependence e^(-iΩt)); change the sign "
-            "of `velocity_im_m_s`"
+            "of `velocity_im_m_s`, or import again with the other `--phase-sign`"
         )
     if reading.turn == 1j:
         said = "turn the phases by +90°, or multiply the phasors by iΩ if they are displacements"

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.doctor.doubts import doubt, with_doubt
 from snrmjax.identify.inference.agreement import compare_with_pointwise
 from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
@@ -138,15 +139,18 @@ def identify_by_points(
         _require_drive(data)
     check_phases(data, "an identification")
     check_force(data, "an identification state by state")
-    found = identify_backbone(
-        data,
-        model,
-        amplitude=settings.amplitude,
-        measure=settings.measure,
-        family=settings.family,
-        n_knots=settings.n_knots,
-        anchor=settings.anchor,
-    )
+    try:
+        found = identify_backbone(
+            data,
+            model,
+            amplitude=settings.amplitude,
+            measure=settings.measure,
+            family=settings.family,
+            n_knots=settings.n_knots,
+            anchor=settings.anchor,
+        )
+    except ValueError as error:
+        raise with_doubt(error, data, model) from error
     backbone, ratio = found.fit.backbone, loads.largest_amplitude_ratio
     predictions = tuple(
         Prediction(
@@ -156,7 +160,8 @@ def identify_by_points(
         )
         for force in dict.fromkeys(loads.forces)
     )
-    notes = (*found.notes, *notes_on_predictions(predictions, ratio, backbone, data))
+    doubts = doubt(data, model, found.points)
+    notes = (*doubts, *found.notes, *notes_on_predictions(predictions, ratio, backbone, data))
     words = {
         "amplitude": f"{settings.amplitude}, {settings.measure}",
         "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
@@ -204,7 +209,8 @@ def identify_jointly(
         predictions.append(Prediction(force, *without_bands(fit, banded), drive, tuple(banded)))
     advice = next_measurements(fit, settings.further) if settings.further else None
     agreement = compare_with_pointwise(data, model, fit)
-    notes = [*data.notes, *found.notes]
+    doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
+    notes = [*doubts, *data.notes, *found.notes]
     notes += agreement.notes() if agreement is not None else ()
     if fit.drive_known_only:
         place = fit.names().index("force_gain")

@@ -5,47 +5,11 @@ import json
 import numpy as np
 import pytest
 from scipy.signal import lsim
+from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
 from snrmjax.cli import app
-from snrmjax.measure import Channel, steady_states, time_recording
-
-OMEGA, ZETA, SHAPE = 2 * np.pi * 60.0, 0.02, 2.5
-CUBIC = 0.1 * OMEGA**2  # of the displacement over its largest: frequencies rise by 3.7 %
-
-
-def states(*, force_of=None, order=None):
-    """Level, Ω, F, V of ω² + ¾γa², exactly: |F| gives two frequencies at every amplitude."""
-    rows = []
-    for level, top in enumerate((0.3, 0.6, 1.0)):
-        a = top * np.sin(np.linspace(0.25, np.pi - 0.25, 15))
-        side = np.sign(np.linspace(-1, 1, 15) + 1e-9)
-        k = OMEGA**2 + 0.75 * CUBIC * a**2
-        force = 2 * ZETA * OMEGA * np.sqrt(OMEGA**2 + 0.75 * CUBIC * top**2) * top
-        w = np.sqrt(k)
-        for _ in range(40):
-            w = np.sqrt(
-                k + side * np.sqrt(np.maximum((force / a) ** 2 - (2 * ZETA * OMEGA * w) ** 2, 0))
-            )
-        v = 1j * w * force * np.ones(15) / (k - w**2 + 2j * ZETA * OMEGA * w)
-        rows.append((np.full(15, level), w, np.full(15, force), v))
-    level, w, force, v = (np.concatenate(one) for one in zip(*rows, strict=True))
-    return level, w, force / SHAPE, SHAPE * v
-
-
-def noisy(v, seed=0):
-    rng = np.random.default_rng(seed)
-    return v * np.exp(0.003 * (rng.normal(size=len(v)) + 1j * rng.normal(size=len(v))))
-
-
-def table(level, w, force, v, **more):
-    stated = {"velocity_std": 0.003 * np.abs(v), "phase_std": np.full(len(v), 0.003)}
-    return steady_states(level + 1, w, force, v, sensors=("tip",), **(stated | more))
-
-
-def model(shape=SHAPE):
-    modes = sj.model.linear_modes([OMEGA], [ZETA], [[shape]], [shape], sensors=("tip",))
-    return sj.model.structure(modes)
+from snrmjax.measure import Channel, time_recording
 
 
 def wrapped(v):

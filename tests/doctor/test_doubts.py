@@ -1,0 +1,133 @@
+"""What identification says where columns mean something else, on the exact responses of a mode."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
+
+import snrmjax as sj
+from snrmjax.doctor.doubts import doubt, with_doubt
+from snrmjax.measure.phase_convention import wrong_phases
+from snrmjax.report.workflow import CurveSettings, Loads, identify_by_points
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FEW = slice(None, None, 5)  # nine states, three a level, from which no phase can be told wrong
+
+
+def few(change=lambda w, f, v: (f, v), seed=0):
+    level, w, f, v = (column[FEW] for column in states())
+    return table(level, w, *change(w, f, noisy(v, seed)))
+
+
+class Points(NamedTuple):
+    """What `identify_points` finds, by the same balance in a line: Ω² + Re iΩF/(cV), Im /Ω."""
+
+    level: np.ndarray
+    amplitude: np.ndarray
+    natural_frequency: np.ndarray
+    damping_ratio: np.ndarray
+    usable: np.ndarray
+
+
+def said(data, structure):
+    w, v = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
+    balance = 1j * w * np.asarray(data.force) * float(structure.modes.mode_shape[0, 0]) ** 2 / v
+    natural = np.sqrt(np.abs(w**2 + balance.real))
+    ratio = balance.imag / w / (2 * natural)
+    level, every = np.asarray(data.level), np.ones(len(w), dtype=bool)
+    return doubt(data, structure, Points(level, np.abs(v) / w, natural, ratio, every))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda w, f, v: (f, v / 9.80665), ("in g", "--unit g")),
+        (lambda w, f, v: (f, 1e3 * v), ("in mm", "--unit mm/s", "--force-unit kN")),
+        (lambda w, f, v: (f / 4.4482216, v), ("pounds", "--force-unit lbf")),
+        (lambda w, f, v: (f, v.conj()), ("conjugates", "--phase-sign lag")),
+        (lambda w, f, v: (f, 1j * w * v), ("accelerations", ":acceleration:m/s^2")),
+        (lambda w, f, v: (f, v / np.sqrt(2)), ("rms", "√2")),
+    ],
+)
+def test_a_wrong_unit_or_phase_sign_is_named_with_its_size_and_its_mend(change, named):
+    (note,) = said(few(change), model())
+    for word in (*named, "the lowest level has", "the model 60 Hz and 2 %", "To mend it: "):
+        assert word in note
+
+
+@pytest.mark.parametrize("factor", [9.80665, 1e-3, 1 / 4.4482216])
+def test_the_size_is_that_of_the_mixed_units(factor):
+    (note,) = said(few(lambda w, f, v: (f, v / factor)), model())
+    found, std = map(float, re.search(r"ask for (\S+) ± (\S+) times", note).groups())
+    assert abs(found - factor) < 4 * std  # 4σ: one in 16000 by chance
+    assert std < 0.01 * factor
+
+
+def test_good_states_are_silent():
+    for seed in range(5):
+        assert said(few(seed=seed), model()) == ()
+
+
+def test_what_identification_says_of_phases_is_not_said_twice():
+    level, w, f, v = states()
+    data = table(level, w, f, noisy(v).conj())
+    assert "conjugated" in wrong_phases(data, model())[0]
+    assert doubt(data, model()) == ()
+
+
+def test_another_assembly_is_doubted():
+    """1 % of the frequency is a linear test's error; 20 % and five times the damping are not."""
+
+    def other(frequency, damping):
+        modes = sj.model.linear_modes(
+            [frequency * OMEGA], [damping * ZETA], [[SHAPE]], [SHAPE], sensors=("tip",)
+        )
+        return said(few(), sj.model.structure(modes))
+
+    assert other(1.01, 1.2) == ()
+    (note,) = other(1.2, 0.2)
+    assert note.startswith("natural frequency and damping at small amplitude are not the linear")
+    assert "72 Hz and 0.4 %" in note
+
+
+def test_few_states_and_voltages_are_left_alone():
+    data = few(lambda w, f, v: (f, 1e3 * v))
+    assert doubt(data.select(np.arange(7)), model()) == ()
+    level, w, f, v = (column[FEW] for column in states())
+    driven = sj.measure.steady_states(level, w, np.full(9, np.nan), v, drive=f, sensors=("tip",))
+    assert doubt(driven, model()) == ()
+
+
+def test_an_error_of_identification_says_why():
+    data = few(lambda w, f, v: (f, v / (1j * w)))
+    told = str(with_doubt(ValueError("no points."), data, model()))
+    assert told.startswith("no points. the responses are displacements")
+    assert str(with_doubt(ValueError("no points."), few(), model())) == "no points."
+
+
+@pytest.mark.long
+def test_an_identification_without_points_says_why():
+    data = few(lambda w, f, v: (f, v / (1j * w)))
+    with pytest.raises(ValueError, match=r"no real natural frequency.*--response CHANNEL:displ"):
+        identify_by_points(data, model(), CurveSettings(), Loads())
+
+
+@pytest.mark.long
+def test_the_note_comes_first():
+    data = few(lambda w, f, v: (f, v / 9.80665))
+    found = identify_by_points(data, model(), CurveSettings(), Loads())
+    assert found.notes[0].startswith(said(data, model())[0].split("; the lowest")[0])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["response_controlled", "force_controlled"])
+def test_measured_beams_are_silent(name):
+    folder = DATA / "brake_reuss_beam"
+    if not folder.exists():
+        pytest.skip("the measured data are not beside the project, in ../shared/data")
+    structure = sj.read_model(folder / "model.toml")
+    data = sj.read_steady_states(folder / f"{name}.csv", structure)
+    assert said(data, structure) == ()
