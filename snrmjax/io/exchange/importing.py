@@ -86,9 +86,10 @@ def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
     if held.responses:
         every.append(_Dataset("responses", held.name, held.responses, held.levels))
     if not every:
+        what = " and ".join([*["mode shapes"] * bool(held.shapes), *["nodes"] * bool(held.nodes)])
         raise ValueError(
-            f"{held.name} holds mode shapes only: a model is made of them by hand, or of frequency "
-            "responses by `snrmjax modes`."
+            f"{held.name} holds {what} only: a model is made of mode shapes by hand, or of "
+            "frequency responses by `snrmjax modes`."
         )
     names = [one.name for one in every]
     if told.dataset:

@@ -47,6 +47,8 @@ def listed_contents(held: LaboratoryFile) -> list[str]:
             f"  mode shapes {shapes.name}: {len(shapes.frequency)} modes at "
             f"{len(shapes.points)} places"
         )
+    for nodes in held.nodes:
+        lines += [f"  {nodes.name}: {nodes.n_rows} points of the structure", *_columns(nodes)]
     return [*lines, *(f"  note: {note}" for note in held.notes[:_MOST])]
 
 

@@ -78,7 +78,8 @@ class LaboratoryFile(NamedTuple):
     """All that a file of a laboratory holds; see `read_laboratory_file`.
 
     `levels` has one number for each of `responses` (UFF: the value on the z axis), NaN where the
-    file states none. `notes` say what was not read, and what was taken for what.
+    file states none. `nodes` are tables of the structure's points (number and m). `notes` say what
+    was not read, and what was taken for what.
     """
 
     name: str
@@ -89,11 +90,13 @@ class LaboratoryFile(NamedTuple):
     shapes: tuple[MeasuredShapes, ...] = ()
     notes: tuple[str, ...] = ()
     levels: tuple[float, ...] = ()
+    nodes: tuple[NumberTable, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing was found."""
-        return not (self.recordings or self.responses or self.tables or self.shapes)
+        measured = self.recordings or self.responses or self.tables or self.shapes
+        return not (measured or self.nodes)
 
 
 def number_table(

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 from snrmjax.io.files import FilePath, file_name
+from snrmjax.io.laboratory.arrays.matlab4_files import begins_as_v4
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile, TextFormat
 
 _ROOM = "snrmjax.io.laboratory"
@@ -17,13 +18,14 @@ _READERS: dict[Kind, tuple[str, str]] = {
     "csv": ("separated_text", "read_separated_text"),
 }
 _HEAD = 4096
+_MOST_REASONS = 6  # notes that say why nothing was read
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) -> LaboratoryFile:
     """All recordings, frequency responses, tables and shapes of a file.
 
-    Formats: UFF/UNV (58, 58b, 55, 15, 151, 164), MATLAB v5 to v7.3, HDF5, netCDF 4, TDMS, and
+    Formats: UFF/UNV (58, 58b, 55, 15, 2411, 151, 164), MATLAB v4 to v7.3, HDF5, netCDF 4, TDMS, and
     CSV or other separated text. Long records are not read before they are asked for (HDF5,
     netCDF, MATLAB v7.3, TDMS).
     Arguments: `text_format` says how a CSV is written where that is not found out by itself.
@@ -37,7 +39,7 @@ def read_laboratory_file(path: FilePath, text_format: TextFormat | None = None) 
     options = (text_format,) if kind == "csv" else ()
     found: LaboratoryFile = read(Path(path), *options)
     if found.is_empty:
-        why = f": {found.notes[0]}" if found.notes else "."
+        why = f": {' '.join(found.notes[:_MOST_REASONS])}" if found.notes else "."
         raise ValueError(f"{found.name} holds nothing that could be read{why}")
     return found
 
@@ -62,7 +64,7 @@ def _kind(path: FilePath) -> Kind:
         return "matlab" if matlab else "netcdf" if netcdf else "hdf5"
     if head.startswith(b"TDSm"):
         return "tdms"
-    if head.startswith(b"MATLAB 5"):
+    if head.startswith(b"MATLAB 5") or begins_as_v4(head):
         return "matlab"
     first = head.lstrip(b"\r\n").split(b"\n", 1)[0].rstrip()
     if first == b"    -1":

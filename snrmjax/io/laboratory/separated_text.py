@@ -130,7 +130,8 @@ def _marks(lines: list[str], told: TextFormat, file: str) -> tuple[str, str]:
             if score is not None and (best is None or score > best[0]):
                 best = (score, separator, decimal)
     if best is None:
-        raise ValueError(f"{file} has no row of numbers in its first {_LOOKED_AT} lines.")
+        begins = f": it begins with {shown(looked[0].strip())}" if looked else ""
+        raise ValueError(f"{file} has no row of numbers in its first {_LOOKED_AT} lines{begins}.")
     return best[1:]
 
 

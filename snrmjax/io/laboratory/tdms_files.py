@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Num
 
 from snrmjax.io.laboratory.arrays.structs import read_struct
-from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection
+from snrmjax.io.laboratory.arrays.value_tree import Node, Numbers, Selection, held
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.libraries import Budget, damaged_if_it_fails, library
 from snrmjax.io.laboratory.physical_units import channel_meaning
@@ -108,12 +108,19 @@ def _read(path: Path) -> LaboratoryFile:
         waves: dict[tuple[float, float, int], list[Any]] = {}
         loose: dict[str, Node] = {}
         for one in channels:
-            if not len(one) or one.dtype.kind not in "biuf":
-                notes.append(f"channel {one.name} holds no real numbers and is not read.")
+            if not len(one) or one.dtype.kind not in "biufc":
+                notes.append(f"channel {one.name} {_why_not(one)} and is not read.")
                 continue
             step = _number(one, "wf_increment")
             start = _number(one, "wf_start_offset") or 0.0
-            if step is not None and step > 0 and len(one) > 1:
+            if step is not None and step > 0 and len(one) > 1 and _is_spectrum(one):
+                lines = start + step * np.arange(len(one))
+                alike = loose.get("frequency")
+                other = isinstance(alike, Numbers) and alike.length != len(lines)
+                axis = f"frequency of {one.name}" if other else "frequency"
+                loose.setdefault(axis, held(lines, {"unit": "Hz"}))
+                loose[one.name] = _numbers(path, name, one)
+            elif step is not None and step > 0 and len(one) > 1 and one.dtype.kind != "c":
                 key = next(
                     (
                         key
@@ -141,7 +148,7 @@ def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str)
     if len(counted) > _MOST_CHANNELS:
         raise ValueError(f"{file} has {len(counted)} channels, more than {_MOST_CHANNELS}.")
     total = sum(
-        length * one.dtype.itemsize for one, length, _ in counted if one.dtype.kind in "biuf"
+        length * one.dtype.itemsize for one, length, _ in counted if one.dtype.kind in "biufc"
     )
     if total > 8 * size:  # scaled channels give doubles for bytes
         raise ValueError(f"{file} states {total} bytes of samples, but has {size} bytes.")
@@ -175,7 +182,21 @@ def _numbers(path: Path, group: str, one: Any) -> Numbers:
         with damaged_if_it_fails(path.name, "a TDMS file"), nptdms.TdmsFile.open(path) as file:
             return file[group][name].read_data(at[0].start, at[0].stop - at[0].start)
 
-    return Numbers((len(one),), read, False, {"unit": unit} if unit else {})
+    return Numbers((len(one),), read, one.dtype.kind == "c", {"unit": unit} if unit else {})
+
+
+def _is_spectrum(one: Any) -> bool:
+    """Whether the even abscissa of a channel is a frequency: its steps are no sampling interval."""
+    unit = str(one.properties.get("wf_xunit_string", "")).strip().lower()
+    name = str(one.properties.get("wf_xname", "")).strip().lower()
+    return unit in ("hz", "hertz") or (not unit and name in ("frequency", "frequenz"))
+
+
+def _why_not(one: Any) -> str:
+    """What a channel holds that is not read."""
+    if not len(one):
+        return "is empty"
+    return "holds times of day" if one.dtype.kind in "MV" else "holds no numbers"
 
 
 def _unit(one: Any) -> str:

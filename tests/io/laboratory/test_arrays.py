@@ -1,5 +1,7 @@
 """MATLAB, HDF5 and netCDF files by scipy, h5py and xarray: what their structs hold."""
 
+import struct
+
 import h5py
 import numpy as np
 import pytest
@@ -241,3 +243,56 @@ def test_texts_of_a_heap_behind_a_user_block_and_of_a_damaged_one(tmp_path):
         path.write_bytes(good[:where] + value.to_bytes(8, "little") + good[where + 8 :])
         with pytest.raises(ValueError, match="heap"):
             read_laboratory_file(path)
+
+
+def v4_matrix(name, values, order, kind, code, imaginary=None):
+    """A matrix of level 4 by the format's description: five whole numbers, name, columns."""
+    text = name.encode() + b"\0"
+    rows, columns = values.shape
+    head = struct.pack(f"{order}5i", code, rows, columns, imaginary is not None, len(text))
+    parts = [values] if imaginary is None else [values, imaginary]
+    return head + text + b"".join(one.T.astype(order + kind).tobytes() for one in parts)
+
+
+def test_level_4_of_both_orders_of_bytes(tmp_path):
+    rng = np.random.default_rng(6)
+    path = tmp_path / "old.mat"
+    curve = rng.normal(size=(3, 1)) + 1j * rng.normal(size=(3, 1))
+    scipy.io.savemat(path, {"frequency": HERTZ[:, None], "H": curve, "title": "test 4"}, format="4")
+    (table,) = read_laboratory_file(path).tables
+    np.testing.assert_array_equal(table.columns["frequency"], HERTZ)
+    np.testing.assert_array_equal(table.columns["H"], curve[:, 0])
+    counts = rng.integers(-99, 99, size=(5, 2))
+    big = v4_matrix("frequency", np.arange(5.0)[:, None], ">", "f8", 1000)
+    big += v4_matrix("counts", counts, ">", "i2", 1030)
+    big += v4_matrix("z", counts[:, :1], ">", "f4", 1010, counts[:, 1:])
+    path.write_bytes(big)
+    (table,) = read_laboratory_file(path).tables
+    np.testing.assert_array_equal(table.columns["counts_2"], counts[:, 1])
+    np.testing.assert_array_equal(table.columns["z"], counts[:, 0] + 1j * counts[:, 1])
+    path.write_bytes(big[:-1])
+    with pytest.raises(ValueError, match="z states 5 by 1 numbers, of which 1 bytes are missing"):
+        read_laboratory_file(path)
+    path.write_bytes(big + b"rest")
+    with pytest.raises(ValueError, match="no matrix of MATLAB v4 begins"):
+        read_laboratory_file(path)
+
+
+def test_texts_alone_are_said_to_be_all(tmp_path):
+    path = tmp_path / "words.mat"
+    scipy.io.savemat(path, {"title": "beam", "n": 3.0, "none": np.zeros((0, 2))})
+    with pytest.raises(ValueError, match=r"only texts, single numbers and empty arrays \(title, n"):
+        read_laboratory_file(path)
+
+
+def test_blanks_without_their_bytes(tmp_path):
+    """A text of one blank as MATLAB may write it: a side of 1, and no byte."""
+    path = tmp_path / "blank.mat"
+    scipy.io.savemat(path, {"note": "q", "frequency": HERTZ}, format="5")
+    content = bytearray(path.read_bytes())
+    at = content.index(struct.pack("<HHc", 16, 1, b"q"))  # a small element: one byte of text
+    content[at : at + 5] = struct.pack("<HHc", 16, 0, b"\0")
+    path.write_bytes(content)
+    assert scipy.io.loadmat(path)["note"].tolist() == [" "]
+    (table,) = read_laboratory_file(path).tables
+    np.testing.assert_array_equal(table.columns["frequency"], HERTZ)

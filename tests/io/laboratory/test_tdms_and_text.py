@@ -38,6 +38,31 @@ def test_a_waveform_of_labview(tmp_path):
     np.testing.assert_array_equal(found.tables[0].columns["frequency"], frequency)
 
 
+def test_spectra_and_complex_channels(tmp_path):
+    """An even abscissa in Hz is a frequency; its steps are no interval between samples."""
+    path = tmp_path / "spectra.tdms"
+    lines = {"wf_increment": 0.25, "wf_start_offset": 20.0, "wf_xunit_string": "Hz"}
+    values = np.random.default_rng(4).normal(size=(2, 80))
+    response = (values[0] + 1j * values[1]).astype(np.complex64)
+    stamps = np.arange(3).astype("datetime64[us]")
+    with TdmsWriter(path) as writer:
+        writer.write_segment(
+            [
+                ChannelObject("Spectra", "H1", response, {**lines, "unit_string": "g"}),
+                ChannelObject("Spectra", "coherence", values[0], lines),
+                ChannelObject("Spectra", "log", stamps, {}),
+            ]
+        )
+    found = read_laboratory_file(path)
+    assert found.recordings == ()
+    (table,) = found.tables
+    np.testing.assert_array_equal(table.columns["frequency"], 20 + np.arange(80) / 4)
+    np.testing.assert_array_equal(table.columns["H1"], response)
+    assert table.units == {"frequency": "Hz", "H1": "g"}
+    np.testing.assert_array_equal(table.columns["coherence"], values[0])
+    assert found.notes == ("channel log holds times of day and is not read.",)
+
+
 def text_of_tdms(word):
     """A text as the format counts it."""
     return struct.pack("<I", len(word)) + word.encode()

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import pyuff
+from truths.import_runs import run_import
 
 from snrmjax.io.laboratory import measured_shapes, read_laboratory_file
 from snrmjax.io.laboratory.uff.writing import write_uff
@@ -75,6 +76,85 @@ def test_a_file_by_hand_in_inches_and_pounds(tmp_path):
     # 1 in = 0.0254 m and 1 lbf = 4.4482216152605 N exactly
     expected = np.array([1 + 2j, -3 + 4j, 0.5 - 6j]) * 0.0254 / 4.4482216152605
     np.testing.assert_allclose(one.values[0, 0], expected, rtol=1e-12)
+
+
+# What programs put around functions: a header, nodes in two forms, elements, qualifiers.
+AROUND = """    -1
+   151
+frame
+    -1
+    -1
+  2411
+        12         1         1        11
+   1.0000000000000000D+01   0.0000000000000000D+00  -2.5000000000000000D+00
+    -1
+    -1
+    15
+        13         0         0        11  2.00000E+01  0.00000E+00  5.00000E+00
+    -1
+    -1
+  2412
+         1        11         2         1         7         2
+         0         1         1
+        12        13
+    -1
+    -1
+  1858
+           1           3           1           0           0           0
+    -1
+"""
+
+
+def test_what_stands_around_functions_is_listed_and_in_nobodys_way(tmp_path):
+    path = tmp_path / "whole.unv"
+    path.write_text(AROUND + HAND)
+    found = read_laboratory_file(path)
+    assert len(found.responses) == 1
+    assert found.tables == ()
+    assert [one.name for one in found.nodes] == ["nodes", "nodes 2"]
+    np.testing.assert_allclose(found.nodes[1].columns["x_m"], [-0.0 + 10 * 0.0254], rtol=1e-12)
+    assert "1 data set of type 2412 (elements) not read." in found.notes
+    assert "1 data set of type 1858 (qualifiers of functions) not read." in found.notes
+    # Nodes ask no question of which part of the file is meant.
+    words = ("--response", "12+z:acceleration", "--force-amplitude", "0.5", "--sensor", "tip")
+    code, said = run_import(path, *words, "--out", tmp_path / "out")
+    assert code == 0, said
+    assert "nodes 2: 1 points of the structure" in run_import(path)[1]
+    path.write_text(AROUND)
+    assert "import it" not in run_import(path)[1]
+    path.write_text("".join(AROUND.partition("    -1\n  2412")[1:]))
+    with pytest.raises(ValueError, match=r"type 2412 \(elements\) not read"):
+        read_laboratory_file(path)
+
+
+def test_labels_of_windows_and_records_without_a_place(tmp_path):
+    path = tmp_path / "western.unv"
+    label = "(1/N)*(mm/s²)"
+    text = HAND.replace(
+        "        12    0    0    0                 NONE                 NONE",
+        "        12    0    0    0 Acceleration         " + f"{label:<20}",
+        1,
+    )
+    path.write_bytes(text.encode("cp1252"))
+    (one,) = read_laboratory_file(path).responses
+    assert one.responses[0].unit == label
+    record = [
+        *("    -1", "    58", "NONE", "made", "NONE", "NONE", "NONE"),
+        "    1         0    0         0 NONE               0   0 NONE               0   0",
+        "         2         3         1 0.00000E+000 5.00000E-005 0.00000E+000",
+        "        17    0    0    0 Time                 s",
+        "         1    0    0    0 strain 1x            m/s²",
+        *["         0    0    0    0 NONE                 NONE"] * 2,
+        " -3.81956E+00 -3.56616E+00 -2.98987E+00",
+        "    -1",
+        "",
+    ]
+    path.write_bytes("\n".join(record).encode("cp1252"))
+    (back,) = read_laboratory_file(path).recordings
+    assert back.channel_names == ("strain 1x",)
+    assert back.channels[0].quantity == "acceleration"
+    assert back.sampling_rate == 20000
+    np.testing.assert_array_equal(back.values()[0], [-3.81956, -3.56616, -2.98987])
 
 
 def test_levels_on_the_z_axis_and_labels_before_units(by_pyuff):

@@ -1,4 +1,4 @@
-"""MATLAB files: v5 to v7 by scipy, v7.3 by h5py."""
+"""MATLAB files: v4 read here, v5 to v7 by scipy, v7.3 by h5py."""
 
 from pathlib import Path
 from typing import Any
@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from snrmjax.io.laboratory.arrays.hdf5_tree import open_tree
+from snrmjax.io.laboratory.arrays.matlab4_files import begins_as_v4, tree_of_v4
 from snrmjax.io.laboratory.arrays.matlab_headers import walk_variables
 from snrmjax.io.laboratory.arrays.tree_contents import file_of_tree
 from snrmjax.io.laboratory.arrays.value_tree import Node, held
 from snrmjax.io.laboratory.contents import LaboratoryFile
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails
 
-_LARGEST = 2**29  # bytes of a v5 file, which is read whole
+_LARGEST = 2**29  # bytes of a file before v7.3, which is read whole
 
 
 def read_matlab(path: Path) -> LaboratoryFile:
@@ -21,6 +22,9 @@ def read_matlab(path: Path) -> LaboratoryFile:
         head = file.read(520)
     if head.startswith(b"MATLAB 5"):
         tree, notes = _tree_of_v5(path)
+    elif begins_as_v4(head):
+        _check_size(path)
+        tree, notes = tree_of_v4(path)
     else:
         tree, notes = open_tree(path)
     return file_of_tree(path.name, "matlab", tree, notes)
@@ -30,12 +34,8 @@ def _tree_of_v5(path: Path) -> tuple[dict[str, Node], list[str]]:
     """The variables of a v5 file as a tree, and what was not read."""
     import scipy.io
 
-    file, size = path.name, path.stat().st_size
-    if size > _LARGEST:
-        raise ValueError(
-            f"{file} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB that are "
-            "read of a file before v7.3: save it with `-v7.3`, which is read piece by piece."
-        )
+    _check_size(path)
+    file = path.name
     variables = walk_variables(path.read_bytes(), file)
     notes = [
         f"variable {one.name} is {one.why_not}, which is not read: save numbers, text, structs "
@@ -58,8 +58,21 @@ def _tree_of_v5(path: Path) -> tuple[dict[str, Node], list[str]]:
     return tree, notes
 
 
+def _check_size(path: Path) -> None:
+    """Refuse to hold very long files whole."""
+    size = path.stat().st_size
+    if size > _LARGEST:
+        raise ValueError(
+            f"{path.name} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB "
+            "that are read of a file before v7.3: save it with `-v7.3`, which is read piece by "
+            "piece."
+        )
+
+
 def _node(value: Any, name: str, notes: list[str]) -> Node | None:
-    """A loaded value as a node, or None with a note."""
+    """A loaded value as a node, or None with a note unless it is empty."""
+    if value is None:
+        return None
     if not isinstance(value, np.ndarray) or type(value) is not np.ndarray:
         notes.append(f"{name} is {type(value).__name__}, which is not read.")
         return None

@@ -19,6 +19,7 @@ _STRANGE = {
     _OPAQUE: "an object (string, table, datetime, …)",
 }
 _DEEPEST = 24
+_MOST_BLANKS = 2**16
 _ALWAYS_INFLATED = 2**25  # bytes; beyond, a file may grow by the factor below
 _INFLATES = 20
 
@@ -154,7 +155,8 @@ def _matrix(walk: _Walk, at: int, end: int, depth: int) -> tuple[str, str]:
                 f"{name or 'a matrix'} states {' by '.join(map(str, sides))} numbers, but has "
                 f"{size} bytes of type {inner}"
             )
-        if kind == _CHAR and count > size:
+        # MATLAB writes blanks without their bytes.
+        if kind == _CHAR and count > (size or _MOST_BLANKS):
             raise walk.damage(f"{name or 'a text'} states {count} letters in {size} bytes")
     return name, ""
 

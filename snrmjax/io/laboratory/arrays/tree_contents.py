@@ -10,6 +10,9 @@ from snrmjax.io.laboratory.arrays.value_tree import Node
 from snrmjax.io.laboratory.contents import Kind, LaboratoryFile
 from snrmjax.io.laboratory.libraries import Budget
 
+_MOST_NAMED = 6
+_NOTHING = "it has only texts, single numbers and empty arrays"
+
 
 def file_of_tree(
     name: str, kind: Kind, tree: Mapping[str, Node], notes: Sequence[str]
@@ -18,6 +21,9 @@ def file_of_tree(
     budget = Budget(name)
     own, rest = take_responses(tree, budget)
     found = read_struct("", rest, budget)
+    if not (own or found.recordings or found.responses or found.tables):
+        listed = f" ({', '.join(list(tree)[:_MOST_NAMED])})" if tree else ""
+        notes = [*notes, *(() if notes or found.notes else (f"{_NOTHING}{listed}.",))]
     return LaboratoryFile(
         name,
         kind,

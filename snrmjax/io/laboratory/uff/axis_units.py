@@ -41,8 +41,11 @@ def unit_system(sets: Sequence[Mapping[str, Any]]) -> UnitSystem:
     length, force = float(one["length"]), float(one["force"])
     if not (0 < length < float("inf") and 0 < force < float("inf")):
         raise ValueError(f"the factors of units (data set 164) must be positive: {length}, {force}")
-    notes = () if length == force == 1 else (f"units {stated(one['units_description'])}.",)
-    return UnitSystem(length, force, notes)
+    if length == force == 1:
+        return UnitSystem()
+    words = stated(one["units_description"])
+    note = f"units{words and ' '}{words}: 1 m is {length:.6g} of the file's, 1 N is {force:.6g}."
+    return UnitSystem(length, force, (note,))
 
 
 def axis_unit(one: Mapping[str, Any], axis: str, units: UnitSystem) -> AxisUnit:

@@ -10,8 +10,17 @@ import numpy as np
 from snrmjax.io.laboratory.libraries import damaged_if_it_fails, library
 
 _LARGEST = 2**29  # bytes: pyuff holds all of a file, and each number as an object for a while
-_READ = {15: "nodes", 55: "data at nodes", 58: "function", 151: "header", 164: "units"}
+_READ = {15: "nodes", 2411: "nodes"} | {
+    **{55: "data at nodes", 58: "function", 151: "header", 164: "units"}
+}
+_OTHERS = {
+    **{18: "coordinate systems", 82: "lines of a drawing", 2400: "header of a model"},
+    **{2412: "elements", 2414: "results at nodes or elements", 2420: "coordinate systems"},
+    **{2429: "groups", 2467: "groups", 1858: "qualifiers of functions"},
+    151: "header, cut short",
+}
 _TAG = re.compile(rb"    -1(?=[\r\n]| {74}|\Z)")
+_HEAD = 2**11  # bytes of a function's lines of text
 _SHORTEST = 8  # bytes of the shortest number: a double in binary; of text even a single has 13
 _DIRECTIONS = {0: ""} | {
     sign * (k + 1): f"{'+' if sign > 0 else '-'}{name}"
@@ -44,13 +53,16 @@ def read_data_sets(path: Path) -> DataSets:
             f"{file} has {size / 2**20:.0f} MiB, more than the {_LARGEST / 2**20:.0f} MiB that are "
             "read of a universal file: split it, or take HDF5 or TDMS for long records."
         )
-    if len(_TAG.findall(path.read_bytes())) % 2:
+    content = path.read_bytes()
+    if len(_TAG.findall(content)) % 2:
         raise ValueError(f"{file} is damaged: it ends within a data set (no closing -1).")
     found: list[Mapping[str, Any]] = []
     left_out: dict[int, int] = {}
     with damaged_if_it_fails(file, "a universal file"):
         source = pyuff.UFF(str(path))
         types = [int(number) for number in source.get_set_types()]
+    starts = [found.start() for found in _TAG.finditer(content)][::2]
+    heads = [content[at : at + _HEAD] for at in starts] + [b""] * len(types)
     for k, number in enumerate(types):
         if number not in _READ:
             left_out[number] = left_out.get(number, 0) + 1
@@ -60,14 +72,28 @@ def read_data_sets(path: Path) -> DataSets:
             with damaged_if_it_fails(file, where):
                 header = source.read_sets(k, header_only=True)
             _check_count(header, size, file, k + 1)
-        with damaged_if_it_fails(file, where):
-            one = source.read_sets(k)
-        found.append(_checked_function(one, file, k + 1) if number == 58 else one)
+        try:
+            with damaged_if_it_fails(file, where):
+                one = source.read_sets(k)
+        except ValueError:
+            if number != 151:
+                raise
+            # A header has nothing that numbers depend on.
+            left_out[number] = left_out.get(number, 0) + 1
+            continue
+        if number == 58:
+            one = _with_letters(_checked_function(one, file, k + 1), heads[k])
+        found.append(one)
     notes = tuple(
-        f"{count} data set{'s' * (count > 1)} of type {number} not read."
+        f"{count} data set{'s' * (count > 1)} of type {number}{_meaning(number)} not read."
         for number, count in sorted(left_out.items())
     )
     return DataSets(tuple(found), notes)
+
+
+def _meaning(number: int) -> str:
+    """What a type of data set holds, in brackets."""
+    return f" ({_OTHERS[number]})" if number in _OTHERS else ""
 
 
 def direction_of(code: int) -> str:
@@ -83,6 +109,19 @@ def stated(text: str) -> str:
     """A field of text, empty where it says NONE."""
     plain = text.strip().strip("\0").strip()
     return "" if plain.upper() == "NONE" else plain
+
+
+def _with_letters(one: dict[str, Any], head: bytes) -> dict[str, Any]:
+    """A function whose texts have Windows' Western letters (², µ, °), which pyuff replaces."""
+    broken = {key for key, value in one.items() if isinstance(value, str) and "\ufffd" in value}
+    restored = {}
+    for line in head.splitlines() if broken else ():
+        seen, meant = line.decode("utf-8", "replace"), line.decode("cp1252", "replace")
+        for key in broken:
+            at = seen.find(one[key])
+            if at >= 0 and len(seen) == len(meant):
+                restored[key] = meant[at : at + len(one[key])]
+    return {**one, **restored}
 
 
 def _check_count(header: Mapping[str, Any], size: int, file: str, number: int) -> None:

@@ -79,13 +79,14 @@ def _grouped(sets: Sequence[_Function]) -> list[list[_Function]]:
 
 
 def _place(one: _Function, side: str) -> str:
-    """Where a function was measured, in words."""
+    """Where a function was measured, in words; of a record without a place, what its axis says."""
     entity = stated(one.get(f"{side}_ent_name", ""))
     node = one.get(f"{side}_node", 0)
     point = f"{node}{direction_of(one.get(f'{side}_dir', 0))}"
-    if entity:
+    if entity and entity.lower() != point:
         return entity if not node else f"{entity}:{point}"
-    return point
+    label = stated(one.get("ordinate_axis_lab", "")) if one["func_type"] == _TIME else ""
+    return label if label and not node else point
 
 
 def _channel(one: _Function, side: str, axis: str, units: UnitSystem, notes: list[str]) -> Channel:

@@ -33,24 +33,26 @@ def read_uff(path: Path) -> LaboratoryFile:
     shapes = _shapes(sets.of_type(55), path.name)
     nodes = _nodes(sets, units)
     names = [stated(one.get("model_name", "")) for one in sets.of_type(151)]
-    notes = [*sets.notes, *units.notes, *functions.notes]
+    used = any(len(sets.of_type(number)) for number in (15, 55, 58, 2411))
+    notes = [*sets.notes, *(units.notes if used else ()), *functions.notes]
     notes += [f"model {name}." for name in names if name]
     return LaboratoryFile(
         path.name,
         "uff",
         functions.recordings,
         functions.responses,
-        (*functions.tables, *nodes),
+        functions.tables,
         shapes,
         tuple(dict.fromkeys(notes)),
         functions.levels,
+        nodes,
     )
 
 
 def _nodes(sets: DataSets, units: UnitSystem) -> tuple[NumberTable, ...]:
     """The points of the structure, in m."""
     found = []
-    for k, one in enumerate(sets.of_type(15)):
+    for k, one in enumerate((*sets.of_type(15), *sets.of_type(2411))):
         columns = {"node": np.asarray(one["node_nums"], float)} | {
             f"{axis}_m": np.asarray(one[axis], float) / units.length for axis in ("x", "y", "z")
         }
