@@ -3,9 +3,11 @@
 The structure is any model of this package: modes, potential, contacts, friction with its memory.
 An electrodynamic shaker drives it through a stinger, so that the force drops at resonance and
 carries harmonics, as on a real shaker. From one sample of the controller to the next the voltage
-goes straight from the last command to the new one (a reconstruction filter's delay of one sample),
-and the equations of motion are integrated by the classical method of Runge and Kutta, of order 4,
-in substeps of equal length; sliders are moved exactly after each of them.
+goes from the last command to the new one (a delay of one sample) on the cubic through the last four
+commands, as smooth as a reconstruction filter leaves it: straight lines, or steps, would have
+images about the sampling rate, which alias into the sampled force. The equations of motion are
+integrated by the classical method of Runge and Kutta, of order 4, in substeps of equal length;
+sliders are moved exactly after each of them.
 
 References: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
 doi:10.1016/0022-460X(79)90681-9; for the flexible stinger, K. G. McConnell & P. S. Varoto,
@@ -93,7 +95,7 @@ class LabState(NamedTuple):
     motion: LabMotion
     controller: Any
     time: Float[Array, ""]
-    voltage: Float[Array, ""]  # of the amplifier, V
+    voltage: Float[Array, "3"]  # of the amplifier at the last three samples, V
     seen: Float[Array, " channel"]  # force (N) and velocity (m/s) behind the anti-alias filter
     filtered: Float[Array, "section 2 channel"]  # memory of the anti-alias filter
     late: Float[Array, "delay channel"]  # samples on their way, the next one first
@@ -108,9 +110,8 @@ class Laboratory(eqx.Module):
     included) needs 20 a cycle. Effects with memory (friction) need `largest_displacement`, in m at
     the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
     motions up to it. With `attached` False the shaker is away and nothing drives the structure.
-    The corners of the voltage, which no filter removes here, alias into the force by
-    (ω period)²/12 of the shaker's own force, which near resonance may be several times the force
-    on the structure.
+    What is left of the voltage's images aliases into the force by about (ω period)⁴/38 of the
+    shaker's own force, which near resonance may be several times the force on the structure.
     Raises `ValueError` for numbers that cannot be, a rate too low, and effects of the measurement
     or of the force's spectrum, which the shaker and the instruments here have themselves.
     """
@@ -159,7 +160,7 @@ class Laboratory(eqx.Module):
             LabMotion(jnp.zeros(n), jnp.zeros(n), jnp.zeros(2), memory),
             controller.initial(),
             jnp.zeros(()),
-            jnp.zeros(()),
+            jnp.zeros(3),
             jnp.zeros(2),
             jnp.zeros((sections, 2, 2)),
             jnp.zeros((int(self.instruments.delay), 2)),
@@ -232,6 +233,7 @@ def _run(
     steps, limit = laboratory.substeps, laboratory.shaker.largest_voltage
     slope = _equations(laboratory.shaker, laboratory.attached, structure, friction)
     step = _integrator(slope, friction, j, period / steps)
+    cubic = _between_samples(np.arange(2 * steps + 1) / (2 * steps))
 
     def channels(motion: LabMotion, voltage: Array) -> Array:
         return jnp.stack([slope(motion, voltage)[1], turn * (shape @ motion.velocity)])
@@ -246,23 +248,24 @@ def _run(
             state.controller, Sample(state.time, force, speed), period
         )
         voltage = jnp.clip(command, -limit, limit)
-        rise = (voltage - state.voltage) / steps
+        known = jnp.append(state.voltage, voltage)
+        along = jnp.clip(cubic @ known, -limit, limit)
 
-        def substep(now: tuple, k: Array) -> tuple[tuple, None]:
+        def substep(now: tuple, volts: Array) -> tuple[tuple, None]:
             motion, filtered, seen = now
-            ends = state.voltage + k * rise, state.voltage + (k + 1) * rise
-            motion = step(motion, ends)
+            motion = step(motion, volts)
             if len(sections):
-                seen, filtered = _filtered(sections, filtered, channels(motion, ends[1]))
+                seen, filtered = _filtered(sections, filtered, channels(motion, volts[2]))
             return (motion, filtered, seen), None
 
         now = (state.motion, state.filtered, state.seen)
-        (motion, filtered, seen), _ = jax.lax.scan(substep, now, jnp.arange(steps), unroll=2)
+        volts_of_steps = jnp.stack([along[:-2:2], along[1::2], along[2::2]], axis=1)
+        (motion, filtered, seen), _ = jax.lax.scan(substep, now, volts_of_steps, unroll=2)
         if not len(sections):
             seen = channels(motion, voltage)
         largest = jnp.maximum(state.largest, jnp.abs(motion.displacement[j]))
         after = LabState(
-            *(motion, control, state.time + period, voltage, seen, filtered),
+            *(motion, control, state.time + period, known[1:], seen, filtered),
             *(arriving[1:], largest),
         )
         return after, (state.time, voltage, force, speed, report)
@@ -328,12 +331,11 @@ def _integrator(
     friction: tuple[AbstractHysteresis, ...],
     j: int,
     h: Array,
-) -> Callable[[LabMotion, tuple[Array, Array]], LabMotion]:
+) -> Callable[[LabMotion, Float[Array, "3"]], LabMotion]:
     """One step of length h by the classical method of Runge and Kutta, sliders moved after it."""
 
-    def step(motion: LabMotion, ends: tuple[Array, Array]) -> LabMotion:
-        first, last = ends
-        middle = (first + last) / 2
+    def step(motion: LabMotion, volts: Float[Array, "3"]) -> LabMotion:
+        first, middle, last = volts
 
         def after(time: Array, rate: LabMotion) -> LabMotion:
             return jax.tree.map(lambda at, by: at + time * by, motion, rate)
@@ -352,6 +354,19 @@ def _integrator(
         return moved._replace(memory=tuple(memory))
 
     return step
+
+
+def _between_samples(share: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 4"]:
+    """Weights of the last four commands, by Lagrange, at shares of the way between the last two."""
+    at = np.arange(-2.0, 2.0)
+    others = [np.delete(at, k) for k in range(4)]
+    return np.stack(
+        [
+            np.prod((share[:, None] - other) / (own - other), axis=1)
+            for own, other in zip(at, others, strict=True)
+        ],
+        axis=1,
+    )
 
 
 def _filtered(

@@ -305,7 +305,7 @@ def decay_test(
         seed=seed,
     )
     free = Playback(jnp.zeros(1))
-    start = held.state._replace(controller=free.initial(), voltage=jnp.zeros(()))
+    start = held.state._replace(controller=free.initial(), voltage=jnp.zeros(3))
     count = round(decay_seconds * laboratory.sampling_rate)
     record, _ = run_test(detached(laboratory), free, count, start=start, seed=seed + 1)
     return DecayTest(record, held.seconds + decay_seconds, held.point)
