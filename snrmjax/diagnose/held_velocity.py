@@ -68,8 +68,28 @@ def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
 
 
 def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
-    """Whether the force changes along the levels of a test, which then hold the response."""
+    """Whether the levels of a test hold the response: its force changes, more than velocity.
+
+    A shaker's force that drops at resonance changes too, but the velocity does far more.
+    """
     if not predicted:
         return False
     same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > _RESPONSE_CONTROLLED)
+    return bool(np.mean(~same) > _RESPONSE_CONTROLLED) and _velocity_is_steadier(data)
+
+
+def _velocity_is_steadier(data: SteadyStates) -> bool:
+    """Whether velocities spread less than forces within most levels, at the sensor that moves most.
+
+    Spreads are ranges of the logarithm between the first and last tenth.
+    """
+    size = np.abs(np.asarray(data.velocity)) * np.asarray(data.measured)
+    speed, force = size[:, int(np.argmax(size.mean(axis=0)))], np.asarray(data.force)
+    good, level = (speed > 0) & (force > 0), np.asarray(data.level)
+    spreads = [
+        float(np.ptp(np.quantile(np.log(one[good & (level == k)]), (0.1, 0.9))))
+        for k in np.unique(level[good])
+        for one in (speed, force)
+    ]
+    pairs = np.reshape(spreads, (-1, 2))
+    return bool(np.median(pairs[:, 0] - pairs[:, 1]) < 0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
+from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.continuation.continuation import CurveStatus
@@ -27,6 +28,7 @@ class PhaseResonance(NamedTuple):
     frequency: float  # Hz
     velocity: float  # m/s
     fold: float = np.nan  # Hz, of the branch that ends nearest above
+    jump: tuple[float, float] | None = None  # Hz, between which measured states jump past it
 
 
 class LevelResponse(NamedTuple):
@@ -72,6 +74,7 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
     """Force of every level that has a known one, N: at resonance, where its states enclose it.
 
     A test that holds the response changes the force along a level; elsewhere it is their mean.
+    Where states jump past the resonance it is that of the last one before the jump.
     Without phases it is that of the state with the largest velocity over force.
     """
     level, force = np.asarray(data.level), np.asarray(data.force)
@@ -87,6 +90,8 @@ def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
         inside = phase.min() <= 0 <= phase.max()
         own = force[mine]
         at = np.interp(0.0, phase[order], own[order]) if inside else np.mean(own)
+        if inside and measured_resonance(data, int(number), sensor).jump is not None:
+            at = own[np.argmin(np.abs(phase))]
         found[int(number)] = float(at)
     return found
 
@@ -147,7 +152,7 @@ def level_simulations(
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
-    """By interpolation between the states on both sides; NaN where one side is empty.
+    """By interpolation between the states on both sides; NaN where one is empty or they jump.
 
     Frequency against tan φ and |V|/cos φ against φ, which along a resonance change least. Without
     phases the state with the largest velocity over force is taken, if others enclose it.
@@ -166,6 +171,9 @@ def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseReso
     phase, velocity, frequency = phase[order], velocity[order], frequency[order]
     if not order.size or phase[0] > 0 or phase[-1] < 0:
         return PhaseResonance(np.nan, np.nan)
+    jump = jump_at_resonance(np.tan(phase), frequency)
+    if jump is not None:
+        return PhaseResonance(np.nan, np.nan, jump=(jump[0] / (2 * np.pi), jump[1] / (2 * np.pi)))
     at = np.interp(0.0, np.tan(phase), frequency)
     tip = np.interp(0.0, phase, np.abs(velocity) / np.cos(phase))
     return PhaseResonance(float(at) / (2 * np.pi), float(tip))

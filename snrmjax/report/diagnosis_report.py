@@ -437,6 +437,9 @@ def _velocity_unit(resonances: Iterable[PhaseResonance]) -> Unit:
 
 
 def _resonance(one: PhaseResonance, unit: Unit) -> str:
+    if one.jump is not None:
+        low, high = (f"{end:.5g}" for end in one.jump)
+        return f"not measured: the states jump past it, {_unbroken(f'{low} → {high} Hz')}"
     if not np.isfinite(one.frequency):
         return "no resonance"
     fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import equinox as eqx
 import numpy as np
 import pytest
+from truths import one_mode
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.verdict import Verdict
+from snrmjax.diagnose.held_velocity import holds_response
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
     LevelModels,
@@ -23,7 +25,8 @@ from snrmjax.diagnose.response_prediction import (
     with_resonances_checked,
 )
 from snrmjax.model.effects import EFFECTS, make_effect
-from snrmjax.report.diagnosis_report import _incomplete
+from snrmjax.report.diagnosis_report import _incomplete, _resonance
+from snrmjax.report.style import unit_for
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
 FORCES = (1.0, 4.0)
@@ -121,6 +124,67 @@ def test_responses_are_those_that_instruments_record():
 
 def test_a_level_on_one_side_of_resonance_has_no_measured_one():
     assert np.isnan(measured_resonance(states(linear(), (10.0, 30.0)), 0, 0).frequency)
+
+
+def jumped(n, early):
+    w, force, v = one_mode.swept_up(n, early)
+    return sj.measure.steady_states(np.zeros(n), w, force, v)
+
+
+@pytest.mark.parametrize("n", [16, 30, 100])
+def test_across_a_jump_no_resonance_was_measured(n):
+    """A sweep that falls 1 % below the phase resonance, by far before the fold."""
+    data = jumped(n, 0.01)
+    found = measured_resonance(data, 0, 0)
+    assert np.isnan(found.frequency)
+    low, high = found.jump
+    resonance = np.sqrt(one_mode.OMEGA**2 + 0.75 * one_mode.STEEP) / (2 * np.pi)
+    assert low < resonance * (1 - 0.01) < high
+    # The force is that of the last state before it.
+    falling = eqx.tree_at(lambda d: d.force, data, data.force * np.linspace(1, 0.5, n))
+    last = int(np.argmin(np.abs(np.asarray(data.frequency) / (2 * np.pi) - low)))
+    assert level_forces(falling)[0] == pytest.approx(float(falling.force[last]), rel=1e-12)
+
+
+@pytest.mark.parametrize("n", [40, 80, 160])
+def test_where_the_states_reach_resonance_before_they_fall_it_is_measured(n):
+    """It falls at the fold, 0.05 % above the resonance: enclosed by few states or by none."""
+    found = measured_resonance(jumped(n, 0.0), 0, 0)
+    resonance = np.sqrt(one_mode.OMEGA**2 + 0.75 * one_mode.STEEP) / (2 * np.pi)
+    spacing = 0.3 * 60 / (n - 1)  # Hz
+    assert found.jump is not None or abs(found.frequency - resonance) < spacing
+
+
+def test_coarse_states_of_one_branch_are_no_jump():
+    found = measured_resonance(states(linear(), (-70.0, -50.0, 50.0, 70.0)), 0, 0)
+    assert found.jump is None
+    # ζ² tan φ₁ tan φ₂/2 is 7e-5: Ω is not quite straight against tan φ.
+    assert found.frequency == pytest.approx(50.0, rel=1e-4)
+
+
+def test_a_resonance_in_a_jump_is_not_missed():
+    nothing = PhaseResonance(np.nan, np.nan, jump=(61.8, 62.1))
+    assert "jump past it, 61.8" in _resonance(nothing, unit_for([1.0], "m/s"))
+    row = LevelResponse(3, 1.0, nothing, nothing, nothing, False)
+    answer = SimpleNamespace(force_gain=1.0)
+    seen = SimpleNamespace(force_misfit=SimpleNamespace(sensor=0), answer=answer)
+    assert with_resonances_checked(seen, linear(), [row]) is seen
+
+
+def test_a_force_that_drops_at_resonance_holds_no_response():
+    data = states(linear(), (-60.0, -40.0, -15.0, 15.0, 40.0, 60.0))
+    row = LevelResponse(0, FORCES[0], *(3 * [PhaseResonance(50.0, 1.0)]), False)
+    rows = [row, row._replace(level=1, force=FORCES[1])]
+    assert not holds_response(data, rows)
+    cosine = np.cos(np.angle(np.asarray(data.velocity)[:, 0]))
+    drops = eqx.tree_at(lambda d: d.force, data, data.force * (1 - 0.3 * cosine))
+    assert not holds_response(drops, rows)
+    held = eqx.tree_at(
+        lambda d: (d.force, d.velocity),
+        data,
+        (data.force / cosine, data.velocity / cosine[:, None]),
+    )
+    assert holds_response(held, rows)
 
 
 def test_the_force_of_a_level_is_that_at_its_resonance():

@@ -7,6 +7,7 @@ from snrmjax.measure import steady_states
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 60.0, 0.02, 2.5
 CUBIC = 0.1 * OMEGA**2  # of the displacement over its largest: frequencies rise by 3.7 %
+STEEP = 4 * CUBIC  # by 14 %, seven bandwidths
 
 
 def states(n=15):
@@ -44,3 +45,24 @@ def model(shape=SHAPE):
     """The linear mode."""
     modes = sj.model.linear_modes([OMEGA], [ZETA], [[shape]], [shape], sensors=("tip",))
     return sj.model.structure(modes)
+
+
+def swept_up(n, early=0.0):
+    """Ω, F, V of the largest level in a sweep upwards that falls to the lower branch.
+
+    It falls at the fold, or `early` (relative to the resonance) below that of phase. The roots of
+    a²((ω² + ¾γa² − Ω²)² + (2ζωΩ)²) = F² are exact.
+    """
+    force = 2 * ZETA * OMEGA * np.sqrt(OMEGA**2 + 0.75 * STEEP)
+    top = np.sqrt(OMEGA**2 + 0.75 * STEEP)  # of the phase resonance, at a = 1
+    w = np.linspace(0.95 * OMEGA, 1.25 * OMEGA, n)
+    amplitude = []
+    for one in w:
+        k, g = OMEGA**2 - one**2, 0.75 * STEEP
+        found = np.roots([g**2, 2 * k * g, k**2 + (2 * ZETA * OMEGA * one) ** 2, -(force**2)])
+        real = np.sort(found.real[np.abs(found.imag) < 1e-9 * np.abs(found)])
+        fallen = early and one > (1 - early) * top
+        amplitude.append(np.sqrt(real[0] if fallen else real[-1]))
+    k = OMEGA**2 + 0.75 * STEEP * np.array(amplitude) ** 2
+    v = 1j * w * force / (k - w**2 + 2j * ZETA * OMEGA * w)
+    return w, np.full(n, force / SHAPE), SHAPE * v

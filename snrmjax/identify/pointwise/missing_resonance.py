@@ -4,12 +4,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.measure.states import SteadyStates
 
 _AMPLITUDES = 200
 _SAME_FORCE = 0.05  # relative difference of a level's force from the one that was asked for
+_ONE_BRANCH = np.radians(45.0)  # of phase, that states beside a resonance may be apart
+_STEEPER = 2.0  # times as steep as beside it, from which on tan φ jumps
 _HERTZ = 2 * np.pi
 
 
@@ -39,10 +42,44 @@ def measured_resonances(data: SteadyStates, sensor: int, sign: float) -> list[Me
             continue
         order = mine[np.argsort(tangent)]
         rows = np.sort(tangent)
+        if jump_at_resonance(rows, frequency[order]) is not None:
+            continue
         columns = (force, frequency / _HERTZ, np.abs(velocity))
         at = (float(np.interp(0.0, rows, column[order])) for column in columns)
         found.append(MeasuredResonance(int(number), *at))
     return found
+
+
+def jump_at_resonance(
+    tangent: Float[np.ndarray, " state"], frequency: Float[np.ndarray, " state"]
+) -> tuple[float, float] | None:
+    """The frequencies between which a level jumps past its phase resonance; None where it does not.
+
+    Between states of one branch tan φ falls steadily with frequency, so that a resonance between
+    them can be interpolated. Across a jump it falls twice as steeply as beside it, or comes back:
+    what lies between was not measured.
+
+    Arguments: `tangent` of the phases of a level's states, rising, and their frequencies.
+    Validity: at least two states on one side; with fewer no jump can be told.
+    """
+    below = int(np.searchsorted(tangent, 0.0, side="right")) - 1
+    if below < 0 or below + 1 >= len(tangent):
+        return None
+    pair = slice(below, below + 2)
+    ends = float(frequency[pair].min()), float(frequency[pair].max())
+    if np.ptp(np.arctan(tangent[pair])) < _ONE_BRANCH:
+        return None
+    beside = [k for k in (below - 1, below + 1) if 0 <= k < len(tangent) - 1]
+    slopes = [_slope(tangent[k : k + 2], frequency[k : k + 2]) for k in beside]
+    if not slopes:
+        return None
+    own = _slope(tangent[pair], frequency[pair])
+    return ends if own >= 0 or own < _STEEPER * min(*slopes, 0.0) else None
+
+
+def _slope(tangent: Float[np.ndarray, " 2"], frequency: Float[np.ndarray, " 2"]) -> float:
+    step = float(frequency[1] - frequency[0])
+    return float(tangent[1] - tangent[0]) / step if step else -np.inf
 
 
 def why_no_resonance(
