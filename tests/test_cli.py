@@ -316,10 +316,14 @@ def test_identify_sends_amplitudes_alone_to_diagnose(files, tmp_path, load, opti
 @pytest.mark.parametrize(
     ("command", "written"),
     [
-        (("simulate", "--force", "1e-4", "--from-hz", "60", "--to-hz", "70"), "response.csv"),
+        pytest.param(
+            ("simulate", "--force", "1e-4", "--from-hz", "60", "--to-hz", "70"),
+            "response.csv",
+            marks=pytest.mark.long,
+        ),
         (("nnm", "--help"), None),
         (("identify", "--help"), None),
-        (("diagnose",), None),
+        pytest.param(("diagnose",), None, marks=pytest.mark.long),
         (("demo", "--help"), None),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",

@@ -150,7 +150,7 @@ class TestIdentifyPoints:
     @pytest.mark.parametrize(
         "stated",
         [
-            pytest.param(stated, marks=pytest.mark.long if stated == "nothing stated" else ())
+            pytest.param(stated, marks=() if stated == "velocities stated" else pytest.mark.long)
             for stated in STATED
         ],
     )
@@ -179,6 +179,7 @@ class TestIdentifyPoints:
         largest = np.max(np.abs(found), axis=1, keepdims=True)
         np.testing.assert_allclose(found / largest, alone / largest, atol=1e-12)
 
+    @pytest.mark.long
     @pytest.mark.parametrize("failure", FAILURES)
     def test_all_states_of_a_batch_with_a_failed_one(self, failure):
         check_derivatives(by_two_sensors, 9, table(failure, **STATED["all stated"]))

@@ -162,6 +162,7 @@ def test_the_pointwise_verb_says_it():
         check_named([str(error.value)], how)
 
 
+@pytest.mark.long
 def test_the_joint_fit_says_it():
     flat = {"backbone": "polynomial:1@displacement", "damping": "polynomial:1@displacement"}
     for how in ("conjugated", "acceleration"):

@@ -394,6 +394,7 @@ def test_matplotlib_is_left_as_it_was(identification, backbone):
     assert dict(mpl.rcParams) == before
 
 
+@pytest.mark.long
 def test_plotting_needs_no_display():
     lines = "import snrmjax.report.figures, sys; sys.exit('matplotlib.pyplot' in sys.modules)"
     finished = subprocess.run([sys.executable, "-c", lines], check=False, timeout=120)

@@ -50,6 +50,7 @@ def test_levels_that_differ_hide_no_effect_and_make_none(found):
     assert found.gap.interpolated.after < 1.3
 
 
+@pytest.mark.long
 def test_the_differences_are_those_that_were_put_in(data):
     model, note = with_level_variance(linear_model(), data)
     assert note.startswith("no errors of levels")

@@ -288,6 +288,7 @@ def test_other_sensors_and_harmonics_are_weighed_by_their_errors():
     assert distance < chi2.ppf(0.999, 8)
 
 
+@pytest.mark.long
 def test_a_state_without_a_balanced_motion_has_no_weight(exact):
     # At 1e150 m/s the restoring force overflows.
     velocity = exact.velocity.at[4].set(1e150)

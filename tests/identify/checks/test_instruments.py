@@ -14,6 +14,7 @@ def on_the_gain(fit):
     return [note for note in fit.notes if "determine the force gain" in note]
 
 
+@pytest.mark.long
 def test_a_gain_that_the_inertia_determines_is_taken_without_a_word():
     fit = sj.fit_jointly(driven(60), modes(), backbone="polynomial:1", damping="polynomial:1")
     assert float(np.exp(fit.unknowns.log_force_gain)) == pytest.approx(GAIN, rel=0.01)

@@ -298,6 +298,7 @@ def test_two_levels_whose_gains_differ_are_found_to():
     np.testing.assert_array_equal(fitted(0.0).noise.level_std, 0.0)
 
 
+@pytest.mark.long
 def test_auto_finds_the_families_that_made_the_data():
     found = fit_jointly(noisy(3, gain=0.002, per_level=15), modes(), level_gain_std=0.002)
     chosen = {c.curve: c for c in found.families.candidates if c.chosen}

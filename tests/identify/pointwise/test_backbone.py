@@ -272,6 +272,7 @@ class TestAnchor:
         assert abs(exact.largest_frequency_shift) < 1e-6 * W0
         assert abs(exact.largest_damping_shift) < 1e-8
 
+    @pytest.mark.long
     def test_gaps_of_noisy_tests_are_as_large_as_stated(self):
         ratios = []
         for seed in range(20):

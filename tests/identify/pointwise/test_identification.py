@@ -83,6 +83,7 @@ class TestMeasuredBeam:
         # Damping of the levels repeats to about 10 %, as those who measured it say.
         np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
 
+    @pytest.mark.long
     def test_a_joint_fit_settles_where_every_level_is_in_phase(self, data, model, crossings):
         """Near folds a state of exact force would be exact in one direction, and fits wandered."""
         families = {"backbone": "spline:6@displacement", "damping": "spline:5@displacement"}
@@ -180,6 +181,7 @@ class TestLinearMode:
         found = sj.identify_backbone(spoilt, MODES)
         assert any(note.startswith("1 of 30 steady states are left out") for note in found.notes)
 
+    @pytest.mark.long
     def test_an_anchor_is_told(self):
         found = sj.identify_backbone(linear_test(0, 0.01), MODES, anchor=True)
         assert any(note.startswith("anchored at the linear mode") for note in found.notes)

@@ -177,7 +177,7 @@ def test_both_methods_give_the_same_multipliers(distance_between):
 # ------------------------------------------------------------------- against maps of the motion
 
 
-@pytest.mark.parametrize("which", ["flat", "curved"])
+@pytest.mark.parametrize("which", [pytest.param("flat", marks=pytest.mark.long), "curved"])
 def test_multipliers_along_a_response_are_those_of_the_integrated_map(
     which, request, time_domain, state_of, distance_between
 ):

@@ -125,7 +125,10 @@ def test_every_curve_of_a_batch_is_the_curve_alone(small_curves):
 # -------------------------------------------------------------------------------- the two beams
 
 
-@pytest.mark.parametrize(("which", "start", "every"), [("flat", 0, 19), ("curved", 1, 17)])
+@pytest.mark.parametrize(
+    ("which", "start", "every"),
+    [pytest.param("flat", 0, 19, marks=pytest.mark.long), ("curved", 1, 17)],
+)
 def test_orbits_close_in_time(which, start, every, request, time_domain, state_of):
     """Points of a curve, refined with 21 harmonics, come back to their start after a period."""
     if which == "flat":

@@ -136,6 +136,7 @@ def test_starts_that_are_given_are_used_and_checked():
         )
 
 
+@pytest.mark.long
 def test_nothing_is_found_where_there_is_nothing():
     modes = linear_modes([OMEGA], [RATIO], [[2.0]], [PARTICIPATION])
     stiffening = structure(modes, polynomial_potential({"1111": 1e9}, 1))

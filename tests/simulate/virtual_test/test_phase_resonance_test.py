@@ -71,6 +71,7 @@ def test_states_lie_inside_the_range_and_are_different(appropriation):
     np.testing.assert_array_equal(states.force, np.repeat(FORCES, 8))
 
 
+@pytest.mark.long
 def test_a_superharmonic_resonance_is_passed_over():
     # At 1.8 mN the phase comes back to 42° at 27.6 Hz, a quarter of the resonance's frequency,
     # on a branch that a sweep from 8 Hz visits.
