@@ -16,7 +16,7 @@ from snrmjax.measure.recordings.settling import (
     settled_part,
     steady_frequency,
 )
-from snrmjax.measure.recordings.steps import Step, recognise_steps
+from snrmjax.measure.recordings.steps import Step, moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import check_rate, track_tone
 from snrmjax.measure.recordings.velocity_states import (
@@ -35,6 +35,7 @@ _FEWEST_CYCLES = 10
 _HIGHEST = 3  # harmonics that are always fitted, so that they do not pass for noise
 _NEAR_TABLE = 0.5  # cycles over a step by which a table's frequency may be off
 _BEYOND = 3.0  # times the usual residual of a block: it lies across the end of a step
+_MOVES = 0.5  # of the way to the next step, within a step: a sweep in pieces
 _COVERED = 0.3  # of the time in which there is a tone, that steps cover at least
 _TRIES = 5  # starts of the part that is used
 _QUIET = 1e-3  # of the largest force: a pause
@@ -224,6 +225,12 @@ def _recognised(
             f"the record has one step only, of {long[0].frequency / _HERTZ:.6g} Hz from "
             f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
             "single tone is meant."
+        )
+    moves = moves_within_steps(long, track)
+    if moves > _MOVES:
+        raise ValueError(
+            f"the record has no steps: the tone of channel {name} moves on within them, by "
+            f"{100 * moves:.0f} % of the way to the next (a sweep? `sweep_states` reads it)."
         )
     return steps
 

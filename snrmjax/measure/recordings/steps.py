@@ -10,6 +10,7 @@ doi:10.1080/01621459.2012.737745.
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +85,22 @@ def recognise_steps(
         )
         for first, longest, last in steps
     ]
+
+
+def moves_within_steps(steps: Sequence[Step], track: ToneTrack) -> float:
+    """How far the frequency moves within a step, over its distance to the next: the median.
+
+    Next to nothing for steps. A sweep passes for steps too, where straight lines of phase fit its
+    short pieces: there it is one.
+    """
+    moves = [0.0]
+    for one, after in itertools.pairwise(steps):
+        rows = slice(*np.searchsorted(track.middle, (one.start, one.stop)))
+        if rows.stop - rows.start > 2 and after.frequency != one.frequency:
+            slope = np.polyfit(track.middle[rows], track.frequency[rows], 1)[0]
+            within = abs(slope) * (one.stop - one.start) / float(np.mean(track.frequency[rows]))
+            moves.append(within * one.frequency / abs(after.frequency - one.frequency))
+    return float(np.median(moves))
 
 
 def _deviations(values: np.ndarray, middle: np.ndarray, floor: float) -> np.ndarray:
