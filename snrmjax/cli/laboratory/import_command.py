@@ -81,6 +81,23 @@ def import_(
             rich_help_panel=_CHANNELS,
         ),
     ] = None,
+    amplitude_std: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Column of the standard deviation of each response's amplitude, in its unit "
+            "(default: by name, as R_std beside R).",
+            metavar="NAME",
+            rich_help_panel=_CHANNELS,
+        ),
+    ] = None,
+    phase_std: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Column of the standard deviation of each phase, in its unit (default: by name).",
+            metavar="NAME",
+            rich_help_panel=_CHANNELS,
+        ),
+    ] = None,
     force_phase: Annotated[
         str,
         typer.Option(
@@ -200,6 +217,8 @@ def import_(
         sensor=sensor or (),
         phase=phase or (),
         imaginary=imaginary or (),
+        amplitude_std=amplitude_std or (),
+        phase_std=phase_std or (),
         force_amplitude=force_amplitude or (),
         words={
             "force": force,

@@ -16,6 +16,8 @@ class MeasuredPart(NamedTuple):
     force: Float[np.ndarray, " state"]  # N or V
     velocity: Complex[np.ndarray, "state sensor"]  # m/s
     key: Float[np.ndarray, " state"] | None = None  # what a column or the order says of levels
+    velocity_std: Float[np.ndarray, "state sensor"] | None = None  # m/s
+    phase_std: Float[np.ndarray, "state sensor"] | None = None  # rad
 
 
 def numbered_levels(

@@ -45,7 +45,7 @@ _MEANING = {
 
 
 class ResponseMap(NamedTuple):
-    """One response: its channel or column, what it is, and where its phase stands."""
+    """One response: its channel or column, what it is, where its phase and its errors stand."""
 
     channel: str
     quantity: str = ""
@@ -53,6 +53,8 @@ class ResponseMap(NamedTuple):
     sensor: str = ""
     phase: str = ""
     imaginary: str = ""
+    amplitude_std: str = ""
+    phase_std: str = ""
 
 
 class ImportMap(NamedTuple):

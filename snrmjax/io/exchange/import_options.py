@@ -18,6 +18,8 @@ def map_of_options(
     sensor: Sequence[str],
     phase: Sequence[str],
     imaginary: Sequence[str],
+    amplitude_std: Sequence[str] = (),
+    phase_std: Sequence[str] = (),
     force_amplitude: Sequence[str],
     words: Mapping[str, str],
     over_force: bool,
@@ -43,6 +45,8 @@ def map_of_options(
         ("--sensor", "sensor", sensor),
         ("--phase", "phase", phase),
         ("--imaginary", "imaginary", imaginary),
+        ("--amplitude-std", "amplitude_std", amplitude_std),
+        ("--phase-std", "phase_std", phase_std),
     ):
         if given and len(given) != len(responses):
             raise ValueError(

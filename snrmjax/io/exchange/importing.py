@@ -164,11 +164,20 @@ def _phasors(
         measured=np.isfinite(velocity),
         sensors=[one.sensor for one in used.responses],
         drive=every if force.is_voltage else missing,
+        velocity_std=_stated([(one.velocity_std, one.velocity) for one in parts]),
+        phase_std=_stated([(one.phase_std, one.velocity) for one in parts]),
     )
     if not np.any(np.abs(velocity) > 0):
         raise ValueError(f"{chosen[0].file} has nothing but zero responses.")
     used = _filled(used._replace(level=rule), assumed)
     return Imported(states, (), used, assumed, tuple(notes))
+
+
+def _stated(errors: Sequence[tuple[np.ndarray | None, np.ndarray]]) -> np.ndarray:
+    """Standard deviations of all parts; NaN where a part states none."""
+    return np.concatenate(
+        [np.full(like.shape, np.nan) if std is None else std for std, like in errors]
+    )
 
 
 def _filled(used: ImportMap, assumed: Assumptions) -> ImportMap:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.io.exchange.import_errors import response_errors, with_errors_by_name
 from snrmjax.io.exchange.import_levels import MeasuredPart
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import (
@@ -74,12 +75,15 @@ def import_table(
         size = size * peak
     # Over the force only its amplitude counts; else phases are of one clock with the force's own.
     turn = np.abs(size) if told.over_force else peak * np.exp(-1j * np.angle(size))
-    velocity, responses = [], []
+    velocity, responses, errors = [], [], []
     for k, one in enumerate(told.responses):
-        row, filled = _response(table, one, told, omega, file, assumed, k + 1)
+        one = with_errors_by_name(table, one, assumed, k + 1)
+        row, filled, scale = _response(table, one, told, omega, file, assumed, k + 1)
         velocity.append(row * turn)
         responses.append(filled)
+        errors.append(response_errors(table, filled, told, file, np.abs(scale * turn)))
     phasors = np.stack(velocity, axis=1)
+    amplitude_std, phase_std = np.moveaxis(np.array(errors), (0, 1, 2), (2, 0, 1))
     level, key = _level(table, told, file, assumed)
     told = told._replace(responses=tuple(responses), level=level)
     good = np.isfinite(omega) & np.isfinite(size) & np.isfinite(phasors).any(axis=1)
@@ -90,7 +94,8 @@ def import_table(
         )
     _check(omega[good], np.abs(size[good]), file)
     part = MeasuredPart(
-        omega[good], np.abs(size[good]), phasors[good], None if key is None else key[good]
+        *(omega[good], np.abs(size[good]), phasors[good], None if key is None else key[good]),
+        *(amplitude_std[good], phase_std[good]),
     )
     return part, told, force, notes
 
@@ -108,8 +113,11 @@ def _response(
     file: str,
     assumed: Assumptions,
     number: int,
-) -> tuple[Complex[np.ndarray, " row"], ResponseMap]:
-    """The velocity phasors of one response (over the force where the table has it so)."""
+) -> tuple[Complex[np.ndarray, " row"], ResponseMap, Complex[np.ndarray, " row"]]:
+    """The velocity phasors of one response (over the force where the table has it so).
+
+    And the map with what was found, and what a number of the response is multiplied with.
+    """
     values = _column(table, one.channel, file, "--response")
     quantity, factor, unit = motion_meaning(
         one.quantity,
@@ -155,10 +163,8 @@ def _response(
     if not one.sensor:
         assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
-    return (
-        phasor * factor * turn,
-        ResponseMap(one.channel, quantity, one.unit, sensor, phase, imaginary),
-    )
+    filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
+    return phasor * factor * turn, filled, factor * turn
 
 
 def _partner(table: NumberTable, channel: str, role: str, told: ImportMap) -> tuple[str, str]:

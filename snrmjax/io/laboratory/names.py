@@ -9,10 +9,10 @@ _ROLES = {
     "frequency": r"f|freq\w*|frequency\w*|frequenz\w*|fr[ée]quence\w*|hz|drive_?freq\w*|"
     r"excitation_?freq\w*|f_?exc|f_?hz|omega\w*|w|frf_?freq",
     "level": r"levels?|lvl|run|stufe|niveau|setpoint|block|sweep|entry|z_axis_value",
+    "deviation": r"\w*(std|sigma|dev|deviation|uncert\w*)\w*",
     "phase": r"\w*pha(se|z)\w*|phi\w*|(\w*_)?ph|\w*_deg|theta\w*|arg\w*",
     "real": r"x|\w+[_. ](re|real|x)|re|real|(re|real)[_ ]\w+|in_?phase",
     "imaginary": r"y|\w+[_. ](im|imag|y)|im|imag|(im|imag)[_ ]\w+|quad\w*",
-    "deviation": r"\w*(std|sigma|dev|deviation|uncert\w*)\w*",
     "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal)\w*|v_?(in|out|exc)|u",
     "force": r"\w*(force|kraft|load_?cell|impedance_?head_?f)\w*|f_?n|fexc|f_?amp\w*|lc\w*",
     "coherence": r"\w*coh\w*",

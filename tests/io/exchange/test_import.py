@@ -271,3 +271,43 @@ def test_measured_tables_by_uff_and_by_matlab(tmp_path, name):
         np.testing.assert_allclose(
             np.asarray(found.velocity)[:, 0], velocity[kept], rtol=2e-15 * 8, atol=0
         )
+
+
+LOCK_IN = "f,F,R [mm/s],Theta [deg],R_std,Theta_dev\n49,1,111.8,26.565,0.5,0.2\n50,1,150,0,0.6,0.1\n"
+
+
+@pytest.mark.parametrize("asked", [(), ("--amplitude-std", "R_std", "--phase-std", "Theta_dev")])
+def test_deviations_of_a_lock_in_are_carried(tmp_path, asked):
+    """Amplitudes in mm/s rms: √2 on both; phases' errors in degrees, as the phases are."""
+    (tmp_path / "log.csv").write_text(LOCK_IN)
+    words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s"]
+    code, said = run(
+        *(tmp_path / "log.csv", *words, "--amplitude", "rms", *asked, "--out", tmp_path / "out")
+    )
+    assert code == 0, said
+    assert ("√N" in said) == (not asked)
+    data = read_steady_states(tmp_path / "out" / "measured.csv")
+    np.testing.assert_allclose(data.velocity_std[:, 0], np.sqrt(2) * np.array([5e-4, 6e-4]))
+    np.testing.assert_allclose(np.degrees(data.phase_std[:, 0]), [0.2, 0.1])
+    assert 'amplitude_std = "R_std"' in (tmp_path / "out" / "map.toml").read_text()
+    again = run(
+        *(tmp_path / "log.csv", "--map", tmp_path / "out" / "map.toml", "--out", tmp_path / "two")
+    )
+    assert again[0] == 0
+    first, second = (tmp_path / one / "measured.csv" for one in ("out", "two"))
+    assert first.read_text() == second.read_text()
+
+
+@pytest.mark.parametrize(
+    ("asked", "row", "complaint"),
+    [
+        (("--amplitude-std", "Rstd"), "", "did you mean R_std"),
+        (("--phase-std", "Theta_dev"), "51,1,100,-30,0.5,-1\n", "row 3 has -1"),
+    ],
+)
+def test_deviations_that_are_none_are_refused(tmp_path, asked, row, complaint):
+    (tmp_path / "log.csv").write_text(LOCK_IN + row)
+    words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s", *asked]
+    code, said = run(tmp_path / "log.csv", *words, "--out", tmp_path / "out")
+    assert code == 2
+    assert complaint in said
