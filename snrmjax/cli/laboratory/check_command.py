@@ -48,6 +48,9 @@ def check(
     force, drift, files of different structures, shapes of another scale, folded frequencies; each
     with its evidence and what mends it. Nothing is said where all is well.
 
+    What scales force and response alike cannot be seen: rms for peak in both, or one wrong range
+    for both, leaves their ratio right and moves all amplitudes.
+
     Writes check.json, a list that is empty when all is well; the exit code is 0 either way.
     """
     from snrmjax.doctor.check import check_test

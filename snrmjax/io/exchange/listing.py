@@ -120,6 +120,8 @@ def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
         words = (["--dataset", "responses"] if several else []) + words
     if not words and not (held.tables and is_own_table(held.tables[0])):
         return []
+    if held.responses and not held.recordings and not held.tables and _is_linear(held):
+        return _as_linear_test(files, held, words)
     line = " ".join(word if word.isupper() else shlex.quote(word) for word in words)
     open_words = [one for one in _TO_FILL_IN if one in line.replace(":", " ").split()]
     fill_in = f"fill in {', '.join(open_words)}, and " if open_words else ""
@@ -127,6 +129,42 @@ def suggested_command(paths: Sequence[Path], held: LaboratoryFile) -> list[str]:
         f"import it ({fill_in}check the guesses):",
         " ".join(f"  snrmjax import {files} {line} --out imported".split("  ")).strip(),
     ]
+
+
+def _is_linear(held: LaboratoryFile) -> bool:
+    """Whether responses look like those of an impact or a broadband test: of one level, or none."""
+    levels = {z for z in held.levels if np.isfinite(z) and z > 0}
+    spectra = any(one.quantity == "force" for each in held.responses for one in each.responses)
+    return len(levels) < 2 and not spectra
+
+
+def _as_linear_test(files: str, held: LaboratoryFile, words: list[str]) -> list[str]:
+    """Commands for frequency responses: linear modes of them, or one level of a stepped sine."""
+    driven = _at_the_force(held.responses)
+    names = list(dict.fromkeys(c.name for one in held.responses for c in one.responses))
+    named = shlex.quote(driven or (names[0] if len(names) == 1 else "SENSOR"))
+    why = "it has the force's place and axis" if driven else f"which is it, of {', '.join(names)}?"
+    sensors = [] if len(names) != 1 else ["--sensor", names[0]]
+    line = " ".join(one if one.isupper() else shlex.quote(one) for one in [*words, *sensors])
+    return [
+        "linear modes of it, as of an impact test (the sensor at the force scales the shapes; "
+        f"{why}):",
+        f"  snrmjax modes {files} --drive-point {named} --out model.toml",
+        "or, if it is one level of a stepped sine, import it under the sensor's name in the model "
+        "(fill in NEWTONS):",
+        f"  snrmjax import {files} {line} --out imported",
+    ]
+
+
+def _at_the_force(sets: Sequence[FrequencyResponses]) -> str:
+    """The response at the place and along the axis of a reference; nothing where nobody said."""
+    for one in sets:
+        for reference in one.references:
+            for response in one.responses:
+                same = response.direction.lstrip("+-") == reference.direction.lstrip("+-")
+                if reference.point and response.point == reference.point and same:
+                    return response.name
+    return ""
 
 
 def _of_record(record: TimeRecording) -> list[str]:

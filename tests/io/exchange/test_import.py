@@ -273,7 +273,9 @@ def test_measured_tables_by_uff_and_by_matlab(tmp_path, name):
         )
 
 
-LOCK_IN = "f,F,R [mm/s],Theta [deg],R_std,Theta_dev\n49,1,111.8,26.565,0.5,0.2\n50,1,150,0,0.6,0.1\n"
+LOCK_IN = (
+    "f,F,R [mm/s],Theta [deg],R_std,Theta_dev\n49,1,111.8,26.565,0.5,0.2\n50,1,150,0,0.6,0.1\n"
+)
 
 
 @pytest.mark.parametrize("asked", [(), ("--amplitude-std", "R_std", "--phase-std", "Theta_dev")])
@@ -311,3 +313,25 @@ def test_deviations_that_are_none_are_refused(tmp_path, asked, row, complaint):
     code, said = run(tmp_path / "log.csv", *words, "--out", tmp_path / "out")
     assert code == 2
     assert complaint in said
+
+
+@pytest.mark.parametrize(
+    ("points", "asked"),
+    [(("1", "7"), "--drive-point tip:1+z --out model.toml"), (("5", "7"), "--drive-point SENSOR")],
+)
+def test_responses_of_an_impact_test_point_to_modes_and_name_the_sensor(tmp_path, points, asked):
+    omega = 2 * np.pi * np.linspace(10, 200, 80)
+    channels = [
+        Channel(name, "acceleration", "m/s^2", point=point, direction="+z")
+        for name, point in zip(("tip", "root"), points, strict=True)
+    ]
+    hammer = Channel("hammer", "force", "N", point="1", direction="-z")
+    values = np.ones((2, 1, 80)) * (1 + 1j * omega)
+    write_uff(
+        tmp_path / "impact.uff", responses=[frequency_responses(omega, values, channels, [hammer])]
+    )
+    code, said = run(tmp_path / "impact.uff")
+    assert code == 0
+    assert f"snrmjax modes {tmp_path / 'impact.uff'} {asked}" in said
+    assert ("which is it, of tip:5+z, root:7+z?" in said) == (points[0] != "1")
+    assert "--force-amplitude NEWTONS" in said
