@@ -45,11 +45,12 @@ class Bench(NamedTuple):
     rate: float = 2000.0
     lines: tuple[int, int] = (60, 160)  # of the multisine, in halves of a hertz
     substeps: int = 2
+    fast: bool = False  # a loop for heavy damping, from rest at once to the largest force
 
 
 BENCHES = dict.fromkeys(STRUCTURES, Bench()) | {
-    "flat": Bench(1e-5, 10000.0, (100, 280), 4),
-    "curved": Bench(1e-7, 2000.0, (80, 200)),
+    "flat": Bench(1e-5, 10000.0, (100, 280), 4, True),
+    "curved": Bench(1e-7, 2000.0, (80, 200), fast=True),
 }
 
 
@@ -95,15 +96,20 @@ def tests(bench, noise, model, forces, true, methods, seed):
     laboratory = sj.methods.Laboratory(
         *(model, shaker, instruments, bench.rate, bench.substeps), largest_displacement=reach
     )
+    omega = float(model.modes.natural_frequency[0])
+    gains = sj.methods.LoopGains(omega / 4, omega / 20) if bench.fast else None
     voltages = np.geomspace(forces[0], largest, _LEVELS)
     if "pll" in methods:
-        yield "pll", lambda: sj.methods.phase_locked_loop(laboratory, voltages, seed=seed)
+        yield (
+            "pll",
+            lambda: sj.methods.phase_locked_loop(laboratory, voltages, gains=gains, seed=seed),
+        )
     if "cbc" in methods:
         motions = resonances(model, true, forces, _LEVELS)
         yield "cbc", lambda: continuation(laboratory, *motions, seed)
     recorded = [name for name in ("resonant_decay", "restoring_force", "ssm") if name in methods]
     if recorded:
-        decay = sj.methods.decay_test(laboratory, largest, 3.0, seed=seed)
+        decay = sj.methods.decay_test(laboratory, largest, 3.0, gains=gains, seed=seed)
         free = recording(decay.record, bench.rate, forced=False)
     if "pnlss" in methods:
         recorded.append("pnlss")

@@ -122,7 +122,7 @@ BAD = {
     "few samples": (table(**{k: v[:9] for k, v in FREE.items()}), (), "needs 16 samples"),
     "too short for a decay": (
         table(**{k: v[:200] for k, v in FREE.items()}),
-        *(("resonant_decay",), "resonant_decay needs 12 cycles, but the record has"),
+        *(("resonant_decay",), "resonant_decay needs 12 cycles, or 5 in which"),
     ),
     "clipped": (
         table(**_changed(FREE, velocity_m_s=np.clip(VELOCITY, -0.1, 0.1))),
@@ -132,7 +132,7 @@ BAD = {
     "falling time": (table(**_changed(FREE, time_s=-TIME)), (), "`time_s` must rise, but row 3"),
     "milliseconds": (
         table(**_changed(FREE, time_s=1000 * TIME)),
-        *((), "is at 0.04 Hz, but the mode of interest is at 40 Hz: is its time in seconds"),
+        *((), "is at 0.04006 Hz, but the mode of interest is at 40 Hz: is its time in seconds"),
     ),
     "too slow sampling": (
         table(**{k: v[::8] for k, v in FREE.items()}),

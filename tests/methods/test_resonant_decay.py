@@ -91,7 +91,7 @@ def test_the_bias_of_a_filter_is_estimated_and_within_the_error(softening, width
 def test_bad_records_are_refused(decay):
     time, velocity = decay
     for times, record, words in (
-        (time[:300], velocity[:300], "needs 12 cycles, but the record has"),
+        (time[:300], velocity[:300], "needs 12 cycles, or 5 in which"),
         (time, np.clip(velocity, -0.2, 0.2), "it is clipped"),
         (time[::20], velocity[::20], "samples a cycle"),
         (time**1.1, velocity, "evenly spaced"),

@@ -3,7 +3,8 @@
 In normal-form coordinates z = ρ e^{iθ} a decaying mode obeys ρ̇ = ρ α(ρ²), θ̇ = ω(ρ²), and what a
 sensor sees is a polynomial of z and its conjugate. Near-identity changes of z that keep the form
 leave one freedom, which is used up by letting ρ be the fundamental amplitude of the sensor:
-v = ρ cos θ + Σ_h Re[(c_h + d_h ρ²) ρ^h e^{ihθ}] + offset.
+v = ρ cos θ + Σ_h Re[(c_h + d_h ρ²) ρ^h e^{ihθ}] + offset + e ρ². Where the elastic force has even
+terms (an arch, a one-sided stop) the middle of the motion moves as it decays: that is e.
 
 References: S. Jain & G. Haller, Nonlinear Dyn. 107 (2022) 1417, doi:10.1007/s11071-021-06957-4
 (polar normal form); T. Breunung & G. Haller, Proc. R. Soc. A 474 (2018) 20180083,
@@ -32,7 +33,7 @@ class NormalForm(NamedTuple):
     frequency: Float[np.ndarray, " term"]  # ω likewise, rad/s
     harmonics: Complex[np.ndarray, "harmonic 2"]  # c and d of each order, m/s at ρ = scale
     orders: tuple[int, ...]
-    offset: float  # m/s
+    middle: Float[np.ndarray, "2"]  # m/s: offset, and e at ρ = scale
     scale: float  # m/s
     start: Float[np.ndarray, "2"]  # ln(ρ/scale) and phase (rad) at the record's first sample
 
@@ -77,7 +78,7 @@ def unknowns_of(form: NormalForm) -> Float[np.ndarray, " unknown"]:
     """Start, decay, frequency, harmonics (real and imaginary parts) and offset in a row."""
     parts = form.harmonics.ravel()
     return np.concatenate(
-        [form.start, form.decay, form.frequency, parts.real, parts.imag, [form.offset]]
+        [form.start, form.decay, form.frequency, parts.real, parts.imag, form.middle]
     )
 
 
@@ -86,11 +87,9 @@ def form_of(
 ) -> NormalForm:
     """A normal form from its unknowns, as `unknowns_of` puts them in a row."""
     start, decay, frequency, rest = np.split(unknowns, [2, 2 + terms, 2 + 2 * terms])
-    parts = rest[:-1].reshape(2, len(orders), 2)
+    parts = rest[:-2].reshape(2, len(orders), 2)
     harmonics = parts[0] + 1j * parts[1]
-    return NormalForm(
-        decay, frequency, harmonics, tuple(orders), float(rest[-1]), scale, np.array(start)
-    )
+    return NormalForm(decay, frequency, harmonics, tuple(orders), rest[-2:], scale, np.array(start))
 
 
 def seen(form: NormalForm, time: Float[np.ndarray, " sample"]) -> Seen:
@@ -105,9 +104,10 @@ def seen(form: NormalForm, time: Float[np.ndarray, " sample"]) -> Seen:
     ratio = np.exp(np.minimum(log_ratio, 0.5 * np.log(_LARGEST)))
     turn = np.exp(1j * phase)
     amplitude = form.scale * ratio
-    signal = amplitude * turn.real + form.offset
+    wanders = form.middle[1] * ratio**2
+    signal = amplitude * turn.real + form.middle[0] + wanders
     # Derivatives of the signal by ln ρ and by θ, harmonics included.
-    by_size, by_phase = signal - form.offset, -amplitude * turn.imag
+    by_size, by_phase = amplitude * turn.real + 2 * wanders, -amplitude * turn.imag
     linear: list[list[np.ndarray]] = [[], []]
     for order, pair in zip(form.orders, form.harmonics, strict=True):
         rotating = turn**order
@@ -125,7 +125,7 @@ def seen(form: NormalForm, time: Float[np.ndarray, " sample"]) -> Seen:
     both = by_size * size_rows + by_phase * phase_rows
     of_frequency = by_phase * slow[4 + 2 * terms :]
     columns = [both[0], by_phase, *both[1:], *of_frequency, *linear[0], *linear[1]]
-    jacobian = np.stack([*columns, np.ones_like(signal)], axis=1)
+    jacobian = np.stack([*columns, np.ones_like(signal), ratio**2], axis=1)
     return Seen(signal, jacobian, amplitude, phase)
 
 

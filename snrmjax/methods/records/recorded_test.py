@@ -98,6 +98,8 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     acting = guide is not None and bool(np.ptp(recording.values([guide], 0, _LOOKED_AT)[0]) > 0)
     fall = _fall(motion)
     if guide is None or not acting:
+        if fall.decays:
+            frequency = _of_fall(motion, fall, recording.sampling_rate)
         return _undriven(recording, channels, frequency, rest, fall, len(motion))
     free = _free_stretches(recording, guide, channels.reference)
     if sum(stop - start for start, stop in free) >= _FREE * recording.n_samples:
@@ -113,6 +115,7 @@ def recorded_test(recording: TimeRecording, modes: LinearModes) -> RecordedTest:
     if fall.decays:
         why = f"the motion decays, and {guide} is noise"
         parts = ((fall.start, len(motion)),)
+        frequency = _of_fall(motion, fall, recording.sampling_rate)
         return RecordedTest(recording, channels, RecordKind.FREE_DECAY, why, parts, frequency)
     low, high = _band(recording.values([guide], 0, _LOOKED_AT)[0], recording.sampling_rate)
     _near_the_mode(recording, low, high, rest)
@@ -267,6 +270,14 @@ def _spectrum(values: Float[np.ndarray, " sample"], rate: float) -> tuple[np.nda
 def _strongest(motion: Float[np.ndarray, " sample"], rate: float) -> float:
     omega, power = _spectrum(motion, rate)
     return float(omega[1 + int(np.argmax(power[1:]))])
+
+
+def _of_fall(motion: Float[np.ndarray, " sample"], fall: _Fall, rate: float) -> float:
+    """Strongest frequency of a decay, in rad/s: its beginning, where it is largest, counts most."""
+    falling = motion[fall.start :] - motion.mean()
+    window = np.hanning(2 * len(falling))[len(falling) :]
+    power = np.abs(np.fft.rfft(falling * window))
+    return float(_HERTZ * np.fft.rfftfreq(len(falling), 1 / rate)[1 + int(np.argmax(power[1:]))])
 
 
 def _band(force: Float[np.ndarray, " sample"], rate: float) -> tuple[float, float]:

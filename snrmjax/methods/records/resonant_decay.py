@@ -25,6 +25,9 @@ from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, meth
 Reading = Literal["peaks", "zero_crossings", "hilbert"]
 
 _FEWEST_CYCLES = 12
+_FEWEST_FALLING = 5  # cycles, of a decay to a quarter
+_QUARTER = 1.4  # of the logarithm of an amplitude
+_WINDOW = (2.5, 8.0)  # cycles that a local line spans: those of a fall to a quarter, if so many
 _FEWEST_SAMPLES = 8  # a cycle: a parabola through an extreme is then within 2 % of a cosine
 _CLIPPED = 4  # neighbouring samples at the largest value that a free decay does not have
 _EVEN = 1e-3  # largest relative deviation of a sampling interval
@@ -50,7 +53,7 @@ def resonant_decay(
     *,
     reading: Reading = "peaks",
     band: tuple[float, float] | None = None,
-    window: float = 8.0,
+    window: float | None = None,
     least_amplitude: float = 0.0,
 ) -> MethodResult:
     """Natural frequency and damping against velocity along a free decay of one mode.
@@ -58,15 +61,17 @@ def resonant_decay(
     Arguments: `time` in s, evenly spaced; `velocity` in m/s, from the moment on at which the force
     was gone; `reading` says how phase and amplitude are read; `band`, two frequencies in Hz, is
     passed by a Butterworth filter of order 4 run forwards and backwards (no phase shift; its
-    ends are cut); `window` is how many cycles a local straight line spans; the record is read down
-    to `least_amplitude` (m/s), where noise takes over.
+    ends are cut); `window` is how many cycles a local straight line spans, by default eight, or
+    those in which a heavily damped motion falls to a quarter; the record is read down to
+    `least_amplitude` (m/s), where noise takes over.
     Returns a `MethodResult` with a point every half window: the velocity is that of the peak, by
     *hilbert* and with a `band` without harmonics that of the fundamental; 1σ from how far the
     windows scatter about one another, growing as the amplitude falls. Where a line rises (the
     mode gains energy) the point is `NOT_A_MODE`. What a filter does to frequency and damping is
     estimated by filtering the decay that was read once more; a note states it, and 1σ holds it.
     Raises `ValueError` for uneven times, a rate below eight samples a cycle, fewer than twelve
-    cycles, a clipped record and numbers that are not finite.
+    cycles (five where the motion falls to a quarter), a clipped record and numbers that are not
+    finite.
     Validity: one mode, light damping, nothing driving; a filter as narrow as the frequency moves
     within its memory smooths both curves more than the note says.
     """
@@ -82,6 +87,7 @@ def resonant_decay(
     kept = trace.log_amplitude >= np.log(max(least_amplitude, np.finfo(float).tiny))
     # The first time that it falls below: what comes after is noise.
     end = len(kept) if kept.all() else int(np.argmin(kept))
+    window = _window(trace, end) if window is None else window
     lines = _local_lines(trace, end, window)
     bias = np.zeros_like(lines)
     notes = [f"read by {reading}"]
@@ -105,8 +111,7 @@ def checked_record(
     times, signal = even_record(time, velocity, method)
     signal = signal - signal.mean()
     ups = np.count_nonzero((signal[:-1] < 0) & (signal[1:] >= 0))
-    if ups < _FEWEST_CYCLES:
-        raise ValueError(f"{method} needs {_FEWEST_CYCLES} cycles, but the record has {ups}.")
+    require_cycles(signal, float(ups), method)
     if len(signal) / ups < _FEWEST_SAMPLES:
         raise ValueError(
             f"{method} needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
@@ -114,6 +119,19 @@ def checked_record(
             "`band`)."
         )
     return times, signal
+
+
+def require_cycles(signal: Float[np.ndarray, " sample"], cycles: float, method: str) -> None:
+    """Raise `ValueError` unless a record has twelve cycles, or five in which it falls enough."""
+    if cycles >= _FEWEST_CYCLES:
+        return
+    part = max(1, int(len(signal) / max(cycles, 1.0)))
+    first, last = np.abs(signal[:part]).max(), np.abs(signal[-part:]).max()
+    if cycles < _FEWEST_FALLING or last > first * np.exp(-_QUARTER):
+        raise ValueError(
+            f"{method} needs {_FEWEST_CYCLES} cycles, or {_FEWEST_FALLING} in which the motion "
+            f"falls to a quarter, but the record has {cycles:.3g}."
+        )
 
 
 def even_record(
@@ -225,6 +243,15 @@ _TRACES = {"peaks": _by_peaks, "zero_crossings": _by_zero_crossings, "hilbert": 
 _TIME, _PHASE, _LEVEL, _OMEGA, _SLOPE = range(5)
 _SWING = 5  # lines over which a filter's error swings
 _ENDS = (slice(0, 4), slice(-4, None))
+
+
+def _window(trace: _Trace, end: int) -> float:
+    """How many cycles a local line spans."""
+    last = min(end, len(trace.time)) - 1
+    fall = trace.log_amplitude[0] - trace.log_amplitude[last] if last > 0 else 0.0
+    cycles = last / trace.per_cycle
+    of_fall = _QUARTER * cycles / fall if fall > 0 else np.inf
+    return float(np.clip(min(of_fall, cycles), *_WINDOW))
 
 
 def _local_lines(trace: _Trace, end: int | None, window: float) -> Float[np.ndarray, "line 5"]:

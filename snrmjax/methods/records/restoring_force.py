@@ -2,8 +2,9 @@
 
 A mode obeys ẍ + s(x) + d(v) = |Φ_r Φᵀb| F. Acceleration and displacement follow from the measured
 velocity, and two polynomials are fitted to what is left of every sample: an elastic force over
-displacement and a damping force over velocity, both per unit of modal mass at the sensor. Harmonic
-balance of one term then gives natural frequency and damping at each amplitude.
+displacement and a damping force over velocity, both per unit of modal mass at the sensor. The
+motions of the elastic force alone, between two displacements of one potential energy, then give the
+natural frequency at each amplitude, and what the damping force takes of them the damping.
 
 References: S. F. Masri & T. K. Caughey, J. Appl. Mech. 46 (1979) 433, doi:10.1115/1.3424568;
 G. Kerschen, K. Worden, A. F. Vakakis & J. C. Golinval, Mech. Syst. Signal Process. 20 (2006) 505,
@@ -21,10 +22,14 @@ from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, meth
 from snrmjax.model.modes import LinearModes
 
 _POINTS = 25  # amplitudes at which the fitted surface is asked
-_ANGLES = 128  # of a cycle
+_ANGLES = 128  # of half a cycle
 _SPLINE = 5  # degree: velocity, its derivative and its integral from one curve
 _ENDS = 2.0  # cycles at each end that the curve's derivative is not trusted in
 _MOST = 9
+_SHIFTS = 4  # rounds in which the displacement's middle and drift are found
+_BISECTIONS = 60
+_ROUNDS = 8  # of the displacement that has a wanted velocity
+_FAR = 4.0  # times it, within which the motion turns on the other side
 
 
 class RestoringForce(NamedTuple):
@@ -63,7 +68,8 @@ def fit_restoring_force(
     Returns a `RestoringForce`. Raises `ValueError` for a record as in `resonant_decay`, for a force
     without modes and for a degree outside 1 to 9.
     Validity: one mode in the record (filter others out before), an elastic force of displacement
-    alone and a damping force of velocity alone, no offset of the displacement: it is integrated.
+    alone and a damping force of velocity alone. Where the integrated displacement has its zero,
+    and what an offset of the velocity makes of it, is fitted: the elastic force is zero at rest.
     """
     from scipy.interpolate import make_interp_spline
 
@@ -84,15 +90,21 @@ def fit_restoring_force(
     end = at[-1] if above.all() else at[int(np.argmin(above))]
     inside = (times > times[0] + _ENDS * cycle) & (times < min(end, times[-1] - _ENDS * cycle))
     used = size[(at > times[0] + _ENDS * cycle) & (at < min(end, times[-1] - _ENDS * cycle))]
-    terms = [displacement[inside] ** power for power in range(1, degree + 1)]
-    design = np.stack([*terms, *_damping_terms(speed[inside])], axis=1)
-    scale = np.sqrt(np.mean(design**2, axis=0))
-    solved, *_ = np.linalg.lstsq(design / scale, -acceleration[inside], rcond=None)
+    moved, away = displacement[inside], (times[inside] - times[inside].mean()) / cycle
+    for _ in range(_SHIFTS):
+        terms = [moved**power for power in range(1, degree + 1)]
+        shifts = [np.ones_like(moved), away]
+        design = np.stack([*terms, *_damping_terms(speed[inside]), *shifts], axis=1)
+        scale = np.sqrt(np.mean(design**2, axis=0))
+        solved, *_ = np.linalg.lstsq(design / scale, -acceleration[inside], rcond=None)
+        found = solved / scale
+        if not found[0] > 0:
+            break
+        moved = moved + (found[-2] + found[-1] * away) / found[0]
     left = design / scale @ solved + acceleration[inside]
     misfit = float(np.sqrt(np.mean(left**2) / np.mean(acceleration[inside] ** 2)))
-    found = solved / scale
     return RestoringForce(
-        found[:degree], found[degree:], float(used.min()), float(used.max()), misfit
+        found[:degree], found[degree : degree + 3], float(used.min()), float(used.max()), misfit
     )
 
 
@@ -107,8 +119,8 @@ def restoring_force(
 ) -> MethodResult:
     """Natural frequency and damping that the fitted forces imply, over the record's amplitudes.
 
-    Of a motion x = X cos θ: ω̃² = ∮ s(x) cos θ dθ / (πX), and 2ζ̃ω̃ = ∮ d(v) sin θ dθ / (πV) with
-    v = V sin θ, the mean power of one term of harmonic balance.
+    A motion of the elastic force alone has the period T = ∮ dx / v with ½v² = ∫ s dx between its
+    ends, and a fundamental velocity V; 2ζ̃ω̃ = ∮ d(v) v dt / (½ V² T), the mean power lost.
 
     Arguments and errors as in `fit_restoring_force`. Returns a `MethodResult` of 25 amplitudes,
     without 1σ, which the method does not give; its note has the misfit.
@@ -116,7 +128,7 @@ def restoring_force(
     fitted = fit_restoring_force(
         time, velocity, force, modes, degree=degree, least_amplitude=least_amplitude
     )
-    points = [_point(fitted, size) for size in _displacements(fitted)]
+    points = _points(fitted)
     note = f"the two forces leave {100 * fitted.misfit:.2g} % of the acceleration (rms)"
     return method_result("restoring_force", points, 0, (note,))
 
@@ -135,44 +147,75 @@ def _damping_terms(velocity: np.ndarray) -> list[np.ndarray]:
     return [velocity, velocity * np.abs(velocity), velocity**3]
 
 
-_ANGLE = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+_ANGLE = np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES  # of half a cycle
 
 
-def _square(fitted: RestoringForce, size: float) -> float:
-    """ω̃² at a displacement amplitude."""
-    pulled = fitted.elastic_force(size * np.cos(_ANGLE))
-    return float(2 * np.mean(pulled * np.cos(_ANGLE)) / size)
+class _Cycle(NamedTuple):
+    """A motion of the elastic force alone."""
+
+    natural: float  # rad/s
+    velocity: float  # m/s, fundamental
+    lost: float  # 2ζ̃ω̃, 1/s
 
 
-def _displacements(fitted: RestoringForce) -> Float[np.ndarray, " k"]:
-    """Displacement amplitudes that span the record's velocity amplitudes."""
-    ends = []
-    for velocity in (fitted.smallest, fitted.largest):
-        size = velocity / np.sqrt(max(fitted.elastic[0], np.finfo(float).tiny))
-        for _ in range(50):  # x = v / ω̃(x): ω̃ changes little with amplitude
-            square = _square(fitted, size)
-            if not square > 0:
+def _points(fitted: RestoringForce) -> list[MethodPoint]:
+    """Amplitudes that span those of the record."""
+    rest = np.sqrt(max(fitted.elastic[0], np.finfo(float).tiny))
+    found = []
+    for wanted in np.linspace(fitted.smallest, fitted.largest, _POINTS):
+        size, cycle = wanted / rest, None
+        for _ in range(_ROUNDS):  # the fundamental velocity is nearly in proportion to the size
+            cycle = _cycle(fitted, size)
+            if cycle is None:
                 break
-            size = velocity / np.sqrt(square)
-        ends.append(size)
-    low, high = ends
-    return np.linspace(low, high, _POINTS)
+            size *= wanted / cycle.velocity
+        if cycle is None or not cycle.lost > 0:
+            found.append(MethodPoint(MethodStatus.NOT_A_MODE, -1))
+            continue
+        found.append(
+            MethodPoint(
+                MethodStatus.FOUND,
+                -1,
+                velocity=cycle.velocity,
+                natural_frequency=cycle.natural,
+                damping_ratio=cycle.lost / (2 * cycle.natural),
+            )
+        )
+    return found
 
 
-def _point(fitted: RestoringForce, size: float) -> MethodPoint:
-    square = _square(fitted, size)
-    if not square > 0:
-        return MethodPoint(MethodStatus.NOT_A_MODE, -1)
-    natural = float(np.sqrt(square))
-    speed = natural * size
-    lost = fitted.damping_force(speed * np.sin(_ANGLE))
-    damping = float(2 * np.mean(lost * np.sin(_ANGLE)) / speed)
-    if not damping > 0:
-        return MethodPoint(MethodStatus.NOT_A_MODE, -1)
-    return MethodPoint(
-        MethodStatus.FOUND,
-        -1,
-        velocity=speed,
-        natural_frequency=natural,
-        damping_ratio=damping / (2 * natural),
-    )
+def _energy(fitted: RestoringForce, displacement: np.ndarray) -> np.ndarray:
+    """∫ s dx from rest, m²/s²."""
+    powers = np.arange(2, len(fitted.elastic) + 2)
+    return np.sum(fitted.elastic / powers * displacement[..., None] ** powers, axis=-1)
+
+
+def _cycle(fitted: RestoringForce, size: float) -> _Cycle | None:
+    """The motion from a displacement on; None where nothing turns it back."""
+    top = _energy(fitted, np.array(size))
+    grid = -size * np.linspace(0, _FAR, _ANGLES)
+    above = _energy(fitted, grid) >= top
+    if not above.any():
+        return None
+    k = int(np.argmax(above))
+    low, high = grid[k], grid[k - 1]  # energies at and above, and below
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _energy(fitted, middle) >= top else (low, middle)
+    centre, radius = (size + low) / 2, (size - low) / 2
+    x = centre + radius * np.cos(_ANGLE)
+    square = 2 * (top - _energy(fitted, x))
+    if not np.all(square > 0):
+        return None
+    speed = np.sqrt(square)
+    # Time per angle is smooth; its cosine series integrates it exactly.
+    by_angle = radius * np.sin(_ANGLE) / speed
+    period = 2 * np.pi * float(by_angle.mean())
+    order = np.arange(1, _ANGLES // 2)
+    series = 2 * np.mean(by_angle[:, None] * np.cos(np.outer(_ANGLE, order)), axis=0)
+    time = by_angle.mean() * _ANGLE + np.sin(np.outer(_ANGLE, order)) @ (series / order)
+    natural = 2 * np.pi / period
+    step = 2 * np.pi / period * by_angle  # dθ/dφ of half a cycle, whose mean over φ is 1
+    fundamental = 2 * float(np.mean(speed * np.sin(natural * time) * step))
+    power = float(np.mean(fitted.damping_force(speed) * speed * step))
+    return _Cycle(natural, fundamental, 2 * power / fundamental**2)

@@ -31,7 +31,7 @@ def ring_down_decays(
     *,
     band: tuple[float, float] | None = None,
     reading: Reading = "peaks",
-    window: float = 8.0,
+    window: float | None = None,
     least_amplitude: float | None = None,
     quiet: float = 0.05,
 ) -> tuple[MethodResult, ...]:

@@ -22,12 +22,11 @@ from numpy.polynomial import chebyshev
 from scipy.signal import decimate
 
 from snrmjax.methods.records.normal_form import NormalForm, form_of, seen, unknowns_of
-from snrmjax.methods.records.resonant_decay import even_record
+from snrmjax.methods.records.resonant_decay import even_record, require_cycles
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 from snrmjax.numerics.levenberg_marquardt import Minimum, StepRule, minimise
 
 _DELAYS = 5  # 2·2 + 1: enough for a plane, by Takens' theorem
-_FEWEST_CYCLES = 12
 _FEWEST_SAMPLES = 8  # a cycle
 _MOST_TERMS = 7  # of α and ω: polynomials of degree 13 in ρ e^{iθ}
 _ORDERS = (2, 3, 4, 5)  # harmonics in the record
@@ -130,10 +129,7 @@ def fit_submanifold(
     step = float(np.mean(np.diff(times)))
     times = times - times[0]
     hertz = _main_frequency(signal, step)
-    if hertz * times[-1] < _FEWEST_CYCLES:
-        raise ValueError(
-            f"ssm needs {_FEWEST_CYCLES} cycles, but the record has {hertz * times[-1]:.1f}."
-        )
+    require_cycles(signal, hertz * float(times[-1]), "ssm")
     if 1 / (hertz * step) < _FEWEST_SAMPLES:
         raise ValueError(
             f"ssm needs {_FEWEST_SAMPLES} samples a cycle, but the record has "
@@ -144,11 +140,7 @@ def fit_submanifold(
     size = np.abs(coordinate)
     below = np.flatnonzero(size < max(least_amplitude, 0.0))
     end = below[0] if below.size else len(size)
-    if end * step * hertz < _FEWEST_CYCLES:
-        raise ValueError(
-            f"ssm needs {_FEWEST_CYCLES} cycles above the least amplitude, but the record has "
-            f"{end * step * hertz:.1f}."
-        )
+    require_cycles(signal[:end], end * step * hertz, "ssm")
     times, signal, coordinate = times[:end], signal[:end], coordinate[:end]
     per_cycle = 1 / (hertz * step)
     orders = tuple(order for order in _ORDERS if order < per_cycle / 2)
@@ -248,7 +240,7 @@ def _started(
     target = np.stack([np.log(ratio), phase], axis=1) * ratio[:, None]
     solved = np.linalg.lstsq(design / length, target, rcond=None)[0] / length[:, None]
     none = np.zeros((len(orders), 2), dtype=complex)
-    return NormalForm(solved[1:, 0], solved[1:, 1], none, orders, 0.0, scale, solved[0])
+    return NormalForm(solved[1:, 0], solved[1:, 1], none, orders, np.zeros(2), scale, solved[0])
 
 
 def _fitted(times: np.ndarray, signal: np.ndarray, starts: list[NormalForm]) -> _Fit | None:
@@ -307,11 +299,12 @@ def _submanifold(
     size = np.linalg.norm(found.jacobian, axis=0)
     inverse = np.linalg.pinv((found.jacobian / size).T @ (found.jacobian / size), hermitian=True)
     noise = float(np.sqrt(variance))
+    first = round(1 / (hertz * float(times[1] - times[0])))  # a cycle says no more of its own fall
     return SpectralSubmanifold(
         form,
         variance * coloured * inverse / np.outer(size, size),
         float(max(found.amplitude.min(), min(noise, 0.1 * found.amplitude.max()))),
-        float(found.amplitude.max()),
+        float(found.amplitude[min(first, len(times) - 1) :].max()),
         noise,
         misfit,
         len(times),
@@ -329,7 +322,7 @@ def _curve_std(found: SpectralSubmanifold, amplitude: np.ndarray) -> Float[np.nd
     form = found.form
     point, std = unknowns_of(form), np.sqrt(np.diag(found.covariance))
     slopes = np.zeros((2, len(amplitude), len(point)))
-    for k in range(2, len(point) - 1):  # neither the start nor the offset moves the curves
+    for k in range(2, len(point) - 2):  # neither the start nor the middle moves the curves
         step = np.zeros(len(point))
         step[k] = _STEP * max(std[k], abs(point[k]), np.finfo(float).tiny)
         ends = [
