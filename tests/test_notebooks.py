@@ -16,6 +16,7 @@ LONG = (
     "05_the_papers_open_ends",
     "06_uncertain_curved_beam",
     "07_models_from_finite_elements",
+    "08_from_laboratory_files",
     "09_the_fields_other_methods",
 )  # a minute and more
 PATHS = [
