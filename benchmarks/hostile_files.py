@@ -2,8 +2,8 @@
 
 Run: python benchmarks/hostile_files.py [--runs 20000] [--seed 0] [--only KIND]
 
-Valid files of every format (UFF 58, 58b and 55, MATLAB v5 and v7.3, HDF5, netCDF, TDMS, CSV in two
-dialects) are mutated: cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts
+Valid files of every format (UFF 58, 58b and 55, MATLAB v4, v5 and v7.3, HDF5, netCDF, TDMS, CSV in
+two dialects) are mutated: cut, bits flipped, counts made huge, runs overwritten, NaN put in, parts
 doubled, text for binary, two formats spliced, gzip and zip around them, one in another. Each is
 listed, and what it holds is read and imported, in a child process whose address space may grow by
 1 GiB, with ten seconds a file; the peak of resident memory above that after the imports is
@@ -69,6 +69,8 @@ def valid_files(folder):
     kinds = [(key, object) for key in ("freq", "force", "amplitude", "phase")]
     rows = [(hertz, hertz * 0 + 0.1 * k, hertz / 80, hertz) for k in (1, 2)]
     scipy.io.savemat(folder / "b.mat", {"d": np.array(rows, dtype=kinds)}, do_compression=True)
+    old = {"freq": hertz, "H": hertz + 1j, "title": "of level 4"}
+    scipy.io.savemat(folder / "d.mat", old, format="4")
     write_netcdf(folder / "a.nc", **every, states=states)
     with h5py.File(folder / "a.h5", "w") as file:
         for key, values in zip(("freq", "F", "X", "Y"), rng.normal(size=(4, 200)), strict=True):

@@ -226,7 +226,7 @@ def _recognised(
             f"{long[0].start / recording.sampling_rate:.4g} s on: state `frequencies` where a "
             "single tone is meant."
         )
-    moves = moves_within_steps(long, track)
+    moves = moves_within_steps(long, track, recording.sampling_rate)
     if moves > _MOVES:
         raise ValueError(
             f"the record has no steps: the tone of channel {name} moves on within them, by "

@@ -87,19 +87,22 @@ def recognise_steps(
     ]
 
 
-def moves_within_steps(steps: Sequence[Step], track: ToneTrack) -> float:
-    """How far the frequency moves within a step, over its distance to the next: the median.
+def moves_within_steps(steps: Sequence[Step], track: ToneTrack, sampling_rate: float) -> float:
+    """How far the frequency moves on within a step, over its distance to the next: the median.
 
     Next to nothing for steps. A sweep passes for steps too, where straight lines of phase fit its
-    short pieces: there it is one.
+    short pieces: there it is one. The move is that of a parabola of the phase, whose noise has
+    either sign.
     """
+    phase = unwrapped_phase(track)
     moves = [0.0]
     for one, after in itertools.pairwise(steps):
         rows = slice(*np.searchsorted(track.middle, (one.start, one.stop)))
-        if rows.stop - rows.start > 2 and after.frequency != one.frequency:
-            slope = np.polyfit(track.middle[rows], track.frequency[rows], 1)[0]
-            within = abs(slope) * (one.stop - one.start) / float(np.mean(track.frequency[rows]))
-            moves.append(within * one.frequency / abs(after.frequency - one.frequency))
+        further = (after.frequency - one.frequency) / sampling_rate
+        if rows.stop - rows.start > 2 and further:
+            away = track.middle[rows] - track.middle[rows].mean()
+            bend = 2 * np.polyfit(away, phase[rows], 2)[0]
+            moves.append(bend * (after.start + after.stop - one.start - one.stop) / 2 / further)
     return float(np.median(moves))
 
 

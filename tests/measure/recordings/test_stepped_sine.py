@@ -231,3 +231,25 @@ def test_steps_are_found_in_noise_with_and_without_jumps_of_phase(hertz, dwell, 
         off = np.abs(np.asarray(found.states.frequency)[:, None] / HERTZ - hertz)
         assert np.array_equal(np.unique(off.argmin(axis=1)), np.arange(len(hertz)))
         assert off.min(axis=1).max() < 0.04 / dwell
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"), [(0.0, "does not stay at one frequency"), (0.1, "moves on within them")]
+)
+def test_a_sweep_is_no_steps_and_fine_noisy_steps_are_no_sweep(noise, words):
+    """Straight lines of phase fit a sweep piece by piece; within each piece it moves on."""
+    rng, rate = np.random.default_rng(7), 400.0
+    hertz = 10 + 0.02 * np.arange(25)  # of 30 cycles: the width of a bin is 0.3 Hz
+    held = np.concatenate([np.full(round(30 / one * rate), one) for one in hertz])
+    swept = np.geomspace(8.5, 12.0, round(90 * rate))
+    for law in (held, swept):
+        turn = HERTZ * np.cumsum(law) / rate
+        values = np.cos(turn) + noise * rng.normal(size=(2, len(turn)))
+        record = recorded(values, rate=rate)
+        if law is held:
+            found = sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
+            # Neighbours that noise joins are fewer: 24 to 25 of them, all at frequencies of steps.
+            assert len(found.status) >= 24
+        else:
+            with pytest.raises(ValueError, match=rf"{words}.*a sweep\? `sweep_states`"):
+                sj.measure.stepped_sine_states(record, "CH1", ["CH2"])
