@@ -103,16 +103,37 @@ def _force(
 
 
 class RecordMethod(NamedTuple):
-    """A method, and the kinds of record that it reads."""
+    """A method, the kinds of record that it reads, and how it reads several as one test."""
 
     run: Callable[[RecordedTest, LinearModes], list[MethodResult]]
     kinds: tuple[RecordKind, ...]
+    together: Callable[[Sequence[RecordedTest], LinearModes], list[MethodResult]] | None = None
 
 
 def _pnlss(test: RecordedTest, modes: LinearModes) -> list[MethodResult]:
+    return [_pnlss_of([test], modes)]
+
+
+def _pnlss_of(tests: Sequence[RecordedTest], modes: LinearModes) -> MethodResult:
+    records, force = [one.recording for one in tests], _force_channel(tests[0])
+    return pnlss(records, force, tests[0].channels.reference, modes)
+
+
+def _force_channel(test: RecordedTest) -> str:
     if test.channels.force is None:
         raise ValueError("the force must be known in N (force_n).")
-    return [pnlss(test.recording, test.channels.force, test.channels.reference, modes)]
+    return test.channels.force
+
+
+def _pnlss_together(tests: Sequence[RecordedTest], modes: LinearModes) -> list[MethodResult]:
+    """One model of all realisations and levels; the one next to the largest is predicted."""
+    if len({(one.channels, one.recording.sampling_rate) for one in tests}) > 1:
+        raise ValueError("records of different channels or rates are fitted one by one.")
+    force = _force_channel(tests[0])
+    size = [float(np.std(one.recording.values([force], 0, _LONGEST))) for one in tests]
+    first, second, *others = np.argsort(size)[::-1]
+    found = _pnlss_of([tests[k] for k in (first, *others, second)], modes)
+    return [_noted(found, (f"one model of {len(tests)} records",))]
 
 
 RECORD_METHODS: dict[str, RecordMethod] = {
@@ -121,7 +142,7 @@ RECORD_METHODS: dict[str, RecordMethod] = {
         _restoring_force, (RecordKind.FREE_DECAY, RecordKind.BROADBAND)
     ),
     "ssm": RecordMethod(_of_decays(ssm), (RecordKind.FREE_DECAY,)),
-    "pnlss": RecordMethod(_pnlss, (RecordKind.BROADBAND,)),
+    "pnlss": RecordMethod(_pnlss, (RecordKind.BROADBAND,), _pnlss_together),
 }
 """Methods that read time records, by name."""
 
@@ -129,7 +150,9 @@ RECORD_METHODS: dict[str, RecordMethod] = {
 def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearModes) -> Found:
     """Run one of `RECORD_METHODS` on all records of its kinds, as one result.
 
-    A record that it cannot read is named in a note, or in the reason where it can read none.
+    Where the method can, records are read as one test; where that fails a note says why, and they
+    are read one by one. A record that it cannot read is named in a note, or in the reason where it
+    can read none.
     """
     method = RECORD_METHODS[name]
     own = [one for one in tests if one.kind in method.kinds]
@@ -139,6 +162,14 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
     found: list[MethodResult] = []
     reasons: list[str] = []
     seconds = 0.0
+    apart: tuple[str, ...] = ()
+    if method.together is not None and len(own) > 1:
+        try:
+            found = method.together(own, modes)
+            seconds = sum(one.recording.duration for one in own)
+            own = []
+        except ValueError as error:
+            apart = (f"each record alone: {error}",)
     for test in own:
         try:
             if test.recording.n_samples > _LONGEST:
@@ -151,7 +182,7 @@ def run_record_method(name: str, tests: Sequence[RecordedTest], modes: LinearMod
             reasons.append(f"{named} ({test.recording.name})")
     if not found:
         return Found(None, reasons[0])
-    return Found(_joined(name, found, reasons, seconds), "")
+    return Found(_noted(_joined(name, found, reasons, seconds), apart), "")
 
 
 def _joined(

@@ -1,5 +1,7 @@
 """Nonlinear state-space models of oscillators whose mode is known without them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -9,6 +11,7 @@ import snrmjax as sj
 from snrmjax.measure import Channel, time_recording
 from snrmjax.methods.records.state_space import StateSpace, hold, modal_constant, monomials
 from snrmjax.methods.records.state_space import response as model_response
+from snrmjax.methods.records.state_space_fit import _order
 from snrmjax.methods.records.state_space_start import linear_terms, subspace_poles
 
 REST, RATIO, CUBIC, MASS = 2 * np.pi * 40.0, 0.01, 6e9, 0.5  # rad/s, 1, 1/(m² s²), kg
@@ -136,3 +139,30 @@ def test_what_cannot_be_fitted_is_refused():
         fit(record(moved), "force", "tip", skip=3)
     with pytest.raises(ValueError, match="does not have 1 oscillating modes"):
         fit(record(push), "force", "tip")
+
+
+@pytest.mark.long
+def test_realisations_and_levels_of_one_test_are_one_model():
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape], sensors=("tip",))
+    records = [multisine(rms, seed, periods=3) for rms, seed in ((0.5, 0), (0.25, 1), (0.5, 2))]
+    (result,) = sj.methods.compare_methods(records, modes, ["pnlss"]).results
+    assert "one model of 3 records" in result.notes
+    assert "of a realisation that was not fitted" in result.notes[0]
+    assert result.found.sum() == 25
+    off = np.asarray(result.natural_frequency) - backbone(np.asarray(result.velocity))
+    assert np.all(np.abs(off) < 4 * np.asarray(result.natural_frequency_std) + 3e-5 * REST)
+
+
+def test_a_model_has_two_states_for_each_mode_that_is_excited():
+    frequency = 2 * np.pi * np.array([30.0, 60.0])
+    linear = SimpleNamespace(responses=SimpleNamespace(frequency=frequency))
+    near = sj.model.linear_modes(
+        2 * np.pi * np.array([40.0, 42.0, 90.0]), 3 * [0.01], np.ones((1, 3)), np.ones(3)
+    )
+    assert _order(linear, None) == 2
+    assert _order(linear, near) == 4
+    many = sj.model.linear_modes(
+        2 * np.pi * np.linspace(40.0, 50.0, 6), 6 * [0.01], np.ones((1, 6)), np.ones(6)
+    )
+    assert _order(linear, many) == 6

@@ -35,7 +35,7 @@ def pnlss(
     motion: str,
     modes: LinearModes | None = None,
     *,
-    order: int = 2,
+    order: int | None = None,
     degrees: tuple[int, ...] = (2, 3),
     period: float | None = None,
     skip: int = 1,

@@ -54,6 +54,7 @@ _MUCH = 0.2  # of the velocity, that a fitted model may leave
 _WIDTH = 31  # lines over which the misfit's power is averaged for the weights
 _ROUNDS = 3  # of fits, each weighted by what the one before left
 _SETTLING = 12  # periods at most until a simulated record repeats itself
+_MOST_MODES = 3  # of a model
 _STRETCHES = 16  # of a period at most
 _CYCLES = 6.0  # of the mode that a stretch has at least
 
@@ -81,7 +82,7 @@ def fit_state_space(
     motion: str,
     modes: LinearModes | None = None,
     *,
-    order: int = 2,
+    order: int | None = None,
     degrees: tuple[int, ...] = (2, 3),
     period: float | None = None,
     skip: int = 1,
@@ -91,9 +92,10 @@ def fit_state_space(
     Arguments: `recordings`, one a realisation of random phases, of one rate and period; `force`
     (N) and `motion` (a velocity, or an acceleration or displacement, which are turned into
     velocities line by line) name their channels; `modes` say where the mode of interest lies, by
-    default at the highest response; `order` is the number of states, two a mode in the excited
-    band; `degrees` of the monomials; `period` in s, found where it is not stated; `skip` periods
-    at the start are left out. With two realisations or more the last is not fitted but predicted.
+    default at the highest response; `order` is the number of states, where it is not stated two for
+    each of the `modes` in the excited band, six at most; `degrees` of the monomials; `period` in s,
+    found where it is not stated; `skip` periods at the start are left out. With two realisations
+    or more the last is not fitted but predicted.
     Returns a `StateSpaceFit`. Raises `ValueError` as `multisine_responses` does, for an `order`
     that is odd or too high, for fewer than 4.5 samples a cycle, a clipped motion, where the
     records do not hold as many oscillating modes as `order` wants, and where the fitted model
@@ -103,7 +105,7 @@ def fit_state_space(
     what a higher degree would say, and with damping by v|v| its band on damping is too narrow
     (`benchmarks/methods_loops_and_decays.py`).
     """
-    if order not in (2, 4, 6):
+    if order not in (None, 2, 4, 6):
         raise ValueError(f"`order` must be 2, 4 or 6 (two states a mode), but is {order}.")
     if not degrees or not all(2 <= one <= 7 for one in degrees):
         raise ValueError(f"`degrees` must lie between 2 and 7, but are {degrees}.")
@@ -116,6 +118,7 @@ def fit_state_space(
         multisine_responses(records, force, [motion], period=period, skip=skip), channel
     )
     natural = _mode_frequency(linear, modes)
+    order = _order(linear, modes) if order is None else order
     periods = _mean_periods(records, (force, channel), linear, skip, natural)
     held_out = periods.force.shape[0] > 1
     fitted = periods._replace(
@@ -180,6 +183,15 @@ def _mode_frequency(linear: MultisineResponses, modes: LinearModes | None) -> fl
             f"{frequency[-1] / (2 * np.pi):.4g} Hz."
         )
     return natural
+
+
+def _order(linear: MultisineResponses, modes: LinearModes | None) -> int:
+    """Two states for each mode that the test excites."""
+    if modes is None:
+        return 2
+    frequency, natural = linear.responses.frequency, np.asarray(modes.natural_frequency)
+    inside = np.count_nonzero((natural >= frequency[0]) & (natural <= frequency[-1]))
+    return int(2 * np.clip(inside, 1, _MOST_MODES))
 
 
 def _mean_periods(
