@@ -72,6 +72,7 @@ SUB_ROOMS = {
     },
     "cli.laboratory": {"cli.console", "cli.options"},
     "report.laws": {"report.style", "report.html"},
+    "report.diagnosis": {"report.style", "report.html"},
     "report.uncertainty": {"report.style"},
     "report.condense": {"report.style", "report.html"},
     "report.methods": {"report.style", "report.html"},

@@ -22,6 +22,14 @@ class Amplitude(StrEnum):
     velocity = "velocity"
 
 
+class AmplitudeAxis(StrEnum):
+    """The amplitude that figures and tables show."""
+
+    velocity = "velocity"
+    displacement = "displacement"
+    acceleration = "acceleration"
+
+
 class Measure(StrEnum):
     """The amplitude of the measured motion that enters the equations."""
 
@@ -84,6 +92,13 @@ def identify(
             rich_help_panel=_PREDICTION,
         ),
     ] = 1.5,
+    axis: Annotated[
+        AmplitudeAxis,
+        typer.Option(
+            help="Amplitude that figures of backbone and damping show; displacement and "
+            "acceleration also add a column to points.csv and backbone.csv.",
+        ),
+    ] = AmplitudeAxis.velocity,
     amplitude: Annotated[
         Amplitude,
         typer.Option(
@@ -173,6 +188,7 @@ def identify(
     also prediction.csv, with a joint fit fit.json, with --next also next.csv.
     """
     from snrmjax.report import workflow
+    from snrmjax.report.sampling import SHOWN_AMPLITUDES
 
     given = {name for name in context.params if _was_given(context, name)}
     _check_options(given)
@@ -195,7 +211,8 @@ def identify(
         for note in found.notes:
             warn(note)
         files = {"data": data.name, "model": f"{structure.name} ({model.name})"}
-        workflow.write_findings(folder, found, data.stem.replace("_", " "), files)
+        shown = SHOWN_AMPLITUDES[axis.value]
+        workflow.write_findings(folder, found, data.stem.replace("_", " "), files, shown)
     for line in workflow.headline(found):
         say(line)
     say(f"written to {out}: open {out / 'report.html'}")

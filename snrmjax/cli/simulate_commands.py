@@ -193,7 +193,7 @@ def _report_truncation(curves: list[sj.simulate.ResponseCurve], harmonics: int) 
 
 
 def _report_equilibria(structure: sj.model.Structure) -> None:
-    from snrmjax.report.workflow import equilibria_notes
+    from snrmjax.report.simulation_figures import equilibria_notes
 
     for note in equilibria_notes(structure):
         warn(note)

@@ -123,8 +123,8 @@ def diagnose_model(
         found, size = _with_noise_found(predictions, misfit, search)
         noise_note = (
             f"no noise is stated: the remaining misfit ({100 * size * ASSUMED_ERROR:.2g} % of "
-            f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, so a good fit "
-            "proves nothing."
+            f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, errors of the "
+            "laws included, which the curves of a joint fit follow; so a good fit proves nothing."
         )
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
     free = locate_misfit(misfit, found.baseline)

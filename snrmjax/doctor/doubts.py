@@ -11,6 +11,8 @@ from snrmjax.doctor.modal_mass import STEEPLY, mass_findings, mass_in_words, mix
 from snrmjax.doctor.mode_checks import misread
 from snrmjax.doctor.mode_states import leading_sensor, mode_states, usable_rows
 from snrmjax.doctor.readings import agrees, best_reading
+from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -18,6 +20,7 @@ from snrmjax.model.structures import Structure
 
 _QUICK = (("1,2", "1"), ("s5", "s4"))  # families of curves, of which one is enough to be content
 _FAR_FREQUENCY, _FAR_DAMPING = 0.05, 3.0  # relative; ratio: beyond any drift of a linear test
+_BAND = 1.96  # standard deviations of a 95 % band
 _HERTZ = 2 * np.pi
 
 
@@ -141,6 +144,29 @@ def _far(points: BackbonePoints, model: Structure, lowest: str) -> tuple[str, ..
         f"mode's{lowest}. Likely a model of another mode or assembly, or a lowest level that is "
         "not small: name the mode by `mode_of_interest`, or find the linear modes of this "
         "assembly by `snrmjax modes`.",
+    )
+
+
+def linear_damping_note(fit: JointFit, model: Structure) -> tuple[str, ...]:
+    """A sentence where a joint fit and the linear test differ in damping at zero amplitude.
+
+    By more than both 95 % bands allow. Nothing where the model states no error of its damping.
+    """
+    modes = model.modes
+    one = modes.mode_of_interest
+    linear, own = float(modes.damping_ratio[one]), float(modes.damping_ratio_std[one])
+    at_rest = fitted_values(fit, displacement=np.zeros(1))
+    fitted, std = float(at_rest.damping_ratio[0]), float(at_rest.damping_ratio_std[0])
+    both = float(np.hypot(std, own))
+    if not own > 0 or not abs(fitted - linear) > _BAND * both:  # NaN says nothing
+        return ()
+    return (
+        f"at zero amplitude the fit has {100 * fitted:.4g} ± {100 * std:.2g} % of critical "
+        f"damping, the model's linear test {100 * linear:.4g} ± {100 * own:.2g} % (1σ): "
+        f"{abs(fitted - linear) / both:.2g} combined standard deviations apart. Likely the lowest "
+        "level is not small (friction and joints damp differently there), the shaker is part of "
+        "one test only, or a force or phase is off in one of them; a level below the lowest, or "
+        "`snrmjax modes` on the lowest level, tells.",
     )
 
 

@@ -71,11 +71,12 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
                     for name in ("measured", "before", "after")
                     for quantity, value in zip(
                         ("frequency_hz", "velocity_m_s", "fold_hz"),
-                        getattr(row, name),
+                        getattr(row, name)[:3],
                         strict=True,
                     )
                     if (name, quantity) != ("measured", "fold_hz")
                 },
+                "measured_jump_hz": row.measured.jump,
             }
             for row in predicted
         ],

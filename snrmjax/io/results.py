@@ -1,6 +1,7 @@
 """Results as tables and as one summary: what the commands write."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
-from snrmjax.io.files import FilePath
+from snrmjax.io.files import FilePath, write_atomically
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.signals import peak_amplitude
@@ -100,6 +101,23 @@ def write_points(path: FilePath, identification: Identification) -> None:
             "status": [PointStatus(int(s)).name.lower() for s in np.asarray(points.status)],
         },
     )
+
+
+def with_amplitude(path: FilePath, of: str, name: str, power: int) -> None:
+    """Add a column at the end of a written table: another amplitude of the motion.
+
+    Arguments: `of` is the column of the velocity (m/s) on the backbone, which times the natural
+    angular frequency to `power` is the column `name`.
+    """
+    rows = [line.split(",") for line in Path(path).read_text(encoding="utf-8").splitlines()]
+    header, *values = rows
+    speed, hertz = header.index(of), header.index("natural_frequency_hz")
+    lines = [",".join([*header, name])]
+    for row in values:
+        known = row[speed] and row[hertz]
+        number = f"{float(row[speed]) * (float(row[hertz]) * HERTZ) ** power:.12g}" if known else ""
+        lines.append(",".join([*row, number]))
+    write_atomically(path, "\n".join(lines) + "\n")
 
 
 def write_backbone(path: FilePath, identification: Identification) -> None:

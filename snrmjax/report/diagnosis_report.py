@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,7 +18,6 @@ from snrmjax.diagnose.former_answer import FormerAnswer
 from snrmjax.diagnose.held_velocity import held_curves, holds_response
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
-    PhaseResonance,
     predict_levels,
     with_resonances_checked,
 )
@@ -28,10 +27,15 @@ from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model
-from snrmjax.measure.states import SteadyStates
+from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.effect_shape import shape_of
 from snrmjax.model.effects import EFFECTS, LAWS, effect_class
 from snrmjax.model.structures import Structure
+from snrmjax.report.diagnosis.resonance_table import (
+    resonance_in_words,
+    resonance_rows,
+    velocity_unit,
+)
 from snrmjax.report.diagnosis_figures import (
     HELD_CAPTION,
     candidates_figure,
@@ -54,7 +58,7 @@ from snrmjax.report.html import (
     write_report,
 )
 from snrmjax.report.laws.drawn_laws import LAW_CAPTION, drawn_laws_figure, law_tables
-from snrmjax.report.style import PrintedFigure, Unit, unit_for, with_unit
+from snrmjax.report.style import PrintedFigure, unit_for, with_unit
 
 _SHOWN = 10  # candidates
 _LEAST_P_VALUE = 1e-12  # smaller ones are not told apart
@@ -217,7 +221,14 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
-    rows.append(("misfit of the force (rms)", misfit))
+    rows.append(("misfit of the force (rms), all that the model leaves", misfit))
+    if np.isfinite(np.asarray(relative_errors(diagnosis.data))).any():
+        rows.append(
+            (
+                "random part of it, by neighbouring states",
+                f"{_times(diagnosis.checks.noise_scale)} × noise, errors of whole levels apart",
+            )
+        )
     rows.append(("probability of this answer", in_words(diagnosis.probability)))
     for place, out in (
         ("misfit of a level between others", gap.interpolated),
@@ -233,8 +244,8 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
         pairs.append(("completed model", top.completed))
         if top.held_out:
             pairs.append((f"predicted without having seen level {top.level}", top.after))
-        unit = _velocity_unit(one for _, one in pairs)
-        text = "; ".join(f"{name}: {_resonance(one, unit)}" for name, one in pairs)
+        unit = velocity_unit(one for _, one in pairs)
+        text = "; ".join(f"{name}: {resonance_in_words(one, unit)}" for name, one in pairs)
         rows.append((f"resonance at {with_unit(top.force, 'N')}", text))
     if diagnosis.decide_by:
         rows.append(("what to measure next", _readable(diagnosis.decide_by)))
@@ -284,7 +295,7 @@ def _comparison_section(
         if any(row.held_out for row in predicted):
             header.append("predicted without having seen the level")
             caption += " The last column is of models that were fitted without that level."
-        tables.append(ReportTable(header, _resonances(predicted), caption))
+        tables.append(ReportTable(header, resonance_rows(predicted), caption))
     figures = [shown[name] for name in ("responses", "residuals") if name in shown]
     text = [_located(part, diagnosis.gap.after) for part in diagnosis.located]
     if not text:
@@ -415,38 +426,3 @@ def _located(part: Located, misfit: float = 1.0) -> str:
         how = "grows" if part.exponent > 0 else "falls"
         text += f"; the change {how} as amplitude^({power})"
     return f"{text} (by chance: {chance})."
-
-
-def _resonances(rows: Sequence[LevelResponse]) -> list[tuple[str, ...]]:
-    """The rows of the table of resonances, all velocities in one unit."""
-    each = [(row.measured, row.before, row.completed, row.after) for row in rows]
-    unit = _velocity_unit(one for four in each for one in four)
-    some_unseen = any(row.held_out for row in rows)
-    table = []
-    for row, (*seen, unseen) in zip(rows, each, strict=True):
-        texts = [_resonance(one, unit) for one in seen]
-        if some_unseen:
-            texts.append(_resonance(unseen, unit) if row.held_out else "–")
-        table.append((str(row.level), _unbroken(with_unit(row.force, "N")), *texts))
-    return table
-
-
-def _velocity_unit(resonances: Iterable[PhaseResonance]) -> Unit:
-    velocities = [one.velocity for one in resonances if np.isfinite(one.velocity)]
-    return unit_for(velocities, "m/s")
-
-
-def _resonance(one: PhaseResonance, unit: Unit) -> str:
-    if one.jump is not None:
-        low, high = (f"{end:.5g}" for end in one.jump)
-        return f"not measured: the states jump past it, {_unbroken(f'{low} → {high} Hz')}"
-    if not np.isfinite(one.frequency):
-        return "no resonance"
-    fold = f", fold at {_unbroken(f'{one.fold:.5g} Hz')}" if np.isfinite(one.fold) else ""
-    speed = _unbroken(f"{one.velocity / unit.size:.3g} {unit.name}")
-    return f"{_unbroken(f'{one.frequency:.5g} Hz')}, {speed}{fold}"
-
-
-def _unbroken(text: str) -> str:
-    """A value that keeps its unit in its line."""
-    return text.replace(" ", "\u00a0")

@@ -29,6 +29,8 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.report.sampling import (
     BAND,
+    VELOCITY,
+    ShownAmplitude,
     measured_near,
     phase_of,
     sample_backbone,
@@ -123,13 +125,14 @@ def backbone_figure(
     *,
     truth: NormalModeBranch | None = None,
     modes: LinearModes | None = None,
+    shown: ShownAmplitude = VELOCITY,
 ) -> Figure:
     """Measured steady states, the points identified from them, and the curves through these.
 
-    Three panels: velocity amplitude over velocity phase against frequency (0° at resonance), and
-    damping ratio against velocity amplitude. Error bars and bands are 95 %; axes fit the points, so
-    that a wide band may leave them. Steady states that have no place in the curves, as their
-    status says, are grey crosses.
+    Three panels: amplitude over velocity phase against frequency (0° at resonance), and damping
+    ratio against amplitude, which is that of the velocity unless `shown` says another. Error
+    bars and bands are 95 %; axes fit the points, so that a wide band may leave them. Steady states
+    that have no place in the curves, as their status says, are grey crosses.
 
     Arguments: `truth` a nonlinear mode to compare with; `modes` the linear modes, of which the
     mode of interest is marked at zero amplitude.
@@ -140,12 +143,13 @@ def backbone_figure(
     omega = np.asarray(points.frequency) / HERTZ
     natural = np.asarray(points.natural_frequency) / HERTZ
     damping = 100 * np.asarray(points.damping_ratio)
-    measured, own = np.abs(np.asarray(points.velocity)), np.asarray(points.backbone_velocity)
-    unit = unit_for([*measured[use], *own[use]], "m/s")
+    measured = shown.of(np.abs(np.asarray(points.velocity)), np.asarray(points.frequency))
+    own = shown.of(points.backbone_velocity, points.natural_frequency)
+    unit = unit_for([*measured[use], *own[use]], shown.unit)
     measured, own = measured / unit.size, own / unit.size
     top = 1.06 * np.max([*measured[use], *own[use]])
     curve = sample_backbone(backbone)
-    velocity = curve.velocity / unit.size
+    amplitude = shown.of(curve.velocity, curve.frequency * HERTZ) / unit.size
 
     figure = Figure(figsize=(PAGE, 4.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(1.8, 1.0))
@@ -163,17 +167,18 @@ def backbone_figure(
     stars(phases, natural[use], np.zeros(use.sum()), xerr=bars)
     stars(dampings, own[use], damping[use], yerr=damping_bars)
     above = {**CURVE, "zorder": 4}
-    speeds.plot(curve.frequency, velocity, color=IDENTIFIED, **above, label="identified curve")
-    dampings.plot(velocity, curve.damping, color=IDENTIFIED, **above)
+    speeds.plot(curve.frequency, amplitude, color=IDENTIFIED, **above, label="identified curve")
+    dampings.plot(amplitude, curve.damping, color=IDENTIFIED, **above)
     sides = curve.frequency - curve.frequency_error, curve.frequency + curve.frequency_error
-    speeds.fill_betweenx(velocity, *sides, color=IDENTIFIED, **FILL, label="95 % band")
+    speeds.fill_betweenx(amplitude, *sides, color=IDENTIFIED, **FILL, label="95 % band")
     sides = curve.damping - curve.damping_error, curve.damping + curve.damping_error
-    dampings.fill_between(velocity, *sides, color=IDENTIFIED, **FILL)
+    dampings.fill_between(amplitude, *sides, color=IDENTIFIED, **FILL)
     seen, seen_damping = [*omega, *curve.frequency], [*curve.damping]
     if truth is not None:
-        true_velocity = np.abs(velocity_of(truth, backbone.sensor)) / unit.size
-        inside = np.where(true_velocity <= top, truth.frequency / HERTZ, np.nan)
-        speeds.plot(inside, true_velocity, "--", color=SIMULATED, **above, label="true mode")
+        true = np.abs(velocity_of(truth, backbone.sensor))
+        true = shown.of(true, np.asarray(truth.frequency)) / unit.size
+        inside = np.where(true <= top, truth.frequency / HERTZ, np.nan)
+        speeds.plot(inside, true, "--", color=SIMULATED, **above, label="true mode")
         seen += [*inside]
     if modes is not None:
         j = modes.mode_of_interest
@@ -188,7 +193,7 @@ def backbone_figure(
     fit_axis(speeds, "x", natural[use], seen, bars)
     fit_axis(dampings, "y", damping[use], seen_damping, damping_bars)
     phase_axis(phases)
-    at, level = plain(backbone.sensor), f"Velocity amplitude ({unit.name})"
+    at, level = plain(backbone.sensor), f"{shown.name.capitalize()} amplitude ({unit.name})"
     name_axes(speeds, f"(a) amplitude at {at}", "", level)
     name_axes(phases, "(b) phase of the mode", "Frequency (Hz)", "Velocity phase (°)")
     name_axes(dampings, "(c) damping", level, "Damping ratio (% of critical)")
@@ -318,8 +323,13 @@ def force_velocity_figure(
     return figure
 
 
-def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | None = None) -> Figure:
-    """Modal damping 2ζ̃ω̃ against the velocity amplitude on the backbone, with 95 % bands.
+def modal_damping_figure(
+    series: Sequence[DampingSeries],
+    *,
+    linear: float | None = None,
+    shown: ShownAmplitude = VELOCITY,
+) -> Figure:
+    """Modal damping 2ζ̃ω̃ against an amplitude on the backbone, with 95 % bands.
 
     Constant for a structure with linear damping, whatever its stiffness does.
 
@@ -327,33 +337,35 @@ def modal_damping_figure(series: Sequence[DampingSeries], *, linear: float | Non
     Returns the figure. Raises `ValueError` when there is nothing to show.
     Reference: Kwarta & Allen, Fig. B.1.
     """
-    shown = [s for s in series if s.points is not None or s.backbone is not None]
-    if not shown:
+    drawn = [s for s in series if s.points is not None or s.backbone is not None]
+    if not drawn:
         raise ValueError("there is no damping to show: no series has points or a backbone.")
     figure, ((axes,),) = panels(COLUMN, 3.5, 1, 1)
-    curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in shown]
-    largest = [c.velocity for c in curves if c]
-    largest += [usable_damping(s.points)[0] for s in shown if s.points]
-    unit = unit_for(np.concatenate(largest), "m/s")
+    curves = [None if s.backbone is None else sample_backbone(s.backbone) for s in drawn]
+    largest = [shown.of(c.velocity, c.frequency * HERTZ) for c in curves if c]
+    largest += [usable_damping(s.points, shown)[0] for s in drawn if s.points]
+    unit = unit_for(np.concatenate(largest), shown.unit)
     dots: list[float] = []
     lines: list[float] = [] if linear is None else [linear]
-    for number, (one, curve) in enumerate(zip(shown, curves, strict=True)):
+    for number, (one, curve) in enumerate(zip(drawn, curves, strict=True)):
         colour, name = SERIES[number % len(SERIES)], plain(one.label)
         if one.points is not None:
-            velocity, damping = usable_damping(one.points)
+            amplitude, damping = usable_damping(one.points, shown)
             style = {**DOT, "color": colour, "alpha": 0.7}
-            marks(axes, velocity / unit.size, damping, style, None if curve else name)
+            marks(axes, amplitude / unit.size, damping, style, None if curve else name)
             dots += [*damping]
         if curve is not None:
-            velocity, damping = curve.velocity / unit.size, curve.modal_damping
+            damping = curve.modal_damping
+            amplitude = shown.of(curve.velocity, curve.frequency * HERTZ) / unit.size
             sides = damping - curve.modal_damping_error, damping + curve.modal_damping_error
-            axes.fill_between(velocity, *sides, color=colour, **FILL)
-            axes.plot(velocity, damping, color=colour, **CURVE, label=name)
+            axes.fill_between(amplitude, *sides, color=colour, **FILL)
+            axes.plot(amplitude, damping, color=colour, **CURVE, label=name)
             lines += [*damping]
     if linear is not None:
         axes.axhline(linear, color=SIMULATED, linestyle=":", linewidth=LINE, label="linear mode")
     axes.set_xlim(left=0.0)
     fit_axis(axes, "y", dots, lines)
-    name_axes(axes, "", f"Velocity amplitude ({unit.name})", "Modal damping 2ζω (1/s)")
+    level = f"{shown.name.capitalize()} amplitude ({unit.name})"
+    name_axes(axes, "", level, "Modal damping 2ζω (1/s)")
     legend(figure)
     return figure

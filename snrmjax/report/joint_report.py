@@ -184,9 +184,11 @@ def with_joint_fit(report: Report, fit: JointFit) -> Report:
     percent = with_error(100 * noise.scale, 100 * noise.scale_std)
     squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
     own = {
-        "noise": f"stated; the fit misses the data by {scale} times as much"
+        "noise": f"stated; states scatter about the curves by {scale} times as much, errors of "
+        "whole levels apart"
         if noise.stated
-        else f"not stated; estimated as {percent} % of the velocity",
+        else f"not stated; states scatter about the curves by {percent} % of the velocity, errors "
+        "of whole levels apart",
         "scatter from level to level": (
             f"{in_words(noise.level_std)} (1σ)" if np.any(noise.level_std > 0) else NO_SCATTER
         ),

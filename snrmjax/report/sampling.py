@@ -110,10 +110,37 @@ def velocity_of(
     return curve.velocity[:, 1, sensor_index(curve.sensors, sensor)]
 
 
-def usable_damping(points: BackbonePoints) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity on the backbone (m/s) and modal damping (1/s) of the points that curves use."""
+class ShownAmplitude(NamedTuple):
+    """The amplitude of a motion that figures and tables show."""
+
+    name: str  # "displacement"
+    unit: str  # its base unit
+    column: str  # how its columns in files end
+    power: int  # of the angular frequency, that turns a velocity into it
+
+    def of(self, velocity: np.ndarray, angular_frequency: np.ndarray) -> np.ndarray:
+        """The amplitude of velocities (m/s) at these frequencies (rad/s)."""
+        if not self.power:  # to the bit
+            return np.asarray(velocity)
+        return np.asarray(velocity) * np.asarray(angular_frequency) ** float(self.power)
+
+
+VELOCITY = ShownAmplitude("velocity", "m/s", "velocity_m_s", 0)
+SHOWN_AMPLITUDES = {
+    "velocity": VELOCITY,
+    "displacement": ShownAmplitude("displacement", "m", "displacement_m", -1),
+    "acceleration": ShownAmplitude("acceleration", "m/s²", "acceleration_m_s2", 1),
+}
+"""What figures may have as their amplitude, by name."""
+
+
+def usable_damping(
+    points: BackbonePoints, shown: ShownAmplitude = VELOCITY
+) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude on the backbone and modal damping (1/s) of the points that curves use."""
     use = np.asarray(points.usable)
-    return np.asarray(points.backbone_velocity)[use], np.asarray(points.modal_damping)[use]
+    amplitude = shown.of(points.backbone_velocity, points.natural_frequency)
+    return amplitude[use], np.asarray(points.modal_damping)[use]
 
 
 def phase_of(velocity: Any, backbone: Backbone) -> np.ndarray:

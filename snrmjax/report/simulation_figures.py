@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.signals import peak_amplitude
+from snrmjax.model.structures import Structure, equilibria
 from snrmjax.report.sampling import BAND, velocity_of
 from snrmjax.report.style import (
     BACKGROUND,
@@ -311,3 +312,19 @@ def bars_figure(orders: Sequence[int], amplitudes: np.ndarray, below: str, besid
     axes.semilogy(orders, np.maximum(good.T, 1e-300), **DOT)
     name_axes(axes, f"{len(good)} records", below, beside)
     return figure
+
+
+def equilibria_notes(model: Structure) -> list[str]:
+    """A sentence when the structure has other equilibria than rest."""
+    found = equilibria(model)
+    others = [e for e in found if np.linalg.norm(e.displacement) > 0]
+    if not others:
+        return []
+    shape = np.asarray(model.modes.mode_shape)
+    listed = ", ".join(
+        f"{'stable' if e.stable else 'unstable'} at q = "
+        f"{np.array2string(e.displacement, precision=3)}"
+        f" ({model.modes.sensors[0]} {1e3 * (shape @ e.displacement)[0]:.3g} mm)"
+        for e in others
+    )
+    return [f"the model has {len(others)} further equilibria: {listed}. Curves start from rest."]

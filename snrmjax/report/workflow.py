@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.doctor.doubts import doubt, with_doubt
+from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
 from snrmjax.identify.inference.agreement import compare_with_pointwise
 from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
@@ -36,7 +36,7 @@ from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates, check_force, check_phases
-from snrmjax.model.structures import Structure, equilibria
+from snrmjax.model.structures import Structure
 from snrmjax.report import figures as plot
 from snrmjax.report.html import Report, ReportFigure, Section, write_report
 from snrmjax.report.identification_report import ComparedResponses, identification_report
@@ -48,6 +48,7 @@ from snrmjax.report.joint_report import (
     reported_fit,
     with_joint_fit,
 )
+from snrmjax.report.sampling import VELOCITY, ShownAmplitude
 from snrmjax.report.simulation_figures import normal_mode_figure
 from snrmjax.report.style import PrintedFigure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
@@ -210,7 +211,7 @@ def identify_jointly(
     advice = next_measurements(fit, settings.further) if settings.further else None
     agreement = compare_with_pointwise(data, model, fit)
     doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
-    notes = [*doubts, *data.notes, *found.notes]
+    notes = [*doubts, *data.notes, *found.notes, *linear_damping_note(fit, model)]
     notes += agreement.notes() if agreement is not None else ()
     if fit.drive_known_only:
         place = fit.names().index("force_gain")
@@ -293,31 +294,18 @@ def headline(found: Findings) -> list[str]:
     return lines
 
 
-def equilibria_notes(model: Structure) -> list[str]:
-    """A sentence when the structure has other equilibria than rest."""
-    found = equilibria(model)
-    others = [e for e in found if np.linalg.norm(e.displacement) > 0]
-    if not others:
-        return []
-    shape = np.asarray(model.modes.mode_shape)
-    listed = ", ".join(
-        f"{'stable' if e.stable else 'unstable'} at q = "
-        f"{np.array2string(e.displacement, precision=3)}"
-        f" ({model.modes.sensors[0]} {1e3 * (shape @ e.displacement)[0]:.3g} mm)"
-        for e in others
-    )
-    return [f"the model has {len(others)} further equilibria: {listed}. Curves start from rest."]
-
-
-def identification_figures(found: Findings) -> dict[str, Figure]:
+def identification_figures(found: Findings, shown: ShownAmplitude = VELOCITY) -> dict[str, Figure]:
     """Figures of an identification by the names of their files."""
     points, backbone = found.identification.points, found.identification.fit.backbone
     modes = found.model.modes
     figures = {
-        "backbone": plot.backbone_figure(points, backbone, truth=found.truth, modes=modes),
+        "backbone": plot.backbone_figure(
+            points, backbone, truth=found.truth, modes=modes, shown=shown
+        ),
         "modal_damping": plot.modal_damping_figure(
             [plot.DampingSeries("identified", points=points, backbone=backbone)],
             linear=_linear_modal_damping(found.model),
+            shown=shown,
         ),
         "loops": plot.force_velocity_figure(
             found.data, _typical_states(found), sensor=points.sensor
@@ -400,10 +388,17 @@ def findings_report(
     return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
 
 
-def write_findings(folder: Path, found: Findings, title: str, done: dict[str, str]) -> Report:
+def write_findings(
+    folder: Path,
+    found: Findings,
+    title: str,
+    done: dict[str, str],
+    shown: ShownAmplitude = VELOCITY,
+) -> Report:
     """Write what `identify` found into a folder: tables, summary, figures and report.
 
-    Arguments: `done` says with which files. Returns the report.
+    Arguments: `done` says with which files; `shown` is the amplitude of the figures of backbone
+    and damping, of which the tables then have a column. Returns the report.
     """
     done = done | found.settings
     results.write_points(folder / "points.csv", found.identification)
@@ -419,6 +414,10 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
         fit = joint_results.summarise_fit(found.fitted.fit, banded, found.fitted.shares)
         summary["joint_fit"] = fit
         summary["agreement"] = joint_results.summarise_agreement(found.fitted.agreement)
+    for name, of in (("points", "backbone_velocity_m_s"), ("backbone", "velocity_m_s")):
+        if shown.power:
+            added = of.replace(VELOCITY.column, shown.column)
+            results.with_amplitude(folder / f"{name}.csv", of, added, shown.power)
     summary |= results.summarise(found.identification, found.values)
     summary["resonances"] = [
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
@@ -427,7 +426,7 @@ def write_findings(folder: Path, found: Findings, title: str, done: dict[str, st
     ]
     summary["notes"] = list(found.notes)
     write_summary(folder / "summary.json", summary)
-    figures = plot.save_figures(folder, identification_figures(found))
+    figures = plot.save_figures(folder, identification_figures(found, shown))
     if found.fitted is not None:
         done = done | {"curves": curves_in_words(found.fitted.fit)}
     report = findings_report(found, title, done, figures)

@@ -25,7 +25,8 @@ from snrmjax.diagnose.response_prediction import (
     with_resonances_checked,
 )
 from snrmjax.model.effects import EFFECTS, make_effect
-from snrmjax.report.diagnosis_report import _incomplete, _resonance
+from snrmjax.report.diagnosis.resonance_table import resonance_in_words
+from snrmjax.report.diagnosis_report import _incomplete
 from snrmjax.report.style import unit_for
 
 OMEGA, ZETA, SHAPE = 2 * np.pi * 50.0, 0.01, 2.0
@@ -164,7 +165,7 @@ def test_coarse_states_of_one_branch_are_no_jump():
 
 def test_a_resonance_in_a_jump_is_not_missed():
     nothing = PhaseResonance(np.nan, np.nan, jump=(61.8, 62.1))
-    assert "jump past it, 61.8" in _resonance(nothing, unit_for([1.0], "m/s"))
+    assert "jump past it, 61.8" in resonance_in_words(nothing, unit_for([1.0], "m/s"))
     row = LevelResponse(3, 1.0, nothing, nothing, nothing, False)
     answer = SimpleNamespace(force_gain=1.0)
     seen = SimpleNamespace(force_misfit=SimpleNamespace(sensor=0), answer=answer)

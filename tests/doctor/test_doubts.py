@@ -2,14 +2,16 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 import pytest
 from truths.one_mode import OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.doctor.doubts import doubt, with_doubt
+from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
 from snrmjax.measure.phase_convention import wrong_phases
 from snrmjax.report.workflow import CurveSettings, Loads, identify_by_points
 
@@ -106,6 +108,23 @@ def test_an_error_of_identification_says_why():
     told = str(with_doubt(ValueError("no points."), data, model()))
     assert told.startswith("no points. the responses are displacements")
     assert str(with_doubt(ValueError("no points."), few(), model())) == "no points."
+
+
+def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
+    """2 % and 2.2 %, each ± 0.05 %: 0.2/√(0.05² + 0.05²) = 2.8 standard deviations apart."""
+
+    def note(fitted, own):
+        at_rest = SimpleNamespace(damping_ratio=[fitted], damping_ratio_std=[5e-4])
+        monkeypatch.setattr("snrmjax.doctor.doubts.fitted_values", lambda *_, **__: at_rest)
+        linear = eqx.tree_at(lambda m: m.modes.damping_ratio_std, model(), np.array([own]))
+        return linear_damping_note(None, linear)
+
+    (said_so,) = note(0.022, 5e-4)
+    assert "2.2 ± 0.05 %" in said_so
+    assert "2 ± 0.05 %" in said_so
+    assert "2.8 combined standard deviations" in said_so
+    assert note(0.021, 5e-4) == ()
+    assert note(0.022, 0.0) == note(0.022, np.nan) == note(np.nan, 5e-4) == ()
 
 
 @pytest.mark.long

@@ -15,9 +15,11 @@ from truths.beam_forces import FORCES
 from truths.printed_page import unreadable
 
 import snrmjax as sj
+from snrmjax.io.results import with_amplitude, write_backbone
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report import figures as plot
 from snrmjax.report import style as drawing
+from snrmjax.report.sampling import SHOWN_AMPLITUDES
 from snrmjax.report.simulation_figures import normal_mode_figure, simulated_response_figure
 from snrmjax.report.style import png_bytes
 
@@ -176,6 +178,41 @@ def test_small_velocities_are_in_millimetres(identification, backbone):
     np.testing.assert_allclose(
         named(speeds, "measured").get_ydata(), 100 * np.abs(points.velocity), rtol=1e-14
     )
+
+
+@pytest.mark.parametrize(("name", "power"), [("displacement", -1), ("acceleration", 1)])
+def test_other_amplitudes_are_the_velocitys_at_each_frequency(
+    identification, backbone, name, power
+):
+    """Ω of a measured state, ω̃ on the backbone; both axes, and the modal damping's."""
+    shown = SHOWN_AMPLITUDES[name]
+    points = identification.points
+    figure = plot.backbone_figure(points, backbone, shown=shown)
+    top, _, damping = figure.axes
+    assert top.get_ylabel().startswith(f"{name.capitalize()} amplitude (")
+    assert damping.get_xlabel() == top.get_ylabel()
+    unit = {"µm": 1e-6, "mm": 1e-3, "m": 1.0, "m/s²": 1.0, "mm/s²": 1e-3, "km/s²": 1e3}
+    size = unit[top.get_ylabel().split("(")[1].rstrip(")")]
+    use = np.asarray(points.usable)
+    dots = named(top, "measured")
+    expected = np.abs(points.velocity) * np.asarray(points.frequency) ** float(power)
+    np.testing.assert_allclose(dots.get_ydata() * size, expected[use], rtol=1e-12)
+    series = [plot.DampingSeries("identified", points=points, backbone=backbone)]
+    label = plot.modal_damping_figure(series, shown=shown).axes[0].get_xlabel()
+    assert label == top.get_ylabel()
+
+
+def test_another_amplitude_is_added_to_a_table_and_nothing_else_changes(tmp_path, identification):
+    write_backbone(tmp_path / "old.csv", identification)
+    write_backbone(tmp_path / "new.csv", identification)
+    with_amplitude(tmp_path / "new.csv", "velocity_m_s", "displacement_m", -1)
+    old = (tmp_path / "old.csv").read_text().splitlines()
+    new = (tmp_path / "new.csv").read_text().splitlines()
+    assert [line.rsplit(",", 1)[0] for line in new] == old
+    rows = np.genfromtxt(tmp_path / "new.csv", delimiter=",", names=True)
+    omega = 2 * np.pi * rows["natural_frequency_hz"]
+    # 12 digits in the file
+    np.testing.assert_allclose(rows["displacement_m"] * omega, rows["velocity_m_s"], rtol=1e-11)
 
 
 def test_far_outliers_leave_the_axis_and_are_counted(identification, backbone):

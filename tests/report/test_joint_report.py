@@ -95,7 +95,7 @@ def test_a_report_of_a_joint_fit_tells_the_joint_fit(fit, free):
     assert rows["scatter from level to level"] == "1 % in gain (1σ)"
     argument = "natural frequency: displacement amplitude; damping: velocity amplitude"
     assert rows["argument of the curves"] == argument
-    assert rows["noise"].startswith("stated; the fit misses the data by")
+    assert rows["noise"].startswith("stated; states scatter about the curves by")
     assert rows["left out"] == "none"
     text = whole.sections[0].figures[0].caption + " ".join(whole.sections[1].text)
     assert "curve through the stars" not in text

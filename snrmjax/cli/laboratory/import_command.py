@@ -204,8 +204,8 @@ def import_(
     them it writes measured.csv, and map.toml with all that was stated, found and assumed, for the
     next test. Records of free decays and broadband tests are written as record.csv.
     """
+    from snrmjax.io.exchange.exports import write_import
     from snrmjax.io.exchange.import_options import map_of_options
-    from snrmjax.io.exchange.import_writing import write_import
     from snrmjax.io.exchange.importing import import_files
     from snrmjax.io.exchange.listing import listed_contents, suggested_command
     from snrmjax.io.laboratory.reading import read_laboratory_file

@@ -1,5 +1,6 @@
 """The command `test`: a folder of a laboratory's files to one report."""
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -58,10 +59,12 @@ def whole_test(
     from snrmjax.report.whole_test.stages import TestRequest, run_whole_test
 
     with staged(out) as target:
+        began = time.perf_counter()
         files = read_test_files(folder, model)
+        say(f"files: {time.perf_counter() - began:.1f} s")
         request = TestRequest(drive_point=drive_point, go_on=go_on, diagnose=diagnose)
         name = folder.resolve().name.replace("_", " ")
-        found = run_whole_test(target, files, name, request)
+        found = run_whole_test(target, files, name, request, progress=say)
     for note in found.notes:
         warn(note)
     for line in found.lines:

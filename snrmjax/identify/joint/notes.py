@@ -125,7 +125,10 @@ def notes_on_noise(
         )
     if stated and components.contradicts_downward:
         more = "" if alike else ", and the bands are wider than need be"
-        notes.append(f"residuals are only {size} times the stated noise: it is overstated{more}.")
+        notes.append(
+            f"states scatter about the curves by only {size} times the stated noise, errors of "
+            f"whole levels apart: it is overstated{more}."
+        )
     found_only = np.where(given > 0, 0.0, components.level)
     if wandering > 0:
         more = "which the stated noise does not explain"

@@ -27,6 +27,8 @@ _MEASURED = (
     *(".tdms", ".tsv", ".dat", ".asc"),
 )
 _MAP = "map.toml"
+_WRITTEN = (".txt", ".md", ".log")
+_SHOWN = 60  # lines of a text
 _OWN_COLUMNS = ({"frequency_hz", "velocity_re_m_s"}, {"frequency_hz", "velocity_m_s", "level"})
 
 
@@ -37,6 +39,11 @@ class NamedStates(NamedTuple):
     states: SteadyStates
     table: Path | None = None
 
+    @property
+    def names_no_sensor(self) -> bool:
+        """Whether the file does not say which sensor it is of."""
+        return self.states.sensors == UNNAMED_SENSOR
+
     def of_model(self, model: Structure) -> SteadyStates:
         """The same with the sensors of the model.
 
@@ -44,7 +51,7 @@ class NamedStates(NamedTuple):
         """
         if self.table is not None:
             return read_steady_states(self.table, model)
-        if self.states.sensors == UNNAMED_SENSOR and len(model.modes.sensors) == 1:
+        if self.names_no_sensor and len(model.modes.sensors) == 1:
             return dataclasses.replace(self.states, sensors=model.modes.sensors)
         if self.states.sensors != model.modes.sensors:
             raise ValueError(
@@ -78,6 +85,7 @@ class TestFiles(NamedTuple):
     records: tuple[NamedRecord, ...]
     passed: tuple[tuple[str, str], ...]  # file and why nothing was measured in it
     notes: tuple[str, ...]  # what was assumed of a file
+    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()  # file and lines of what people wrote
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Each file, and what was found in it."""
@@ -116,10 +124,12 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
     responses: list[NamedResponses] = []
     records: list[NamedRecord] = []
     passed: list[tuple[str, str]] = []
+    texts: list[tuple[str, tuple[str, ...]]] = []
     for path in files:
         suffix = path.suffix.lower()
         if suffix == ".toml" and path.name == map_name:
             passed.append((path.name, "how files are imported"))
+            texts.append((path.name, _said_of_map(path)))
         elif suffix == ".toml":
             if not _is_model(path):
                 passed.append((path.name, "not used: it has no [[mode]]"))
@@ -127,6 +137,9 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
                 models.append(path)
             elif path.resolve() != model.resolve():
                 passed.append((path.name, f"not used: the model is {model.name}"))
+        elif suffix in _WRITTEN and _readable(path):
+            passed.append((path.name, "not used: a text of the laboratory, shown below"))
+            texts.append((path.name, _lines(path)))
         elif suffix not in _MEASURED:
             passed.append((path.name, "not used: no file of measurements, by its ending"))
         elif suffix == ".csv" and _is_own(path):
@@ -162,7 +175,31 @@ def read_test_files(folder: Path, model: Path | None = None) -> TestFiles:
         read_model(models[0]) if models else None,
         models[0].name if models else "",
         *(tuple(states), tuple(responses), tuple(records), tuple(passed), tuple(notes)),
+        tuple((name, lines) for name, lines in texts if lines),
     )
+
+
+def _readable(path: Path) -> bool:
+    """Whether a file is text."""
+    return b"\0" not in path.read_bytes()[:4096]
+
+
+def _lines(path: Path) -> tuple[str, ...]:
+    """The first lines of a text, and how many follow."""
+    lines = [line.rstrip() for line in path.read_text("utf-8", errors="replace").splitlines()]
+    lines = [line for line in lines if line]
+    further = len(lines) - _SHOWN
+    return (*lines[:_SHOWN], *([f"… {further} further lines"] if further > 0 else []))
+
+
+def _said_of_map(path: Path) -> tuple[str, ...]:
+    """What a map says was assumed or noted when it was written: its keys with these comments."""
+    found = []
+    for line in read_text(path).splitlines():
+        key, _, comment = line.partition("#")
+        if comment.strip().startswith(("assumed:", "note:")):
+            found.append(" – ".join(filter(None, (key.strip(), comment.strip()))))
+    return tuple(found)
 
 
 def _is_model(path: Path) -> bool:

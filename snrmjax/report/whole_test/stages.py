@@ -1,6 +1,7 @@
 """The stages of a test: linear modes, states of records, identification, diagnosis; one report."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from snrmjax.io.models import read_model
 from snrmjax.io.tables import write_steady_states
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
-from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates, join_steady_states
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
@@ -80,16 +81,25 @@ class _Steps(NamedTuple):
     note: str
 
 
-def run_whole_test(folder: Path, files: TestFiles, name: str, request: TestRequest) -> WholeTest:
+def run_whole_test(
+    folder: Path,
+    files: TestFiles,
+    name: str,
+    request: TestRequest,
+    progress: Callable[[str], None] = lambda _: None,
+) -> WholeTest:
     """Check, find linear modes, identify and diagnose a test, and write all of it into a folder.
 
     Writes model.toml and modes.csv where the linear modes were found here, measured.csv (all
     steady states), check.json, report.html, and what `identify` and `diagnose` write into folders
     of these names.
+    Arguments: `progress` is told each stage when it ends, with its seconds.
     Raises `ValueError`, as a question, where it would have to guess: which sensor is at the force,
     or whether to go on in spite of what the check found; and as its stages do.
     """
+    stage = _Stages(progress)
     modes = _linear_model(folder, files, request)
+    stage.ends("linear modes")
     sorted_records = [_sorted(one, modes.model) for one in files.records]
     steps = [
         _steps(named, one)
@@ -104,10 +114,12 @@ def run_whole_test(folder: Path, files: TestFiles, name: str, request: TestReque
             "all that it tells, as `snrmjax modes` writes them."
         )
     data = join_steady_states(parts)
+    stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
     _stop_at_errors(checkup, request)
     write_steady_states(folder / "measured.csv", data)
     write_checkup(folder / "check.json", checkup)
+    stage.ends("check")
     findings, why = _identified(data, modes.model)
     (folder / "identify").mkdir()
     found = write_findings(
@@ -119,13 +131,16 @@ def run_whole_test(folder: Path, files: TestFiles, name: str, request: TestReque
     folded: list[FoldedRecord | None] = [None] * sum(one.n_states for one in tables)
     folded += [shown for one in steps for shown in one.folded]
     live = state_explorer(data, findings.identification, folded if steps else ())
+    stage.ends("backbone and damping")
     diagnosis, diagnosed = None, None
     if request.diagnose:
         (folder / "diagnose").mkdir()
         diagnosis, diagnosed = write_diagnosis(
             folder / "diagnose", "measured", modes.model, data, simulate=True
         )
-    notes = (*files.notes, *(one.note for one in steps), *why)
+        stage.ends("diagnosis")
+    unnamed = _taken_sensors(files, modes.model)
+    notes = (*files.notes, *unnamed, *(one.note for one in steps), *why)
     sorted_in_words = [
         (named.file, f"{one.kind.value}: {one.why}")
         for named, one in zip(files.records, sorted_records, strict=True)
@@ -145,9 +160,43 @@ def run_whole_test(folder: Path, files: TestFiles, name: str, request: TestReque
         live,
         [("Linear modes", modes.report), ("Backbone", found), ("Diagnosis", diagnosed)],
         notes,
-        lines,
+        _result(checkup, found, diagnosis),
     )
+    stage.ends("report")
     return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
+
+
+class _Stages:
+    """Tells each stage with its seconds."""
+
+    def __init__(self, progress: Callable[[str], None]) -> None:
+        self.progress, self.began = progress, time.perf_counter()
+
+    def ends(self, name: str) -> None:
+        """One stage ended, and the next one begins."""
+        now = time.perf_counter()
+        self.progress(f"{name}: {now - self.began:.1f} s")
+        self.began = now
+
+
+def _taken_sensors(files: TestFiles, model: Structure) -> tuple[str, ...]:
+    """That files without a name of a sensor were taken for the model's only one."""
+    names = [one.file for one in files.states if one.names_no_sensor]
+    if not names or model.modes.sensors == UNNAMED_SENSOR:
+        return ()
+    verb = "names" if len(names) == 1 else "name"
+    return (
+        f"the file{'s' if len(names) > 1 else ''} {', '.join(names)} {verb} no sensor: taken for "
+        f"the model's only one, {model.modes.sensors[0]}. A column `sensor`, or `--sensor` of the "
+        "import, states it.",
+    )
+
+
+def _result(checkup: Checkup, found: Report, diagnosis: Diagnosis | None) -> str:
+    """Check, backbone and diagnosis in a sentence each; their numbers are in the summary."""
+    told = [f"{_check_sentence(checkup).capitalize()}.", found.result]
+    told += [] if diagnosis is None else [readable_verdict(diagnosis)]
+    return " ".join(one for one in told if one)
 
 
 def _linear_model(folder: Path, files: TestFiles, request: TestRequest) -> _Modes:
@@ -264,16 +313,25 @@ def _write_whole_report(
     live: LiveFigures,
     stages: Sequence[tuple[str, Report | None]],
     notes: Sequence[str],
-    lines: Sequence[str],
+    result: str,
 ) -> None:
     """One page: files, check, all states to look at, then the stages' own sections."""
     told = [(stage, report) for stage, report in stages if report is not None]
-    summary = [row for _, report in told for row in report.summary]
+    rows = [(stage, row) for stage, report in told for row in report.summary]
+    if told[0][0] == "Linear modes":  # which has the linear mode with its errors already
+        rows = [(stage, row) for stage, row in rows if row[0] != "linear mode"]
+    summary = list(dict.fromkeys(row for _, row in rows))
     sections = [
         Section(
             "Files",
             [f"{file}: {words}." for file, words in sorted_records],
-            tables=[ReportTable(("file", "what was found in it"), list(files.rows()))],
+            tables=[
+                ReportTable(("file", "what was found in it"), list(files.rows())),
+                *(
+                    ReportTable((file,), [(line,) for line in lines], _caption(file))
+                    for file, lines in files.texts
+                ),
+            ],
         ),
         _check_section(checkup),
         Section(
@@ -285,18 +343,28 @@ def _write_whole_report(
             one._replace(heading=f"{stage}: {one.heading[0].lower()}{one.heading[1:]}")
             for one in report.sections
         ]
-    every = [f"{stage}: {note}" for stage, report in told for note in report.notes]
+    first: dict[str, str] = {}  # each note once, of the stage that said it first
+    for stage, report in told:
+        for note in report.notes:
+            first.setdefault(note, stage)
+    every = [f"{stage}: {note}" for note, stage in first.items() if note not in notes]
     write_report(
         folder / "report.html",
         Report(
             title=f"Test: {name}",
             done=[("program", f"snrmjax {version('snrmjax')}")],
-            result=". ".join(line.rstrip(".") for line in lines) + ".",
+            result=result,
             summary=summary,
             notes=[*notes, *every],
             sections=sections,
         ),
     )
+
+
+def _caption(file: str) -> str:
+    if file.endswith(".toml"):
+        return f"What {file} says was assumed or noted when the files were first imported."
+    return f"{file}, as it lies in the folder: read by nobody but you."
 
 
 def _check_section(checkup: Checkup) -> Section:

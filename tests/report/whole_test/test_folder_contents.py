@@ -81,6 +81,22 @@ def test_a_map_beside_a_table_of_other_names_is_used(tmp_path):
     )
 
 
+def test_what_people_wrote_and_a_map_assumed_is_kept_for_the_report(folder):
+    (folder / "technician.txt").write_text("sensor glued anew\n\n" + 70 * "x\n")
+    (folder / "map.toml").write_text(
+        '# note: 2 rows are incomplete.\nforce = "F"  # channel of the force\n'
+        'phase_sign = "lead"  # assumed: lead: ahead (lead: ahead)\n'
+    )
+    (folder / "sines.mat").unlink()  # of which the map would have to say more
+    texts = dict(read_test_files(folder).texts)
+    assert texts["notes.txt"] == ("warm day",)
+    assert texts["technician.txt"][0] == "sensor glued anew"
+    assert texts["technician.txt"][-1] == "… 11 further lines"
+    first, second = texts["map.toml"]
+    assert first == "note: 2 rows are incomplete."
+    assert second.startswith('phase_sign = "lead" – assumed: lead: ahead')
+
+
 def broken(folder, name, content=b"\0garbage"):
     (folder / name).write_bytes(content)
 

@@ -1,6 +1,7 @@
 """From a folder to one report: questions on the way, and the whole chain on known truth."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,9 +9,19 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
+from snrmjax.doctor import Checkup
 from snrmjax.io.exchange.exports import write_matlab
 from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, frequency_responses, time_recording
+from snrmjax.report.html import LiveFigures, Report
+from snrmjax.report.whole_test import folder_contents
+from snrmjax.report.whole_test.folder_contents import read_test_files
+from snrmjax.report.whole_test.stages import (
+    _result,
+    _Stages,
+    _taken_sensors,
+    _write_whole_report,
+)
 
 HERTZ = 2 * np.pi
 OWN, RATIO = 50 * HERTZ, 0.01
@@ -66,6 +77,47 @@ def test_what_the_check_finds_is_a_question(tmp_path):
     assert "is this meant? conjugated response" in str(done.exception)
     assert "--go-on" in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_without_a_sensor_is_said_to_be_the_models_only_one(tmp_path):
+    (tmp_path / "model.toml").write_text(
+        'name = "one"\n[[mode]]\nfrequency_hz = 50.0\ndamping_ratio = 0.01\n'
+        "shape = { tip = 1.0 }\nparticipation = 1.0\n"
+    )
+    write_states(tmp_path / "states.csv")
+    files = read_test_files(tmp_path)
+    (note,) = _taken_sensors(files, files.model)
+    assert "states.csv names no sensor: taken for the model's only one, tip" in note
+    lines = (tmp_path / "states.csv").read_text().splitlines()
+    named = [f"{one},{'tip' if k else 'sensor'}" for k, one in enumerate(lines)]
+    (tmp_path / "states.csv").write_text("\n".join(named) + "\n")
+    assert _taken_sensors(read_test_files(tmp_path), files.model) == ()
+
+
+def test_a_page_says_things_once_and_shows_what_people_wrote(tmp_path):
+    texts = (("technician.txt", ("glued anew",)), ("map.toml", ('phase_sign = "lead"',)))
+    files = folder_contents.TestFiles(None, "", (), (), (), (), (), texts)
+    modes = Report("m", summary=[("mode 1", "50 Hz ± 0.01 Hz")], notes=["warm."])
+    rows = [("linear mode", "50 Hz"), ("noise", "stated")]
+    found = Report("b", summary=rows, notes=["warm.", "cold."], result="It rises.")
+    stages = [("Linear modes", modes), ("Backbone", found), ("Diagnosis", None)]
+    said = _result(Checkup(), found, None)
+    assert said == "Check: nothing found. It rises."
+    live = LiveFigures("", "")
+    _write_whole_report(tmp_path, "t", files, [], Checkup(), live, stages, ["a note."], said)
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("arm.") == page.count("old.") == 1
+    assert "linear mode" not in page
+    assert "glued anew" in page
+    assert "phase_sign" in page
+
+
+def test_each_stage_is_told_with_its_seconds():
+    told = []
+    stage = _Stages(told.append)
+    stage.ends("check")
+    stage.ends("diagnosis")
+    assert [re.fullmatch(r"(\w+): \d+\.\d s", one)[1] for one in told] == ["check", "diagnosis"]
 
 
 def duffing_record(force, rng):
