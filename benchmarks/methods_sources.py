@@ -1,28 +1,46 @@
 """Each method against its own source: data, claims or formulas that its authors published.
 
-Run: python benchmarks/methods_sources.py [--pff FOLDER]
+Run: python benchmarks/methods_sources.py [--pff FOLDER] [--pyvib FOLDER] [--nltest FOLDER]
+         [--only METHOD ...]
 
-`FOLDER` is a copy of github.com/JustinPorter88/pff-analysis, whose measured decay and 600-point
-result of the authors' MATLAB program are read where they lie (they are not part of this project).
-One JSON line a method, `kind` says what it was held against:
+The folders are copies of github.com/JustinPorter88/pff-analysis, github.com/pawsen/pyvib and
+github.com/maltekrack/NLtest, whose programs and data are used where they lie (they are not part of
+this project); NLtest needs Octave. pyvib takes a quarter of an hour. One JSON line a method, `kind`
+says what it was held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run
   beside, and the stored result of their MATLAB program, which are also held against each other);
 - own_claim: a figure that the source's text states, in the virtual laboratory;
 - public_example: an example with numbers that others published for the method;
+- independent_program: a program of others, run on the same data;
 - own_formula: the source's formula, written out here a second time, on the same data;
 - physics_only: no numbers of the source could be had; the method's central claim against harmonic
   balance, which it does not use.
+
+What could not be had: the worked examples of Arslan, Aykan & Özgüven (2011) and of Özer, Özgüven &
+Royston (2009), the structures of Karaağaçlı & Özgüven (2020, 2021), and the example of Carrella &
+Ewins (2011) — abstracts alone, without coefficients or tables; the record of the Silverbox, for
+which Paduart et al. (2010) state 0.26 mV (rms) of a polynomial state-space model: no package has it
+in itself; the response-controlled tests of the Tribomechadynamics challenge that NLtest works on
+(40 GB, not in its repository).
 """
 
 import argparse
 import importlib.util
 import json
+import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 
+import methods_state_space
 import numpy as np
+from contourpy import contour_generator
+from scipy.integrate import solve_ivp
+from scipy.linalg import eigh
 
 import snrmjax as sj
+from snrmjax.methods.one_sensor import sensor_states
 
 HERTZ = 2 * np.pi
 REST, RATIO, MASS, CUBIC = 40 * HERTZ, 0.01, 0.8, 3e9  # cubic per modal mass, 1/(m² s²)
@@ -177,7 +195,7 @@ def held_displacements(model, sizes, frequencies=None):
     return sj.measure.join_steady_states(tables)
 
 
-def response_controlled() -> None:
+def response_controlled(nltest: Path | None) -> None:
     """Modal analysis of held levels: the line of inverse receptance beside a circle fit."""
     model, sizes = duffing(), np.array([4e-4, 8e-4, 1.2e-3, 1.6e-3])
     data = held_displacements(model, sizes)
@@ -199,6 +217,62 @@ def response_controlled() -> None:
         circle_damping_error_max=float(np.abs(ratios * true / (RATIO * REST) - 1).max()),
         damping_difference_max=float(np.abs(ours / ratios - 1).max()),
     )
+    source = "NLtest (github.com/maltekrack/NLtest), circleFit.m, run under Octave"
+    octave = shutil.which("octave-cli") or shutil.which("octave")
+    if nltest is None or octave is None:
+        why = "--nltest FOLDER is missing" if nltest is None else "Octave is not installed"
+        tell("rct", "independent_program", source, not_run=why)
+        return
+    theirs = np.array(
+        [_their_circle(octave, nltest, data, level) for level in np.asarray(found.level)[good]]
+    )
+    # Theirs answers with the frequency of the state next to resonance: to the test's step at best.
+    middle = theirs[:, 0] * HERTZ
+    tell(
+        *("rct", "independent_program", source),
+        levels=len(theirs),
+        step_of_frequency=float(np.ptp(np.asarray(data.frequency)[:13]) / 12 / REST),
+        frequency_difference_max=float(
+            np.abs(np.asarray(found.natural_frequency)[good] / middle - 1).max()
+        ),
+        damping_difference_by_level=np.abs(ours / theirs[:, 1] - 1).tolist(),
+        their_damping_error_max=float(np.abs(theirs[:, 1] * true / (RATIO * REST) - 1).max()),
+        their_damping_std_by_level=(theirs[:, 2] / theirs[:, 1]).tolist(),
+    )
+
+
+def _their_circle(octave: str, folder: Path, data, level: int) -> tuple[float, float, float]:
+    """Frequency (Hz), damping ratio and its scatter by NLtest's `circleFit`.
+
+    It takes states from high to low frequency, a positive damping ratio coming out that way, and
+    phases within 90° of resonance as seen from the middle of the circle; as in its own scripts
+    states are left out whose displacement is 2 % off. `combvec` is of a toolbox that Octave does
+    not have.
+    """
+    rows = np.flatnonzero(np.asarray(data.level) == level)
+    omega = np.asarray(data.frequency)[rows]
+    velocity = np.asarray(data.velocity)[rows, 0]
+    receptance = velocity / (1j * omega) / np.asarray(data.force)[rows]
+    size = np.abs(velocity) / omega
+    kept = np.abs(np.angle(velocity)) < np.pi / 4
+    kept &= np.abs(size / np.median(size) - 1) < 0.02
+    order = np.flatnonzero(kept)[np.argsort(-omega[kept])]
+    table = np.stack([omega / HERTZ, receptance.real, receptance.imag], axis=1)[order]
+    with tempfile.TemporaryDirectory() as place:
+        np.savetxt(Path(place) / "states.txt", table, fmt="%.17g")
+        Path(place, "combvec.m").write_text(
+            "function c = combvec(a, b)\n[x, y] = meshgrid(a, b);\nc = [x(:)'; y(:)'];\nend\n"
+        )
+        script = (
+            f"addpath('{folder / 'SRC'}'); t = load('states.txt');"
+            "[f, d, s] = circleFit(t(:, 1), t(:, 2) + 1i * t(:, 3)); printf('%.17g\\n', f, d, s);"
+        )
+        said = subprocess.run(
+            *([octave, "--no-gui", "--quiet", "--eval", script],),
+            **{"cwd": place, "capture_output": True, "text": True, "check": True},
+        )
+    frequency, ratio, scatter = (float(one) for one in said.stdout.split())
+    return frequency, ratio, scatter
 
 
 def harmonic_force_surface() -> None:
@@ -206,7 +280,8 @@ def harmonic_force_surface() -> None:
     model, force = duffing(), 1.5
     frequencies = HERTZ * np.linspace(39.4, 42.2, 29)
     data = held_displacements(model, np.linspace(2e-4, 1.6e-3, 9), frequencies)
-    omega, cut = sj.methods.force_surface(data, model.modes).cut(force)
+    surface = sj.methods.force_surface(data, model.modes)
+    omega, cut = surface.cut(force)
     (exact,) = sj.forced_response(model, [force], 38 * HERTZ, 43 * HERTZ)
     height = np.abs(exact.velocity[:, 1, 0]) / exact.frequency
     # The exact curve at each point's frequency: the branch that is nearest.
@@ -227,6 +302,29 @@ def harmonic_force_surface() -> None:
         amplitude_error_median=float(np.median(distance)),
         amplitude_error_max=float(np.max(distance)),
     )
+    # Frequencies in half-power widths, amplitudes in that of the peak: distances from the line.
+    unit = np.array([2 * RATIO * REST, height.max()])
+    drawn = contour_generator(surface.frequency, surface.amplitude, np.abs(surface.force))
+    lines = [one / unit for one in drawn.lines(force)]
+    apart = [min(_distance(at, line) for line in lines) for at in np.stack([omega, cut], 1) / unit]
+    tell(
+        *("harmonic_force_surface", "independent_program"),
+        "ContourPy: contour lines of the sizes of the forces, on the same levels; distances in "
+        "half-power widths and peak heights",
+        points=len(cut),
+        distance_median=float(np.median(apart)),
+        distance_max=float(np.max(apart)),
+        peak_from_exact=float(cut.max() / height.max() - 1),
+        their_peak_from_exact=float(max(one[:, 1].max() for one in lines) - 1),
+    )
+
+
+def _distance(point: np.ndarray, line: np.ndarray) -> float:
+    """From a point to a line of straight pieces."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    share = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
+    nearest = start + np.clip(share, 0, 1)[:, None] * along
+    return float(np.hypot(*(nearest - point).T).min())
 
 
 def _circle(data, level: int) -> float:
@@ -298,17 +396,118 @@ def concerto() -> None:
     )
 
 
+def spring_in_a_chain() -> None:
+    """Four masses with a cubic spring from the last to the ground, by time integration.
+
+    The source's step is written out in matrices: N = F − Z X from the motion of all masses, where
+    snrmjax has modes and one sensor; and the mode from the matrices with N/X added. What the
+    coefficient is off is the describing function's own: it has no third harmonic, here near the
+    second mode.
+    """
+    count, tip, cubic = 4, 3, 2e9  # N/m³
+    stiffness = 1e6 * (2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
+    stiffness[tip, tip] = 1e6
+    mass = np.diag([1.0, 1.2, 0.9, 1.1])
+    squares, shapes = eigh(stiffness, mass)
+    ratios = np.array([0.02, 0.015, 0.01, 0.01])
+    damping = mass @ shapes @ np.diag(2 * ratios * np.sqrt(squares)) @ shapes.T @ mass
+    states = [
+        (level, omega, force, _steady_motion(stiffness, damping, mass, cubic, force, omega))
+        for level, force in ((1, 60.0), (2, 120.0))
+        for omega in np.sqrt(squares[0]) * np.array([0.93, 0.98, 1.02, 1.06, 1.12])
+    ]
+    level, omega, force, motion = (np.array(one) for one in zip(*states, strict=True))
+    names = tuple(f"mass {k + 1}" for k in range(count))
+    modes = sj.model.linear_modes(np.sqrt(squares), ratios, shapes, shapes[0], sensors=names)
+    data = sj.measure.steady_states(
+        *(level, omega, force, 1j * omega[:, None] * motion), sensors=names
+    )
+    v = sj.methods.describing_function(sensor_states(data, modes, "arslan_ozguven"), modes)
+    theirs, elsewhere, mode = [], [], []
+    end = np.eye(count)[tip]
+    for at, push, moved in zip(omega, force, motion, strict=True):
+        dynamic = stiffness - at**2 * mass + 1j * at * damping
+        pull = push * np.eye(count)[0] - dynamic @ moved
+        theirs.append(pull[tip] / moved[tip])
+        elsewhere.append(np.abs(pull[:tip]).max() / np.abs(pull[tip]))
+        added = stiffness + theirs[-1].real * np.outer(end, end)
+        found, shape = (one[..., 0] for one in eigh(added, mass))
+        loss = shape @ damping @ shape + theirs[-1].imag / at * shape[tip] ** 2
+        mode.append((np.sqrt(found), loss / (2 * np.sqrt(found))))
+    theirs, mode, size = np.array(theirs), np.array(mode), np.abs(motion[:, tip])
+    mode = mode[np.argsort(mode[:, 0] * size)]  # as snrmjax's answers: by velocity
+    result = sj.methods.arslan_ozguven(data, modes)
+    ours = np.stack([result.natural_frequency, result.damping_ratio], axis=1)
+    apart = np.abs(ours / mode - 1).max(axis=0)
+    fitted = [float(np.sum(one.real * size**2) / np.sum(0.75 * size**4)) for one in (v, theirs)]
+    tell(
+        *("arslan_ozguven", "own_formula"),
+        "Arslan, Aykan & Özgüven, Mech. Syst. Signal Process. 25 (2011) 1112, "
+        "doi:10.1016/j.ymssp.2010.10.010: nonlinearity matrix and describing function, written out "
+        "here in matrices (their examples' numbers were not found)",
+        states=int(np.sum(result.found)),
+        of=len(omega),
+        largest_shift=float(mode[:, 0].max() / np.sqrt(squares[0]) - 1),
+        describing_function_difference_max=float(np.abs(v - theirs).max() / np.abs(theirs).max()),
+        frequency_difference_max=float(apart[0]),
+        damping_difference_max=float(apart[1]),
+        force_elsewhere_max=float(np.max(elsewhere)),
+        cubic_coefficient_error=fitted[0] / cubic - 1,
+        cubic_coefficient_error_in_matrices=fitted[1] / cubic - 1,
+    )
+
+
+def _steady_motion(stiffness, damping, mass, cubic, force, omega) -> np.ndarray:
+    """Fundamental of the displacements under a force cos ωt on the first mass."""
+    count = len(mass)
+    inverse = np.linalg.inv(mass)
+
+    def rate(at, state):
+        q, v = state[:count], state[count:]
+        pull = stiffness @ q + damping @ v
+        pull[-1] += cubic * q[-1] ** 3
+        pull[0] -= force * np.cos(omega * at)
+        return np.concatenate([v, -inverse @ pull])
+
+    at = 2 * np.pi / omega * (120 + np.arange(64) / 64)  # at 2 % damping 3e-7 of the start is left
+    found = solve_ivp(
+        rate, (0, at[-1]), np.zeros(2 * count), t_eval=at, rtol=1e-8, atol=1e-12, method="DOP853"
+    )
+    return np.fft.fft(found.y[:count], axis=1)[:, 1] / 32
+
+
+def state_space(folder: Path | None) -> None:
+    """The same multisine records by two programs."""
+    source = (
+        "pyvib (github.com/pawsen/pyvib), after the authors' PNLSS toolbox; method of Paduart et "
+        "al., Automatica 46 (2010) 647, doi:10.1016/j.automatica.2010.01.001"
+    )
+    if folder is None:
+        tell("pnlss", "independent_program", source, not_run="--pyvib FOLDER is missing")
+        return
+    for numbers in methods_state_space.compared(folder):
+        tell("pnlss", "independent_program", source, **numbers)
+
+
 def main() -> None:
     """All methods in turn."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--pff", type=Path)
+    for name in ("--pff", "--pyvib", "--nltest"):
+        parser.add_argument(name, type=lambda given: Path(given).resolve())
+    runs = {
+        "resonant_decay": lambda: resonant_decay(given.pff),
+        "pll": phase_locked_loop,
+        "cbc": continuation,
+        "rct": lambda: response_controlled(given.nltest),
+        "harmonic_force_surface": harmonic_force_surface,
+        "concerto": concerto,
+        "arslan_ozguven": spring_in_a_chain,
+        "pnlss": lambda: state_space(given.pyvib),
+    }
+    parser.add_argument("--only", nargs="*", choices=list(runs), default=list(runs))
     given = parser.parse_args()
-    resonant_decay(given.pff)
-    phase_locked_loop()
-    continuation()
-    response_controlled()
-    harmonic_force_surface()
-    concerto()
+    for name in given.only:
+        runs[name]()
 
 
 if __name__ == "__main__":
