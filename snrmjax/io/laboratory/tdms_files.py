@@ -3,9 +3,9 @@
 import logging
 import weakref
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Num
@@ -91,18 +91,17 @@ def read_tdms(path: Path) -> LaboratoryFile:
 
 
 def _read(path: Path) -> LaboratoryFile:
-    nptdms, size = library("nptdms", "reading TDMS"), path.stat().st_size
+    size = path.stat().st_size
     recordings: list[TimeRecording] = []
     tables: list[NumberTable] = []
     notes: list[str] = []
     budget = Budget(path.name)
-    with damaged_if_it_fails(path.name, "a TDMS file"):
-        source = nptdms.TdmsFile.open(path)
-        with source:
-            groups = [(group.name, list(group.channels())) for group in source.groups()]
-            counted = [
-                (one, len(one), dict(one.properties)) for _, channels in groups for one in channels
-            ]
+    with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
+        source = _contents(file)
+        groups = [(group.name, list(group.channels())) for group in source.groups()]
+        counted = [
+            (one, len(one), dict(one.properties)) for _, channels in groups for one in channels
+        ]
     _check_sizes(counted, size, path.name)
     for name, channels in groups:
         waves: dict[tuple[float, float, int], list[Any]] = {}
@@ -143,6 +142,14 @@ def _read(path: Path) -> LaboratoryFile:
     )
 
 
+def _contents(file: BinaryIO) -> Any:
+    """Groups and channels of an open file.
+
+    The library would believe an index of another measurement that lies beside a file of its path.
+    """
+    return library("nptdms", "reading TDMS").TdmsFile.open(file)
+
+
 def _check_sizes(counted: Sequence[tuple[Any, int, dict]], size: int, file: str) -> None:
     """Refuse more samples than the file has bytes for, and more channels than a test has."""
     if len(counted) > _MOST_CHANNELS:
@@ -158,10 +165,11 @@ def _recording(
     path: Path, name: str, channels: Sequence[Any], step: float, start: float, length: int
 ) -> TimeRecording:
     """Channels of one rate as a time record."""
-    nptdms = library("nptdms", "reading TDMS")
-    with damaged_if_it_fails(path.name, "a TDMS file"):
-        file = nptdms.TdmsFile.open(path)
-        opened = [file[name][one.name] for one in channels]
+    with ExitStack() as kept, damaged_if_it_fails(path.name, "a TDMS file"):
+        file = kept.enter_context(open(path, "rb"))
+        group = _contents(file)[name]
+        opened = [group[one.name] for one in channels]
+        kept.pop_all()  # it stays open until the samples are forgotten
     samples = TdmsSamples(file, opened, length, path.name)
     listed = []
     for one in channels:
@@ -176,11 +184,12 @@ def _recording(
 
 def _numbers(path: Path, group: str, one: Any) -> Numbers:
     """A channel without a rate as numbers that are read when asked."""
-    nptdms, name, unit = library("nptdms", "reading TDMS"), one.name, _unit(one)
+    name, unit = one.name, _unit(one)
 
     def read(at: Selection) -> np.ndarray:
-        with damaged_if_it_fails(path.name, "a TDMS file"), nptdms.TdmsFile.open(path) as file:
-            return file[group][name].read_data(at[0].start, at[0].stop - at[0].start)
+        with damaged_if_it_fails(path.name, "a TDMS file"), open(path, "rb") as file:
+            channel = _contents(file)[group][name]
+            return channel.read_data(at[0].start, at[0].stop - at[0].start)
 
     return Numbers((len(one),), read, one.dtype.kind == "c", {"unit": unit} if unit else {})
 

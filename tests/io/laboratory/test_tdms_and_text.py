@@ -113,6 +113,19 @@ def test_interleaved_segments_written_by_hand(tmp_path):
     )
 
 
+@pytest.mark.parametrize("index", ["of another record", "garbage"])
+def test_an_index_beside_a_tdms_file_is_not_believed(tmp_path, index):
+    samples = np.random.default_rng(6).normal(size=(200, 2))
+    path = tmp_path / "log.tdms"
+    path.write_bytes(segment(*interleaved(samples)))
+    wrong = segment(*interleaved(samples[:50])).replace(b"TDSm", b"TDSh")
+    (tmp_path / "log.tdms_index").write_bytes(
+        wrong[: -50 * 16] if index == "of another record" else b"TDSh" + bytes(range(90))
+    )
+    (record,) = read_laboratory_file(path).recordings
+    np.testing.assert_array_equal(record.values(["Force"])[0], samples[:, 0])
+
+
 def test_a_tdms_that_states_more_than_it_has_is_refused(tmp_path):
     path = tmp_path / "log.tdms"
     samples = np.zeros((200, 2))

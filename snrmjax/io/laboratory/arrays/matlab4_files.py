@@ -28,7 +28,7 @@ class _Header(NamedTuple):
     size: int  # bytes of header and name
 
     @property
-    def count(self) -> int:
+    def numbers(self) -> int:
         """Numbers in the file."""
         return self.sides[0] * self.sides[1] * (2 if self.is_complex else 1)
 
@@ -52,7 +52,7 @@ def tree_of_v4(path: Path) -> tuple[dict[str, Node], list[str]]:
         if header is None:
             raise ValueError(f"{file} is damaged: at byte {at} no matrix of MATLAB v4 begins.")
         start = at + header.size
-        at = start + header.count * int(header.kind[1])
+        at = start + header.numbers * int(header.kind[1])
         if at > len(content):
             raise ValueError(
                 f"{file} is damaged: {header.name} states {header.sides[0]} by {header.sides[1]} "
@@ -62,7 +62,7 @@ def tree_of_v4(path: Path) -> tuple[dict[str, Node], list[str]]:
             notes.append(f"variable {header.name} is a sparse matrix, which is not read.")
             continue
         kind = np.dtype(header.order + header.kind)
-        numbers = np.frombuffer(content, kind, header.count, start).astype(kind.newbyteorder("="))
+        numbers = np.frombuffer(content, kind, header.numbers, start).astype(kind.newbyteorder("="))
         tree[header.name] = (
             _text(numbers, header) if header.matter == _TEXT else _held(numbers, header)
         )
