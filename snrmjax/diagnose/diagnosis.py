@@ -20,7 +20,11 @@ from snrmjax.diagnose.checks.cross_validation import (
     rms_misfit,
     without_level,
 )
-from snrmjax.diagnose.checks.level_variance import states_level_errors, with_level_variance
+from snrmjax.diagnose.checks.level_variance import (
+    beyond_random_noise,
+    states_level_errors,
+    with_level_variance,
+)
 from snrmjax.diagnose.checks.verdict import (
     Verdict,
     judge,
@@ -166,6 +170,9 @@ def diagnose_model(
             f"{gain:.3g})."
         )
     notes += [*judgement.reasons, levels_note, noise_note]
+    if predictions.chosen.noise_stated:
+        scatter, n = float(np.sqrt(neighbours.variance)), predictions.chosen.n_levels
+        notes.append(beyond_random_noise(model, rms_misfit(misfit, fit), scatter, n))
     if levels is None:
         n = predictions.chosen.n_levels
         notes.append(

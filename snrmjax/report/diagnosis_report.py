@@ -221,7 +221,7 @@ def _key_numbers(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]) -> li
     misfit = f"{_times(gap.before)} → {_times(gap.after)} × noise"
     if diagnosis.effects and gap.after > AS_NOISE:
         misfit += "; the ± above holds only if the noise is as stated"
-    rows.append(("misfit of the force (rms), all that the model leaves", misfit))
+    rows.append(("misfit of the force (rms), errors of levels and laws in it", misfit))
     if np.isfinite(np.asarray(relative_errors(diagnosis.data))).any():
         rows.append(
             (

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from snrmjax.identify.inference.fitted_curves import fitted_values
 from snrmjax.identify.joint.joint_fit import JointFit
@@ -118,7 +119,7 @@ class ShownAmplitude(NamedTuple):
     column: str  # how its columns in files end
     power: int  # of the angular frequency, that turns a velocity into it
 
-    def of(self, velocity: np.ndarray, angular_frequency: np.ndarray) -> np.ndarray:
+    def of(self, velocity: ArrayLike, angular_frequency: ArrayLike) -> np.ndarray:
         """The amplitude of velocities (m/s) at these frequencies (rad/s)."""
         if not self.power:  # to the bit
             return np.asarray(velocity)

@@ -8,12 +8,31 @@ import numpy as np
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
+_QUIETER = 0.65  # times the misfit that is left, below which neighbours' scatter is no part of it
 _MOST = 0.2  # 1σ of a deviation, beyond which the smooth curves do not describe the structure
 
 
 def states_level_errors(model: Structure) -> bool:
     """Whether a model states any error that the states of one level share."""
     return any(std > 0 for std in model.level_stds)
+
+
+def beyond_random_noise(model: Structure, left: float, neighbours: float, n_levels: int) -> str:
+    """That what is left is no random noise, but may be errors of levels, of which none is stated.
+
+    Arguments: the misfit that the answer leaves and the scatter of neighbouring states, both in
+    units of the stated noise. The latter is what a joint fit calls noise; the former has errors of
+    whole levels and of the laws in it, too.
+    """
+    if states_level_errors(model) or n_levels < 2 or not neighbours < _QUIETER * left:
+        return ""
+    return (
+        f"the misfit that is left is {left:.2g} times the stated noise, but neighbouring states "
+        f"scatter by {neighbours:.2g} times that noise only (which is what a joint fit calls "
+        "noise): the rest is shared by whole levels, or no effect follows it. `snrmjax identify "
+        "--fit auto` says by how much levels differ; stated in the model's [measurement] "
+        "(`level_gain_std`, `level_phase_std_deg`) it counts as noise here, too."
+    )
 
 
 def with_level_variance(model: Structure, data: SteadyStates) -> tuple[Structure, str]:

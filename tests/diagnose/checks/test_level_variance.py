@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from truths.balanced_sets import (
@@ -16,7 +17,7 @@ from truths.balanced_sets import (
 
 import snrmjax as sj
 from snrmjax.diagnose import diagnosis
-from snrmjax.diagnose.checks.level_variance import with_level_variance
+from snrmjax.diagnose.checks.level_variance import beyond_random_noise, with_level_variance
 
 LEVELS, SHIFT, SEED = 6, 4e-3, 3
 
@@ -122,3 +123,16 @@ def test_errors_of_levels_need_the_phases_of_every_sensor(monkeypatch, data):
     )
     with pytest.raises(Reached):
         sj.diagnose_model(sj.model.structure(modes), two)
+
+
+def test_what_levels_share_is_told_from_random_noise():
+    """A joint fit says 0.38, the diagnosis 1.2 times the stated noise: both are right."""
+    said = beyond_random_noise(linear_model(), 1.2, 0.38, 3)
+    assert "1.2 times the stated noise" in said
+    assert "0.38 times that noise only" in said
+    assert "level_gain_std" in said
+    stated = dataclasses.replace(linear_model(), level_gain_std=jnp.asarray(0.01))
+    assert beyond_random_noise(stated, 1.2, 0.38, 3) == ""
+    assert beyond_random_noise(linear_model(), 1.2, 0.38, 1) == ""
+    assert beyond_random_noise(linear_model(), 1.0, 0.9, 3) == ""
+    assert beyond_random_noise(linear_model(), 0.35, 0.36, 3) == ""
