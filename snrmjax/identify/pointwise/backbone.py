@@ -18,6 +18,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     CurveFit,
     LeftOut,
     PointSample,
+    between_knots_on_host,
     fit_curve,
     linearised_on_host,
     log_slope,
@@ -35,6 +36,10 @@ CurveFamily = Literal["spline", "piecewise_linear"]
 MOST_KNOTS = 60
 _SAMPLES = 200  # as many as files have: one compiled function serves both
 _HERTZ = 2 * np.pi
+# 1σ of d ln(what the motion adds to ω̃² and to 2ζ̃ω̃) / d ln Ω at equal amplitude, of which the
+# method knows nothing. Damping: −1 for dry friction, 1 for v|v|, 2 for v³; stiffness: 0 where
+# harmonics are small, 0.75 on the curved beam, whose static and second harmonic soften it.
+OFF_RESONANCE = (0.5, 1.0)
 SMOOTHING = tuple(float(w) for w in 10.0 ** np.arange(-12, 3))
 
 
@@ -154,7 +159,8 @@ class Backbone(AbstractResult):
     def values(self, amplitude: Float[Array, " point"]) -> BackboneValues:
         """All that the backbone says at some amplitudes, with standard deviations (1σ).
 
-        The two curves' errors are taken as independent. Differentiable; numbers that nothing is
+        The two curves' errors are taken as independent, and include how far another curve
+        through the same knots is off between them. Differentiable; numbers that nothing is
         differentiated by are evaluated by the host, where nothing compiles.
         """
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, amplitude))):
@@ -171,9 +177,13 @@ class Backbone(AbstractResult):
                 (by_modal, self.modal_damping_covariance),
             )
         )
+        open_squared, open_modal = (
+            between_knots_on_host(curve, amplitude)
+            for curve in (self.squared_frequency, self.modal_damping)
+        )
         omega = np.sqrt(np.where(squared > 0, squared, np.nan))
-        omega_std = np.sqrt(np.maximum(variance, 0.0)) / (2 * omega)
-        modal_std = np.sqrt(np.maximum(modal_variance, 0.0))
+        omega_std = np.hypot(np.sqrt(np.maximum(variance, 0.0)), open_squared) / (2 * omega)
+        modal_std = np.hypot(np.sqrt(np.maximum(modal_variance, 0.0)), open_modal)
         zeta = modal / (2 * omega)
         zeta_std = np.hypot(modal_std / (2 * omega), zeta * omega_std / omega)
         speed = amplitude if self.argument == "velocity" else amplitude * omega
@@ -186,8 +196,11 @@ class Backbone(AbstractResult):
         damping = CurveFit(self.modal_damping, self.modal_damping_covariance)
         omega = self.natural_frequency(amplitude)
         modal = self.modal_damping(amplitude)
-        omega_std = squared.std(amplitude) / (2 * omega)
-        modal_std = damping.std(amplitude)
+        open_squared, open_modal = (
+            one.curve.between_knots(amplitude) for one in (squared, damping)
+        )
+        omega_std = jnp.hypot(squared.std(amplitude), open_squared) / (2 * omega)
+        modal_std = jnp.hypot(damping.std(amplitude), open_modal)
         zeta = modal / (2 * omega)
         return BackboneValues(
             velocity=self.velocity(amplitude),
@@ -265,6 +278,9 @@ def fit_backbone(
     a level share, as `Structure.level_stds` has them: relative gain, phase (rad), natural frequency
     (rad/s) and damping ratio. A stated error of the modal mass, which all points share, widens
     the bands: that of the damping by the same share, that of the frequency off resonance only.
+    They also hold that stiffness and damping which come with the motion may change with the
+    frequency of the force at equal amplitude, and, where noise is stated, grow where the points
+    are farther off the curves than it explains.
     Returns `BackboneFit`. Raises `ValueError` when fewer than two points are usable.
     Validity: the mode must be the only nonlinear one and ω̃, ζ̃ functions of amplitude alone.
     Not differentiable: knots and smoothing are chosen on the host.
@@ -282,13 +298,14 @@ def fit_backbone(
     kept = jax.tree.map(lambda values: values[use], points)
     mass_std = modes.own_modal_mass_std
     shared = (level_stds, 0.0 if mass_std is None else float(mass_std))
-    settings = (stated, shared, family, n_knots)
-    free = _fit_pair(kept, *settings, None)
-    pair, report = free, None
     j, r = modes.mode_of_interest, reference_sensor(modes)
     omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    linear = (omega**2, 2 * zeta * omega)
+    settings = (stated, shared, family, n_knots, linear)
+    free = _fit_pair(kept, *settings, None)
+    pair, report = free, None
     if anchor:
-        pair = _fit_pair(kept, *settings, (omega**2, 2 * zeta * omega))
+        pair = _fit_pair(kept, *settings, linear)
         report = _anchor_report(
             (free[0][0], free[1][0]),
             (pair[0][0], pair[1][0]),
@@ -326,6 +343,7 @@ def _fit_pair(
     shared_stds: tuple[tuple[float, float, float, float], float],
     family: CurveFamily,
     n_knots: int | None,
+    linear: tuple[float, float],
     anchor: tuple[float, float] | None,
 ) -> tuple[tuple[CurveFit, ErrorSizes], tuple[CurveFit, ErrorSizes]]:
     amplitude, level, natural, damping, frequency = map(
@@ -342,6 +360,7 @@ def _fit_pair(
     (gain, phase, *own_stds), mass = shared_stds
     # In proportion to the force over the modal mass: the same relative error of all points.
     by_mass = (values[0] - frequency**2, damping)
+    away = np.log(frequency / natural)
 
     def fit(component: int) -> tuple[CurveFit, ErrorSizes]:
         fixed = None if anchor is None else anchor[component]
@@ -356,12 +375,18 @@ def _fit_pair(
             std = np.maximum(std, 1e-12 * np.max(np.abs(values[component])))
             own = 2 * natural * own_stds[component]
             shared = np.column_stack([gain * moved[:, 1], phase * moved[:, 2], own])
-            common = mass * by_mass[component] if mass > 0 else None
+            nonlinear = values[component] - linear[component]
+            common = np.column_stack(
+                [mass * by_mass[component], OFF_RESONANCE[component] * nonlinear * away]
+            )
             sample = PointSample(amplitude, values[component], std, level, shared, common)
             weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
             smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
             used = sizes._replace(noise_scale=1.0) if stated else sizes
-            best = fit_curve(family, knots, smoothing, sample, fixed_first=fixed, sizes=used)
+            best = fit_curve(
+                *(family, knots, smoothing, sample),
+                **{"fixed_first": fixed, "sizes": used, "own_misfit": stated},
+            )
             slope = log_slope(best.curve, amplitude)
         return best, sizes
 

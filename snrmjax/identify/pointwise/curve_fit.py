@@ -17,7 +17,12 @@ from jaxtyping import Array, Float
 from scipy.linalg import lstsq
 
 from snrmjax.identify.pointwise.knot_terms import CondensedPoints, KnotTerms, slopes_at_knots
-from snrmjax.numerics.least_squares import ErrorSizes, error_sizes, penalised_least_squares
+from snrmjax.numerics.least_squares import (
+    ErrorSizes,
+    LeastSquares,
+    error_sizes,
+    penalised_least_squares,
+)
 
 
 class AbstractPointwiseCurve(eqx.Module):
@@ -48,6 +53,10 @@ class AbstractPointwiseCurve(eqx.Module):
         slopes = jax.vmap(jax.grad(lambda u: self.within(u[None])[0]))(jnp.stack([first, last]))
         below = jnp.minimum(x - first, 0.0) * slopes[0]
         return value + below + jnp.maximum(x - last, 0.0) * slopes[1]
+
+    def between_knots(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """How far another curve through the same knots is off: what the knots leave open."""
+        return jnp.zeros_like(amplitude)
 
 
 class PiecewiseLinear(AbstractPointwiseCurve):
@@ -89,11 +98,23 @@ class PchipCurve(AbstractPointwiseCurve):
         method = "monotonic" if self.knots.shape[0] > 2 else "linear"
         return interpax.interp1d(abscissa, knots, self.values, method=method, extrap=True)
 
+    def between_knots(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractPointwiseCurve.between_knots`; the other one bends without kinks (C²)."""
+        if self.knots.shape[0] < _FEWEST_OF_SPLINE:
+            return jnp.zeros_like(amplitude)
+        knots = self.abscissa(self.knots)
+        inside = jnp.clip(self.abscissa(amplitude), knots[0], knots[-1]).reshape(-1)
+        other = interpax.interp1d(inside, knots, self.values, method="cubic2")
+        return (other - self.within(inside)).reshape(jnp.shape(amplitude))
+
 
 CURVES: dict[str, type[AbstractPointwiseCurve]] = {
     curve.kind: curve for curve in (PiecewiseLinear, PchipCurve)
 }
 """Families of curves by name."""
+
+_FEWEST_OF_SPLINE = 4  # knots that a cubic without kinks needs
+_NEIGHBOURS = 4.0  # knots about a knot, whose points tell how well the curve fits there
 
 AS_STATED = ErrorSizes(1.0, 0.0)
 """Errors of the stated size, none of them shared."""
@@ -130,8 +151,8 @@ class PointSample(NamedTuple):
     level: np.ndarray  # (point,): points of one level share a part of their errors
     # 1σ of the errors that are known to be shared by the points of a level.
     shared: Float[np.ndarray, "point kind"] | None = None
-    # 1σ of an error that all points share, each to its own extent.
-    common: Float[np.ndarray, " point"] | None = None
+    # 1σ of errors that all points share, each to its own extent.
+    common: Float[np.ndarray, "point kind"] | None = None
 
 
 def place_knots(
@@ -169,17 +190,19 @@ def fit_curve(
     *,
     fixed_first: float | None = None,
     sizes: ErrorSizes = AS_STATED,
+    own_misfit: bool = False,
 ) -> CurveFit:
     """Fit a curve to points by penalised least squares over its values at the knots.
 
     Arguments: `kind` of `CURVES`; `knots` that enclose the amplitudes; `smoothing` weighs the
     bending of the curve in its abscissa against the points (relative to what a knot knows on
     average). `fixed_first` pins the value at the first knot. `sizes` scale the two parts of the
-    covariance.
+    covariance. With `own_misfit` the part that is not shared grows wherever the points near a knot
+    are farther off the curve than their errors explain.
     Returns `CurveFit`.
     """
     problem = _problem(kind, knots, smoothing, points, fixed_first)
-    at_knots, _, by_values = _settle(problem)
+    at_knots, slopes, by_values = _settle(problem)
     free, n = problem.free, len(knots)
     design = problem.condensed.terms.curve(np.eye(n), by_values)
     _, level = np.unique(points.level, return_inverse=True)
@@ -187,26 +210,69 @@ def fit_curve(
     together += [] if points.shared is None else list(points.shared.T)
     groups = [(one, level) for one in together]
     if points.common is not None:
-        groups.append((points.common, np.zeros_like(level)))
+        groups += [(one, np.zeros_like(level)) for one in points.common.T]
+    members = [problem.condensed.of_groups(one / points.std, group) for one, group in groups]
     result = penalised_least_squares(
         design[:, free],
         np.zeros(len(design)),
         np.ones(len(design)),
-        np.concatenate(
-            [problem.condensed.of_groups(one / points.std, group) for one, group in groups],
-            axis=1,
-        ),
+        np.concatenate(members, axis=1),
         problem.rough[:, free],
         np.zeros(len(problem.rough)),
     )
+    of_noise = sizes.noise_scale**2 * result.unshared_covariance
+    if own_misfit:
+        inverse = np.linalg.pinv(
+            np.concatenate([design[:, free], problem.rough[:, free]]), rcond=1e-15
+        )
+        arms = [inverse[:, : len(design)] @ one for one in members]
+        shared = [
+            (one / points.std, arm[:, group])
+            for (one, group), arm in zip(groups, arms, strict=True)
+        ]
+        scale = _misfit_at_knots(
+            problem, (at_knots, slopes, by_values), inverse @ inverse.T, result, shared
+        )[free]
+        of_noise = of_noise * np.outer(scale, scale)
     covariance = np.zeros((n, n))
-    covariance[free, free] = (
-        sizes.noise_scale**2 * result.unshared_covariance + result.shared_covariance
-    )
+    covariance[free, free] = of_noise + result.shared_covariance
     return CurveFit(
         curve=CURVES[kind](*jax.device_put((knots, at_knots * problem.unit))),
         covariance=jax.device_put(covariance * problem.unit**2),
     )
+
+
+def _misfit_at_knots(
+    problem: "_Problem",
+    settled: tuple[np.ndarray, np.ndarray, np.ndarray],
+    inverse: np.ndarray,
+    result: LeastSquares,
+    shared: list[tuple[np.ndarray, np.ndarray]],
+) -> Float[np.ndarray, " knot"]:
+    """How many times as far as their errors explain points near a knot are off; 1 at least.
+
+    Residuals are M e, M = 1 − X (XᵀX + R)⁻¹ Xᵀ with `inverse` in its middle: their variances are
+    those of M cov(e) Mᵀ. `shared` are the errors that points share, in units of the points' own,
+    and what each does to the knots.
+    """
+    at_knots, slopes, by_values = settled
+    n = len(at_knots)
+    spread = problem.spread[:, None]
+    x = problem.terms.curve(np.eye(n), by_values)[:, problem.free] / spread
+    left = (problem.target - problem.terms.curve(at_knots, slopes)) / problem.spread
+
+    def through(matrix: np.ndarray) -> np.ndarray:
+        return np.einsum("pk,kl,pl->p", x, matrix, x)
+
+    expected = 1 - 2 * through(inverse) + through(result.unshared_covariance)
+    expected = expected + through(result.shared_covariance)
+    for size, arm in shared:
+        expected = expected + size**2 - 2 * size * np.einsum("pk,kp->p", x, arm)
+    # Every knot sees the points of its neighbours, the nearer the more.
+    place = problem.terms.below + problem.terms.shares[:, 2:].clip(0.0, 1.0)[:, 0]
+    near = np.maximum(0.0, 1 - np.abs(place - np.arange(n)[:, None]) / _NEIGHBOURS)
+    excess = (near @ left**2) / np.maximum(near @ np.maximum(expected, 0.0), 1e-300)
+    return np.sqrt(np.maximum(excess, 1.0))
 
 
 class _Problem(NamedTuple):
@@ -393,6 +459,19 @@ def linearised_on_host(
         inside + slopes[0] * below + slopes[-1] * above,
         by_inside + np.outer(below, by_values[0]) + np.outer(above, by_values[-1]),
     )
+
+
+def between_knots_on_host(
+    curve: AbstractPointwiseCurve, amplitude: Float[np.ndarray, " point"]
+) -> Float[np.ndarray, " point"]:
+    """`AbstractPointwiseCurve.between_knots` in NumPy."""
+    from scipy.interpolate import CubicSpline
+
+    if curve.kind != PchipCurve.kind or len(curve.knots) < _FEWEST_OF_SPLINE:
+        return np.zeros(len(amplitude))
+    x, values = np.asarray(curve.knots) ** 2, np.asarray(curve.values)
+    inside = np.clip(np.asarray(amplitude) ** 2, x[0], x[-1])
+    return CubicSpline(x, values)(inside) - values_on_host(curve, np.sqrt(inside))
 
 
 def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
