@@ -271,6 +271,11 @@ def test_levels_that_hold_the_response_are_told_and_their_states_pale(drag, pict
     assert "hold the response" not in html_of(drag[2], pictures)
     force = np.asarray(data.force)
     swept = dataclasses.replace(data, force=force * np.linspace(0.7, 1.3, len(force)))
+    assert not told.holds_response(swept, pictures[0])  # its velocities change far more
+    velocity, level = np.asarray(data.velocity), np.asarray(data.level)
+    size = np.abs(velocity[:, 0])
+    held = np.array([np.median(size[level == one]) for one in level]) / size
+    swept = dataclasses.replace(swept, velocity=velocity * held[:, None])
     assert told.holds_response(swept, pictures[0])
     html = html_of(dataclasses.replace(drag[2], data=swept), pictures)
     assert "hold the response" in html
