@@ -5,7 +5,7 @@ Run: python benchmarks/methods_sources.py [--pff FOLDER] [--pyvib FOLDER] [--nlt
 
 The folders are copies of github.com/JustinPorter88/pff-analysis, github.com/pawsen/pyvib and
 github.com/maltekrack/NLtest, whose programs and data are used where they lie (they are not part of
-this project); NLtest needs Octave. pyvib takes a quarter of an hour. One JSON line a method, `kind`
+this project); NLtest needs Octave. pyvib takes some minutes. One JSON line a method, `kind`
 says what it was held against:
 
 - own_result: the authors' own numbers for the authors' own record (their Python program, run

@@ -7,7 +7,8 @@ MATLAB toolbox), which is run where it lies. Three realisations of a multisine o
 with a cubic spring, two to fit and one to predict, from two laboratories that know nothing of each
 other: the virtual one with its shaker, and SciPy's Runge-Kutta method of order 8. Both programs
 get the same samples, monomials of the states of degrees 2 and 3 in the state equation, and two
-states. pyvib takes the force as it is sampled; snrmjax corrects it for the lines between samples.
+states. pyvib takes the force as it is sampled; snrmjax corrects it for the straight lines between
+samples, and pyvib is run once more on a force that was corrected in the same way.
 pyvib starts its simulation two periods early: after the one period of its tutorial 0.6 % of the
 transient of this mode would be left.
 
@@ -158,10 +159,11 @@ def ours(records: Records, velocity: np.ndarray | None) -> tuple[Answer, np.ndar
     return Answer(*parts, natural, damping, seconds), velocity
 
 
-def pyvib(folder: Path, records: Records, velocity: np.ndarray) -> Answer:
-    """pyvib's model by the steps of its tutorial, without weights: with the noise's it fits worse.
+def pyvib(folder: Path, records: Records, velocity: np.ndarray, *, corrected: bool) -> Answer:
+    """pyvib's model by the steps of its tutorial, all samples alike: what is left is not noise.
 
-    pyvib's data are (sample, channel, realisation, period).
+    pyvib's data are (sample, channel, realisation, period). A `corrected` force has the samples of
+    a force that is straight in between and has the same lines.
     """
     sys.path.insert(0, str(folder))
     with warnings.catch_warnings(), contextlib.redirect_stdout(sys.stderr):
@@ -172,9 +174,13 @@ def pyvib(folder: Path, records: Records, velocity: np.ndarray) -> Answer:
 
         began = time.perf_counter()
         units = [float(np.std(one)) for one in records]
+        push, moved = records.steady()
+        if corrected:
+            turn = HERTZ * np.fft.rfftfreq(SAMPLES)
+            push = np.fft.irfft(np.fft.rfft(push) / _straight(turn), SAMPLES)
         force, motion = (
             (one / unit).transpose(2, 0, 1)[:, None]
-            for one, unit in zip(records.steady(), units, strict=True)
+            for one, unit in zip((push, moved), units, strict=True)
         )
         signal = Signal(force[:, :, :-1], motion[:, :, :-1], fs=RATE)
         signal.lines = LINES
@@ -202,12 +208,19 @@ def pyvib(folder: Path, records: Records, velocity: np.ndarray) -> Answer:
         seconds = time.perf_counter() - began
     multiplier = max(np.linalg.eigvals(model.A), key=np.imag)
     angle, force_size = _resonances(model, velocity / units[1])
-    _, slight_force = _resonances(model, velocity[:1] * 1e-4 / units[1])
+    slight, slight_force = _resonances(model, velocity[:1] * 1e-4 / units[1])
+    if corrected:
+        force_size, slight_force = force_size * _straight(angle), slight_force * _straight(slight)
     # Force over velocity goes with 2ζ̃ω̃, which the poles say at rest.
     per_velocity = slight_force[0] / (velocity[0] * 1e-4)
     at_rest = -2 * np.log(np.abs(multiplier)) * RATE
     damping = at_rest * (force_size / velocity) / per_velocity
     return Answer(*errors, complex(multiplier), RATE, angle * RATE, damping, seconds)
+
+
+def _straight(angle: np.ndarray) -> np.ndarray:
+    """What straight lines between samples leave of a sine by its angle a sample."""
+    return np.sinc(angle / (2 * np.pi)) ** 2
 
 
 def _relative(found: np.ndarray, wanted: np.ndarray) -> float:
@@ -270,7 +283,8 @@ def compared(folder: Path) -> Iterator[dict]:
     records["virtual_laboratory"] = tested(22.0, noise)
     for name, record in records.items():
         own, velocity = ours(record, None)
-        theirs = pyvib(folder, record, velocity)
+        theirs = pyvib(folder, record, velocity, corrected=False)
+        alike = pyvib(folder, record, velocity, corrected=True)
         natural, damping = exact_mode(velocity)
         steady = record.steady()[1]
         kept = steady.shape[1]
@@ -280,7 +294,11 @@ def compared(folder: Path) -> Iterator[dict]:
             "noise_of_mean_period": float(scatter / np.std(steady)),
             "largest_shift": float(natural.max() / REST - 1),
         }
-        for program, one in (("snrmjax", own), ("pyvib", theirs)):
+        for program, one in (
+            ("snrmjax", own),
+            ("pyvib", theirs),
+            ("pyvib_corrected_force", alike),
+        ):
             pole = np.log(one.multiplier) * one.rate
             line |= {
                 f"{program}_estimation": one.estimation,
@@ -296,6 +314,8 @@ def compared(folder: Path) -> Iterator[dict]:
             **line,
             "frequency_difference_max": _most(own.natural, theirs.natural),
             "damping_difference_max": _most(own.damping, theirs.damping),
+            "frequency_difference_corrected_force_max": _most(own.natural, alike.natural),
+            "damping_difference_corrected_force_max": _most(own.damping, alike.damping),
         }
 
 
