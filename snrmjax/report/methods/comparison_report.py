@@ -46,6 +46,9 @@ _EVERY = (*METHODS, *RECORD_METHODS)
 # Curves at amplitudes of their own choice are lines, answers state by state are points.
 _LINES = {"snrm": "-", "restoring_force": "--", "ssm": "-.", "pnlss": ":"}
 _MARKERS = ("o", ".", "s", "D", "^", "v", "x")
+# Methods whose 1σ knows noise alone, and those that also take all forces for polynomials.
+_OF_NOISE = ("concerto", "arslan_ozguven", "rct", "phase_resonance", "resonant_decay")
+_OF_POLYNOMIALS = ("ssm", "pnlss")
 _FEW = 40  # points that are drawn large
 _CAPTION = (
     "Natural frequency and damping against the velocity amplitude at resonance, by each method "
@@ -205,7 +208,33 @@ def _distances(found: MethodComparison) -> list[tuple[str, float, float, int]]:
 def _notes(found: MethodComparison) -> list[str]:
     results, stopped = found.comparison.results, found.comparison.stopped
     own = [f"{_NAMES.get(one.method, one.method)}: {note}" for one in results for note in one.notes]
-    return [*found.comparison.records, *(f"did not run: {why}" for why in stopped.values()), *own]
+    why_not = [f"did not run: {why}" for why in stopped.values()]
+    return [*found.comparison.records, *why_not, *notes_on_bands(results), *own]
+
+
+def notes_on_bands(results: Sequence[MethodResult]) -> list[str]:
+    """Sentences on bands that do not hold all errors of their method."""
+    banded = [
+        one.method
+        for one in results
+        if np.isfinite(np.asarray(one.natural_frequency_std)[one.found]).any()
+    ]
+    noise, polynomial = (
+        " and ".join(_NAMES[name] for name in banded if name in kind)
+        for kind in (_OF_NOISE, _OF_POLYNOMIALS)
+    )
+    notes = []
+    if noise:
+        notes.append(
+            f"the bands of {noise} hold noise alone: what the method itself neglects is not in "
+            "them, and is the larger part where there is little noise."
+        )
+    if polynomial:
+        notes.append(
+            f"the bands of {polynomial} hold noise alone and take the forces for polynomials: "
+            "with friction, stops or damping by v|v| they are too narrow."
+        )
+    return notes
 
 
 def _summary(found: MethodComparison) -> dict:
@@ -215,6 +244,7 @@ def _summary(found: MethodComparison) -> dict:
     near = {name: (hertz, ratio) for name, hertz, ratio, _ in _distances(found) if own}
     return {
         "records": list(found.comparison.records),
+        "bands": notes_on_bands(results),
         "methods": {
             one.method: {
                 "points": int(one.found.sum()),

@@ -339,3 +339,24 @@ class TestRefusals:
         found, std = curve_and_std(curve, covariance, at)
         assert np.isfinite(std).all()
         np.testing.assert_allclose(np.sqrt(found), np.sqrt(squared(at)), rtol=0.01)  # a bandwidth
+
+
+def test_bands_hold_damping_that_changes_with_the_frequency_of_the_force():
+    # Viscous damping of 0.25 % and a hysteretic one of 0.25 %, c(Ω) = c₁ + c₂ ω/Ω, measured below
+    # resonance only: the curve of a one-sided test is off by up to c₂ ln(Ω/ω), which is known.
+    natural, modal = 2 * np.pi * 50.0, 0.01 * 2 * np.pi * 50.0
+    frequency = np.tile(natural * np.linspace(0.985, 0.999, 12), 4)
+    force = np.repeat([1.0, 2.0, 3.0, 4.0], 12)
+    damping = modal / 2 * (1 + natural / frequency)
+    velocity = force / (damping + 1j * (frequency**2 - natural**2) / frequency)
+    data = steady_states(
+        np.repeat([1, 2, 3, 4], 12), frequency, force, velocity[:, None],
+        **{"velocity_std": 1e-5 * np.abs(velocity)[:, None], "phase_std": np.full((48, 1), 1e-5)},
+    )  # fmt: skip
+    modes = linear_modes([natural], [0.0025], [[1.0]], [1.0])
+    backbone = fit_backbone(identify_points(data, modes), modes).backbone
+    ends = float(backbone.smallest), float(backbone.largest)
+    found = backbone.values(jnp.linspace(*ends, 21))
+    off = np.abs(np.asarray(found.modal_damping) - modal) / np.asarray(found.modal_damping_std)
+    assert np.median(np.abs(np.asarray(found.modal_damping) / modal - 1)) > 1e-3  # it is off
+    assert np.mean(off < 1.96) > 0.9

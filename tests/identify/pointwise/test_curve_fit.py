@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from snrmjax.identify.pointwise.curve_fit import (
     AS_STATED,
@@ -16,6 +16,7 @@ from snrmjax.identify.pointwise.curve_fit import (
     PchipCurve,
     PiecewiseLinear,
     PointSample,
+    between_knots_on_host,
     fit_curve,
     log_slope,
     place_knots,
@@ -377,3 +378,28 @@ class TestPlaceKnots:
         assert (np.diff(knots) > 0).all()
         assert (knots[0], knots[-1]) == (amplitude.min(), amplitude.max())
         assert len(knots) <= max(n_knots, 2)
+
+
+def test_what_knots_leave_open_is_the_distance_of_a_smoother_curve():
+    curve, inside = curve_of("spline"), INSIDE**2
+    off = CubicSpline(KNOTS**2, VALUES)(inside) - PchipInterpolator(KNOTS**2, VALUES)(inside)
+    np.testing.assert_allclose(between_knots_on_host(curve, INSIDE), off, atol=1e-12)
+    np.testing.assert_allclose(curve.between_knots(jnp.asarray(INSIDE)), off, atol=1e-12)
+    for other in (curve_of("piecewise_linear"), curve_of("spline", KNOTS[:3], VALUES[:3])):
+        np.testing.assert_array_equal(between_knots_on_host(other, INSIDE), 0.0)
+        np.testing.assert_array_equal(other.between_knots(jnp.asarray(INSIDE)), 0.0)
+
+
+def test_errors_grow_where_points_are_farther_off_than_stated():
+    amplitude, level = np.linspace(0.2, 2.0, 400), np.arange(400) % 4
+    noise = np.random.default_rng(3).standard_normal(400) * np.where(amplitude > 1.2, 0.04, 0.01)
+    knots = np.linspace(0.2, 2.0, 21)
+    points = PointSample(amplitude, 1 + amplitude**2 + noise, np.full(400, 0.01), level)
+    stated, grown = (
+        np.sqrt(np.diag(fit_curve("spline", knots, 1e-12, points, own_misfit=own).covariance))
+        for own in (False, True)
+    )
+    ratio = grown / stated
+    # Residuals of some 60 points about a knot tell a scale within 10 % (1σ).
+    assert ((ratio[:7] >= 1.0) & (ratio[:7] < 1.3)).all()
+    np.testing.assert_allclose(ratio[-5:], 4.0, rtol=0.3)
