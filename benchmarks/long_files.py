@@ -54,8 +54,8 @@ def write(kind, path, samples):
 
 def digest(kind, path):
     """Import the file and print the line."""
-    from snrmjax.io.exchange.import_map import ImportMap, response_word
     from snrmjax.io.exchange.exports import write_import
+    from snrmjax.io.exchange.import_map import ImportMap, response_word
     from snrmjax.io.exchange.importing import import_files
 
     told = ImportMap(

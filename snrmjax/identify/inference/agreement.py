@@ -15,7 +15,7 @@ from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone import BackboneFit, BackboneValues, fit_backbone
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints, identify_points
-from snrmjax.identify.pointwise.curve_fit import place_knots
+from snrmjax.identify.pointwise.knot_terms import place_knots
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
 from snrmjax.model.structures import Structure, modes_of

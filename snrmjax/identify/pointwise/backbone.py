@@ -22,10 +22,10 @@ from snrmjax.identify.pointwise.curve_fit import (
     fit_curve,
     linearised_on_host,
     log_slope,
-    place_knots,
     predict_left_out,
 )
 from snrmjax.identify.pointwise.inversion_result import reasons_in_words, spans
+from snrmjax.identify.pointwise.knot_terms import place_knots
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.model.modes import LinearModes
 from snrmjax.numerics.compiled import compiled
@@ -346,16 +346,9 @@ def _fit_pair(
     linear: tuple[float, float],
     anchor: tuple[float, float] | None,
 ) -> tuple[tuple[CurveFit, ErrorSizes], tuple[CurveFit, ErrorSizes]]:
-    amplitude, level, natural, damping, frequency = map(
-        np.asarray,
-        (
-            points.amplitude,
-            points.level,
-            points.natural_frequency,
-            points.modal_damping,
-            points.frequency,
-        ),
-    )
+    amplitude, level = np.asarray(points.amplitude), np.asarray(points.level)
+    frequency = np.asarray(points.frequency)
+    natural, damping = np.asarray(points.natural_frequency), np.asarray(points.modal_damping)
     values = (natural**2, damping)
     (gain, phase, *own_stds), mass = shared_stds
     # In proportion to the force over the modal mass: the same relative error of all points.
@@ -376,17 +369,14 @@ def _fit_pair(
             own = 2 * natural * own_stds[component]
             shared = np.column_stack([gain * moved[:, 1], phase * moved[:, 2], own])
             nonlinear = values[component] - linear[component]
-            common = np.column_stack(
-                [mass * by_mass[component], OFF_RESONANCE[component] * nonlinear * away]
-            )
+            off_resonance = OFF_RESONANCE[component] * nonlinear * away
+            common = np.column_stack([mass * by_mass[component], off_resonance])
             sample = PointSample(amplitude, values[component], std, level, shared, common)
             weights = SMOOTHING if n_knots is None else SMOOTHING[:1]
             smoothing, sizes = _best_smoothing(family, knots, weights, sample, fixed)
             used = sizes._replace(noise_scale=1.0) if stated else sizes
-            best = fit_curve(
-                *(family, knots, smoothing, sample),
-                **{"fixed_first": fixed, "sizes": used, "own_misfit": stated},
-            )
+            given = (family, knots, smoothing, sample)
+            best = fit_curve(*given, fixed_first=fixed, sizes=used, own_misfit=stated)
             slope = log_slope(best.curve, amplitude)
         return best, sizes
 

@@ -16,7 +16,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import lstsq
 
-from snrmjax.identify.pointwise.knot_terms import CondensedPoints, KnotTerms, slopes_at_knots
+from snrmjax.identify.pointwise.knot_terms import (
+    CondensedPoints,
+    KnotTerms,
+    bending,
+    slopes_at_knots,
+)
 from snrmjax.numerics.least_squares import (
     ErrorSizes,
     LeastSquares,
@@ -155,33 +160,6 @@ class PointSample(NamedTuple):
     common: Float[np.ndarray, "point kind"] | None = None
 
 
-def place_knots(
-    amplitude: Float[np.ndarray, " point"], level: np.ndarray, n_knots: int
-) -> Float[np.ndarray, " knot"]:
-    """At most `n_knots` amplitudes, spread as the points are, from the smallest to the largest.
-
-    A level that was held at one amplitude (within 15 % from end to end) gets one knot: what
-    varies inside it is not amplitude. Otherwise knots are at least 3 % apart.
-    """
-    candidates: list[float] = []
-    for one in np.unique(level):
-        inside = amplitude[level == one]
-        held = len(inside) > 1 and inside.max() < 1.15 * inside.min()
-        candidates += [float(np.median(inside))] if held else inside.tolist()
-    ordered = np.sort(candidates)
-    apart = [ordered[0]]
-    for value in ordered[1:]:
-        if value >= 1.03 * apart[-1]:
-            apart.append(value)
-    pick = np.linspace(0, len(apart) - 1, min(max(n_knots, 2), len(apart)))
-    knots = np.asarray(apart)[np.unique(np.round(pick).astype(int))]
-    lowest, highest = amplitude.min(), amplitude.max()
-    if len(knots) == 1:
-        return np.array([lowest, highest]) if highest > lowest else knots
-    knots[0], knots[-1] = lowest, highest
-    return knots
-
-
 def fit_curve(
     kind: str,
     knots: Float[np.ndarray, " knot"],
@@ -222,17 +200,15 @@ def fit_curve(
     )
     of_noise = sizes.noise_scale**2 * result.unshared_covariance
     if own_misfit:
-        inverse = np.linalg.pinv(
-            np.concatenate([design[:, free], problem.rough[:, free]]), rcond=1e-15
-        )
+        stacked = np.concatenate([design[:, free], problem.rough[:, free]])
+        inverse = np.linalg.pinv(stacked, rcond=1e-15)
         arms = [inverse[:, : len(design)] @ one for one in members]
         shared = [
             (one / points.std, arm[:, group])
             for (one, group), arm in zip(groups, arms, strict=True)
         ]
-        scale = _misfit_at_knots(
-            problem, (at_knots, slopes, by_values), inverse @ inverse.T, result, shared
-        )[free]
+        settled = (at_knots, slopes, by_values)
+        scale = _misfit_at_knots(problem, settled, inverse @ inverse.T, result, shared)[free]
         of_noise = of_noise * np.outer(scale, scale)
     covariance = np.zeros((n, n))
     covariance[free, free] = of_noise + result.shared_covariance
@@ -312,7 +288,7 @@ def _problem(
         condensed=CondensedPoints.of(terms, spread),
         target=target,
         spread=spread,
-        rough=np.sqrt(smoothing * information) * _bending(abscissa),
+        rough=np.sqrt(smoothing * information) * bending(abscissa),
         first=float(np.mean(target)) if fixed_first is None else fixed_first / unit,
         free=slice(0 if fixed_first is None else 1, len(knots)),
         unit=unit,
@@ -472,15 +448,3 @@ def between_knots_on_host(
     x, values = np.asarray(curve.knots) ** 2, np.asarray(curve.values)
     inside = np.clip(np.asarray(amplitude) ** 2, x[0], x[-1])
     return CubicSpline(x, values)(inside) - values_on_host(curve, np.sqrt(inside))
-
-
-def _bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
-    """Rows whose squares add up to about ∫(d²g/du²)² du of values at knots, u from 0 to 1."""
-    u = (abscissa - abscissa[0]) / max(abscissa[-1] - abscissa[0], 1e-300)
-    n = len(u)
-    rows = np.zeros((max(n - 2, 0), n))
-    for k in range(n - 2):
-        left, right = u[k + 1] - u[k], u[k + 2] - u[k + 1]
-        mean = 0.5 * (left + right)
-        rows[k, k : k + 3] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) / np.sqrt(mean)
-    return rows

@@ -117,3 +117,42 @@ def slopes_at_knots(
     last = (3 * third[-1] * width + 2 * second[-1]) * width + first[-1]
     slopes = np.concatenate([first, last[None]])
     return slopes[:, 0], (slopes[:, 1 : n + 1] - slopes[:, n + 1 :]) / (2 * step)
+
+
+def place_knots(
+    amplitude: Float[np.ndarray, " point"], level: np.ndarray, n_knots: int
+) -> Float[np.ndarray, " knot"]:
+    """At most `n_knots` amplitudes, spread as the points are, from the smallest to the largest.
+
+    A level that was held at one amplitude (within 15 % from end to end) gets one knot: what
+    varies inside it is not amplitude. Otherwise knots are at least 3 % apart.
+    """
+    candidates: list[float] = []
+    for one in np.unique(level):
+        inside = amplitude[level == one]
+        held = len(inside) > 1 and inside.max() < 1.15 * inside.min()
+        candidates += [float(np.median(inside))] if held else inside.tolist()
+    ordered = np.sort(candidates)
+    apart = [ordered[0]]
+    for value in ordered[1:]:
+        if value >= 1.03 * apart[-1]:
+            apart.append(value)
+    pick = np.linspace(0, len(apart) - 1, min(max(n_knots, 2), len(apart)))
+    knots = np.asarray(apart)[np.unique(np.round(pick).astype(int))]
+    lowest, highest = amplitude.min(), amplitude.max()
+    if len(knots) == 1:
+        return np.array([lowest, highest]) if highest > lowest else knots
+    knots[0], knots[-1] = lowest, highest
+    return knots
+
+
+def bending(abscissa: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "row knot"]:
+    """Rows whose squares add up to about ∫(d²g/du²)² du of values at knots, u from 0 to 1."""
+    u = (abscissa - abscissa[0]) / max(abscissa[-1] - abscissa[0], 1e-300)
+    n = len(u)
+    rows = np.zeros((max(n - 2, 0), n))
+    for k in range(n - 2):
+        left, right = u[k + 1] - u[k], u[k + 2] - u[k + 1]
+        mean = 0.5 * (left + right)
+        rows[k, k : k + 3] = np.array([1 / left, -1 / left - 1 / right, 1 / right]) / np.sqrt(mean)
+    return rows

@@ -19,10 +19,10 @@ from snrmjax.identify.pointwise.curve_fit import (
     between_knots_on_host,
     fit_curve,
     log_slope,
-    place_knots,
     predict_left_out,
     values_on_host,
 )
+from snrmjax.identify.pointwise.knot_terms import place_knots
 from snrmjax.numerics.least_squares import ErrorSizes
 
 KNOTS = np.array([0.2, 0.5, 0.6, 1.1, 1.7, 2.0])
