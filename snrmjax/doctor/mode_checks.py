@@ -30,12 +30,14 @@ _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "conjugated": (
         "conjugated_response",
         "complex conjugates (phasors e^{-iωt}, or response over force upside down)",
-        f"{_OTHER_SIGN}, or negate `velocity_im_m_s`",
+        f"{_OTHER_SIGN} (where the sensor is no velocity sensor turn its sign, too), or "
+        "negate `velocity_im_m_s`",
     ),
     "conjugated_opposite": (
         "conjugated_response",
         "complex conjugates of turned sign",
-        f"{_OTHER_SIGN}, and turn the sensor's sign; both together negate `velocity_re_m_s`",
+        f"{_OTHER_SIGN} (where the sensor is a velocity sensor turn its sign, too), or "
+        "negate `velocity_re_m_s`",
     ),
     "opposite": (
         "shape_not_mass_normalised",

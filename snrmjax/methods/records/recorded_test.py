@@ -12,7 +12,6 @@
    channel, and the record is a free decay.
 """
 
-import itertools
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from jaxtyping import Float
 
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.recordings.ring_down import find_ring_downs
-from snrmjax.measure.recordings.steps import Step, recognise_steps
+from snrmjax.measure.recordings.steps import moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import ToneTrack, track_tone, unwrapped_phase
 from snrmjax.measure.sweeps.sweep_runs import sweep_runs
@@ -234,7 +233,8 @@ def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[Re
         if (one.stop - one.start) * one.frequency / _HERTZ / rate >= _STEP_CYCLES
     ]
     covered = sum(one.stop - one.start for one in steps) / max(float(np.ptp(track.middle)), 1.0)
-    if len(steps) > 1 and covered >= _STEPS_COVER and _moves_within(steps, track) < _MOVES:
+    stays = moves_within_steps(steps, track, rate) < _MOVES
+    if len(steps) > 1 and covered >= _STEPS_COVER and stays:
         return RecordKind.STEPPED_SINE, f"{guide} is a tone of {len(steps)} steps"
     runs = sweep_runs(track, unwrapped_phase(track))
     if runs:
@@ -243,22 +243,6 @@ def _of_tone(recording: TimeRecording, guide: str, track: ToneTrack) -> tuple[Re
         f"{recording.name}: {guide} is a single tone of "
         f"{np.median(track.frequency) * rate / _HERTZ:.5g} Hz, of which no method makes a backbone."
     )
-
-
-def _moves_within(steps: list[Step], track: ToneTrack) -> float:
-    """Median over steps of the frequency's move within one over that to the next.
-
-    A sweep passes for steps where straight lines of phase fit its short pieces: there it is one.
-    """
-    moves = [0.0]
-    for one, after in itertools.pairwise(steps):
-        rows = (track.middle >= one.start) & (track.middle <= one.stop)
-        if np.count_nonzero(rows) > 2 and after.frequency != one.frequency:
-            slope = np.polyfit(track.middle[rows], track.frequency[rows], 1)[0]
-            between = abs(after.frequency - one.frequency) / one.frequency
-            within = abs(slope) * (one.stop - one.start) / float(np.mean(track.frequency[rows]))
-            moves.append(within / between)
-    return float(np.median(moves))
 
 
 def _spectrum(values: Float[np.ndarray, " sample"], rate: float) -> tuple[np.ndarray, np.ndarray]:
