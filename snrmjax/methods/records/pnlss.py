@@ -27,6 +27,7 @@ from snrmjax.model.modes import LinearModes
 
 _POINTS = 25
 _SMALLEST = 0.04  # of the largest velocity: where the curves begin
+_BEYOND = 1.2  # times the noise, from which on what is left says that the model's form is another
 
 
 def pnlss(
@@ -101,7 +102,15 @@ def _notes(fit: StateSpaceFit) -> tuple[str, ...]:
         if np.isnan(fit.validation)
         else f"{100 * fit.validation:.2g} % of a realisation that was not fitted"
     )
-    return (
+    left = (
         f"{len(fit.exponents)} monomials a state; the model leaves {100 * fit.misfit:.2g} % (rms) "
-        f"of the velocity, the linear one {100 * fit.linear_misfit:.2g} %; {checked}",
+        f"of the velocity, the linear one {100 * fit.linear_misfit:.2g} %; {checked}"
+    )
+    if not fit.excess > _BEYOND:
+        return (left,)
+    return (
+        left,
+        f"what is left of the fitted lines is {fit.excess:.2g} times the noise by which periods "
+        "scatter: forces are no polynomials of these degrees, or the record is not periodic, and "
+        "the bands do not hold the error that this makes",
     )

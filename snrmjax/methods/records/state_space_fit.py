@@ -73,6 +73,7 @@ class StateSpaceFit(NamedTuple):
     linear: MultisineResponses
     misfit: float  # rms of what the model leaves of the fitted records, relative
     linear_misfit: float  # likewise of the linear model
+    excess: float  # what is left of the fitted lines, over the noise that periods scatter by
     validation: float  # of a realisation that was not fitted; NaN where there was only one
 
 
@@ -134,7 +135,8 @@ def fit_state_space(
     shot = [_over_stretches(one, fitted, exponents, natural) for one in starts]
     first = min([*starts, *shot], key=lambda one: _misfit(one, fitted, exponents))
     model, covariance, states = _fitted(first.model, first.states[:, 0], fitted, exponents, natural)
-    misfit = _relative(_simulated(model, states, fitted, exponents), fitted.velocity)
+    simulated = _simulated(model, states, fitted, exponents)
+    misfit = _relative(simulated, fitted.velocity)
     if not misfit < _MUCH:
         raise ValueError(
             f"pnlss: the best model of degree {max(degrees)} that was found leaves "
@@ -153,6 +155,7 @@ def fit_state_space(
         linear,
         misfit,
         linear_misfit,
+        _excess(simulated, fitted, natural),
         _validated(model, periods, exponents) if held_out else np.nan,
     )
 
@@ -346,9 +349,8 @@ def _fitted(
 ) -> tuple[StateSpace, Float[np.ndarray, "coefficient coefficient"], np.ndarray]:
     """The polynomial model, the covariance of its coefficients and the periods' first states."""
     flat, rebuild = ravel_pytree(start)
-    count, samples = periods.force.shape
-    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * samples
-    lines = np.arange(1, min(len(periods.noise), int(highest)))
+    count = len(periods.force)
+    lines = _lines(periods, natural)
     target = _spectrum(periods.velocity, lines)
     force = jnp.asarray(periods.force)
     point = np.concatenate([np.asarray(flat), starts.ravel()])
@@ -394,6 +396,20 @@ def _fitted(
         inverse[: len(flat), : len(flat)],
         point[len(flat) :].reshape(count, states),
     )
+
+
+def _lines(periods: Periods, natural: float) -> np.ndarray:
+    """Lines that are fitted."""
+    highest = HIGHEST * natural / (2 * np.pi * periods.rate) * periods.force.shape[1]
+    return np.arange(1, min(len(periods.noise), int(highest)))
+
+
+def _excess(simulated: np.ndarray, periods: Periods, natural: float) -> float:
+    """rms of what a model leaves of the fitted lines, over that of the noise."""
+    lines = _lines(periods, natural)
+    left = _spectrum(simulated - periods.velocity, lines)
+    noise = max(float(np.mean(periods.noise[lines])), np.finfo(float).tiny)
+    return float(np.sqrt(np.mean(np.abs(left) ** 2) / noise))
 
 
 def _spectrum(signal: np.ndarray, lines: np.ndarray) -> Complex[np.ndarray, "*batch line"]:
