@@ -321,10 +321,10 @@ def test_identify_sends_amplitudes_alone_to_diagnose(files, tmp_path, load, opti
             "response.csv",
             marks=pytest.mark.long,
         ),
-        (("nnm", "--help"), None),
+        pytest.param(("nnm", "--help"), None, marks=pytest.mark.long),
         (("identify", "--help"), None),
         pytest.param(("diagnose",), None, marks=pytest.mark.long),
-        (("demo", "--help"), None),
+        pytest.param(("demo", "--help"), None, marks=pytest.mark.long),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )

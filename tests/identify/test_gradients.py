@@ -147,13 +147,8 @@ def of_the_others(relative, data):
 
 
 class TestIdentifyPoints:
-    @pytest.mark.parametrize(
-        "stated",
-        [
-            pytest.param(stated, marks=() if stated == "velocities stated" else pytest.mark.long)
-            for stated in STATED
-        ],
-    )
+    @pytest.mark.long
+    @pytest.mark.parametrize("stated", STATED)
     def test_by_what_was_measured(self, stated):
         check_derivatives(by_measurements, 4 * N, table(**STATED[stated]))
 

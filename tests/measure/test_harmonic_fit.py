@@ -199,7 +199,7 @@ class TestFit:
         assert np.isnan(amplitude).all()
         assert len(traces) == 1
 
-    @pytest.mark.parametrize("refine", [False, True])
+    @pytest.mark.parametrize("refine", [pytest.param(False, marks=pytest.mark.long), True])
     def test_gradients_against_finite_differences(self, refine):
         time = uneven_times(2.3)
         values = signal(time) + 0.1 * np.random.default_rng(7).standard_normal(N_SAMPLES)
