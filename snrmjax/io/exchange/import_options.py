@@ -39,6 +39,12 @@ def map_of_options(
             )
     base = ImportMap() if map_file is None else read_import_map(map_file)
     responses = tuple(response_word(word, unit) for word in response) or base.responses
+    stated = [word for word in response if response_word(word).unit]
+    if unit and stated:
+        raise ValueError(
+            f"--unit {unit} is of responses whose unit is not stated, but --response {stated[0]} "
+            "states one: leave one of the two out."
+        )
     if unit and not response:
         responses = tuple(one._replace(unit=unit) for one in responses)
     for option, key, given in (

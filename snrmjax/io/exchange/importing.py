@@ -74,7 +74,16 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
             for one in own
             if isinstance(one.content, NumberTable)
         ]
-        notes.append("the columns are those of our table: taken as they are.")
+        if told.phase_sign == "lag":
+            parts = [
+                dataclasses.replace(
+                    one, velocity=jnp.conj(one.velocity), harmonics=jnp.conj(one.harmonics)
+                )
+                for one in parts
+            ]
+            notes.append("the columns are those of our table: phasors were conjugated.")
+        else:
+            notes.append("the columns are those of our table: taken as they are.")
         return Imported(_joined(parts), (), told, assumed, tuple(notes))
     return _phasors(chosen, told, assumed, notes)
 
@@ -112,6 +121,12 @@ def _datasets(held: LaboratoryFile, told: ImportMap) -> list[_Dataset]:
 def _records(
     chosen: Sequence[_Dataset], told: ImportMap, assumed: Assumptions, notes: list[str]
 ) -> Imported:
+    if told.phase_sign == "lag":
+        raise ValueError(
+            f"--phase-sign must be left out of the time records of {chosen[0].file}: phases follow "
+            "from force and motion there. A sensor of the other sign is turned in the model's "
+            "`shape`."
+        )
     parts: list[SteadyStates] = []
     kept: list[TimeRecording] = []
     used = told

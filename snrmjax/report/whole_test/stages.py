@@ -1,5 +1,6 @@
 """The stages of a test: linear modes, states of records, identification, diagnosis; one report."""
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -46,6 +47,10 @@ from snrmjax.report.workflow import (
     identify_jointly,
     write_findings,
 )
+
+_FEWEST_ALIKE = 3  # states of two files
+_ALIKE = 1e-5  # relative difference of frequency and velocity, below what repeated tests reach
+_TINY = 1e-300
 
 
 class TestRequest(NamedTuple):
@@ -101,11 +106,7 @@ def run_whole_test(
     modes = _linear_model(folder, files, request)
     stage.ends("linear modes")
     sorted_records = [_sorted(one, modes.model) for one in files.records]
-    steps = [
-        _steps(named, one)
-        for named, one in zip(files.records, sorted_records, strict=True)
-        if one.kind is RecordKind.STEPPED_SINE
-    ]
+    steps = [_steps(named, one) for named, one in _stepped(files, sorted_records)]
     tables = [one.of_model(modes.model) for one in files.states]
     parts = all_states([*tables, *(one.states for one in steps)])
     if not parts:
@@ -113,6 +114,8 @@ def run_whole_test(
             f"{name} holds no steady states and no record of a stepped sine: the linear modes are "
             "all that it tells, as `snrmjax modes` writes them."
         )
+    stepped = [named.file for named, one in _stepped(files, sorted_records)]
+    _refuse_doubled([*(one.file for one in files.states), *stepped], parts)
     data = join_steady_states(parts)
     stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
@@ -249,7 +252,37 @@ def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
     try:
         return recorded_test(named.record, model.modes)
     except ValueError as error:
-        raise ValueError(f"{named.file}: {error}") from error
+        mend = (
+            f" `snrmjax import {named.file}` says what the file holds; put the map.toml that it "
+            "then writes into the folder."
+            if "has no channel of motion" in str(error)
+            else ""
+        )
+        raise ValueError(f"{named.file}: {str(error).lstrip(' :')}{mend}") from error
+
+
+def _stepped(
+    files: TestFiles, tests: Sequence[RecordedTest]
+) -> list[tuple[NamedRecord, RecordedTest]]:
+    """Records that are stepped sines."""
+    both = zip(files.records, tests, strict=True)
+    return [(named, one) for named, one in both if one.kind is RecordKind.STEPPED_SINE]
+
+
+def _refuse_doubled(names: Sequence[str], parts: Sequence[SteadyStates]) -> None:
+    """Raise `ValueError` where two files hold the same states: no repetition is that alike."""
+    for (a, one), (b, two) in itertools.combinations(zip(names, parts, strict=True), 2):
+        first, second = (
+            np.log([part.frequency, np.sum(np.abs(part.velocity), axis=1) + _TINY])
+            for part in (one, two)
+        )
+        apart = np.max(np.abs(first[:, :, None] - second[:, None, :]), axis=0)
+        same = int(np.sum(apart.min(axis=0) < _ALIKE))
+        if same >= max(_FEWEST_ALIKE, min(one.n_states, two.n_states) / 2):
+            raise ValueError(
+                f"which of {a} and {b} is the test? Both hold the same {same} steady states, which "
+                "would count twice: move one of them out of the folder."
+            )
 
 
 def _steps(named: NamedRecord, test: RecordedTest) -> _Steps:

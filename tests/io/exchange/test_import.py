@@ -7,11 +7,11 @@ import pytest
 import scipy.io
 from truths.import_runs import run_import as run
 
-from snrmjax.io import read_steady_states
+from snrmjax.io import read_steady_states, write_steady_states
 from snrmjax.io.exchange.exports import write_netcdf
 from snrmjax.io.exchange.import_map import read_import_map
 from snrmjax.io.laboratory.uff.writing import write_uff
-from snrmjax.measure import Channel, time_recording
+from snrmjax.measure import Channel, steady_states, time_recording
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -191,6 +191,24 @@ def test_a_record_of_steps_in_volts(tmp_path):
     velocity = np.asarray(states.velocity)[:, 0]
     np.testing.assert_allclose(velocity, 0.1 * np.exp(0.2j), rtol=1e-3)
     assert read_import_map(tmp_path / "out" / "map.toml").record == "steps"
+
+
+def test_options_without_effect_are_refused(tmp_path):
+    path = tmp_path / "steps.nc"
+    write_netcdf(path, recordings=[stepped()])
+    words = (path, "--force", "CH1", "--force-unit", "50 N", "--out", tmp_path / "out")
+    code, said = run(*words, "--response", "CH2:acceleration:10 g", "--unit", "g")
+    assert code == 2
+    assert "--unit g is of responses whose unit is not stated" in said
+    code, said = run(*words, "--response", "CH2:acceleration:10 g", "--phase-sign", "lag")
+    assert code == 2
+    assert "--phase-sign must be left out of the time records of steps.nc" in said
+
+
+def test_our_own_table_is_conjugated(tmp_path):
+    states = steady_states(LEVEL, F * HERTZ, FORCE, VELOCITY.conj())
+    write_steady_states(tmp_path / "measured.csv", states)
+    same(imported(tmp_path, tmp_path / "measured.csv", "--phase-sign", "lag"), 1e-15)
 
 
 def test_a_decay_becomes_a_record(tmp_path):

@@ -17,6 +17,7 @@ from snrmjax.report.html import LiveFigures, Report
 from snrmjax.report.whole_test import folder_contents
 from snrmjax.report.whole_test.folder_contents import read_test_files
 from snrmjax.report.whole_test.stages import (
+    _refuse_doubled,
     _result,
     _Stages,
     _taken_sensors,
@@ -77,6 +78,23 @@ def test_what_the_check_finds_is_a_question(tmp_path):
     assert "is this meant? conjugated response" in str(done.exception)
     assert "--go-on" in str(done.exception)
     assert not (tmp_path / "out").exists()
+
+
+def test_states_that_two_files_hold_are_a_question(tmp_path):
+    """As where an import is written beside the raw files: its states would count twice."""
+    (tmp_path / "model.toml").write_text(
+        'name = "one"\n[[mode]]\nfrequency_hz = 50.0\ndamping_ratio = 0.01\n'
+        "shape = { tip = 1.0 }\nparticipation = 1.0\n"
+    )
+    write_states(tmp_path / "measured.csv")
+    write_states(tmp_path / "states.csv")
+    done = CliRunner().invoke(app, ["test", str(tmp_path), "--out", str(tmp_path / "out")])
+    said = str(done.exception)
+    assert "which of measured.csv and states.csv is the test? Both hold the same 36" in said
+    names = [one.file for one in read_test_files(tmp_path).states]
+    # A repetition has other noise: 0.1 % of it is enough.
+    write_states(tmp_path / "states.csv", lambda v: 1.001 * v)
+    _refuse_doubled(names, [one.states for one in read_test_files(tmp_path).states])
 
 
 def test_a_file_without_a_sensor_is_said_to_be_the_models_only_one(tmp_path):
