@@ -62,7 +62,10 @@ def test_phase_at_resonance_is_zero_for_both_signs_of_the_modal_constant():
 
 def test_damping_of_the_points_that_curves_use():
     points = SimpleNamespace(
-        usable=[True, False, True], backbone_velocity=[1.0, 2.0, 3.0], modal_damping=[4.0, 5.0, 6.0]
+        usable=[True, False, True],
+        backbone_velocity=[1.0, 2.0, 3.0],
+        natural_frequency=[2.0, 2.0, 2.0],
+        modal_damping=[4.0, 5.0, 6.0],
     )
     velocity, damping = plot_data.usable_damping(points)
     assert (velocity.tolist(), damping.tolist()) == ([1.0, 3.0], [4.0, 6.0])
