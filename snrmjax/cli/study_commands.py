@@ -13,6 +13,8 @@ from snrmjax.cli.console import console, say, staged, warn
 from snrmjax.cli.options import FILES, Out
 
 if TYPE_CHECKING:
+    import xarray
+
     from snrmjax.report.study.summary import ScalarSummary
     from snrmjax.study.engine import Progress, ProgressReport
     from snrmjax.study.run import Expected, Shard, StudyRun
@@ -177,18 +179,32 @@ def _say_expected(expected: "Expected") -> None:
 def _say_done(done: "StudyRun", out: Path) -> None:
     if done.damaged_chunks:
         warn(f"{done.damaged_chunks} chunks were damaged; they were computed again.")
-    if done.failed:
+    if done.failed and not done.complete:
         warn(f"{done.failed} of {done.computed} members have no whole result: see `status`.")
     if not done.complete:
         say(f"this shard is done; {done.missing_chunks} chunks are left to other shards.")
     elif done.computed:
         from snrmjax.report.study.digest import output_summaries
 
-        _say_summary(f"{done.members} members", output_summaries(done.open()))
+        data = done.open()
+        _say_failures(data)
+        _say_summary(f"{done.members} members", output_summaries(data))
         say(f"{done.computed} members in {_duration(done.seconds)}; written to {out}")
         say(f"figures and tables of it: snrmjax study report {out} --out report")
     else:
         say(f"nothing was left to compute; {done.members} members are in {out}")
+
+
+def _say_failures(data: "xarray.Dataset") -> None:
+    """How many members have no whole result, by status, and what to do about it."""
+    from snrmjax.report.study.failures import failures_of, range_notes
+
+    found = failures_of(data)
+    if found.n_failed:
+        each = ", ".join(f"{count} {status}" for status, count in found.failed_counts.items())
+        warn(f"{found.n_failed} of {len(found.failed)} members have no whole result: {each}.")
+    for note in range_notes(found):
+        say(note)
 
 
 def _say_summary(title: str, summaries: "Sequence[ScalarSummary]") -> None:
@@ -249,7 +265,8 @@ class _Lines:
 
 
 def _line(now: "Progress") -> str:
-    return f"{now.done}/{now.members} members, {now.failed} failed, {now.per_second:.3g}/s"
+    done = f"{now.done}/{now.members} members"
+    return f"{done}, {now.failed} without a whole result, {now.per_second:.3g}/s"
 
 
 def _duration(seconds: float) -> str:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import snrmjax as sj
-from snrmjax.study.computations.base import OfForces
+from snrmjax.report.study.digest import digest, digest_notes
+from snrmjax.study.computations.base import HIGHEST_AT_END, NO_PEAK, OfForces
 from snrmjax.study.computations.responses import velocity_bounds
 from snrmjax.study.run import RunSettings
 
@@ -145,3 +146,36 @@ def test_peaks_of_a_study_are_those_of_the_formula_with_isolated_ones_asked_for(
     np.testing.assert_allclose(data.peak_velocity_m_s, peak_velocity(0.5, [0.02]), rtol=1e-9)
     assert data.n_isolated.values.tolist() == [0]  # a linear structure has one response
     assert np.isnan(data.isolated_peak_velocity_m_s[0])
+
+
+def test_a_range_without_the_resonance_has_a_status_of_its_own(linear_model, tmp_path):
+    """Linear modes: the velocity is highest at the natural frequency exactly."""
+    within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1, stability=False)
+    computation = sj.study.Peaks(within, OfForces(np.array([0.5])))
+    varied = (sj.study.listed("mode_1.natural_frequency", [OMEGA, 0.5 * OMEGA, 1.5 * OMEGA]),)
+    data = computed(linear_model, computation, varied, tmp_path)
+    assert data.status.values.tolist() == ["upper_end", NO_PEAK, NO_PEAK]
+    np.testing.assert_array_equal(np.isnan(data.peak_frequency_hz), [False, True, True])
+    found = digest(data)
+    assert found.failures.n_outside == found.failures.n_failed == 2
+    assert found.headline == "3 members, none failed; 2 have no peak in the range."
+    assert any(
+        note.startswith("2 members have no peak between `from_hz` and `to_hz`")
+        for note in digest_notes(found, data)
+    )
+
+
+def test_a_peak_below_the_response_at_the_end_of_the_range_is_not_the_highest(tmp_path):
+    """A weak mode in the range beside a strong one above it, whose flank is higher."""
+    modes = sj.model.linear_modes([OMEGA, 1.25 * OMEGA], [0.01, 0.01], [[1.0, 1.0]], [0.1, 3.0])
+    omega = OMEGA * np.array([1.0, 1.2])
+    own = np.array([[OMEGA], [1.25 * OMEGA]])
+    receptance = np.array([[0.1], [3.0]]) / (own**2 - omega**2 + 0.02j * own * omega)
+    inside, at_end = np.abs(omega * receptance.sum(axis=0))
+    assert at_end > 2 * inside  # of the two modes in closed form
+    within = sj.study.ResponseRange(0.8 * OMEGA, 1.2 * OMEGA, harmonic_order=1, stability=False)
+    varied = (sj.study.listed("mode_2.participation", [3.0, 0.0003]),)
+    computation = sj.study.Peaks(within, OfForces(np.array([0.5])))
+    data = computed(sj.model.structure(modes), computation, varied, tmp_path)
+    assert data.status.values.tolist() == [HIGHEST_AT_END, "upper_end"]
+    assert np.all(np.abs(data.peak_frequency_hz * HERTZ / OMEGA - 1) < 0.01)

@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from snrmjax.report.html import ReportTable
-from snrmjax.report.study.failures import Failures, failures_of
+from snrmjax.report.study.failures import Failures, failures_of, range_notes
 from snrmjax.report.study.main_effects import FEWEST, MainEffect, correlated_pairs, main_effect
 from snrmjax.report.study.scalars import Scalar, scalars, varied_quantities, varied_unit
 from snrmjax.report.study.study_figures import EffectPanels
@@ -45,9 +45,11 @@ class StudyDigest(NamedTuple):
 
     @property
     def headline(self) -> str:
-        """How many members failed, in one sentence."""
-        n, failed = self.n_members, self.failures.n_failed
-        return f"{n} members, " + (f"of which {failed} failed." if failed else "none failed.")
+        """How many members failed, or have no peak in the range, in one sentence."""
+        n, outside = self.n_members, self.failures.n_outside
+        failed = self.failures.n_failed - outside
+        text = f"{n} members, " + (f"of which {failed} failed" if failed else "none failed")
+        return text + (f"; {outside} have no peak in the range." if outside else ".")
 
 
 def output_summaries(data: "xarray.Dataset") -> list[ScalarSummary]:
@@ -128,6 +130,7 @@ def digest_notes(found: StudyDigest, data: "xarray.Dataset") -> list[str]:
         *_on_sampling(found, data),
         *_on_shares(found),
         *_on_missing(found),
+        *range_notes(found.failures),
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.report.html import ReportTable
-from snrmjax.study.computations.base import COMPLETE, FORCE
+from snrmjax.study.computations.base import COMPLETE, FORCE, HIGHEST_AT_END, NO_PEAK
 
 if TYPE_CHECKING:
     import xarray
@@ -31,7 +31,17 @@ class Failures(NamedTuple):
     @property
     def kinds(self) -> list[str]:
         """The statuses of failed members, the most frequent first."""
-        return [name for name, _ in Counter(self.status[self.failed].tolist()).most_common()]
+        return list(self.failed_counts)
+
+    @property
+    def failed_counts(self) -> dict[str, int]:
+        """How many members failed with each status, the most frequent first."""
+        return dict(Counter(self.status[self.failed].tolist()).most_common())
+
+    @property
+    def n_outside(self) -> int:
+        """How many members were computed but have their resonance outside the range."""
+        return sum(self.failed_counts.get(name, 0) for name in (NO_PEAK, HIGHEST_AT_END))
 
 
 class FailureShare(NamedTuple):
@@ -51,6 +61,23 @@ def failures_of(data: "xarray.Dataset") -> Failures:
     worst = rows[np.arange(len(rows)), np.argmax(bad, axis=1)]
     counts = Counter(status.ravel().tolist())
     return Failures(dict(counts.most_common()), np.any(bad, axis=1), worst)
+
+
+def range_notes(failures: Failures) -> list[str]:
+    """What to do about members whose resonance is not in the range of a study of peaks."""
+    counts, notes = failures.failed_counts, []
+    if NO_PEAK in counts:
+        notes.append(
+            f"{counts[NO_PEAK]} members have no peak between `from_hz` and `to_hz` (status "
+            f"{NO_PEAK}): their response is highest at an end of the range; widen it"
+        )
+    if HIGHEST_AT_END in counts:
+        notes.append(
+            f"the response of {counts[HIGHEST_AT_END]} members is higher at an end of the range "
+            f"than at its highest peak (status {HIGHEST_AT_END}): widen the range to have that "
+            "resonance, or narrow it to leave the other resonance out"
+        )
+    return notes
 
 
 def failure_share(

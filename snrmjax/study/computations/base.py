@@ -15,6 +15,8 @@ FORCE = "force_n"
 TEXT = "text"
 COMPLETE = ("upper_end", "lower_end", "closed", "largest_velocity", "solved", "answered")
 """Statuses of members that have their whole result."""
+NO_PEAK, HIGHEST_AT_END = "no_peak_in_range", "highest_at_range_end"
+"""Statuses of members whose response was traced but whose resonance is not in the range."""
 
 
 class Output(NamedTuple):

@@ -14,6 +14,9 @@ from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.solutions.isolated_responses import isolated_responses
 from snrmjax.study.computations.base import (
+    COMPLETE,
+    HIGHEST_AT_END,
+    NO_PEAK,
     TEXT,
     AbstractComputation,
     Axis,
@@ -51,6 +54,10 @@ class ResponseRange(eqx.Module):
 
 class Peaks(AbstractComputation):
     """Highest peak, strongest phase resonance and all folds of every forced response.
+
+    A member whose response has no peak between the ends of the range has the status
+    `no_peak_in_range`; one whose response is higher at an end than at its highest peak has
+    `highest_at_range_end`: the resonance lies outside, and a wider range would have it.
 
     With `grid_points` also the highest and the lowest velocity of the response at that many
     frequencies: what the response bands of a report are made of. With `isolated` also the responses
@@ -100,6 +107,9 @@ class Peaks(AbstractComputation):
         """See `AbstractComputation.rows`."""
         curves, summary = traced_members(self.within, self.forces, members)
         folds = [_at_folds(parts) for parts in curves]
+        summary["status"] = np.array(
+            [peak_status(*one) for one in zip(curves, summary["status"].tolist(), strict=True)]
+        )
         rows = {name: self.forces.shaped(values) for name, values in summary.items()}
         rows |= dict(zip(_FOLD, np.concatenate(folds, axis=1), strict=True))
         if self.grid_points:
@@ -188,6 +198,24 @@ def traced_members(
     columns = {name: np.asarray(one.values) for name, one in batch.variables().items()}
     columns.pop("member")
     return batch.curves, columns
+
+
+def peak_status(curves: Sequence[ResponseCurve], status: str) -> str:
+    """The status of a response whose highest peak is asked for.
+
+    Arguments: `status` says how its curves ended; one that stopped early keeps it.
+    """
+    if status not in COMPLETE:
+        return status
+    speed = [np.abs(one.velocity[:, 1, 0]) for one in curves]
+    peaks = [v[one.at_events("peak")] for v, one in zip(speed, curves, strict=True)]
+    highest = max(np.concatenate(peaks), default=None)
+    if highest is None:
+        missed = any("peak" in one.not_located for one in curves)
+        return "peak_not_located" if missed else NO_PEAK
+    open_ended = [v for v, c in zip(speed, curves, strict=True) if c.status != CurveStatus.CLOSED]
+    at_ends = max((max(v[0], v[-1]) for v in open_ended), default=0.0)
+    return HIGHEST_AT_END if at_ends > highest else status
 
 
 def velocity_bounds(
