@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates, as_recorded, fit_balance
 from snrmjax.doctor.check import FEWEST
-from snrmjax.doctor.modal_mass import STEEPLY, mass_findings, mass_in_words, mixed_unit
+from snrmjax.doctor.modal_mass import STEEPLY, mass_findings
 from snrmjax.doctor.mode_checks import misread
 from snrmjax.doctor.mode_states import leading_sensor, mode_states, usable_rows
 from snrmjax.doctor.readings import agrees, best_reading
@@ -83,14 +83,9 @@ def _misread(states: ModeStates, model: Structure, sensor: str, lowest: str) -> 
     if not errors:
         return None
     one = errors[0]
-    unit = None if of_phases else mixed_unit(best.fit, model)
-    if unit is None:
-        return _Said(of_phases, f"{one.evidence.rstrip('.')}{lowest}. To mend it: {one.mend}")
-    return _Said(
-        of_phases,
-        f"{mass_in_words(best.fit)}, as with {unit.what}{lowest}. To mend it: import again with "
-        f"{unit.option}; if the units are right, `snrmjax check` names what else it may be.",
-    )
+    more = "; if the units are right, `snrmjax check` names what else it may be."
+    mend = one.mend if one.kind != "wrong_unit" else f"{one.mend.rstrip('.')}{more}"
+    return _Said(of_phases, f"{one.evidence.rstrip('.')}{lowest}. To mend it: {mend}")
 
 
 def _lowest(points: BackbonePoints, model: Structure) -> str:

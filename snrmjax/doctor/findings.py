@@ -25,6 +25,7 @@ Kind = Literal[
     "different_structures",
     "shape_not_mass_normalised",
     "missing_anti_alias",
+    "wrong_unit",
 ]
 
 KINDS: tuple[str, ...] = get_args(Kind)

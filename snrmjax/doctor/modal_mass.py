@@ -1,4 +1,4 @@
-"""The modal mass that a table asks for over the model's: rms, volts, a shape of another scale."""
+"""The modal mass that a table asks for over the model's: rms, units, volts, another scale."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ STEEPLY = 0.13  # relative, from which on it is no error of a linear test
 _MOST_ERROR = 0.04  # relative 1σ of the modal mass, beyond which the states do not say it
 _BY_FREQUENCY = 0.15  # relative distance from Ω or 1/Ω
 _ROOT_TWO = 0.02  # relative distance from √2, that is an rms
-_LOW, _HIGH = 0.5, 2.0
+_ALIKE = 0.35  # logarithm of a ratio of stiffness, within which potential and states agree
 
 
 def mass_findings(
@@ -60,35 +60,34 @@ def mass_findings(
     if by_frequency is not None:
         return [by_frequency]
     volts, shape = _votes(states, fit, model)
-    unit = mixed_unit(fit, model)
-    first, mend = "", ""
-    if unit is not None:
-        first = f"that is {unit.factor:.4g}, as with {unit.what}; otherwise "
-        mend = f"look at the units first and import again with {unit.option}; "
+    units = mixed_units(states, fit, model)
+    if units:
+        size = "if the units are right"
     either = [
         Finding(
-            *("volts_as_force", "error", where),
-            f"{size}: {first}the force column is no force in newtons but {kappa:.3g} per "
+            *("volts_as_force", "warning" if units else "error", where),
+            f"{size}: the force column is no force in newtons but {kappa:.3g} per "
             f"newton, as a drive voltage is{volts.why}.",
-            f"{mend}if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
+            f"if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
             "`drive_v` and identify with `--free force_gain,instrument_phase`; where the response "
             "is wrong in its place, that would leave all amplitudes wrong.",
         ),
         Finding(
-            *("shape_not_mass_normalised", "error", where),
+            *("shape_not_mass_normalised", "warning" if units else "error", where),
             f"{size}: the shape (or participation) of the model is not mass-normalised{shape.why}.",
-            f"{mend}if it is the shape: divide `shape` and `participation` by "
+            f"if it is the shape: divide `shape` and `participation` by "
             f"{np.sqrt(kappa):.4g} each (or one by {kappa:.4g}); `snrmjax modes` scales shapes by "
             "the drive point.",
         ),
     ]
+    first = [wrong_unit(fit, units, where)] if units else []
     if volts.weight > shape.weight:
-        return either[:1]
+        return [*first, *either[:1]]
     if shape.weight > volts.weight:
-        return either[1:]
+        return [*first, *either[1:]]
     # The data cannot say which: both are named, each with the other.
     other = "; a {} of another scale would look the same"
-    return [
+    return first + [
         one._replace(evidence=one.evidence.rstrip(".") + other.format(word) + ".")
         for one, word in zip(either, ("mode shape", "force"), strict=True)
     ]
@@ -116,34 +115,71 @@ def _differentiated(off: float, log_omega: float, size: str, where: str) -> Find
 
 
 class MixedUnit(NamedTuple):
-    """A unit that was taken for another one, as the factor between them says."""
+    """Numbers of one unit that were read as another's, and what the modal mass then becomes."""
 
-    factor: float
-    what: str
-    option: str
+    column: str  # "response" or "force"
+    unit: str  # of the numbers
+    taken_for: str
+    mass: float  # over the model's
+
+    @property
+    def words(self) -> str:
+        """The mistake."""
+        return f"the {self.column} in {self.unit}, taken for {self.taken_for}"
+
+    @property
+    def option(self) -> str:
+        """The option of the import that states the unit."""
+        name = "--force-unit" if self.column == "force" else "--unit"
+        return f"{name} {_WRITTEN.get(self.unit, self.unit)}"
 
 
-# κ is force over response: what it becomes where a number of one unit is read as another's.
-_MIXED_UNITS = (
-    MixedUnit(9.80665, "the response in g, taken for m/s²", "`--unit g`"),
-    MixedUnit(
-        *(1e-3, "the response in mm, taken for m, or the force in kN"),
-        "`--unit mm/s` (or its like), or `--force-unit kN`",
-    ),
-    MixedUnit(1e-6, "the response in µm, taken for m", "`--unit um/s` (or its like)"),
-    MixedUnit(1e3, "the force in mN, taken for N", "`--force-unit mN`"),
-    MixedUnit(1 / 4.4482216, "the force in pounds, taken for N", "`--force-unit lbf`"),
-    MixedUnit(1 / 39.370079, "the response in inches, taken for m", "`--unit in/s` (or its like)"),
+# The likely one first: a number of the small unit read as one of the large, then the reverse.
+_SIZES = (
+    *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
+    *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
+    *(("force", "mN", "N", 1e-3), ("force", "kN", "N", 1e3), ("force", "pounds", "N", 4.4482216)),
 )
+_WRITTEN = {"m/s²": "m/s^2", "mm": "mm/s", "µm": "um/s", "inches": "in/s", "m": "m/s"}
+_WRITTEN |= {"pounds": "lbf"}
 
 
-def mixed_unit(fit: BalanceFit, model: Structure) -> MixedUnit | None:
-    """The mix-up of units whose factor is the modal mass over the model's, if there is one."""
+def _every_mix_up() -> tuple[MixedUnit, ...]:
+    """κ is force over response: upside down for a force, and where both units change places."""
+    taken, swapped = [], []
+    for column, unit, other, size in _SIZES:
+        mass = size if column == "response" else 1 / size
+        taken.append(MixedUnit(column, unit, other, mass))
+        swapped.append(MixedUnit(column, other, unit, 1 / mass))
+    return (*taken, *swapped)
+
+
+_MIXED_UNITS = _every_mix_up()
+
+
+def mixed_units(states: ModeStates, fit: BalanceFit, model: Structure) -> tuple[MixedUnit, ...]:
+    """The mix-ups of units that explain the modal mass over the model's, the likeliest first.
+
+    Where the model's potential says that the response is right, those of the force alone.
+    """
     own = model.modes.own_modal_mass_std
     allowed = float(UNSTATED_MODAL_MASS_STD if own is None else own)
     tolerance = max(_ROOT_TWO, 3 * float(np.hypot(fit.mass_std / fit.mass, allowed)))
-    near = [one for one in _MIXED_UNITS if abs(np.log(fit.mass / one.factor)) < tolerance]
-    return near[0] if near else None
+    near = [one for one in _MIXED_UNITS if abs(np.log(fit.mass / one.mass)) < tolerance]
+    bend = _bend(states, fit, model) if near else None
+    right = bend is not None and abs(np.log(bend)) < _ALIKE
+    return tuple(one for one in near if not (right and one.column == "response"))
+
+
+def wrong_unit(fit: BalanceFit, units: tuple[MixedUnit, ...], where: str) -> Finding:
+    """That the modal mass is off by the factor between two units, and which these may be."""
+    words = ", or ".join(one.words for one in units)
+    options = " or ".join(f"`{one.option}`" for one in units)
+    return Finding(
+        *("wrong_unit", "error", where),
+        f"{mass_in_words(fit)}, {units[0].mass:.4g} of it as with {words}.",
+        f"import again with {options} (or the unit of that kind which the numbers have).",
+    )
 
 
 def mass_in_words(fit: BalanceFit) -> str:
@@ -177,7 +213,7 @@ def _votes(states: ModeStates, fit: BalanceFit, model: Structure) -> tuple[_Vote
     bend = _bend(states, fit, model)
     if bend is not None:
         ratio = bend
-        if abs(np.log(ratio)) < 0.35:
+        if abs(np.log(ratio)) < _ALIKE:
             volts.add(2.0, f"the model's potential, which knows the shape, agrees to {ratio:.2f}")
         else:
             shape.add(2.0, f"the stiffness grows {ratio:.3g} times as the model's potential says")

@@ -79,16 +79,46 @@ KINDS = (
 
 
 @pytest.mark.parametrize(
-    ("factor", "option"),
-    [(1 / 9.80665, "--unit g"), (1e3, "--unit mm/s"), (0.55, None)],
+    ("response", "force", "words", "option"),
+    [
+        (1 / 9.80665, 1, "the response in g, taken for m/s²", "--unit g"),
+        (9.80665, 1, "the response in m/s², taken for g", "--unit m/s^2"),
+        (1e3, 1, "the response in mm, taken for m", "--unit mm/s"),
+        (1e6, 1, "the response in µm, taken for m", "--unit um/s"),
+        (39.3701, 1, "the response in inches, taken for m", "--unit in/s"),
+        (1, 1e3, "the force in mN, taken for N", "--force-unit mN"),
+        (1, 1 / 4.44822, "the force in pounds, taken for N", "--force-unit lbf"),
+        (1, 4.44822, "the force in N, taken for pounds", "--force-unit N"),
+    ],
 )
-def test_units_that_were_mixed_up_are_named_by_their_factor(factor, option):
+def test_units_that_were_mixed_up_come_first(response, force, words, option):
+    level, w, f, v = states()
+    found = sj.doctor.check_test(table(level, w, force * f, response * noisy(v)), model()).findings
+    assert [one.kind for one in found] == list(UNIT_FIRST)
+    assert [one.severity for one in found] == ["error", "warning", "warning"]
+    assert words in found[0].evidence
+    assert f"`{option}`" in found[0].mend
+    assert all(one.evidence.startswith("if the units are right") for one in found[1:])
+
+
+UNIT_FIRST = ("wrong_unit", "volts_as_force", "shape_not_mass_normalised")
+
+
+@pytest.mark.parametrize("factor", [0.55, 0.75 / 9.80665, 700])
+def test_a_factor_between_no_units_is_none_of_theirs(factor):
     level, w, force, v = states()
     found = sj.doctor.check_test(table(level, w, force, factor * noisy(v)), model())
-    assert "volts_as_force" in found.kinds
-    for one in found.findings:
-        assert ("import again" in one.mend) == (option is not None)
-        assert option is None or option in one.mend
+    assert found.kinds == UNIT_FIRST[1:]
+
+
+def test_a_potential_that_agrees_speaks_for_the_force():
+    """¾γa² of the model's own cubic spring, 3.7 % of the frequency: the response has its size."""
+    level, w, force, v = states()
+    cubic = sj.model.polynomial_potential({"1111": CUBIC / 4}, 1)
+    structure = sj.model.structure(model().modes, cubic)
+    found = sj.doctor.check_test(table(level, w, force * 1e-3, noisy(v)), structure)
+    assert found.kinds == UNIT_FIRST[:2]
+    assert "response" not in found.findings[0].evidence
 
 
 def raised(found):
