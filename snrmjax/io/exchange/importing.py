@@ -18,6 +18,7 @@ from snrmjax.io.exchange.table_import import import_table
 from snrmjax.io.laboratory.contents import LaboratoryFile, NumberTable
 from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
+from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states, steady_states
 
@@ -129,16 +130,20 @@ def _records(
         )
     parts: list[SteadyStates] = []
     kept: list[TimeRecording] = []
+    steps: list[StepCounts] = []
     used = told
     for one in chosen:
         if isinstance(one.content, TimeRecording):
             record, used = told_record(one.content, told, one.file, assumed)
-            states, used, more = import_record(record, used, one.file, assumed)
+            states, used, more, counts = import_record(record, used, one.file, assumed)
             notes += [f"{one.file}: {note}" for note in more]
+            steps += [] if counts is None else [counts]
             if states is None:
                 kept.append(record)
             else:
                 parts.append(states)
+    if steps:
+        notes.append(f"{joined_counts(steps).words}.")
     if not parts:
         return Imported(None, tuple(kept), used, assumed, tuple(notes))
     if told.level == "file" or (len(parts) > 1 and not told.level):

@@ -7,6 +7,7 @@ import numpy as np
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
 from snrmjax.io.exchange.import_units import Assumptions, force_meaning, motion_meaning
 from snrmjax.measure.recordings.channels import Channel, channel_number
+from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.velocity_states import Levels
@@ -68,13 +69,14 @@ def told_record(
 
 def import_record(
     record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
-) -> tuple[SteadyStates | None, ImportMap, list[str]]:
+) -> tuple[SteadyStates | None, ImportMap, list[str], StepCounts | None]:
     """Steady states of a record of steps or of sweeps, or None for one that stays a record.
 
+    Returns them, the map with what was found, notes, and how many of the steps were used.
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     if told.record in ("decay", "broadband"):
-        return None, told, []
+        return None, told, [], None
     if not told.force:
         raise ValueError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
@@ -90,6 +92,7 @@ def import_record(
     sensors = [one.sensor for one in told.responses]
     drive = told.drive or None
     failed = []
+    counts: StepCounts | None
     for kind in (told.record,) if told.record else ("steps", "sweep"):
         try:
             if kind == "steps":
@@ -101,7 +104,7 @@ def import_record(
                     sensors=sensors,
                     drive=drive,
                 )
-                states, notes = found.states, list(found.summary()[1:])
+                states, notes, counts = found.states, list(found.notes), found.counts
             else:
                 swept = sweep_states(
                     record,
@@ -111,7 +114,7 @@ def import_record(
                     sensors=sensors,
                     drive=drive,
                 )
-                states, notes = swept.states, list(swept.summary()[1:])
+                states, notes, counts = swept.states, list(swept.summary()[1:]), None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue
@@ -121,7 +124,7 @@ def import_record(
             assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} found" + "".join(
                 f", {note}" for note in states.notes if note.startswith("levels")
             )
-        return states, told._replace(record=kind, level=told.level or level), notes
+        return states, told._replace(record=kind, level=told.level or level), notes, counts
     if told.record:
         raise ValueError(f"{file} does not read as {failed[0]}")
     raise ValueError(

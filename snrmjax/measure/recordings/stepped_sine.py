@@ -16,6 +16,7 @@ from snrmjax.measure.recordings.settling import (
     settled_part,
     steady_frequency,
 )
+from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.steps import Step, moves_within_steps, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import check_rate, track_tone
@@ -81,6 +82,16 @@ class SteppedSineStates(AbstractResult):
     state: Int[np.ndarray, " step"]  # row of `states`, −1 where there is none
     status: Int[np.ndarray, " step"]  # a `StepStatus`
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def counts(self) -> StepCounts:
+        """How many steps were used, and why the others were not."""
+        left = {
+            kind.name.lower().replace("_", " "): int(np.sum(self.status == int(kind)))
+            for kind in StepStatus
+            if kind is not StepStatus.SETTLED and np.any(self.status == int(kind))
+        }
+        return StepCounts(self.states.n_states, left)
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""

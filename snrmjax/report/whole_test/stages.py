@@ -21,6 +21,7 @@ from snrmjax.io.laboratory.checkups import write_checkup
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import write_steady_states
 from snrmjax.io.units import HERTZ
+from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
 from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates, join_steady_states
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
@@ -37,6 +38,7 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
+from snrmjax.report.whole_test.used_steps import used_steps, with_steps
 from snrmjax.report.workflow import (
     CurveSettings,
     Findings,
@@ -83,6 +85,7 @@ class _Steps(NamedTuple):
 
     states: SteadyStates
     folded: list[FoldedRecord | None]
+    counts: StepCounts
     note: str
 
 
@@ -148,8 +151,13 @@ def run_whole_test(
         (named.file, f"{one.kind.value}: {one.why}")
         for named, one in zip(files.records, sorted_records, strict=True)
     ]
+    counts = used_steps(files, [one.counts for one in steps])
+    found = found._replace(
+        summary=with_steps(found.summary, counts, findings.identification.points)
+    )
     lines = (
         modes.sentence,
+        *(() if counts is None else (f"steady states: {counts.words}",)),
         _check_sentence(checkup),
         *headline(findings),
         *(() if diagnosis is None else (readable_verdict(diagnosis),)),
@@ -163,7 +171,7 @@ def run_whole_test(
         live,
         [("Linear modes", modes.report), ("Backbone", found), ("Diagnosis", diagnosed)],
         notes,
-        _result(checkup, found, diagnosis),
+        _result(checkup, found, diagnosis, counts),
     )
     stage.ends("report")
     return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
@@ -195,9 +203,12 @@ def _taken_sensors(files: TestFiles, model: Structure) -> tuple[str, ...]:
     )
 
 
-def _result(checkup: Checkup, found: Report, diagnosis: Diagnosis | None) -> str:
+def _result(
+    checkup: Checkup, found: Report, diagnosis: Diagnosis | None, counts: StepCounts | None
+) -> str:
     """Check, backbone and diagnosis in a sentence each; their numbers are in the summary."""
     told = [f"{_check_sentence(checkup).capitalize()}.", found.result]
+    told += [f"{counts.words}."] if counts is not None and counts.reasons else []
     told += [] if diagnosis is None else [readable_verdict(diagnosis)]
     return " ".join(one for one in told if one)
 
@@ -299,9 +310,7 @@ def _steps(named: NamedRecord, test: RecordedTest) -> _Steps:
         drive=channels.drive if channels.force else None,
     )
     folded = folded_records(named.record, found, force, channels.reference)
-    left = int(np.sum(np.asarray(found.state) < 0))
-    words = f"{named.file}: {found.states.n_states} settled steps"
-    return _Steps(found.states, folded, f"{words}, {left} left out" if left else words)
+    return _Steps(found.states, folded, found.counts, f"{named.file}: {found.counts.words}")
 
 
 def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:

@@ -119,7 +119,7 @@ def test_a_page_says_things_once_and_shows_what_people_wrote(tmp_path):
     rows = [("linear mode", "50 Hz"), ("noise", "stated")]
     found = Report("b", summary=rows, notes=["warm.", "cold."], result="It rises.")
     stages = [("Linear modes", modes), ("Backbone", found), ("Diagnosis", None)]
-    said = _result(Checkup(), found, None)
+    said = _result(Checkup(), found, None, None)
     assert said == "Check: nothing found. It rises."
     live = LiveFigures("", "")
     _write_whole_report(tmp_path, "t", files, [], Checkup(), live, stages, ["a note."], said)
