@@ -1,6 +1,7 @@
 """Reports: one HTML file that holds its figures, to be read on a screen, a phone or on paper."""
 
 import base64
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -99,6 +100,8 @@ def _embedded(one: ReportFigure) -> dict[str, str | bool]:
     }
 
 
+# A word with an ending, or anything with one before a colon: names of files may have spaces.
+_FILE_FIRST = re.compile(r"\S+\.[A-Za-z]\w{0,9}[:,]?\s|[^:]+\.[A-Za-z]\w{0,9}:")
 _PLAIN = (-4, 5)  # powers of ten between which numbers are written without one
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -144,6 +147,11 @@ def minus(text: str) -> str:
 
 
 def _sentence(text: str) -> str:
-    """A note as a sentence: a capital first, a full stop last."""
+    """A note as a sentence: a capital first but for a file's name, a full stop last.
+
+    >>> _sentence("two rows are incomplete"), _sentence("run1.mat: two rows are incomplete.")
+    ('Two rows are incomplete.', 'run1.mat: two rows are incomplete.')
+    """
     text = text.strip()
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+    first = text[:1] if _FILE_FIRST.match(text) else text[:1].upper()
+    return first + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")

@@ -30,6 +30,23 @@ LINEAR_HZ, DAMPING = 80.0, 0.02
 LINEAR_DAMPING = 2 * DAMPING * LINEAR_HZ * HERTZ  # 1/s
 
 
+@pytest.mark.parametrize(
+    ("note", "shown"),
+    [
+        ("run1.mat: 44 settled steps", "run1.mat: 44 settled steps."),
+        ("second run.h5: three steps.", "second run.h5: three steps."),
+        ("a_states.csv has no phases", "a_states.csv has no phases."),
+        ("run1.mat, run2.mat are alike", "run1.mat, run2.mat are alike."),
+        ("the file run1.mat names no sensor", "The file run1.mat names no sensor."),
+        ("0.3 % is left", "0.3 % is left."),
+        ("two levels", "Two levels."),
+    ],
+)
+def test_a_note_begins_with_a_capital_but_for_a_files_name(tmp_path, note, shown):
+    write_report(tmp_path / "report.html", Report("t", notes=[note]))
+    assert f"<li>{shown}</li>" in (tmp_path / "report.html").read_text()
+
+
 @pytest.fixture(scope="module")
 def modes():
     return sj.model.linear_modes(

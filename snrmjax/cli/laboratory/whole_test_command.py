@@ -63,7 +63,7 @@ def whole_test(
         files = read_test_files(folder, model)
         say(f"files: {time.perf_counter() - began:.1f} s")
         request = TestRequest(drive_point=drive_point, go_on=go_on, diagnose=diagnose)
-        name = folder.resolve().name.replace("_", " ")
+        name = folder.resolve().name
         found = run_whole_test(target, files, name, request, progress=say)
     for note in found.notes:
         warn(note)
