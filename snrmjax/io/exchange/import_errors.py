@@ -12,10 +12,7 @@ from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.laboratory.names import role_of
 
 _DEVIATION = re.compile(r"stdev|stddev|std|sigma|deviation|dev")
-_OF_ONE_ROW = (
-    "by its name, taken for 1σ of the row's value; if rows are means of N readings and the column "
-    "is the readings' own deviation, divide it by √N"
-)
+_OF_ONE_ROW = "1σ of the row, by its name (if of each of N readings: divide by √N)"
 
 
 def with_errors_by_name(

@@ -53,5 +53,5 @@ def numbered_levels(
     chosen = level or "auto"
     number, note = number_levels(chosen, force, None, frequency)  # type: ignore[arg-type]
     if not level:
-        assumed["level"] = f"{len(np.unique(number))} found, {note}"
+        assumed["level"] = f"{len(np.unique(number))} {note}"
     return number, level or ("force" if "amplitude" in note else "runs")

@@ -173,21 +173,22 @@ def map_text(used: ImportMap, assumed: Mapping[str, str], notes: tuple[str, ...]
         value = getattr(used, key)
         if key == "force_amplitude":
             value = "z" if value == ("z",) else [float(one) for one in value]
-        lines.append(f"{_line(key, value)}  # {_comment(key, meaning, assumed)}")
+        lines.append(f"{_line(key, value)}  # {_comment(key, value, assumed) or meaning}")
     for k, one in enumerate(used.responses):
         lines += ["", "[[response]]"]
         for key, value in one._asdict().items():
-            why = assumed.get(f"response {k + 1}.{key}")
-            lines.append(_line(key, value) + (f"  # assumed: {_flat(why)}" if why else ""))
+            why = _comment(f"response {k + 1}.{key}", value, assumed)
+            lines.append(_line(key, value) + (f"  # {why}" if why else ""))
     return "\n".join(lines) + "\n"
 
 
-def _comment(key: str, meaning: str, assumed: Mapping[str, str]) -> str:
-    return f"assumed: {_flat(assumed[key])} ({meaning})" if key in assumed else meaning
-
-
-def _flat(text: str) -> str:
-    return " ".join(text.split())
+def _comment(key: str, value: object, assumed: Mapping[str, str]) -> str:
+    """Why a value was assumed, and what else it could be; empty for one that was stated."""
+    if key not in assumed:
+        return ""
+    why = " ".join(assumed[key].split()).removeprefix(f"{value}: ")
+    others = ", ".join(one for one in CHOICES.get(key, ()) if one not in ("", value))
+    return f"assumed: {why}" + (f" (else {others})" if others else "")
 
 
 def _line(key: str, value: object) -> str:

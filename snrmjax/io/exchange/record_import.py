@@ -55,7 +55,7 @@ def told_record(
         channels[k] = old._replace(quantity=quantity, unit=unit, calibration=factor)  # type: ignore[arg-type]
         sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
         if not one.sensor:
-            assumed[f"response {number + 1}.sensor"] = "nobody names the sensor: --sensor does"
+            assumed[f"response {number + 1}.sensor"] = "not stated; --sensor names it"
         filled.append(ResponseMap(one.channel, quantity, one.unit, sensor))
     if told.drive:
         k = _number(record, told.drive, file, "--drive")
@@ -69,14 +69,14 @@ def told_record(
 
 def import_record(
     record: TimeRecording, told: ImportMap, file: str, assumed: Assumptions
-) -> tuple[SteadyStates | None, ImportMap, list[str], StepCounts | None]:
+) -> tuple[SteadyStates | None, ImportMap, tuple[str, ...], StepCounts | None]:
     """Steady states of a record of steps or of sweeps, or None for one that stays a record.
 
     Returns them, the map with what was found, notes, and how many of the steps were used.
     Raises `ValueError` with a question that names the option for what cannot be told.
     """
     if told.record in ("decay", "broadband"):
-        return None, told, [], None
+        return None, told, (), None
     if not told.force:
         raise ValueError(
             f"which channel of {file} is the force? --force CHANNEL names it, of "
@@ -104,7 +104,7 @@ def import_record(
                     sensors=sensors,
                     drive=drive,
                 )
-                states, notes, counts = found.states, list(found.notes), found.counts
+                states, notes, counts = found.states, found.notes, found.counts
             else:
                 swept = sweep_states(
                     record,
@@ -114,16 +114,17 @@ def import_record(
                     sensors=sensors,
                     drive=drive,
                 )
-                states, notes, counts = swept.states, list(swept.summary()[1:]), None
+                states, notes, counts = swept.states, swept.remarks, None
         except ValueError as error:
             failed.append(f"{kind}: {error}")
             continue
         if not told.record:
             assumed["record"] = f"{kind}: recognised in the record"
         if not told.level:
-            assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} found" + "".join(
-                f", {note}" for note in states.notes if note.startswith("levels")
-            )
+            found_by = [note for note in states.notes if note.startswith("levels")]
+            assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} {found_by[0]}"
+        if told.level != "auto":  # which is assumed or stated then
+            notes = tuple(one for one in notes if not one.startswith("levels"))
         return states, told._replace(record=kind, level=told.level or level), notes, counts
     if told.record:
         raise ValueError(f"{file} does not read as {failed[0]}")

@@ -171,7 +171,7 @@ def _velocity(
         assumed["phase_sign"] = "lead: phasors are e^(+iwt)"
     sensor = told.sensor or (UNNAMED_SENSOR[0] if len(whole.responses) == 1 else told.channel)
     if not told.sensor:
-        assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
+        assumed[f"response {number}.sensor"] = "not stated; --sensor names it"
     as_channel = Channel(told.channel, _motion(quantity))
     turn = velocity_factors([as_channel], [1], one.frequency)[:, 0, 0]
     return values * turn, ResponseMap(told.channel, quantity, told.unit, sensor)

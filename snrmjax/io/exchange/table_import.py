@@ -161,7 +161,7 @@ def _response(
             phasor = values * np.exp(1j * _phase(table, phase, told, file, assumed, "--phase"))
     sensor = one.sensor or (UNNAMED_SENSOR[0] if len(told.responses) == 1 else one.channel)
     if not one.sensor:
-        assumed[f"response {number}.sensor"] = "nobody names the sensor: --sensor does"
+        assumed[f"response {number}.sensor"] = "not stated; --sensor names it"
     turn = velocity_factors([Channel(one.channel, quantity)], [1], omega)[:, 0, 0]  # type: ignore[arg-type]
     filled = one._replace(quantity=quantity, sensor=sensor, phase=phase, imaginary=imaginary)
     return phasor * factor * turn, filled, factor * turn

@@ -60,8 +60,7 @@ SWEEP_MESSAGE: dict[SweepStatus, str] = {
     SweepStatus.FOUND: "found",
     SweepStatus.OUTSIDE: "the window leaves the sweep, or samples are missing",
     SweepStatus.TOO_FAST: (
-        "the phasor changes so fast (a jump, or too fast a sweep) that its steady state cannot be "
-        "told"
+        "the phasor changes too fast for a steady state (a jump, or too fast a sweep)"
     ),
     SweepStatus.CLIPPED: "a channel stays at its largest value: it is clipped",
 }
@@ -102,12 +101,27 @@ class SweptStates(AbstractResult):
         share = np.abs(self.moving)
         if self.corrected:
             lines.append(f"taken out: up to {100 * share.max():.2g} % of the force")
-        lines += [
+        notes = (f"note: {note}" for note in self.states.notes)
+        return (*lines, *self._left_out_in_words(), *notes)
+
+    def _left_out_in_words(self) -> tuple[str, ...]:
+        return tuple(
             f"{count} left out: {SWEEP_MESSAGE[kind]}"
             for kind, count in zip(SweepStatus, self.left_out, strict=True)
             if count and kind is not SweepStatus.FOUND
-        ]
-        return (*lines, *(f"note: {note}" for note in self.states.notes))
+        )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the states should know: the bias of all sweeps, and what is missing."""
+        bias = [one for one in self.bias if one is not None]
+        shift = max((abs(one.frequency_shift) for one in bias), default=0.0) / _HERTZ
+        lowest = min((one.peak_ratio for one in bias), default=1.0)
+        told = (
+            f"each of {len(self.sweeps)} sweeps by itself shifts the peak by up to {shift:.2g} Hz "
+            f"and lowers it to {100 * lowest:.4g} %: {'' if self.corrected else 'not '}taken out"
+        )
+        return (*((told,) if bias else ()), *self._left_out_in_words(), *self.states.notes)
 
     def variables(self) -> dict[str, Variable]:
         """See `AbstractResult`."""
@@ -312,8 +326,8 @@ def _result(
     notes = []
     if correct and not corrected:
         notes.append(
-            "the modal constant cannot be told from these sweeps (too few states near resonance): "
-            "the bias of the sweep is not taken out, but held by the stated errors"
+            "too few states near resonance: the bias of the sweep is not taken out, but is within "
+            "the stated errors"
         )
     states = states_of_phasors(reader.recording, reader.chosen, table, orders, level, notes)
     rate, begin = reader.recording.sampling_rate, reader.recording.start_time

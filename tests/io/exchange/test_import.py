@@ -353,3 +353,20 @@ def test_responses_of_an_impact_test_point_to_modes_and_name_the_sensor(tmp_path
     assert f"snrmjax modes {tmp_path / 'impact.uff'} {asked}" in said
     assert ("which is it, of tip:5+z, root:7+z?" in said) == (points[0] != "1")
     assert "--force-amplitude NEWTONS" in said
+
+
+def test_a_map_says_at_a_glance_what_was_assumed(tmp_path):
+    (tmp_path / "log.csv").write_text(LOCK_IN)
+    words = ["--force", "F", "--force-unit", "N", "--response", "R:velocity:mm/s"]
+    assert run(tmp_path / "log.csv", *words, "--out", tmp_path)[0] == 0
+    lines = (tmp_path / "map.toml").read_text().splitlines()[1:]
+    said = dict(line.split("  # ", 1) for line in lines if "  # assumed: " in line)
+    assert said['amplitude = "peak"'] == "assumed: nothing is said (else rms, peak_to_peak)"
+    assert said['phase_unit = "deg"'] == "assumed: the file says so (else rad)"
+    assert "ahead of the force" in said['phase_sign = "lead"']
+    assert said['phase_sign = "lead"'].endswith("(else lag)")
+    assert said['frequency = "f"'] == "assumed: the column's name says so"
+    assert "√N" in said['amplitude_std = "R_std"']
+    assert said['sensor = "sensor 1"'].startswith("assumed: not stated")
+    for line in lines:
+        assert len(line.partition("# ")[2]) < 80, line
