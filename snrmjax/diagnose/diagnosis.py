@@ -20,6 +20,13 @@ from snrmjax.diagnose.checks.cross_validation import (
     rms_misfit,
     without_level,
 )
+from snrmjax.diagnose.checks.level_forces import (
+    level_gains,
+    notes_on_level_forces,
+    suspected_level_forces,
+    with_forces_that_acted,
+    with_level_forces_doubted,
+)
 from snrmjax.diagnose.checks.level_variance import (
     beyond_random_noise,
     states_level_errors,
@@ -84,7 +91,9 @@ def diagnose_model(
     gain is free. Where neither noise nor errors of levels are stated, both are estimated: the
     noise is what the answer leaves, and the level-to-level variance what no smooth curves of
     amplitude explain. Where no effect of the library explains the data, a law that does is drawn
-    from them (`laws.law_answer`), if their noise and their forces are known.
+    from them (`laws.law_answer`), if their noise and their forces are known. Where gains of the
+    forces of single levels explain the data better than any effects, the answer is found beside
+    them (`level_forces`); where they explain them as well, they are said first.
 
     Returns a `Diagnosis`; `checks.verdict.judge` has the rules of its verdict. Raises `ValueError`
     for too few states, an unknown force or sensors other than the model's.
@@ -121,10 +130,18 @@ def diagnose_model(
     search = partial(
         find_effects, scales=scales, kinds=kinds, further_starts=former.starts if former else {}
     )
+    rival = None
     if predictions.chosen.noise_stated:
-        found = search(misfit)
+        found = as_recorded = search(misfit)
+        if estimable:
+            rival = suspected_level_forces(
+                found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
+            )
+        if rival is not None and rival.is_better:
+            found = search(weighted_misfit(predictions.with_level_forces_free(rival.places)))
     else:
         found, size = _with_noise_found(predictions, misfit, search)
+        as_recorded = found
         noise_note = (
             f"no noise is stated: the remaining misfit ({100 * size * ASSUMED_ERROR:.2g} % of "
             f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, errors of the "
@@ -138,6 +155,9 @@ def diagnose_model(
     judgement = judge(found, neighbours, free.parts, levels)
     errors = {name: one.std for name, one in parameters.items()}
     judgement = with_answer_checked(judgement, misfit, fit, errors)
+    gains = level_gains(misfit, fit)
+    if not gains:
+        judgement = with_level_forces_doubted(judgement, rival)
     test = None
     # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
@@ -169,6 +189,7 @@ def diagnose_model(
             f"with the effects found the gain becomes {gain * answer.force_gain:.3g} N/V (before: "
             f"{gain:.3g})."
         )
+    notes += notes_on_level_forces(gains, rival, as_recorded)
     notes += [*judgement.reasons, levels_note, noise_note]
     if predictions.chosen.noise_stated:
         scatter, n = float(np.sqrt(neighbours.variance)), predictions.chosen.n_levels
@@ -191,13 +212,18 @@ def diagnose_model(
         decide_by=recommendation(
             found,
             test,
-            [doubt.decide_by for doubt in judgement.open_questions],
+            [
+                *([rival.remedy] if rival is not None and gains else []),
+                *(doubt.decide_by for doubt in judgement.open_questions),
+            ],
             phases=not unknown.any(),
         ),
         discriminating_test=test,
         located=free.parts,
         gap=Gap(
-            rms_misfit(misfit, found.baseline), rms_misfit(misfit, fit), *(levels or (None, None))
+            rms_misfit(as_recorded.misfit, as_recorded.baseline),
+            rms_misfit(misfit, fit),
+            *(levels or (None, None)),
         ),
         checks=Checks(
             found.p_value, float(np.sqrt(neighbours.variance)), without, len(unconverged)
@@ -206,7 +232,8 @@ def diagnose_model(
         table=found.table,
         notes=tuple(note for note in notes if note),
         force_misfit=_force_misfit(misfit, found.baseline, fit),
-        data=data,
+        data=with_forces_that_acted(data, gains),
+        level_forces=gains,
     )
     known = predictions.chosen.noise_stated and force_gain_std == 0 and not unknown.any()
     if judgement.verdict is not Verdict.UNKNOWN or not known:

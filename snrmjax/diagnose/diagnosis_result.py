@@ -5,10 +5,12 @@ from collections.abc import Iterable, Mapping
 from itertools import product
 from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut
+from snrmjax.diagnose.checks.level_forces import LevelGain, level_forces_sentence
 from snrmjax.diagnose.checks.probabilities import answer_name
 from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
 from snrmjax.diagnose.completed_model import CompletedStatus
@@ -95,6 +97,8 @@ class Diagnosis(AbstractResult):
     notes: tuple[str, ...]
     force_misfit: ForceMisfit
     data: SteadyStates  # as they were compared: in N, where a drive voltage was given
+    # Of levels whose force was recorded in a wrong scale: the acting one over it.
+    level_forces: dict[int, LevelGain] = eqx.field(default_factory=dict)
 
     coordinates: ClassVar[tuple[str, ...]] = ("candidate", "part", "parameter")
 
@@ -142,7 +146,8 @@ class Diagnosis(AbstractResult):
         """The verdict in one plain sentence."""
         before, after = self.gap.before, self.gap.after
         names = [[law.name] for law in self.answer.laws] or self.candidates
-        return verdict_sentence(Verdict(self.verdict), names, before, after)
+        sentence = verdict_sentence(Verdict(self.verdict), names, before, after)
+        return f"{level_forces_sentence(self.level_forces)} {sentence}".strip()
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult.summary`."""

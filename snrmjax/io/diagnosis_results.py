@@ -25,7 +25,8 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
     `measured_up_to` (m or m/s) it is extrapolated, and `further` laws that were needed beside it
     have tables of their own. `probability` is that of the answer given: of its verdict, or of
     the members of its classes; `probabilities` are those of all answers considered. `tried` has
-    every fit that was compared with its `status`.
+    every fit that was compared with its `status`. `level_forces` are the forces that acted over the
+    recorded ones, of levels whose force was found to be recorded in a wrong scale.
     """
     gap = diagnosis.gap
     inner, outer = gap.interpolated, gap.extrapolated
@@ -56,6 +57,10 @@ def summarise_diagnosis(diagnosis: Diagnosis, predicted: Sequence[LevelResponse]
             "top_level": outer.level if outer else None,
             "top_level_before": outer.before if outer else None,
             "top_level_after": outer.after if outer else None,
+        },
+        "level_forces": {
+            str(level): {"value": gain.value, "std": gain.std}
+            for level, gain in diagnosis.level_forces.items()
         },
         "detection_limits": diagnosis.detection_limits,
         "p_value": diagnosis.checks.p_value,

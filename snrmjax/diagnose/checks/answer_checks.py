@@ -37,23 +37,11 @@ def gain_found(misfit: WeightedMisfit, fit: EffectFit) -> GainFound | None:
     if prior == 0:
         return None
     value = 1 + prior * float(misfit.noise.shared_errors(fit.rows)[place])
-    std = prior * _shared_std(misfit, fit, place)
+    std = prior * misfit.noise.shared_std(fit.slopes, place)
     phase = np.angle(np.asarray(misfit.predictions.chosen.states.velocity)[:, 0])
     known_phase = ~misfit.predictions.chosen.phase_unknown[:, 0]
     farthest = float(np.max(np.abs(phase[known_phase]), initial=0.0))
     return GainFound(value, std / max(abs(value), 1e-12), farthest)
-
-
-def _shared_std(misfit: WeightedMisfit, fit: EffectFit, place: int) -> float:
-    """1σ that the data leave a shared error, in units of its prior's, beside an answer."""
-    columns = np.concatenate([fit.slopes, misfit.noise.shared], axis=1)
-    known = np.append(np.zeros(fit.slopes.shape[1]), np.ones(misfit.noise.shared.shape[1]))
-    size = np.linalg.norm(np.vstack([columns, np.diag(known)]), axis=0)
-    size = np.where(size > 0, size, 1.0)
-    scaled = columns / size
-    covariance = np.linalg.pinv(scaled.T @ scaled + np.diag(known / size**2), hermitian=True)
-    at = fit.slopes.shape[1] + place
-    return float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
 
 
 class ModalMassFound(NamedTuple):
@@ -78,7 +66,9 @@ def modal_mass_found(misfit: WeightedMisfit, fit: EffectFit) -> ModalMassFound |
     model = 1 / abs(float(modes.mode_shape[sensor, j]) * own)
     mass = model * own / (own + prior * step)
     relative = prior / abs(own)
-    return ModalMassFound(mass, mass * relative * _shared_std(misfit, fit, place), model, relative)
+    return ModalMassFound(
+        mass, mass * relative * misfit.noise.shared_std(fit.slopes, place), model, relative
+    )
 
 
 def notes_on_found_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:

@@ -59,6 +59,17 @@ class NoiseModel(NamedTuple):
             return -self.covariance.of_rows(kept).most_likely_errors(rows[kept])
         return -self.covariance.most_likely_errors(rows)
 
+    def shared_std(self, slopes: Float[np.ndarray, "row parameter"], place: int) -> float:
+        """1σ of a shared error that the rows leave beside parameters, in units of its own 1σ."""
+        columns = np.concatenate([slopes, self.shared], axis=1)
+        known = np.append(np.zeros(slopes.shape[1]), np.ones(self.shared.shape[1]))
+        size = np.linalg.norm(np.vstack([columns, np.diag(known)]), axis=0)
+        size = np.where(size > 0, size, 1.0)
+        scaled = columns / size
+        covariance = np.linalg.pinv(scaled.T @ scaled + np.diag(known / size**2), hermitian=True)
+        at = slopes.shape[1] + place
+        return float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
+
 
 def noise_model(
     measured: Measured,

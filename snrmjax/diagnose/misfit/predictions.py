@@ -106,6 +106,11 @@ class Predictions:
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
     motions: programs.Stored
+    free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
+
+    def with_level_forces_free(self, places: tuple[int, ...]) -> "Predictions":
+        """The same with forces of levels, by their places, that have gains of their own."""
+        return dataclasses.replace(self, free_level_forces=places)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""

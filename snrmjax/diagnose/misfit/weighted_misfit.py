@@ -13,6 +13,9 @@ from snrmjax.diagnose.misfit.predictions import Group, Predicted, Predictions
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.structures import Structure
 
+FREE_LEVEL_FORCE_STD = 0.3
+"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
+
 _WEAK = 0.1  # of its strength, at which a start without a motion is evaluated
 
 
@@ -86,6 +89,11 @@ class WeightedMisfit:
     def level_numbers(self) -> Int[np.ndarray, " level"]:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
+
+    @property
+    def first_level_force(self) -> int:
+        """Place of the first force of a level that is free among the shared errors."""
+        return len(self.predictions.stated) + (self.predictions.force_gain_std > 0)
 
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """χ² of misfits in units of noise."""
@@ -202,7 +210,11 @@ def _weighted(
     measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
-    shared = np.concatenate([own, gain], axis=2) if np.any(gain) else own
+    parts = [own, gain] if np.any(gain) else [own]
+    of_level = np.asarray(predictions.chosen.states.level)[:, None, None]
+    levels = of_level == np.array(predictions.free_level_forces, dtype=int)
+    parts.append(FREE_LEVEL_FORCE_STD * passed_on.by_error[:, :, :1] * levels)
+    shared = np.concatenate(parts, axis=2)
     noise = noise_model(measured, shared, by_linear, np.array(predictions.model.level_stds))
     base = noise.noise_units(baseline.columns[None])[0]
     linear = noise.noise_units(np.moveaxis(by_linear, 2, 0)).T
