@@ -1,5 +1,6 @@
 """The command `import`: what a laboratory's files hold, and their way to our tables."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -131,7 +132,8 @@ def import_(
     unit: Annotated[
         str,
         typer.Option(
-            help="Unit of the responses: m/s, mm/s, g, m/s^2, mm, …",
+            help="Unit of the responses: m/s, mm/s, g, m/s^2, mm, …; of our own table, what its "
+            "velocity columns are.",
             metavar="UNIT",
             rich_help_panel=_MEANING,
         ),
@@ -248,7 +250,7 @@ def import_(
         raise ValueError("where shall measured.csv be written? --out DIR.")
     found = import_files(files, told)
     with staged(out) as folder:
-        written = write_import(folder, found)
+        written = write_import(folder, found, [os.path.relpath(one, out) for one in files])
     for note in dict.fromkeys(found.notes):
         warn(note)
     for key, why in found.assumed.items():

@@ -95,11 +95,11 @@ def write_netcdf(
                 _put_samples(group, samples[name])
 
 
-def write_import(folder: Path, found: Imported) -> list[str]:
+def write_import(folder: Path, found: Imported, files: Sequence[str] = ()) -> list[str]:
     """Write `measured.csv` (or `record.csv`, `record_2.csv`, …, or `.nc` of long ones), `map.toml`.
 
     Records have the columns `time_s`, `force_n` or `drive_v`, and one motion a sensor
-    (`tip.velocity_m_s`), in SI units.
+    (`tip.velocity_m_s`), in SI units. The map says of which `files` all is.
     Returns the names of the files.
     """
     written = []
@@ -119,7 +119,7 @@ def write_import(folder: Path, found: Imported) -> list[str]:
         write_atomically(folder / f"{stem}.csv", "\n".join(lines) + "\n")
         written.append(f"{stem}.csv")
     notes = tuple(dict.fromkeys(found.notes))
-    write_atomically(folder / "map.toml", map_text(found.used, found.assumed, notes))
+    write_atomically(folder / "map.toml", map_text(found.used, found.assumed, notes, files))
     return [*written, "map.toml"]
 
 

@@ -1,6 +1,9 @@
 """The map of an import: which channel or column is what, as options and as `map.toml`."""
 
-from collections.abc import Mapping
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
@@ -30,6 +33,7 @@ _MEANING = {
     "frequency_unit": "its unit",
     "force": "channel or column of the force (or of the voltage that drives it)",
     "force_unit": "its unit; V: the force is known as a drive voltage only",
+    "unit": "of the velocity columns of our own table; a response of other files has its own",
     "force_phase": "column of the force's own phase; empty: phases are relative to the force",
     "force_amplitude": "N, one for all or one a set of frequency responses; z: the z axis has it",
     "over_force": "whether responses are divided by the force",
@@ -67,6 +71,7 @@ class ImportMap(NamedTuple):
     frequency_unit: str = ""
     force: str = ""
     force_unit: str = ""
+    unit: str = ""
     force_phase: str = ""
     force_amplitude: tuple[str, ...] = ()
     over_force: bool = False
@@ -158,15 +163,32 @@ def _amplitudes(table: TomlTable) -> tuple[str, ...]:
     return tuple(map(repr, table.numbers("force_amplitude", each="entry")))
 
 
-def map_text(used: ImportMap, assumed: Mapping[str, str], notes: tuple[str, ...] = ()) -> str:
+_FILES = "# files: "
+
+
+def files_of_map(path: FilePath) -> tuple[Path, ...]:
+    """The files that were read when a map was written; none where one of them is gone."""
+    lines = [line for line in read_text(path).splitlines() if line.startswith(_FILES)]
+    words = shlex.split(lines[0].removeprefix(_FILES)) if lines else []
+    files = tuple(Path(os.path.normpath(Path(path).parent / one)) for one in words)
+    return files if all(one.is_file() for one in files) else ()
+
+
+def map_text(
+    used: ImportMap,
+    assumed: Mapping[str, str],
+    notes: tuple[str, ...] = (),
+    files: Sequence[str] = (),
+) -> str:
     """`map.toml`: every key with its meaning, and what was assumed with the reason.
 
     Arguments: `assumed` has the reason of each key that nobody stated; keys of the k-th response
-    (from 1) as "response 1.unit".
+    (from 1) as "response 1.unit"; `files` that were read, as seen from the map's folder.
     """
     lines = [
         "# How the laboratory's files were read. Take it for the next test: snrmjax import "
         "FILE --map map.toml --out DIR",
+        *([_FILES + shlex.join(files)] if files else []),
         *(f"# note: {' '.join(note.split())}" for note in notes),
     ]
     for key, meaning in _MEANING.items():

@@ -75,7 +75,8 @@ def map_of_options(
     )
     given_words: dict[str, Any] = dict(words)
     options = options._replace(**given_words)
-    return options.over(base)._replace(responses=responses)
+    own = unit if not responses else ""  # of our own table, which has no responses to be named
+    return options._replace(unit=own).over(base)._replace(responses=responses)
 
 
 def _amplitudes(words: Sequence[str]) -> tuple[str, ...]:

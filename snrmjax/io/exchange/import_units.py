@@ -10,7 +10,9 @@ from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.laboratory.physical_units import UnitMeaning, unit_meaning
 from snrmjax.measure.recordings.channels import SI_UNIT
 
-_SIZES = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
+AMPLITUDE_FACTORS = {"peak": 1.0, "": 1.0, "rms": np.sqrt(2.0), "peak_to_peak": 0.5}
+"""What makes peak amplitudes of peak, rms and peak-to-peak ones."""
+
 _HERTZ = 2 * np.pi
 
 
@@ -99,7 +101,7 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
             raise ValueError(
                 f"--amplitude says {told.amplitude}, but a unit says {min(sizes)}: which is right?"
             )
-        return float(_SIZES[told.amplitude])
+        return float(AMPLITUDE_FACTORS[told.amplitude])
     if len(sizes) > 1 or (sizes and "" in said and sizes != {"peak"}):
         raise ValueError(
             f"units say {' and '.join(sorted(sizes))} of some columns and not of others: which "
@@ -107,7 +109,7 @@ def amplitude_factor(told: ImportMap, units: Mapping[str, str], assumed: Assumpt
         )
     size = next(iter(sizes), "peak")
     assumed["amplitude"] = f"{size}: {'the units say so' if sizes else 'nothing is said'}"
-    return float(_SIZES[size])
+    return float(AMPLITUDE_FACTORS[size])
 
 
 def frequency_in_rad(

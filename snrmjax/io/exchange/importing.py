@@ -11,7 +11,12 @@ import numpy as np
 from snrmjax.io.exchange.import_levels import MeasuredPart, numbered_levels
 from snrmjax.io.exchange.import_map import ImportMap
 from snrmjax.io.exchange.import_units import Assumptions, Force
-from snrmjax.io.exchange.layouts import is_own_table, states_of_own_table
+from snrmjax.io.exchange.layouts import (
+    is_own_table,
+    restated,
+    restated_in_words,
+    states_of_own_table,
+)
 from snrmjax.io.exchange.record_import import import_record, told_record
 from snrmjax.io.exchange.response_import import import_responses
 from snrmjax.io.exchange.table_import import import_table
@@ -71,20 +76,12 @@ def import_files(paths: Sequence[Path], told: ImportMap) -> Imported:
     ]
     if own and not told.responses:
         parts = [
-            states_of_own_table(one.content, one.file)
+            restated(states_of_own_table(one.content, one.file), told)
             for one in own
             if isinstance(one.content, NumberTable)
         ]
-        if told.phase_sign == "lag":
-            parts = [
-                dataclasses.replace(
-                    one, velocity=jnp.conj(one.velocity), harmonics=jnp.conj(one.harmonics)
-                )
-                for one in parts
-            ]
-            notes.append("the columns are those of our table: phasors were conjugated.")
-        else:
-            notes.append("the columns are those of our table: taken as they are.")
+        taken = restated_in_words(told) or "taken as they are"
+        notes.append(f"the columns are those of our table: {taken}.")
         return Imported(_joined(parts), (), told, assumed, tuple(notes))
     return _phasors(chosen, told, assumed, notes)
 

@@ -1,16 +1,21 @@
 """Records, responses and steady states as named arrays and texts: what MATLAB and netCDF hold."""
 
+import dataclasses
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Num
 
+from snrmjax.io.exchange.import_map import ImportMap
+from snrmjax.io.exchange.import_units import AMPLITUDE_FACTORS, force_meaning, motion_meaning
 from snrmjax.io.laboratory.contents import NumberTable
 from snrmjax.io.tables import steady_state_fields, steady_states_of_fields
 from snrmjax.io.units import HERTZ, in_unit
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
+from snrmjax.measure.recordings.velocity_states import velocity_factors
 from snrmjax.measure.states import SteadyStates
 
 SHORTEST_RECORD = 64
@@ -91,6 +96,66 @@ def states_of_own_table(table: NumberTable, file: str) -> SteadyStates:
     if "sensor" in table.words:
         fields["sensor"] = list(table.words["sensor"])
     return steady_states_of_fields(fields, file)
+
+
+def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
+    """Steady states of our table whose numbers are not what our columns say, in SI.
+
+    Arguments: `told.unit` of the velocity columns (of an acceleration, say), `told.force_unit` of
+    the force's (a voltage makes it a drive), `told.amplitude`, `told.phase_sign`.
+    Raises `ValueError` for units that are none of a motion or of a force.
+    """
+    orders = (1, *states.harmonic_order)
+    factors = np.ones((states.n_states, len(orders)), dtype=complex)
+    if told.unit:
+        quantity, factor, _ = motion_meaning("", told.unit, "", "the velocity")
+        channel = Channel("", quantity)  # type: ignore[arg-type]
+        factors = factor * velocity_factors([channel], orders, np.asarray(states.frequency))[:, 0]
+    factors = factors * AMPLITUDE_FACTORS[told.amplitude]
+    phasors = np.concatenate(
+        [np.asarray(states.velocity)[:, :, None], np.asarray(states.harmonics)], axis=2
+    )
+    phasors = phasors * factors[:, None]
+    if told.phase_sign == "lag":
+        phasors = phasors.conj()
+    size = np.abs(factors[:, :1])
+    changed = dataclasses.replace(
+        states,
+        velocity=jnp.asarray(phasors[:, :, 0]),
+        harmonics=jnp.asarray(phasors[:, :, 1:]),
+        velocity_std=states.velocity_std * size,
+        harmonic_std=states.harmonic_std * size,
+    )
+    return _with_force(changed, told)
+
+
+def _with_force(states: SteadyStates, told: ImportMap) -> SteadyStates:
+    """With the force, or the drive in its place, in the unit that is told."""
+    force = force_meaning(told, "N", "the force")
+    factor = force.factor * AMPLITUDE_FACTORS[told.amplitude]
+    missing = jnp.full(states.n_states, jnp.nan)
+    known = jnp.isfinite(states.force)
+    if not told.force_unit:
+        drive, newtons = states.drive * AMPLITUDE_FACTORS[told.amplitude], states.force * factor
+    else:
+        every = factor * jnp.where(known, states.force, states.drive)
+        drive, newtons = (every, missing) if force.is_voltage else (missing, every)
+    std = missing if force.is_voltage else states.force_std * factor
+    return dataclasses.replace(states, force=newtons, drive=drive, force_std=std)
+
+
+def restated_in_words(told: ImportMap) -> str:
+    """What of our table is told to be otherwise; empty where nothing is."""
+    return ", ".join(
+        words
+        for said, words in (
+            (told.unit, f"velocity columns in {told.unit}"),
+            (told.force_unit, f"forces in {told.force_unit}"),
+            (told.amplitude not in ("", "peak"), f"amplitudes {told.amplitude}"),
+            (told.phase_sign == "lag", "phasors conjugated"),
+        )
+        if said
+    )
 
 
 def _text(value: float) -> str:

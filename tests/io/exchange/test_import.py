@@ -9,7 +9,7 @@ from truths.import_runs import run_import as run
 
 from snrmjax.io import read_steady_states, write_steady_states
 from snrmjax.io.exchange.exports import write_netcdf
-from snrmjax.io.exchange.import_map import read_import_map
+from snrmjax.io.exchange.import_map import files_of_map, read_import_map
 from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, steady_states, time_recording
 from snrmjax.measure.recordings.frequency_responses import frequency_responses
@@ -370,3 +370,54 @@ def test_a_map_says_at_a_glance_what_was_assumed(tmp_path):
     assert said['sensor = "sensor 1"'].startswith("assumed: not stated")
     for line in lines:
         assert len(line.partition("# ")[2]) < 80, line
+
+
+OWN = """level,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s,velocity_std_m_s,\
+velocity_h3_re_m_s,velocity_h3_im_m_s
+1,49,2,0.3,0.4,0.01,0.03,0.06
+2,50,4,0.6,0,0.02,0,0.09
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "velocity", "third", "force"),
+    [
+        (["--unit", "g"], 9.80665 / (2j * np.pi), 9.80665 / (6j * np.pi), 1),
+        (["--unit", "mm"], 2e-3j * np.pi, 6e-3j * np.pi, 1),
+        (["--unit", "1.5 m/s", "--force-unit", "kN"], 1.5, 1.5, 1e3),
+        (["--amplitude", "rms"], np.sqrt(2), np.sqrt(2), np.sqrt(2)),
+    ],
+)
+def test_our_own_table_in_other_units_is_restated(tmp_path, words, velocity, third, force):
+    """1/(ikΩ) of order k for accelerations, ikΩ for displacements."""
+    (tmp_path / "measured.csv").write_text(OWN)
+    code, said = run(tmp_path / "measured.csv", *words, "--out", tmp_path / "out")
+    assert code == 0, said
+    found = read_steady_states(tmp_path / "out" / "measured.csv")
+    power = -1 if "g" in words else 1 if "mm" in words else 0
+    turn = np.array([49.0, 50.0]) ** power
+    np.testing.assert_allclose(found.velocity[:, 0], velocity * turn * [0.3 + 0.4j, 0.6])
+    np.testing.assert_allclose(found.velocity_std[:, 0], abs(velocity) * turn * [0.01, 0.02])
+    np.testing.assert_allclose(found.harmonics[:, 0, 0], third * turn * [0.03 + 0.06j, 0.09j])
+    np.testing.assert_allclose(found.force, np.array([2, 4]) * force)
+
+
+def test_our_own_tables_force_may_be_a_voltage(tmp_path):
+    (tmp_path / "measured.csv").write_text(OWN)
+    words = ("--force-unit", "V", "--out", tmp_path / "out")
+    assert run(tmp_path / "measured.csv", *words)[0] == 0
+    found = read_steady_states(tmp_path / "out" / "measured.csv")
+    np.testing.assert_allclose(found.drive, [2, 4])
+    assert np.isnan(found.force).all()
+    code, said = run(tmp_path / "measured.csv", "--force-unit", "g", "--out", tmp_path / "out")
+    assert code == 2
+    assert "must be a force or a voltage" in said
+
+
+def test_a_map_knows_the_files_that_were_read(tmp_path):
+    (tmp_path / "our test.csv").write_text(OWN)
+    out = tmp_path / "two" / "out"
+    assert run(tmp_path / "our test.csv", "--out", out)[0] == 0
+    assert files_of_map(out / "map.toml") == (tmp_path / "our test.csv",)
+    (tmp_path / "our test.csv").unlink()
+    assert files_of_map(out / "map.toml") == ()
