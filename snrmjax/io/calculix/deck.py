@@ -50,6 +50,7 @@ class Deck(eqx.Module):
     element_types: tuple[str, ...] = eqx.field(static=True)
     thickness: float = eqx.field(static=True)  # m, the smallest of its sections
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
+    small_displacements: bool = eqx.field(static=True, default=False)  # its steps, all of them
 
     def node_index(self, number: int) -> int:
         """Row of a node in `nodes`. Raises `ValueError` where no element has it."""
@@ -96,6 +97,7 @@ def read_deck(path: FilePath) -> Deck:
         element_types=types,
         thickness=_thickness(model, np.array([nodes[label] for label in labels])),
         left_out=left_out,
+        small_displacements=_small_displacements(blocks),
     )
 
 
@@ -112,6 +114,13 @@ def _split(blocks: list[Block]) -> tuple[list[Block], list[Block], tuple[str, ..
     unwanted = {"NODE PRINT", "EL PRINT", "NODE FILE", "EL FILE", "NODE OUTPUT", "OUTPUT"}
     model = [block for block in blocks[:first] if block.keyword not in unwanted]
     return model, supports, tuple(dict.fromkeys(left_out))
+
+
+def _small_displacements(blocks: list[Block]) -> bool:
+    """Whether there are steps and none of them has large displacements."""
+    steps = [block for block in blocks if block.keyword == "STEP"]
+    large = [s for s in steps if "NLGEOM" in s.parameters and s.named("NLGEOM") != "NO"]
+    return bool(steps) and not large
 
 
 def _thickness(blocks: list[Block], coordinates: Float[np.ndarray, "node 3"]) -> float:

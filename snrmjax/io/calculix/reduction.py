@@ -9,7 +9,7 @@ from jaxtyping import Float
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.io.calculix.deck import Deck, read_deck
 from snrmjax.io.calculix.modes import DeckModes, modes_of_deck
-from snrmjax.io.calculix.static import run_static_cases
+from snrmjax.io.calculix.static import STEP_OF_CASES, run_static_cases
 from snrmjax.io.files import FilePath
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 
@@ -73,6 +73,11 @@ def _notes(deck: Deck, drive: Place, *, forced: bool) -> tuple[str, ...]:
         notes.append(
             f"the model is driven and observed at node {drive[0]} in {drive[1]}, where its first "
             "mode is largest"
+        )
+    if deck.small_displacements:
+        notes.append(
+            "no step of the deck has NLGEOM, without which it would be linear: the load cases ran "
+            f"with large displacements, as `{STEP_OF_CASES}` in place of the deck's steps"
         )
     if deck.left_out:
         notes.append(

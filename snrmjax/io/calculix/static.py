@@ -29,6 +29,7 @@ from snrmjax.io.files import FilePath, write_atomically
 
 CONVERGED, DIVERGED = "converged", "diverged"
 KILLED, REFUSED = "killed", "refused"
+STEP_OF_CASES = "*STEP, NLGEOM, INC=1000"
 _ALL_ELEMENTS = "SNRMJAX_ELEMENTS"
 # First and longest increment a quarter of the load; CalculiX cuts back where it has to.
 _INCREMENTS = "0.25, 1., 1.e-5, 1."
@@ -144,7 +145,7 @@ def _step(modes: DeckModes, force: Float[np.ndarray, " mode"]) -> str:
     energy = [f"*EL PRINT, ELSET={_ALL_ELEMENTS}, TOTALS=ONLY", "ELSE"]
     return "\n".join(
         [
-            *("*STEP, NLGEOM, INC=1000", "*STATIC", _INCREMENTS),
+            *(STEP_OF_CASES, "*STATIC", _INCREMENTS),
             *("*CONTROLS, PARAMETERS=FIELD", _CONTROLS),
             *load_rows(modes.deck, loads),
             *(f"*NODE PRINT, NSET={ALL_NODES}", "U"),

@@ -39,6 +39,20 @@ def test_supports_of_the_first_step_stay_and_its_loads_go(write):
     assert deck.text.endswith("*BOUNDARY\n1, 1, 6\n*BOUNDARY\n13, 3, 3\n")
 
 
+@pytest.mark.parametrize(
+    ("steps", "small"),
+    [
+        ("", False),  # nothing is stated that could be replaced
+        ("*STEP\n*STATIC\n*END STEP", True),
+        ("*STEP, NLGEOM=NO\n*STATIC\n*END STEP", True),
+        ("*STEP\n*FREQUENCY\n3\n*END STEP\n*Step, Inc=9, nlgeom\n*STATIC\n*END STEP", False),
+        ("*STEP, NLGEOM=YES\n*STATIC\n*END STEP", False),
+    ],
+)
+def test_steps_without_large_displacements_are_known(write, steps, small):
+    assert read_deck(write(beam_deck(steps=steps))).small_displacements is small
+
+
 def test_unknown_keywords_are_kept_as_they_stand(write):
     deck = read_deck(
         write(beam_deck() + "*EQUATION\n2\n13, 3, 1., 11, 3, -1.\n*ORIENTATION, NAME=O\n")

@@ -62,8 +62,11 @@ def test_the_command_writes_a_model_of_a_deck(write, tmp_path, capsys):
     with mock.patch.object(Figure, "savefig", lambda _, buffer, **__: buffer.write(dot)):
         assert command("rom", "--calculix", deck, "--modes", 1, "--no-study", "--out", out) == 0
     said = capsys.readouterr()
-    assert "driven and observed at node 5 in z" in " ".join((said.out + said.err).split())
-    assert "left out (*CLOAD)" in " ".join((said.out + said.err).split())
+    words = " ".join((said.out + said.err).split())
+    assert "driven and observed at node 5 in z" in words
+    assert "left out (*CLOAD)" in words
+    assert "no step of the deck has NLGEOM" in words
+    assert "`*STEP, NLGEOM, INC=1000` in place of the deck's steps" in words
     model = read_model(out / "model.toml")
     assert model.modes.sensors == ("node 5 z",)
     assert (out / "report.html").is_file()
