@@ -95,8 +95,9 @@ def identify(
     axis: Annotated[
         AmplitudeAxis,
         typer.Option(
-            help="Amplitude that figures of backbone and damping show; displacement and "
-            "acceleration also add a column to points.csv and backbone.csv.",
+            help="Amplitude over which backbone, damping, the joint fit's curves and residuals "
+            "are drawn; responses over frequency stay velocities. Displacement and acceleration "
+            "also add a column to points.csv and backbone.csv.",
         ),
     ] = AmplitudeAxis.velocity,
     amplitude: Annotated[

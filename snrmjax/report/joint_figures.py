@@ -18,10 +18,13 @@ from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
     BAND,
+    VELOCITY,
     BackboneSamples,
+    ShownAmplitude,
     fit_residuals,
     sample_backbone,
     sample_fit,
+    usable_damping,
     velocity_of,
 )
 from snrmjax.report.style import (
@@ -38,7 +41,6 @@ from snrmjax.report.style import (
     SIMULATED,
     SMALL,
     TEXT,
-    Unit,
     explain_lines,
     fit_axis,
     legend,
@@ -71,11 +73,13 @@ def fitted_curves_figure(
     *,
     truth: NormalModeBranch | DampedModeBranch | None = None,
     pointwise: Backbone | None = None,
+    shown: ShownAmplitude = VELOCITY,
 ) -> Figure:
     """Natural frequency and damping of joint fits against amplitude, with 95 % bands.
 
-    Dots are what single states give on their own. Of a single fit whose levels scatter, the paler
-    band holds the curve of one further level.
+    The amplitude is that of the velocity unless `shown` says another. Dots are what single states
+    give on their own. Of a single fit whose levels scatter, the paler band holds the curve of one
+    further level.
 
     Arguments: `truth` a mode to compare with, of which a damped one shows its damping too;
     `pointwise` the curves through the points, which are drawn with their bands.
@@ -84,11 +88,11 @@ def fitted_curves_figure(
     if not series:
         raise ValueError("there is no fit to show: `series` is empty.")
     curves = [sample_fit(one.fit) for one in series]
-    unit = unit_for(np.concatenate([curve.velocity for curve in curves]), "m/s")
-    reach = [curve.velocity[-1] for curve in curves]
+    unit = unit_for(np.concatenate([curve.amplitude(shown) for curve in curves]), shown.unit)
+    reach = [curve.amplitude(shown)[-1] for curve in curves]
     for one in series:
         if one.points is not None:
-            reach += [*np.asarray(one.points.backbone_velocity)[np.asarray(one.points.usable)]]
+            reach += [*usable_damping(one.points, shown)[0]]
     top = 1.04 * max(reach) / unit.size
     figure, ((natural, damping),) = panels(PAGE, 3.4, 1, 2)
     seen: tuple[list[float], list[float]] = ([], [])
@@ -97,7 +101,7 @@ def fitted_curves_figure(
         colour, name = SERIES[number % len(SERIES)], plain(one.label)
         if one.points is not None:
             use = np.asarray(one.points.usable)
-            own = np.asarray(one.points.backbone_velocity)[use] / unit.size
+            own = usable_damping(one.points, shown)[0] / unit.size
             each = (
                 np.asarray(one.points.natural_frequency)[use] / HERTZ,
                 100 * np.asarray(one.points.damping_ratio)[use],
@@ -110,10 +114,12 @@ def fitted_curves_figure(
                 kept += [*y]
         if len(series) == 1 and np.any(one.fit.noise.level_std[2:] > 0):
             wide = sample_fit(one.fit, of_a_new_level=True)
-            _bands(natural, damping, wide, unit, colour, "95 % band of a further level", 0.5)
-        _bands(natural, damping, curve, unit, colour, "95 % band")
+            x = wide.amplitude(shown) / unit.size
+            _bands(natural, damping, x, wide, colour, "95 % band of a further level", 0.5)
+        x = curve.amplitude(shown) / unit.size
+        _bands(natural, damping, x, curve, colour, "95 % band")
         for axes, y in ((natural, curve.frequency), (damping, curve.damping)):
-            axes.plot(curve.velocity / unit.size, y, color=colour, zorder=4, **CURVE, label=name)
+            axes.plot(x, y, color=colour, zorder=4, **CURVE, label=name)
         for kept, y, error in (
             (seen[0], curve.frequency, curve.frequency_error),
             (seen[1], curve.damping, curve.damping_error),
@@ -121,26 +127,25 @@ def fitted_curves_figure(
             kept += [*(y - error), *(y + error)]
     if pointwise is not None:
         curve = sample_backbone(pointwise)
-        _bands(
-            natural, damping, curve, unit, SIMULATED, "95 % band of that through the points", 0.6
-        )
+        x = curve.amplitude(shown) / unit.size
+        _bands(natural, damping, x, curve, SIMULATED, "95 % band of that through the points", 0.6)
         style = {**CURVE, "color": SIMULATED, "linestyle": "--", "zorder": 5}
-        x = curve.velocity / unit.size
         natural.plot(x, curve.frequency, **style, label="curve through the points")
         damping.plot(x, curve.damping, **style)
         seen[0].extend([*curve.frequency])
         seen[1].extend([*curve.damping])
     if truth is not None:
         x = np.abs(velocity_of(truth, series[0].fit.modes.sensors[series[0].fit.data.sensor]))
+        x = shown.of(x, truth.frequency)
         inside = x / unit.size <= top
         style = {"color": SIMULATED, "linestyle": "--", "linewidth": LINE, "zorder": 5}
         natural.plot(x[inside] / unit.size, truth.frequency[inside] / HERTZ, **style, label="true")
         if isinstance(truth, DampedModeBranch):
             damping.plot(x[inside] / unit.size, 100 * truth.damping_ratio[inside], **style)
-    for axes, kept, shown in zip((natural, damping), dots, seen, strict=True):
+    for axes, kept, lines in zip((natural, damping), dots, seen, strict=True):
         axes.set_xlim(0.0, top)
-        fit_axis(axes, "y", kept, shown)
-    level = f"Velocity amplitude ({unit.name})"
+        fit_axis(axes, "y", kept, lines)
+    level = f"{shown.name.capitalize()} amplitude ({unit.name})"
     name_axes(natural, "(a) natural frequency", level, "Natural frequency (Hz)")
     name_axes(damping, "(b) damping", level, "Damping ratio (% of critical)")
     legend(figure)
@@ -150,14 +155,13 @@ def fitted_curves_figure(
 def _bands(
     natural: Axes,
     damping: Axes,
+    x: np.ndarray,
     curve: BackboneSamples,
-    unit: Unit,
     colour: str,
     name: str,
     strength: float = 1.0,
 ) -> None:
     fill = {**FILL, "alpha": strength * FILL["alpha"], "color": colour}
-    x = curve.velocity / unit.size
     for axes, y, error in (
         (natural, curve.frequency, curve.frequency_error),
         (damping, curve.damping, curve.damping_error),
@@ -168,20 +172,22 @@ def _bands(
 PARTS = ("in phase with the force", "in quadrature with it")
 
 
-def residuals_figure(fit: JointFit) -> Figure:
+def residuals_figure(fit: JointFit, shown: ShownAmplitude = VELOCITY) -> Figure:
     """Misfit of each point in standard deviations, against amplitude and phase, and its spread.
 
+    The amplitude is that of the velocity unless `shown` says another.
     The part of the force balance in phase with the force, which is the damping's at resonance, and
     the part in quadrature, which is the stiffness's there, made independent of the first. A
     trend is what the curves do not follow; more outside ±1.96 than one in twenty is noise larger
     than stated, or outliers.
     """
     left = fit_residuals(fit)
-    unit = unit_for(left.velocity, "m/s")
+    amplitude = shown.of(left.velocity, left.frequency)
+    unit = unit_for(amplitude, shown.unit)
     figure, ((speeds, phases, spread),) = panels(PAGE, 2.9, 1, 3)
     for part, (colour, name) in enumerate(((MEASURED, PARTS[0]), (IDENTIFIED, PARTS[1]))):
         style = {**DOT, "color": colour, "markersize": 2.8, "alpha": 0.7}
-        marks(speeds, left.velocity / unit.size, left.parts[:, part], style, name)
+        marks(speeds, amplitude / unit.size, left.parts[:, part], style, name)
         marks(phases, left.phase, left.parts[:, part], style)
     reach = max(3.5, 1.08 * float(np.max(np.abs(left.parts))))
     for axes in (speeds, phases):
@@ -196,7 +202,8 @@ def residuals_figure(fit: JointFit) -> Figure:
     spread.plot(x, normal, color=SIMULATED, **CURVE, label="standard normal distribution")
     outside = 100 * float(np.mean(np.abs(left.parts) > BAND))
     ylabel = "Misfit (σ)"
-    name_axes(speeds, "(a) against amplitude", f"Velocity amplitude ({unit.name})", ylabel)
+    level = f"{shown.name.capitalize()} amplitude ({unit.name})"
+    name_axes(speeds, "(a) against amplitude", level, ylabel)
     name_axes(phases, "(b) against phase", "Velocity phase (°)", ylabel)
     title = f"(c) rms {left.rms:.2f} σ,\n{outside:.1f} % outside ±1.96 σ"
     name_axes(spread, title, ylabel, "Density (1/σ)")

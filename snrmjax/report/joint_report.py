@@ -29,6 +29,7 @@ from snrmjax.report.joint_figures import (
     next_measurements_figure,
     residuals_figure,
 )
+from snrmjax.report.sampling import VELOCITY, ShownAmplitude
 from snrmjax.report.style import PrintedFigure, unit_for
 
 _LISTED = 12  # contributions by name; the rest stands in one row
@@ -81,15 +82,21 @@ def reported_fit(
     return ReportedFit(fit, shares, tuple(advice), tuple(responses), agreement)
 
 
-def joint_figures(told: ReportedFit, points: BackbonePoints) -> dict[str, Figure]:
-    """Figures of a joint fit by the names of their files; `points` of single states."""
+def joint_figures(
+    told: ReportedFit, points: BackbonePoints, shown: ShownAmplitude = VELOCITY
+) -> dict[str, Figure]:
+    """Figures of a joint fit by the names of their files; `points` of single states.
+
+    `shown` is the amplitude over which curves and residuals are drawn.
+    """
     beside = None
     if told.agreement is not None and not told.agreement.agree:
         beside = told.agreement.curves.backbone
-    drawn = fitted_curves_figure([FitSeries("joint fit", told.fit, points)], pointwise=beside)
+    series = [FitSeries("joint fit", told.fit, points)]
+    drawn = fitted_curves_figure(series, pointwise=beside, shown=shown)
     figures = {
         "joint_fit": drawn,
-        "residuals": residuals_figure(told.fit),
+        "residuals": residuals_figure(told.fit, shown),
         "contributions": contributions_figure(told.shares),
     }
     if told.advice:

@@ -23,6 +23,21 @@ BAND = 1.96
 _CURVE_POINTS = 200  # as many as files have: one compiled function serves both
 
 
+class ShownAmplitude(NamedTuple):
+    """The amplitude of a motion that figures and tables show."""
+
+    name: str  # "displacement"
+    unit: str  # its base unit
+    column: str  # how its columns in files end
+    power: int  # of the angular frequency, that turns a velocity into it
+
+    def of(self, velocity: ArrayLike, angular_frequency: ArrayLike) -> np.ndarray:
+        """The amplitude of velocities (m/s) at these frequencies (rad/s)."""
+        if not self.power:  # to the bit
+            return np.asarray(velocity)
+        return np.asarray(velocity) * np.asarray(angular_frequency) ** float(self.power)
+
+
 class BackboneSamples(NamedTuple):
     """A backbone at some amplitudes, in the units of the figures; errors are 95 %."""
 
@@ -34,6 +49,10 @@ class BackboneSamples(NamedTuple):
     modal_damping: np.ndarray  # 1/s
     modal_damping_error: np.ndarray
     beyond: np.ndarray  # whether the amplitude exceeds the measured ones
+
+    def amplitude(self, shown: ShownAmplitude) -> np.ndarray:
+        """The amplitude that a figure shows, in its base unit."""
+        return shown.of(self.velocity, self.frequency * HERTZ)
 
 
 def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
@@ -80,6 +99,7 @@ class FitResiduals(NamedTuple):
 
     level: np.ndarray  # counted from one
     velocity: np.ndarray  # m/s
+    frequency: np.ndarray  # rad/s
     phase: np.ndarray  # degrees, 0 at resonance
     parts: np.ndarray  # (state, 2)
     rms: float
@@ -93,6 +113,7 @@ def fit_residuals(fit: JointFit) -> FitResiduals:
     return FitResiduals(
         level=np.asarray(fit.data.level) + 1,
         velocity=np.abs(velocity),
+        frequency=np.asarray(fit.data.frequency),
         phase=np.angle(sign * velocity) / DEGREE,
         parts=fit.residuals,
         rms=float(np.sqrt(np.mean(fit.residuals**2))),
@@ -109,21 +130,6 @@ def velocity_of(
     if isinstance(curve, PredictedResponse):
         return curve.velocity
     return curve.velocity[:, 1, sensor_index(curve.sensors, sensor)]
-
-
-class ShownAmplitude(NamedTuple):
-    """The amplitude of a motion that figures and tables show."""
-
-    name: str  # "displacement"
-    unit: str  # its base unit
-    column: str  # how its columns in files end
-    power: int  # of the angular frequency, that turns a velocity into it
-
-    def of(self, velocity: ArrayLike, angular_frequency: ArrayLike) -> np.ndarray:
-        """The amplitude of velocities (m/s) at these frequencies (rad/s)."""
-        if not self.power:  # to the bit
-            return np.asarray(velocity)
-        return np.asarray(velocity) * np.asarray(angular_frequency) ** float(self.power)
 
 
 VELOCITY = ShownAmplitude("velocity", "m/s", "velocity_m_s", 0)

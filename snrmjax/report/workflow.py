@@ -320,7 +320,7 @@ def identification_figures(found: Findings, shown: ShownAmplitude = VELOCITY) ->
             measured=found.data,
         )
     if found.fitted is not None:
-        figures |= joint_figures(found.fitted, points)
+        figures |= joint_figures(found.fitted, points, shown)
     if found.truth is not None:
         figures["nnm"] = normal_mode_figure(found.truth, sensor=points.sensor)
     return figures

@@ -40,6 +40,14 @@ def figures(told):
     return joint_report.joint_figures(told, points)
 
 
+def test_the_report_passes_the_amplitude_on(told):
+    points = sj.identify.identify_points(noisy(1, gain=0.01), modes())
+    shown = plot_data.SHOWN_AMPLITUDES["displacement"]
+    figures = joint_report.joint_figures(told, points, shown)
+    for name in ("joint_fit", "residuals"):
+        assert figures[name].axes[0].get_xlabel().startswith("Displacement amplitude (")
+
+
 @pytest.fixture(scope="module")
 def sections(told, figures):
     return joint_report.joint_sections(told, figures)
@@ -158,6 +166,21 @@ def test_lines_are_the_known_curves():
     )
     assert natural.get_ylabel() == "Natural frequency (Hz)"
     assert natural.get_xlabel() == ratio.get_xlabel() == "Velocity amplitude (m/s)"
+
+
+def test_curves_and_residuals_are_drawn_over_the_amplitude_that_is_asked_for():
+    exact, shown = exact_fit(), plot_data.SHOWN_AMPLITUDES["displacement"]
+    figure = joint_plot.fitted_curves_figure([joint_plot.FitSeries("fit", exact)], shown=shown)
+    left = joint_plot.residuals_figure(exact, shown)
+    level = figure.axes[0].get_xlabel()
+    size = {"m": 1.0, "mm": 1e-3, "µm": 1e-6}[level.removeprefix("Displacement amplitude (")[:-1]]
+    assert figure.axes[1].get_xlabel() == left.axes[0].get_xlabel() == level
+    (line,) = figure.axes[0].lines
+    # The truth's backbone is a function of the displacement, v/ω of every state.
+    omega = HERTZ * line.get_ydata()
+    np.testing.assert_allclose(omega**2, squared(size * line.get_xdata()), rtol=1e-7)
+    states = np.abs(np.asarray(exact.motion().velocity)) / np.asarray(exact.data.frequency)
+    np.testing.assert_allclose(left.axes[0].lines[0].get_xdata(), states / size, rtol=1e-12)
 
 
 def test_bands_are_ninety_five_per_cent(fit, figures):
