@@ -83,8 +83,12 @@ def _misread(states: ModeStates, model: Structure, sensor: str, lowest: str) -> 
     if not errors:
         return None
     one = errors[0]
-    more = "; if the units are right, `snrmjax check` names what else it may be."
-    mend = one.mend if one.kind != "wrong_unit" else f"{one.mend.rstrip('.')}{more}"
+    more = "; `snrmjax check` writes the command" + (
+        ", and names what else it may be where the units are right."
+        if one.kind == "wrong_unit"
+        else "."
+    )
+    mend = f"{one.mend.rstrip('.')}{more if one.repairs else '.'}"
     return _Said(of_phases, f"{one.evidence.rstrip('.')}{lowest}. To mend it: {mend}")
 
 

@@ -35,6 +35,22 @@ FORCE_HARMONICS: Kind = "force_harmonics"
 """Of the force that was measured; an effect of the model has this name, too."""
 
 
+class Repair(NamedTuple):
+    """How a table is read again, relative to how it was read: what a command does."""
+
+    response: float = 1.0  # factor of the velocities
+    force: float = 1.0  # likewise
+    unit: str = ""  # of the responses, where a number of that unit was taken for one of another
+    force_unit: str = ""  # likewise; V makes the force a drive voltage
+    quantity: str = ""  # "acceleration" or "displacement" that was taken for a velocity
+    conjugate: bool = False
+    phase_unit: str = ""  # "deg" or "rad"
+    fit_gain: bool = False  # then identify with the gain of the force unknown
+    scale_model: bool = False  # find the model's shapes anew
+    apart: bool = False  # identify each table for itself
+    read_record: bool = False  # import the time record
+
+
 class Finding(NamedTuple):
     """One thing that is wrong with a test, or may be.
 
@@ -48,6 +64,7 @@ class Finding(NamedTuple):
     evidence: str  # in numbers, with their errors, and what else would explain it
     mend: str  # the line or option that mends it
     rows: tuple[int, ...] = ()
+    repairs: tuple[Repair, ...] = ()  # that commands can do, the likeliest first
 
     def as_dict(self) -> dict[str, str]:
         """What `check.json` has of it."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
-from snrmjax.doctor.findings import Finding
+from snrmjax.doctor.findings import Finding, Repair
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
 from snrmjax.model.structures import Structure
 
@@ -54,6 +54,7 @@ def mass_findings(
                 f"{size}, √2 = 1.414 {'times too much' if off > 0 else 'too little'}: the {which} "
                 "are rms, not peak amplitudes.",
                 f"multiply the {columns} by √2 = 1.41421.",
+                repairs=(_factor(off > 0, 2**0.5),),
             )
         ]
     by_frequency = _differentiated(off, float(np.log(np.median(states.frequency))), size, where)
@@ -68,16 +69,18 @@ def mass_findings(
             *("volts_as_force", "warning" if units else "error", where),
             f"{size}: the force column is no force in newtons but {kappa:.3g} per "
             f"newton, as a drive voltage is{volts.why}.",
-            f"if it is a voltage: divide `force_n` by {kappa:.4g}, or call it "
-            "`drive_v` and identify with `--free force_gain,instrument_phase`; where the response "
-            "is wrong in its place, that would leave all amplitudes wrong.",
+            "if it is a voltage, call the column `drive_v` and leave its gain to the "
+            "identification; where the response is wrong in its place, that would leave all "
+            "amplitudes wrong.",
+            repairs=(Repair(force_unit="V", fit_gain=True),),
         ),
         Finding(
             *("shape_not_mass_normalised", "warning" if units else "error", where),
             f"{size}: the shape (or participation) of the model is not mass-normalised{shape.why}.",
-            f"if it is the shape: divide `shape` and `participation` by "
-            f"{np.sqrt(kappa):.4g} each (or one by {kappa:.4g}); `snrmjax modes` scales shapes by "
-            "the drive point.",
+            f"if it is the shape, divide `shape` and `participation` of the model by "
+            f"{np.sqrt(kappa):.4g} each (or one by {kappa:.4g}), or find the modes anew, scaled "
+            "by the sensor at the force.",
+            repairs=(Repair(scale_model=True),),
         ),
     ]
     first = [wrong_unit(fit, units, where)] if units else []
@@ -101,15 +104,13 @@ def _differentiated(off: float, log_omega: float, size: str, where: str) -> Find
         return Finding(
             *("acceleration_as_velocity", "error", where),
             f"{size}, 1/Ω of it: the amplitudes are accelerations, the phases those of velocities.",
-            "divide the amplitudes by Ω: import again with `--response CHANNEL:acceleration:m/s^2` "
-            "(or `:g`).",
+            "divide the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
         )
     if abs(off - log_omega) < _BY_FREQUENCY:
         return Finding(
             *("displacement_as_velocity", "error", where),
             f"{size}, Ω of it: the amplitudes are displacements, the phases those of velocities.",
-            "multiply the amplitudes by Ω: import again with `--response CHANNEL:displacement:m` "
-            "(or `:mm`).",
+            "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
         )
     return None
 
@@ -128,10 +129,12 @@ class MixedUnit(NamedTuple):
         return f"the {self.column} in {self.unit}, taken for {self.taken_for}"
 
     @property
-    def option(self) -> str:
-        """The option of the import that states the unit."""
-        name = "--force-unit" if self.column == "force" else "--unit"
-        return f"{name} {_WRITTEN.get(self.unit, self.unit)}"
+    def repair(self) -> Repair:
+        """Reading with the right unit."""
+        unit = _WRITTEN.get(self.unit, self.unit)
+        if self.column == "force":
+            return Repair(force=1 / self.mass, force_unit=unit)
+        return Repair(response=self.mass, unit=unit)
 
 
 # The likely one first: a number of the small unit read as one of the large, then the reverse.
@@ -140,8 +143,7 @@ _SIZES = (
     *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
     *(("force", "mN", "N", 1e-3), ("force", "kN", "N", 1e3), ("force", "pounds", "N", 4.4482216)),
 )
-_WRITTEN = {"m/s²": "m/s^2", "mm": "mm/s", "µm": "um/s", "inches": "in/s", "m": "m/s"}
-_WRITTEN |= {"pounds": "lbf"}
+_WRITTEN = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
 
 
 def _every_mix_up() -> tuple[MixedUnit, ...]:
@@ -174,12 +176,17 @@ def mixed_units(states: ModeStates, fit: BalanceFit, model: Structure) -> tuple[
 def wrong_unit(fit: BalanceFit, units: tuple[MixedUnit, ...], where: str) -> Finding:
     """That the modal mass is off by the factor between two units, and which these may be."""
     words = ", or ".join(one.words for one in units)
-    options = " or ".join(f"`{one.option}`" for one in units)
+    right = ", or ".join(f"{one.column}s in {one.unit}" for one in units)
     return Finding(
         *("wrong_unit", "error", where),
-        f"{mass_in_words(fit)}, {units[0].mass:.4g} of it as with {words}.",
-        f"import again with {options} (or the unit of that kind which the numbers have).",
+        f"{mass_in_words(fit)}: the factor {units[0].mass:.4g} of {words}.",
+        f"import again, {right}.",
+        repairs=tuple(one.repair for one in units),
     )
+
+
+def _factor(of_response: bool, factor: float) -> Repair:
+    return Repair(response=factor) if of_response else Repair(force=factor)
 
 
 def mass_in_words(fit: BalanceFit) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
 from snrmjax.doctor.corrections import Remedy, corrections
-from snrmjax.doctor.findings import Finding, Kind, rows_in_words
+from snrmjax.doctor.findings import Finding, Kind, Repair, rows_in_words
 from snrmjax.doctor.modal_mass import mass_findings
 from snrmjax.doctor.readings import Reading, best_reading, wild_phases
 from snrmjax.model.structures import Structure
@@ -22,10 +22,14 @@ _MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
 _OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
 _LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between files
 
-_OTHER_SIGN = (
-    "import again with the other phase sign: `--phase-sign lag`, or `--phase-sign lead` where "
-    "`phase_sign` of map.toml says lag"
-)
+_OTHER_SIGN = "import again with the other phase sign"
+_REPAIRS = {
+    "conjugated": Repair(conjugate=True),
+    "acceleration": Repair(quantity="acceleration"),
+    "displacement": Repair(quantity="displacement"),
+    "radians_read_as_degrees": Repair(phase_unit="rad"),
+    "degrees_read_as_radians": Repair(phase_unit="deg"),
+}
 _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "conjugated": (
         "conjugated_response",
@@ -47,12 +51,12 @@ _MEANINGS: dict[str, tuple[Kind, str, str]] = {
     "acceleration": (
         "acceleration_as_velocity",
         "accelerations (m/s²)",
-        "divide by iΩ: import again with `--response CHANNEL:acceleration:m/s^2` (or `:g`)",
+        "divide by iΩ: import again as accelerations",
     ),
     "displacement": (
         "displacement_as_velocity",
         "displacements (m)",
-        "multiply by iΩ: import again with `--response CHANNEL:displacement:m` (or `:mm`)",
+        "multiply by iΩ: import again as displacements",
     ),
     "radians_read_as_degrees": (
         "degrees_for_radians",
@@ -120,6 +124,7 @@ def misread(recorded: Reading, best: Reading, where: str) -> Finding:
         f"as recorded and by {100 * new.misfit:.3g} % so read (criterion smaller by "
         f"{recorded.criterion - best.criterion:.4g}).",
         mend + ".",
+        repairs=(_REPAIRS[best.name],) if best.name in _REPAIRS else (),
     )
 
 
@@ -131,6 +136,7 @@ def _wild(fit: BalanceFit, where: str) -> Finding:
         f"phases jump at random from state to state while amplitudes are smooth: no mode is nearer "
         f"than {100 * fit.misfit:.3g} %, as where phases in degrees were read as radians.",
         "convert phases by π/180 (or 180/π) before the real and imaginary part are made.",
+        repairs=(_REPAIRS["degrees_read_as_radians"],),
     )
 
 
@@ -236,6 +242,7 @@ def _mended(
             f"the first, differs from the others' by {100 * value:.3g} ± {100 * std:.2g} %"
             f"{damping}{left}",
             "identify them apart: one call and one model for each structure or assembly.",
+            repairs=(Repair(apart=True),) if one.levels in groups else (),
         )
     if one.kind == "volts_as_force":
         gains = ", ".join(f"{np.exp(g):.3g}" for g in fit.extra)
@@ -243,15 +250,17 @@ def _mended(
             *("volts_as_force", "error", where),
             f"the force over that of the first level is off by the factors {gains} at levels 2 and "
             f"on: a drive voltage or an amplifier's range{left}",
-            "call the column `drive_v` and identify with `--free force_gain,instrument_phase`.",
+            "measure the force, or calibrate the drive at each level and divide `force_n` by what "
+            "it gives.",
         )
     if one.kind == "unsettled_steps":
         return Finding(
             *("unsettled_steps", "error", where),
             f"about {100 * one.value:.2g} % of the motion of the state before is left at the end "
             f"of a step{left}",
-            "dwell longer (5/(ζω) per step), or read the record again by "
-            "`sj.measure.stepped_sine_states`, which leaves the transients out.",
+            "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are "
+            "left out.",
+            repairs=(Repair(read_record=True),),
         )
     return _clipping(states, one, where, left)
 

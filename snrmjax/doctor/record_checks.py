@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair
 from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
@@ -245,8 +245,9 @@ def _unsettled(
             f"to {100 * worst:.3g} % at the end of the step (worst at "
             f"{one.frequency / (2 * np.pi):.5g} Hz, {one.start / rate:.4g} to "
             f"{one.stop / rate:.4g} s).",
-            "dwell longer (5/(ζω) a step), or read it by `sj.measure.stepped_sine_states`, which "
-            "leaves transients out.",
+            "dwell longer, 5/(ζω) a step; or import this record, whose unsettled steps are left "
+            "out.",
+            repairs=(Repair(read_record=True),),
         )
     ]
 

@@ -79,25 +79,27 @@ KINDS = (
 
 
 @pytest.mark.parametrize(
-    ("response", "force", "words", "option"),
+    ("response", "force", "words", "repair"),
     [
-        (1 / 9.80665, 1, "the response in g, taken for m/s²", "--unit g"),
-        (9.80665, 1, "the response in m/s², taken for g", "--unit m/s^2"),
-        (1e3, 1, "the response in mm, taken for m", "--unit mm/s"),
-        (1e6, 1, "the response in µm, taken for m", "--unit um/s"),
-        (39.3701, 1, "the response in inches, taken for m", "--unit in/s"),
-        (1, 1e3, "the force in mN, taken for N", "--force-unit mN"),
-        (1, 1 / 4.44822, "the force in pounds, taken for N", "--force-unit lbf"),
-        (1, 4.44822, "the force in N, taken for pounds", "--force-unit N"),
+        (1 / 9.80665, 1, "the response in g, taken for m/s²", ("g", "")),
+        (9.80665, 1, "the response in m/s², taken for g", ("m/s2", "")),
+        (1e3, 1, "the response in mm, taken for m", ("mm", "")),
+        (1e6, 1, "the response in µm, taken for m", ("um", "")),
+        (39.3701, 1, "the response in inches, taken for m", ("in", "")),
+        (1, 1e3, "the force in mN, taken for N", ("", "mN")),
+        (1, 1 / 4.44822, "the force in pounds, taken for N", ("", "lbf")),
+        (1, 4.44822, "the force in N, taken for pounds", ("", "N")),
     ],
 )
-def test_units_that_were_mixed_up_come_first(response, force, words, option):
+def test_units_that_were_mixed_up_come_first(response, force, words, repair):
     level, w, f, v = states()
     found = sj.doctor.check_test(table(level, w, force * f, response * noisy(v)), model()).findings
     assert [one.kind for one in found] == list(UNIT_FIRST)
     assert [one.severity for one in found] == ["error", "warning", "warning"]
     assert words in found[0].evidence
-    assert f"`{option}`" in found[0].mend
+    first = found[0].repairs[0]
+    assert (first.unit, first.force_unit) == repair
+    assert first.response / first.force * response / force == pytest.approx(1, rel=1e-5)
     assert all(one.evidence.startswith("if the units are right") for one in found[1:])
 
 

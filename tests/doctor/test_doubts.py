@@ -46,17 +46,18 @@ def said(data, structure):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (lambda w, f, v: (f, v / 9.80665), ("in g", "--unit g")),
-        (lambda w, f, v: (f, 1e3 * v), ("in mm", "--unit mm/s", "--force-unit kN")),
-        (lambda w, f, v: (f / 4.4482216, v), ("pounds", "--force-unit lbf")),
-        (lambda w, f, v: (f, v.conj()), ("conjugates", "--phase-sign lag")),
-        (lambda w, f, v: (f, 1j * w * v), ("accelerations", ":acceleration:m/s^2")),
+        (lambda w, f, v: (f, v / 9.80665), ("in g", "responses in g")),
+        (lambda w, f, v: (f, 1e3 * v), ("in mm", "responses in mm", "forces in kN")),
+        (lambda w, f, v: (f / 4.4482216, v), ("pounds", "forces in pounds")),
+        (lambda w, f, v: (f, v.conj()), ("conjugates", "with the other phase sign")),
+        (lambda w, f, v: (f, 1j * w * v), ("accelerations", "import again as accelerations")),
         (lambda w, f, v: (f, v / np.sqrt(2)), ("rms", "√2")),
     ],
 )
 def test_a_wrong_unit_or_phase_sign_is_named_with_its_size_and_its_mend(change, named):
     (note,) = said(few(change), model())
-    for word in (*named, "the lowest level has", "the model 60 Hz and 2 %", "To mend it: "):
+    said_too = ("the lowest level has", "the model 60 Hz and 2 %", "To mend it: ", "snrmjax check")
+    for word in (*named, *said_too):
         assert word in note
 
 
@@ -130,7 +131,7 @@ def test_damping_at_rest_is_compared_with_the_linear_tests(monkeypatch):
 @pytest.mark.long
 def test_an_identification_without_points_says_why():
     data = few(lambda w, f, v: (f, v / (1j * w)))
-    with pytest.raises(ValueError, match=r"no real natural frequency.*--response CHANNEL:displ"):
+    with pytest.raises(ValueError, match=r"no real natural frequency.*as displacements"):
         identify_by_points(data, model(), CurveSettings(), Loads())
 
 

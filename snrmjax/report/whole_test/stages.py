@@ -38,6 +38,7 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
+from snrmjax.report.whole_test.mends import TestedFiles, with_channels, with_commands
 from snrmjax.report.whole_test.used_steps import used_steps, with_steps
 from snrmjax.report.workflow import (
     CurveSettings,
@@ -61,6 +62,7 @@ class TestRequest(NamedTuple):
     drive_point: str | None = None
     go_on: bool = False  # in spite of errors that the check finds
     diagnose: bool = True
+    place: TestedFiles | None = None  # of the files, by which commands that mend are written
 
 
 class WholeTest(NamedTuple):
@@ -122,6 +124,9 @@ def run_whole_test(
     data = join_steady_states(parts)
     stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
+    if request.place is not None:
+        place = with_channels(request.place, files, sorted_records, modes.model)
+        checkup = with_commands(checkup, place)
     _stop_at_errors(checkup, request)
     write_steady_states(folder / "measured.csv", data)
     write_checkup(folder / "check.json", checkup)
@@ -317,8 +322,8 @@ def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
     errors = [one for one in checkup.findings if one.severity == "error"]
     if not errors or request.go_on:
         return
-    first = errors[0]
-    more = f" ({len(errors) - 1} more: `snrmjax check` lists them)" if len(errors) > 1 else ""
+    first, *others = errors
+    more = "".join(f" Or {one.evidence} {one.mend}" for one in others)
     raise ValueError(
         f"is this meant? {first.kind.replace('_', ' ')} in {first.where}: {first.evidence} To mend "
         f"it: {first.mend}{more} To go on nevertheless: `--go-on`."

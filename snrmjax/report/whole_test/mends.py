@@ -1,0 +1,240 @@
+"""Mends of findings as commands that can be pasted, with the files of the test and its options."""
+
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.io.exchange.import_map import files_of_map, read_import_map
+from snrmjax.io.files import FilePath
+from snrmjax.methods.records.recorded_test import RecordedTest
+from snrmjax.model.structures import Structure
+from snrmjax.report.whole_test.folder_contents import TestFiles
+
+_MAP = "map.toml"
+_PER_SECOND = {"displacement": "", "velocity": "/s", "acceleration": "/s2"}
+_ACCELERATIONS = ("g", "m/s2")
+_QUOTED = re.compile(r"[^\"$`\\!]+")  # what double quotes keep, in every shell
+
+Words = Sequence[FilePath]
+
+
+class TestedFiles(NamedTuple):
+    """Where the states of a test come from, and how it goes on once they are mended.
+
+    `tables` have our own columns; `sources` are the laboratory's files, which an import with the
+    words `options` reads; one of both is empty where the other is not known.
+    """
+
+    mended: Path  # folder of what the commands write
+    tables: tuple[Path, ...] = ()
+    sources: tuple[Path, ...] = ()
+    options: tuple[FilePath, ...] = ()
+    quantities: tuple[str, ...] = ()  # of the responses, as the import takes them
+    phase_unit: str = ""  # likewise
+    model: Path | None = None
+    sensors: tuple[str, ...] = ()
+    records: tuple[Path, ...] = ()
+    folder: Path | None = None  # of `snrmjax test`; None: of `snrmjax check`
+    out: Path | None = None  # of `snrmjax test`
+    drive_point: str | None = None
+    responses: tuple[Path, ...] = ()  # of which the linear modes are found
+
+
+def with_sources(where: TestedFiles, map_file: Path) -> TestedFiles:
+    """The same with the laboratory's files that a map was written of, where they are still there.
+
+    Also with the map itself where the sources are known already.
+    """
+    if not map_file.is_file():
+        return where
+    told = read_import_map(map_file)
+    sources = where.sources or files_of_map(map_file)
+    return where._replace(
+        sources=sources,
+        options=("--map", map_file) if sources else (),
+        quantities=tuple(one.quantity for one in told.responses),
+        phase_unit=told.phase_unit,
+    )
+
+
+def checked_files(
+    tables: Sequence[Path],
+    model: Path | None,
+    sensors: Sequence[str],
+    records: Sequence[Path],
+) -> TestedFiles:
+    """The files of `snrmjax check`: the map beside a table says what it was imported from."""
+    mended = tables[0].parent / "mended"
+    where = TestedFiles(
+        mended, tuple(tables), model=model, sensors=tuple(sensors), records=tuple(records)
+    )
+    return where if len(tables) > 1 else with_sources(where, tables[0].parent / _MAP)
+
+
+def tested_files(
+    folder: Path, files: TestFiles, model: Path | None, drive_point: str | None, out: Path
+) -> TestedFiles:
+    """The files of `snrmjax test`; those of the laboratory are read by the folder's map."""
+    tables = tuple(one.table for one in files.states if one.table is not None)
+    read = [one.file for one in files.states if one.table is None]
+    read += [one.file.partition(": ")[0] for one in files.records]
+    own = None if files.model is None else model or folder / files.model_file
+    where = TestedFiles(
+        out.with_name(f"{out.name}_mended"),
+        () if read else tables,
+        () if tables else tuple(folder / one for one in dict.fromkeys(read)),
+        model=own,
+        records=tuple(folder / one.file.partition(": ")[0] for one in files.records),
+        folder=folder,
+        out=out,
+        drive_point=drive_point,
+        responses=() if own else tuple(folder / one.file for one in files.responses),
+    )
+    return with_sources(where, folder / _MAP) if where.tables or where.sources else where
+
+
+def with_channels(
+    where: TestedFiles, files: TestFiles, tests: Sequence[RecordedTest], model: Structure
+) -> TestedFiles:
+    """With the model's sensors, and the channels of a record that no map tells."""
+    where = where._replace(sensors=model.modes.sensors)
+    if where.options or not where.sources or not tests:
+        return where
+    channels = tests[0].channels
+    known = {one.name: one.quantity for one in files.records[0].record.channels}
+    words: list[FilePath] = ["--force", channels.force or channels.drive or ""]
+    for motion in channels.motions:
+        words += ["--response", f"{motion}:{known[motion]}"]
+    for sensor in channels.sensors:
+        words += ["--sensor", sensor]
+    quantities = tuple(known[motion] for motion in channels.motions)
+    return where._replace(options=tuple(words), quantities=quantities)
+
+
+def with_commands(checkup: Checkup, where: TestedFiles) -> Checkup:
+    """The findings with the commands that mend them, each a line of its own."""
+    return Checkup(tuple(_told(one, where) for one in checkup.findings), checkup.notes)
+
+
+def _told(one: Finding, where: TestedFiles) -> Finding:
+    sensor = next((name for name in where.sensors if one.where.endswith(f" at {name}")), "")
+    lines = [line for each in one.repairs if (line := _command(each, where, sensor))]
+    if not lines:
+        return one
+    return one._replace(mend=f"{one.mend.rstrip('.')}: `{'`, or `'.join(lines)}`.")
+
+
+def _command(repair: Repair, where: TestedFiles, sensor: str) -> str:
+    """What does a repair, steps joined by &&; empty where no command can."""
+    steps: list[Words]
+    if repair.read_record:
+        steps = [["import", one] for one in where.records]
+    elif repair.apart:
+        steps = _identified_apart(where)
+    elif repair.scale_model:
+        steps = _scaled(where, sensor)
+    else:
+        steps = _imported(repair, where)
+    return " && ".join(" ".join(map(_word, ("snrmjax", *step))) for step in steps)
+
+
+def _word(one: FilePath) -> str:
+    text = str(one)
+    return (
+        f'"{text}"' if shlex.quote(text) != text and _QUOTED.fullmatch(text) else shlex.quote(text)
+    )
+
+
+def _identified_apart(where: TestedFiles) -> list[Words]:
+    if where.model is None or where.folder is not None or len(where.tables) < 2:
+        return []
+    return [
+        ["identify", one, "--model", where.model, "--out", where.mended / f"{k + 1}_{one.stem}"]
+        for k, one in enumerate(where.tables)
+    ]
+
+
+def _scaled(where: TestedFiles, sensor: str) -> list[Words]:
+    """The modes anew, of the states themselves, and the test again with them."""
+    first, tables = _as_tables(where)
+    if len(tables) != 1 or not sensor:
+        return []
+    model = where.mended / "model.toml"
+    modes: Words = ["modes", tables[0], "--drive-point", sensor, "--out", model]
+    again = where._replace(model=model, responses=())
+    return [*first, modes, *_again(again, tables, where.folder)]
+
+
+def _imported(repair: Repair, where: TestedFiles) -> list[Words]:
+    """The laboratory's files with another unit, or else our own table read as what it is."""
+    out: list[FilePath] = ["--out", where.mended]
+    table = where.mended / "measured.csv"
+    named = _options_of_files(repair, where) if where.sources else []
+    if named:
+        steps: list[Words] = [["import", *where.sources, *where.options, *named, *out]]
+    else:
+        first, tables = _as_tables(where)
+        own = _options_of_own(repair)
+        if not own or not tables:
+            return []
+        steps = [*first, ["import", *tables, *own, *out]]
+    if repair.fit_gain and where.folder is None and where.model is not None:
+        free = ["--fit", "auto", "--free", "force_gain,instrument_phase"]
+        to = where.mended / "identify"
+        return [*steps, ["identify", table, "--model", where.model, *free, "--out", to]]
+    return [*steps, *_again(where, (table,), where.mended)]
+
+
+def _as_tables(where: TestedFiles) -> tuple[list[Words], tuple[Path, ...]]:
+    """Our own tables of the test, and the import that makes them where there are none yet."""
+    if where.tables or not where.sources:
+        return [], where.tables
+    read = where.mended.with_name(f"{where.mended.name}_before")
+    step: Words = ["import", *where.sources, *where.options, "--out", read]
+    return [step], (read / "measured.csv",)
+
+
+def _again(where: TestedFiles, tables: Sequence[Path], folder: Path | None) -> list[Words]:
+    """The check or the whole test of what is mended."""
+    model: list[FilePath] = [] if where.model is None else ["--model", where.model]
+    if where.folder is None or where.out is None or folder is None:
+        return [["check", *tables, *model, "--out", where.mended]]
+    point = [] if where.drive_point is None else ["--drive-point", where.drive_point]
+    steps: list[Words] = []
+    if where.responses:
+        model = ["--model", where.mended / "model.toml"]
+        steps = [["modes", *where.responses, *point, "--out", model[1]]]
+    scaled = point if not model else []
+    return [*steps, ["test", folder, *model, *scaled, "--out", where.out]]
+
+
+def _options_of_files(repair: Repair, where: TestedFiles) -> list[str]:
+    """Options of the first import that state a unit by its name; none where it has no name."""
+    kinds = set(where.quantities)
+    if repair.phase_unit:
+        changes = where.phase_unit not in ("", repair.phase_unit)
+        return ["--phase-unit", repair.phase_unit] if changes else []
+    if repair.force_unit:
+        return ["--force-unit", repair.force_unit]
+    if not repair.unit or len(kinds) != 1:
+        return []
+    (kind,) = kinds
+    if repair.unit in _ACCELERATIONS:
+        return ["--unit", repair.unit] if kind == "acceleration" else []
+    return ["--unit", f"{repair.unit}{_PER_SECOND[kind]}"] if kind in _PER_SECOND else []
+
+
+def _options_of_own(repair: Repair) -> list[str]:
+    """Options that read our own table as what it is; none where it does not hold enough."""
+    if repair.quantity:
+        return ["--unit", "m/s2" if repair.quantity == "acceleration" else "m"]
+    if repair.conjugate:
+        return ["--phase-sign", "lag"]
+    if repair.fit_gain:
+        return ["--force-unit", repair.force_unit]
+    if repair.response != 1:
+        return ["--unit", f"{repair.response:.8g} m/s"]
+    return ["--force-unit", f"{repair.force:.8g} N"] if repair.force != 1 else []
