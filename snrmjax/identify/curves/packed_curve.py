@@ -104,10 +104,13 @@ def _filled(parameters: Array, missing: int) -> Array:
     return jnp.asarray(np.pad(np.asarray(parameters), (0, missing)))
 
 
-def packed(family: AbstractFamily) -> AbstractCurve:
-    """The same curve as an `PackedCurve`; a family that users wrote stays what it is."""
+def packed(family: AbstractFamily, room: int = 0) -> AbstractCurve:
+    """The same curve as an `PackedCurve`; a family that users wrote stays what it is.
+
+    There is room for so many parameters at least.
+    """
     n = family.parameters.shape[0]
-    size = -(-n // _SIZE) * _SIZE
+    size = -(-max(n, room) // _SIZE) * _SIZE
     exponents, knots = np.zeros(size), _FAR * np.arange(1.0, size + 3)
     mix, free = np.zeros((2 * size, size)), np.zeros(size, dtype=bool)
     largest, prior = 1.0, np.zeros((size, size))

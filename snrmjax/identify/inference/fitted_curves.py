@@ -187,10 +187,10 @@ def curve_values(
     """ω̃² and 2ζ̃ω̃ at velocities on the backbone, `near` displacements; differentiable."""
     squared, damping = unknowns.squared_frequency, unknowns.modal_damping
 
-    def excess(x: Array) -> Array:
+    def excess(squared: AbstractCurve, x: Array) -> Array:
         return x * jnp.sqrt(squared(squared.amplitude(x, velocity))) - velocity
 
-    x = _solved(excess, near)
+    x = _solved(excess, squared, near)
     return jnp.stack(
         [squared(squared.amplitude(x, velocity)), damping(damping.amplitude(x, velocity))], axis=1
     )
@@ -199,23 +199,31 @@ def curve_values(
 def _speed(squared: AbstractCurve, displacement: Float[Array, " point"]) -> Float[Array, " point"]:
     """Velocity amplitude of the backbone; its derivative is that of the equation's solution."""
 
-    def excess(v: Array) -> Array:
+    def excess(squared: AbstractCurve, v: Array) -> Array:
         return v - displacement * jnp.sqrt(squared(squared.amplitude(displacement, v)))
 
-    return _solved(excess, displacement * jnp.sqrt(squared(jnp.zeros_like(displacement))))
+    start = displacement * jnp.sqrt(squared(jnp.zeros_like(displacement)))
+    return _solved(excess, squared, start)
 
 
-def _solved(excess: Callable[[Array], Array], start: Array) -> Array:
-    """Newton's method for every point by itself; the derivative is the solution's."""
+def _solved(
+    excess: Callable[[AbstractCurve, Array], Array], curve: AbstractCurve, start: Array
+) -> Array:
+    """Newton's method for every point by itself; the derivative is the solution's.
 
-    def step(_: int, x: Array) -> Array:
-        value, slope = jax.jvp(excess, (x,), (jnp.ones_like(x),))
-        return x - value / slope
+    Newton's steps are taken of a curve without derivatives: nothing is pushed through the loop.
+    """
+    still, start = jax.lax.stop_gradient((curve, start))
 
-    fixed = jax.lax.stop_gradient
-    found = fixed(jax.lax.fori_loop(0, _ITERATIONS, step, fixed(start)))
-    slope = fixed(jax.jvp(excess, (found,), (jnp.ones_like(found),))[1])
-    return found - excess(found) / slope
+    def values(x: Array) -> tuple[Array, Array]:
+        return jax.jvp(lambda x: excess(still, x), (x,), (jnp.ones_like(x),))
+
+    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        value, slope = values(state[0])
+        return state[0] - value / slope, slope
+
+    found, slope = jax.lax.fori_loop(0, _ITERATIONS, step, (start, jnp.ones_like(start)))
+    return found - excess(curve, found) / slope
 
 
 def values_with_slopes(

@@ -251,6 +251,7 @@ def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     return motion_of(unknowns, problem, no_errors(problem.data.level.shape[0]))
 
 
+@compiled
 def motion_of(
     unknowns: Unknowns,
     problem: BalanceProblem,
@@ -273,6 +274,7 @@ def motion_of(
     return Motion(own, jnp.abs(own) / data.frequency, force)
 
 
+@compiled
 def force_balance(
     unknowns: Unknowns,
     problem: BalanceProblem,

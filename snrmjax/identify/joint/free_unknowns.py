@@ -182,6 +182,8 @@ def named_unknowns(
 
 
 def with_packed_curves(unknowns: Unknowns) -> Unknowns:
-    """The same unknowns with both curves as compiled programs take them."""
-    pair = (packed(unknowns.squared_frequency), packed(unknowns.modal_damping))
+    """The same unknowns with both curves as compiled programs take them, in arrays of one size."""
+    curves = (unknowns.squared_frequency, unknowns.modal_damping)
+    most = max(curve.parameters.shape[0] for curve in curves)
+    pair = tuple(packed(curve, most) for curve in curves)
     return eqx.tree_at(lambda u: (u.squared_frequency, u.modal_damping), unknowns, pair)
