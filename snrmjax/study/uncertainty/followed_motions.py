@@ -1,6 +1,6 @@
 """Peaks, folds and phase resonances of a forced response as functions of uncertain inputs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from snrmjax.model.parameters import checked_names, with_parameters
+from snrmjax.model.parameters import checked_names
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, mapped
 from snrmjax.numerics.compiled import compiled
@@ -20,6 +20,13 @@ from snrmjax.simulate.solutions.forced_response import (
     forced_response_batch,
 )
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion, periodic_motion, turning
+from snrmjax.study.uncertainty.made_models import (
+    Base,
+    MadeModels,
+    ModelOf,
+    made_models,
+    with_numbers,
+)
 from snrmjax.study.uncertainty.quantities import (
     AbstractQuantities,
     Expansion,
@@ -47,14 +54,6 @@ class NominalMotion(NamedTuple):
     turning: Float[Array, ""]  # which way the curve turns there
 
 
-class Base(NamedTuple):
-    """What is not uncertain."""
-
-    model: Structure
-    force: Float[np.ndarray, ""]  # N, where it is not among the inputs
-    model_of: Callable[[dict[str, Array]], Structure] | None = None  # of the inputs by name
-
-
 class ResponseQuantities(AbstractQuantities):
     """Frequency and velocity of events of one response curve, by uncertain inputs.
 
@@ -71,6 +70,7 @@ class ResponseQuantities(AbstractQuantities):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
+    made: MadeModels | None = None  # of inputs that are no numbers of the model
 
     def expansion(self) -> Expansion:
         """See `AbstractQuantities`."""
@@ -108,9 +108,10 @@ class ResponseQuantities(AbstractQuantities):
         """
         rows = np.asarray(z, dtype=np.float64)
         models, forces = [], []
-        for row in rows:
-            model, force = _at(self.base, self.inputs, jnp.asarray(row))
-            models.append(model)
+        numbers = _none(rows) if self.made is None else self.made.numbers(rows)
+        for row, own in zip(rows, numbers, strict=True):
+            model, force = self.base.at(self.inputs, jnp.asarray(row))
+            models.append(model if self.made is None else with_numbers(model, own))
             forces.append(float(force))
         order = (self.motions[0].coefficients.shape[0] - 1) // 2
         settings = ResponseSettings(harmonic_order=order, stability=False)
@@ -130,18 +131,26 @@ class ResponseQuantities(AbstractQuantities):
         rows = np.asarray(z, dtype=np.float64)
         possible = self.inputs.possible(rows)
         safe = np.where(possible[:, None], rows, 0.0)
-        values, by_z = [], []
+        values, by_z, made = [], [], self.made
+        rest = _none(safe) if made is None else made.rest(safe)
+        own = [_none(safe)] * 2
+        if made is not None and slopes:
+            own = [made.numbers(safe), made.slopes(safe)]
         for kind, motion in zip(self.kinds, self.motions, strict=True):
 
             def block(
-                some: np.ndarray, kind: EventKind = kind, motion: NominalMotion = motion
+                some: np.ndarray,
+                rest: np.ndarray,
+                *own: np.ndarray,
+                kind: EventKind = kind,
+                motion: NominalMotion = motion,
             ) -> tuple:
-                found = _follow(self.base, self.inputs, kind, motion, some)
+                found = _follow(self.base, self.inputs, kind, motion, some, rest)
                 if not slopes:
                     return found[0], np.zeros((len(some), 2, some.shape[1]))
-                return found[0], _slopes(self.base, self.inputs, kind, found[1:], some)
+                return found[0], _slopes(self.base, self.inputs, kind, found[1:], some, *own)
 
-            found, gradient = by_blocks(block, _BLOCK, safe)
+            found, gradient = by_blocks(block, _BLOCK, safe, rest, *own)
             values.append(found)
             by_z.append(gradient)
         table = np.where(possible[:, None], np.concatenate(values, axis=1), np.nan)
@@ -160,7 +169,7 @@ def response_quantities(
     force: float | None = None,
     kinds: Sequence[EventKind] = ("peak", "fold", "phase_resonance"),
     harmonic_order: int = 9,
-    model_of: Callable[[dict[str, Array]], Structure] | None = None,
+    model_of: ModelOf | None = None,
 ) -> ResponseQuantities:
     """Frequency (Hz) and velocity (m/s) of a response's events as functions of uncertain inputs.
 
@@ -173,7 +182,8 @@ def response_quantities(
 
     Arguments: frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
     among `inputs`; `model_of`, a differentiable JAX function that makes the model of the inputs'
-    values by name, where inputs are no parameters of `model` (dimensions, say).
+    values by name, where inputs are no parameters of `model` (dimensions, say). It is
+    differentiated once, at the nominal inputs, and called once for every member.
     Returns `ResponseQuantities`; kinds of which the nominal curve has none are in its `notes`.
     Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
     where the nominal curve has none of the events.
@@ -200,8 +210,9 @@ def response_quantities(
         verb = "are given none of" if force is None else "have"
         raise ValueError(f"`force` must be given once, but it is {force!r} and inputs {verb} it.")
     load = np.asarray(1.0 if force is None else force, dtype=np.float64)
-    base = Base(model, load, model_of)
-    nominal, nominal_force = _at(base, inputs, jnp.zeros(len(inputs.names)))
+    made = None if model_of is None else made_models(model_of, inputs)
+    base = Base(model, load, None if made is None else made.series)
+    nominal, nominal_force = base.at(inputs, jnp.zeros(len(inputs.names)))
     settings = ResponseSettings(harmonic_order=harmonic_order, stability=False)
     ends = np.array([from_frequency, to_frequency], dtype=np.float64)
     (curves,) = forced_response_batch(
@@ -239,7 +250,13 @@ def response_quantities(
         names=tuple(names),
         units=units,
         notes=tuple(notes),
+        made=made,
     )
+
+
+def _none(rows: np.ndarray) -> Float[np.ndarray, "member zero"]:
+    """Nothing of every member."""
+    return np.zeros((len(rows), 0))
 
 
 def _name(kind: EventKind, number: int) -> str:
@@ -254,25 +271,10 @@ def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[Resp
     return [max(every, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
 
 
-def _at(base: Base, inputs: UncertainInputs, z: Float[Array, " input"]) -> tuple[Structure, Array]:
-    """Model and force at standard normal numbers."""
-    values = inputs.values(z)
-    own = [k for k, name in enumerate(inputs.names) if name != FORCE]
-    load, model = jnp.asarray(base.force), base.model
-    if FORCE in inputs.names:
-        load = values[inputs.names.index(FORCE)]
-    if base.model_of is not None:
-        model = base.model_of(dict(zip(inputs.names, values, strict=True)))
-    elif own:
-        names = [inputs.names[k] for k in own]
-        model = with_parameters(model, names, values[np.array(own)])
-    return model, load
-
-
 def _motion(
     base: Base, inputs: UncertainInputs, kind: EventKind, start: tuple, z: Array
 ) -> PeriodicMotion:
-    model, force = _at(base, inputs, z)
+    model, force = base.at(inputs, z)
     return periodic_motion(model, force, start, condition=kind, iterations=_ITERATIONS)
 
 
@@ -291,7 +293,7 @@ def _nominal(
         return (motion.coefficients, motion.frequency), motion
 
     slopes, motion = jax.jacfwd(found, has_aux=True)(zero)
-    turn = turning(*_at(base, inputs, zero), motion, kind)
+    turn = turning(*base.at(inputs, zero), motion, kind)
     nominal = NominalMotion(motion.coefficients, motion.frequency, slopes[0], slopes[1], turn)
     return nominal, motion.converged
 
@@ -327,18 +329,23 @@ def _follow(
     kind: EventKind,
     near: NominalMotion,
     z: Array,
+    rests: Array,
 ) -> tuple[Array, Array, Array]:
-    """Frequency (Hz) and velocity of every member, and its coefficients and frequency (rad/s)."""
+    """Frequency (Hz) and velocity of every member, and its coefficients and frequency (rad/s).
+
+    `rests` are the numbers of every member's model less those of the series.
+    """
     size, speed = jnp.max(jnp.abs(near.coefficients)), near.frequency
 
-    def member(row: Array) -> tuple[Array, Array, Array]:
+    def member(row: Array, rest: Array) -> tuple[Array, Array, Array]:
         def apart(one: tuple, other: tuple) -> Array:
             moved = jnp.max(jnp.abs(one[0] - other[0])) / size
             return jnp.maximum(moved, jnp.abs(one[1] - other[1]) / speed)
 
         def slope(way: _Way) -> tuple[Array, Array]:
             def along(share: Array) -> tuple[Array, Array]:
-                motion = _motion(base, inputs, kind, way.point, share * row)
+                own = base.toward(rest, share)
+                motion = _motion(own, inputs, kind, way.point, share * row)
                 return motion.coefficients, motion.frequency
 
             def computed() -> tuple[Array, Array]:
@@ -355,9 +362,10 @@ def _follow(
                 lambda x, s, last: x + step * s + bend * (s - last), here, ahead, way.slope_before
             )
             to = way.share + step
-            motion = _motion(base, inputs, kind, guess, to * row)
+            own = base.toward(rest, to)
+            motion = _motion(own, inputs, kind, guess, to * row)
             there = (motion.coefficients, motion.frequency)
-            turn = turning(*_at(base, inputs, to * row), motion, kind)
+            turn = turning(*own.at(inputs, to * row), motion, kind)
             close = apart(there, guess) <= _LATE * apart(guess, here) + _NEAR
             good = motion.converged & close & (turn * near.turning > 0)
 
@@ -392,18 +400,26 @@ def _follow(
         end = jax.lax.while_loop(going, body, begin)
         arrived = end.share >= 1
         start = (jnp.where(arrived, end.point[0], jnp.nan), end.point[1])
-        return _pair(_motion(base, inputs, kind, start, row)), *start
+        arrived_at = base.toward(rest, jnp.ones(()))
+        return _pair(_motion(arrived_at, inputs, kind, start, row)), *start
 
-    return mapped(member, z)
+    return mapped(member, z, rests)
 
 
 @compiled
 def _slopes(
-    base: Base, inputs: UncertainInputs, kind: EventKind, starts: tuple[Array, Array], z: Array
+    base: Base,
+    inputs: UncertainInputs,
+    kind: EventKind,
+    starts: tuple[Array, Array],
+    z: Array,
+    numbers: Array,
+    by_z: Array,
 ) -> Array:
     """Derivatives of frequency and velocity by z, of members whose motion is known."""
 
-    def member(row: Array, *start: Array) -> Array:
-        return jax.jacfwd(lambda z: _pair(_motion(base, inputs, kind, start, z)))(row)
+    def member(row: Array, numbers: Array, by_z: Array, *start: Array) -> Array:
+        own = base.about(row, numbers, by_z)
+        return jax.jacfwd(lambda z: _pair(_motion(own, inputs, kind, start, z)))(row)
 
-    return mapped(member, z, *starts)
+    return mapped(member, z, numbers, by_z, *starts)
