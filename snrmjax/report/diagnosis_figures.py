@@ -171,7 +171,8 @@ def comparison_figure(
             size = np.abs(np.asarray(curve.velocity)[:, 1, r]) / unit.size
             label = name if k == 0 else None
             axes.plot(curve.frequency / HERTZ, size, color=colour, **CURVE, label=label)
-        highest = max(float(np.max(np.abs(c.velocity[:, 1, r]))) for c in curves) / unit.size
+        peaks = [np.max(np.abs(c.velocity[:, 1, r]), initial=0.0) for c in curves]  # or no point
+        highest = float(max(peaks)) / unit.size
         if highest > top:
             place: Style = {"transform": axes.transAxes, "ha": "right", "va": "top"}
             text = f"peaks up to {highest:.2g} {unit.name}"

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -321,3 +322,11 @@ def test_figures_of_a_diagnosis_can_be_read_on_a_printed_page(pictures, states):
     }
     for name, figure in figures.items():
         assert unreadable(figure) == [], name
+
+
+def test_a_response_of_which_no_point_was_found_leaves_its_place_empty(states):
+    velocity = np.zeros((0, 2, len(states.sensors)), dtype=complex)
+    none = SimpleNamespace(force=1.0, frequency=np.zeros(0), velocity=velocity)
+    given, completed = plot.comparison_figure([none], [none], states).axes
+    assert not any(len(line.get_xdata()) for line in completed.lines if line.get_linestyle() == "-")
+    assert given.get_ylim() == completed.get_ylim()

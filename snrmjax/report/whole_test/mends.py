@@ -21,7 +21,7 @@ _QUOTED = re.compile(r"[^\"$`\\!]+")  # what double quotes keep, in every shell
 Words = Sequence[FilePath]
 
 
-class TestedFiles(NamedTuple):
+class FilesOfTest(NamedTuple):
     """Where the states of a test come from, and how it goes on once they are mended.
 
     `tables` have our own columns; `sources` are the laboratory's files, which an import with the
@@ -43,7 +43,7 @@ class TestedFiles(NamedTuple):
     responses: tuple[Path, ...] = ()  # of which the linear modes are found
 
 
-def with_sources(where: TestedFiles, map_file: Path) -> TestedFiles:
+def with_sources(where: FilesOfTest, map_file: Path) -> FilesOfTest:
     """The same with the laboratory's files that a map was written of, where they are still there.
 
     Also with the map itself where the sources are known already.
@@ -65,10 +65,10 @@ def checked_files(
     model: Path | None,
     sensors: Sequence[str],
     records: Sequence[Path],
-) -> TestedFiles:
+) -> FilesOfTest:
     """The files of `snrmjax check`: the map beside a table says what it was imported from."""
     mended = tables[0].parent / "mended"
-    where = TestedFiles(
+    where = FilesOfTest(
         mended, tuple(tables), model=model, sensors=tuple(sensors), records=tuple(records)
     )
     return where if len(tables) > 1 else with_sources(where, tables[0].parent / _MAP)
@@ -76,13 +76,13 @@ def checked_files(
 
 def tested_files(
     folder: Path, files: TestFiles, model: Path | None, drive_point: str | None, out: Path
-) -> TestedFiles:
+) -> FilesOfTest:
     """The files of `snrmjax test`; those of the laboratory are read by the folder's map."""
     tables = tuple(one.table for one in files.states if one.table is not None)
     read = [one.file for one in files.states if one.table is None]
     read += [one.file.partition(": ")[0] for one in files.records]
     own = None if files.model is None else model or folder / files.model_file
-    where = TestedFiles(
+    where = FilesOfTest(
         out.with_name(f"{out.name}_mended"),
         () if read else tables,
         () if tables else tuple(folder / one for one in dict.fromkeys(read)),
@@ -97,8 +97,8 @@ def tested_files(
 
 
 def with_channels(
-    where: TestedFiles, files: TestFiles, tests: Sequence[RecordedTest], model: Structure
-) -> TestedFiles:
+    where: FilesOfTest, files: TestFiles, tests: Sequence[RecordedTest], model: Structure
+) -> FilesOfTest:
     """With the model's sensors, and the channels of a record that no map tells."""
     where = where._replace(sensors=model.modes.sensors)
     if where.options or not where.sources or not tests:
@@ -114,12 +114,12 @@ def with_channels(
     return where._replace(options=tuple(words), quantities=quantities)
 
 
-def with_commands(checkup: Checkup, where: TestedFiles) -> Checkup:
+def with_commands(checkup: Checkup, where: FilesOfTest) -> Checkup:
     """The findings with the commands that mend them, each a line of its own."""
     return Checkup(tuple(_told(one, where) for one in checkup.findings), checkup.notes)
 
 
-def _told(one: Finding, where: TestedFiles) -> Finding:
+def _told(one: Finding, where: FilesOfTest) -> Finding:
     sensor = next((name for name in where.sensors if one.where.endswith(f" at {name}")), "")
     lines = [line for each in one.repairs if (line := _command(each, where, sensor))]
     if not lines:
@@ -127,7 +127,7 @@ def _told(one: Finding, where: TestedFiles) -> Finding:
     return one._replace(mend=f"{one.mend.rstrip('.')}: `{'`, or `'.join(lines)}`.")
 
 
-def _command(repair: Repair, where: TestedFiles, sensor: str) -> str:
+def _command(repair: Repair, where: FilesOfTest, sensor: str) -> str:
     """What does a repair, steps joined by &&; empty where no command can."""
     steps: list[Words]
     if repair.read_record:
@@ -138,7 +138,12 @@ def _command(repair: Repair, where: TestedFiles, sensor: str) -> str:
         steps = _scaled(where, sensor)
     else:
         steps = _imported(repair, where)
-    return " && ".join(" ".join(map(_word, ("snrmjax", *step))) for step in steps)
+    return " && ".join(map(command_line, steps))
+
+
+def command_line(words: Words) -> str:
+    """A command of this program with its words quoted."""
+    return " ".join(map(_word, ("snrmjax", *words)))
 
 
 def _word(one: FilePath) -> str:
@@ -148,7 +153,7 @@ def _word(one: FilePath) -> str:
     )
 
 
-def _identified_apart(where: TestedFiles) -> list[Words]:
+def _identified_apart(where: FilesOfTest) -> list[Words]:
     if where.model is None or where.folder is not None or len(where.tables) < 2:
         return []
     return [
@@ -157,7 +162,7 @@ def _identified_apart(where: TestedFiles) -> list[Words]:
     ]
 
 
-def _scaled(where: TestedFiles, sensor: str) -> list[Words]:
+def _scaled(where: FilesOfTest, sensor: str) -> list[Words]:
     """The modes anew, of the states themselves, and the test again with them."""
     first, tables = _as_tables(where)
     if len(tables) != 1 or not sensor:
@@ -168,7 +173,7 @@ def _scaled(where: TestedFiles, sensor: str) -> list[Words]:
     return [*first, modes, *_again(again, tables, where.folder)]
 
 
-def _imported(repair: Repair, where: TestedFiles) -> list[Words]:
+def _imported(repair: Repair, where: FilesOfTest) -> list[Words]:
     """The laboratory's files with another unit, or else our own table read as what it is."""
     out: list[FilePath] = ["--out", where.mended]
     table = where.mended / "measured.csv"
@@ -188,7 +193,7 @@ def _imported(repair: Repair, where: TestedFiles) -> list[Words]:
     return [*steps, *_again(where, (table,), where.mended)]
 
 
-def _as_tables(where: TestedFiles) -> tuple[list[Words], tuple[Path, ...]]:
+def _as_tables(where: FilesOfTest) -> tuple[list[Words], tuple[Path, ...]]:
     """Our own tables of the test, and the import that makes them where there are none yet."""
     if where.tables or not where.sources:
         return [], where.tables
@@ -197,7 +202,7 @@ def _as_tables(where: TestedFiles) -> tuple[list[Words], tuple[Path, ...]]:
     return [step], (read / "measured.csv",)
 
 
-def _again(where: TestedFiles, tables: Sequence[Path], folder: Path | None) -> list[Words]:
+def _again(where: FilesOfTest, tables: Sequence[Path], folder: Path | None) -> list[Words]:
     """The check or the whole test of what is mended."""
     model: list[FilePath] = [] if where.model is None else ["--model", where.model]
     if where.folder is None or where.out is None or folder is None:
@@ -211,7 +216,7 @@ def _again(where: TestedFiles, tables: Sequence[Path], folder: Path | None) -> l
     return [*steps, ["test", folder, *model, *scaled, "--out", where.out]]
 
 
-def _options_of_files(repair: Repair, where: TestedFiles) -> list[str]:
+def _options_of_files(repair: Repair, where: FilesOfTest) -> list[str]:
     """Options of the first import that state a unit by its name; none where it has no name."""
     kinds = set(where.quantities)
     if repair.phase_unit:

@@ -38,7 +38,8 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
-from snrmjax.report.whole_test.mends import TestedFiles, with_channels, with_commands
+from snrmjax.report.whole_test.mends import FilesOfTest, with_channels, with_commands
+from snrmjax.report.whole_test.undiagnosed import not_diagnosed
 from snrmjax.report.whole_test.used_steps import used_steps, with_steps
 from snrmjax.report.workflow import (
     CurveSettings,
@@ -62,7 +63,7 @@ class TestRequest(NamedTuple):
     drive_point: str | None = None
     go_on: bool = False  # in spite of errors that the check finds
     diagnose: bool = True
-    place: TestedFiles | None = None  # of the files, by which commands that mend are written
+    place: FilesOfTest | None = None  # of the files, by which commands that mend are written
 
 
 class WholeTest(NamedTuple):
@@ -144,14 +145,15 @@ def run_whole_test(
     live = state_explorer(data, findings.identification, folded if steps else ())
     stage.ends("backbone and damping")
     diagnosis, diagnosed = None, None
-    if request.diagnose:
+    skipped = not_diagnosed(data, modes.model, request.place) if request.diagnose else ()
+    if request.diagnose and not skipped:
         (folder / "diagnose").mkdir()
         diagnosis, diagnosed = write_diagnosis(
             folder / "diagnose", "measured", modes.model, data, simulate=True
         )
         stage.ends("diagnosis")
     unnamed = _taken_sensors(files, modes.model)
-    notes = (*files.notes, *unnamed, *(one.note for one in steps), *why)
+    notes = (*skipped, *files.notes, *unnamed, *(one.note for one in steps), *why)
     sorted_in_words = [
         (named.file, f"{one.kind.value}: {one.why}")
         for named, one in zip(files.records, sorted_records, strict=True)
@@ -176,7 +178,8 @@ def run_whole_test(
         live,
         [("Linear modes", modes.report), ("Backbone", found), ("Diagnosis", diagnosed)],
         notes,
-        _result(checkup, found, diagnosis, counts),
+        _result(checkup, found, diagnosis, counts)
+        + (" The diagnosis was left out: the first note says why." if skipped else ""),
     )
     stage.ends("report")
     return WholeTest(modes.model, checkup, findings, diagnosis, notes, lines)
