@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from snrmjax.condense.case_checks import rms
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
@@ -113,12 +113,12 @@ def load_scale_study(
         )
         cases = solve(np.asarray(loads.force))
         if k == nearest:
-            typical = _typical(cases) / one
+            typical = typical_displacement(cases) / one
         if cases.usable.all():
             coefficient[k], misfit[k], ratio[k] = _fitted(basis, cases, monomials)
         if report is not None:
             report(k + 1, scale.size)
-    leading = _leading(coefficient[nearest], typical, monomials)
+    leading = leading_terms(coefficient[nearest], typical, monomials)
     return LoadScaleStudy(
         scale=scale,
         coefficient=coefficient,
@@ -165,15 +165,17 @@ def _fitted(
     return scaled * np.asarray(system.column_scale), misfit, float(ratio.max())
 
 
-def _typical(cases: StaticCases) -> np.ndarray:
+def typical_displacement(cases: StaticCases) -> Float[np.ndarray, " mode"]:
     """Modal displacements, rms over the load cases that were solved."""
     moved = np.asarray(cases.modal_displacement)[cases.usable]
     return np.sqrt(np.mean(moved**2, axis=0)) if len(moved) else np.ones(moved.shape[1])
 
 
-def _leading(
-    coefficient: np.ndarray, typical: np.ndarray, monomials: tuple[Monomial, ...]
-) -> np.ndarray:
+def leading_terms(
+    coefficient: Float[np.ndarray, " monomial"],
+    typical: Float[np.ndarray, " mode"],
+    monomials: tuple[Monomial, ...],
+) -> Bool[np.ndarray, " monomial"]:
     """The coefficients whose terms have a tenth of the energy of the largest of their degree."""
     size = np.array([np.prod(typical[list(m)]) for m in monomials]) * np.abs(coefficient)
     degree = np.array([len(m) for m in monomials])

@@ -11,7 +11,13 @@ from snrmjax.condense.case_checks import case_names
 from snrmjax.condense.condensation import Condensation, condense
 from snrmjax.condense.load_cases import StaticCases
 from snrmjax.condense.load_set import NONLINEAR_RATIO, modal_loads
-from snrmjax.condense.scale_study import TOLERANCE, LoadScaleStudy, load_scale_study
+from snrmjax.condense.scale_study import (
+    TOLERANCE,
+    LoadScaleStudy,
+    leading_terms,
+    load_scale_study,
+    typical_displacement,
+)
 from snrmjax.io.files import write_atomically, write_summary
 from snrmjax.io.models import write_model
 from snrmjax.io.reduction.source import ReductionSource, run_load_cases, write_load_cases
@@ -56,6 +62,7 @@ SCALE = (
     f"{100 * TOLERANCE:g} %."
 )
 _SWEEP = (2.0, 3.0, 5.0, 7.5, 10.0)  # of the loads of single modes, to see the model's range
+_MEANINGLESS = 0.5  # share of a force or a coefficient that is missed: beyond it there is no model
 _REFUSED_LINEAR = 0.2  # deviation of the linear stiffness beyond which nothing fits together
 
 
@@ -101,6 +108,7 @@ def reduce(
         displacement, cases = run_load_cases(source)
     found = condense(source.basis, cases, degree=source.degree)
     _refuse_contradictions(source, found)
+    compared = _stated_scale_compared(source, found)
     scales = sweep = None
     if displacement is not None and source.solve is not None:
         far = modal_loads(source.basis, displacement, most_modes=1, levels=_SWEEP)
@@ -115,7 +123,7 @@ def reduce(
             report=report,
         )
     structure = source.structure(found)
-    notes = [*source.notes, *(one.message for one in found.warnings)]
+    notes = [*source.notes, *compared, *(one.message for one in found.warnings)]
     if scales is not None and not scales.holds_default:
         notes.append("the load scale of the model is not inside a plateau of the coefficients")
     states = [one for one in equilibria(structure) if one.stable]
@@ -141,6 +149,44 @@ def _refuse_contradictions(source: ReductionSource, found: Condensation) -> None
             f"{found.basis.numbers[worst]} as linear stiffness: units, loads, shapes and "
             "frequencies do not belong together."
         )
+
+
+def _stated_scale_compared(source: ReductionSource, found: Condensation) -> list[str]:
+    """What a stated load scale does to the coefficients, beside the one that would be chosen.
+
+    Raises `ValueError` where the model is none of the structure: where the potential leaves more
+    than half of the nonlinear force of its own load cases, or where a leading coefficient differs
+    from that of the chosen scale by more than half of it.
+    """
+    if source.load_scale is None or source.solve is None or source.thickness is None:
+        return []
+    stated, misfit = f"`load_scale` = {source.load_scale:g} thicknesses", found.quality.misfit
+    if misfit > _MEANINGLESS:
+        raise ValueError(
+            f"with {stated} the potential leaves {100 * misfit:.0f} % of the nonlinear force of "
+            "its own load cases, so that it is no model of the structure: leave the key out, and a "
+            "scale is chosen."
+        )
+    try:
+        displacement, cases = run_load_cases(source._replace(load_scale=None))
+    except ValueError as error:
+        return [f"{stated} cannot be compared with a scale that is chosen: {error}"]
+    chosen = condense(source.basis, cases, degree=source.degree)
+    scale = float(np.max(displacement)) / source.thickness
+    monomials, own = chosen.potential.monomials, np.asarray(chosen.potential.coefficient)
+    leading = np.flatnonzero(leading_terms(own, typical_displacement(cases), monomials))
+    change = np.asarray(found.potential.coefficient)[leading] / own[leading] - 1
+    worst = int(np.argmax(np.abs(change)))
+    if not abs(change[worst]) > TOLERANCE:
+        return []
+    said = (
+        f"with {stated} the coefficient {monomial_key(monomials[leading[worst]])} differs by "
+        f"{100 * change[worst]:+.0f} % from that of {scale:.2g} thicknesses, the scale that is "
+        "chosen where none is stated"
+    )
+    if abs(change[worst]) > _MEANINGLESS:
+        raise ValueError(f"{said}: leave the key out, or state a smaller scale.")
+    return [f"{said}: leave the key out, unless the model is for motions that large"]
 
 
 def write_reduction(folder: Path, reduction: Reduction) -> None:

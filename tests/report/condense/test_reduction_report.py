@@ -1,10 +1,12 @@
 """What `snrmjax rom` writes: a model that reads back, load cases, a summary and a page."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from condense.conftest import basis_of, cases_of
+from scipy import optimize
 from truths.hidden_membrane import hidden_membrane
 from truths.printed_page import unreadable
 
@@ -105,6 +107,48 @@ def test_a_stated_load_scale_is_in_thicknesses(source):
     basis = of_truth.basis
     assert alone[0] / basis.frequency[0] ** 2 * basis.largest[0] == pytest.approx(1.0)
     assert found.study is None
+
+
+def softening(last=0.0):
+    """One mode with the force ω²q + βq³/(1 + q²), whose cubic part ends at q of about one.
+
+    Beyond a force of -`last` (0: none) another solution is found, as a solver that jumps would.
+    """
+    frequency, beta, force = np.array([2.0]), 3.0, lambda q: 4.0 * q + 3.0 * q**3 / (1 + q**2)
+    basis = sj.condense.ReductionBasis(frequency, np.eye(1), np.eye(1), (1,))
+
+    def solve(forces):
+        rows = np.asarray(forces)
+        q = np.array([[optimize.brentq(lambda x, f=f: force(x) - f, -1e3, 1e3)] for (f,) in rows])
+        jumped = np.where((last > 0) & (rows < -last), -q, q)
+        return sj.condense.StaticCases(rows, jumped, np.ones(len(q), bool))
+
+    one = ReductionSource("spring", basis, np.array([0.01]), {"tip": np.ones(1)}, np.ones(1))
+    return beta, one._replace(solve=solve, thickness=1.0)
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.5])
+def test_a_scale_beyond_the_plateau_is_compared_with_the_chosen_one(scale):
+    beta, spring = softening()
+    found = reduce(spring._replace(load_scale=scale), study=False)
+    (note,) = (n for n in found.notes if n.startswith("with `load_scale`"))
+    lost = float(re.search(r"by ([+-][\d.]+) % from", note)[1])
+    chosen = reduce(spring, study=False)
+    cubic = [4 * float(one.structure.potential.coefficient[-1]) for one in (chosen, found)]
+    # The chosen loads are small: their coefficient is the force's own third derivative, nearly.
+    assert cubic[0] == pytest.approx(beta, rel=0.05)
+    assert -50 < lost < -2
+    assert lost == pytest.approx(100 * (cubic[1] / cubic[0] - 1), abs=0.51)  # as printed
+    assert not any("load_scale" in note for note in chosen.notes)
+
+
+def test_a_scale_whose_model_is_none_of_the_structure_is_refused():
+    _, spring = softening()
+    with pytest.raises(ValueError, match=r"1111 differs by -\d+ % .* leave the key out"):
+        reduce(spring._replace(load_scale=30.0), study=False)
+    _, jumping = softening(last=4.0)
+    with pytest.raises(ValueError, match=r"leaves \d+ % of the nonlinear force of its own load"):
+        reduce(jumping._replace(load_scale=2.0), study=False)
 
 
 def test_load_cases_that_were_written_condense_to_the_same_model(source, tmp_path, monkeypatch):
