@@ -210,10 +210,22 @@ def _again(where: FilesOfTest, tables: Sequence[Path], folder: Path | None) -> l
     point = [] if where.drive_point is None else ["--drive-point", where.drive_point]
     steps: list[Words] = []
     if where.responses:
-        model = ["--model", where.mended / "model.toml"]
-        steps = [["modes", *where.responses, *point, "--out", model[1]]]
+        # Not into the folder that is tested: the table of modes beside it is no measurement.
+        found = where.mended.with_name(f"{where.mended.name}_modes") / "model.toml"
+        model = ["--model", found]
+        steps = [["modes", *where.responses, *point, "--out", found]]
     scaled = point if not model else []
     return [*steps, ["test", folder, *model, *scaled, "--out", where.out]]
+
+
+def command_to_go_on(where: FilesOfTest, *, diagnose: bool) -> str:
+    """The same test in spite of what the check found."""
+    words: list[FilePath] = [] if where.folder is None else [where.folder]
+    words += [] if where.model is None else ["--model", where.model]
+    words += [] if where.drive_point is None else ["--drive-point", where.drive_point]
+    words += [] if diagnose else ["--no-diagnose"]
+    words += [] if where.out is None else ["--out", where.out]
+    return command_line(("test", *words, "--go-on"))
 
 
 def _options_of_files(repair: Repair, where: FilesOfTest) -> list[str]:

@@ -38,7 +38,12 @@ from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
 from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
-from snrmjax.report.whole_test.mends import FilesOfTest, with_channels, with_commands
+from snrmjax.report.whole_test.mends import (
+    FilesOfTest,
+    command_to_go_on,
+    with_channels,
+    with_commands,
+)
 from snrmjax.report.whole_test.undiagnosed import not_diagnosed
 from snrmjax.report.whole_test.used_steps import used_steps, with_steps
 from snrmjax.report.workflow import (
@@ -326,10 +331,13 @@ def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
     if not errors or request.go_on:
         return
     first, *others = errors
+    place, go_on = request.place, "--go-on"
+    if place is not None:
+        go_on = command_to_go_on(place, diagnose=request.diagnose)
     more = "".join(f" Or {one.evidence} {one.mend}" for one in others)
     raise ValueError(
         f"is this meant? {first.kind.replace('_', ' ')} in {first.where}: {first.evidence} To mend "
-        f"it: {first.mend}{more} To go on nevertheless: `--go-on`."
+        f"it: {first.mend}{more} To go on nevertheless: `{go_on}`."
     )
 
 

@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
+from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.report.whole_test import mends
 
 RAW = "Freq [Hz],Load [N],Amp [{}],Phase [deg]\n"
 TOLD = ("--force", "Load", "--frequency", "Freq", "--phase", "Phase", "--sensor", "tip")
@@ -128,6 +130,31 @@ def test_a_shape_of_another_scale_is_found_anew(folder):
     assert kinds(folder / "mended") == []
     found = sj.read_model("mended/model.toml").modes
     assert abs(float(found.mode_shape[0, 0])) == pytest.approx(SHAPE, rel=0.02)
+
+
+def test_modes_found_here_are_found_again_beside_what_is_mended(tmp_path):
+    """Their table would be one more file of measurements in the folder that is tested."""
+    place = mends.FilesOfTest(
+        tmp_path / "mended",
+        sources=(tmp_path / "run1.mat",),
+        options=("--force", "F"),
+        quantities=("acceleration",),
+        folder=tmp_path,
+        out=tmp_path / "out",
+        responses=(tmp_path / "frf.uff",),
+    )
+    finding = Finding(
+        "wrong_unit", "error", "1 level at tip", "", "Again.", (), (Repair(unit="g"),)
+    )
+    (told,) = mends.with_commands(Checkup((finding,)), place).findings
+    steps = [shlex.split(one) for one in re.findall("`(.+)`", told.mend)[0].split(" && ")]
+    assert [one[1] for one in steps] == ["import", "modes", "test"]
+    assert steps[0][2:] == [
+        *(f"{tmp_path}/run1.mat", "--force", "F", "--unit", "g", "--out", f"{tmp_path}/mended"),
+    ]
+    model = steps[1][steps[1].index("--out") + 1]
+    assert steps[2][steps[2].index("--model") + 1] == model
+    assert f"{tmp_path}/mended/" not in model
 
 
 @pytest.mark.long

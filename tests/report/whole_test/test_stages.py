@@ -76,7 +76,8 @@ def test_what_the_check_finds_is_a_question(tmp_path):
     write_states(tmp_path / "states.csv", np.conj)
     done = CliRunner().invoke(app, ["test", str(tmp_path), "--out", str(tmp_path / "out")])
     assert "is this meant? conjugated response" in str(done.exception)
-    assert "--go-on" in str(done.exception)
+    whole = f"snrmjax test {tmp_path} --model {tmp_path}/model.toml --out {tmp_path}/out --go-on"
+    assert f"`{whole}`" in str(done.exception)
     assert not (tmp_path / "out").exists()
 
 
