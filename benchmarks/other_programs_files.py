@@ -1,12 +1,12 @@
 """Files that other programs wrote: what is read of them, beside what the formats' own readers read.
 
-Run: python benchmarks/other_programs_files.py FOLDER [FOLDER …] [--scenarios FOLDER]
+Run: python benchmarks/other_programs_files.py FOLDER [FOLDER …] [--scenarios]
 
 Every file of the folders (UFF, MATLAB, HDF5, netCDF, TDMS) is listed as `snrmjax import FILE` does,
 and all numbers that were read are compared bit for bit with those of pyuff, nptdms, scipy, h5py or
 xarray. Such folders are `data` of pyuff, `nptdms/test/data` of npTDMS, `scipy/io/matlab/tests/data`
-of an installed scipy. `--scenarios nptdms/test` also writes the files that npTDMS' tests describe
-byte by byte (`scenarios.py`), and compares with the numbers that stand there.
+of an installed scipy. `--scenarios` also writes the files that the tests of the installed npTDMS
+describe byte by byte (`nptdms.test.scenarios`), and compares with the numbers that stand there.
 
 One JSON line a file: what it is, `outcome` (read, refused, crashed), the arrays that agree and
 those that do not, the arrays of the peer that are `unsaid` (neither read nor named in a note or
@@ -227,7 +227,7 @@ def judged(path, peer_arrays=None):
     return line | ({"says": said} if held is None else {"notes": list(held.notes)})
 
 
-def described(folder, into):
+def described(into):
     """The files of npTDMS' scenarios, with the numbers that stand beside them."""
     scenarios = importlib.import_module("nptdms.test.scenarios")
     for parameter in scenarios.get_scenarios():
@@ -257,7 +257,7 @@ def main():
                 print(json.dumps(lines[-1], ensure_ascii=False), flush=True)
     if options.scenarios:
         with tempfile.TemporaryDirectory() as into:
-            for path, arrays in described(options.scenarios, Path(into)):
+            for path, arrays in described(Path(into)):
                 lines.append(judged(path, arrays))
                 print(json.dumps(lines[-1], ensure_ascii=False), flush=True)
     counts = {
