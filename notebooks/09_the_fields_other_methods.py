@@ -48,6 +48,7 @@ TABLE = next(
 )
 OF_RECORDS = {
     "pll": "phase-locked loop",
+    "cbc": "control-based continuation",
     "resonant_decay": "resonant decay",
     "restoring_force": "restoring force surface",
     "ssm": "spectral submanifold",
