@@ -52,6 +52,7 @@ class Corrected(NamedTuple):
     parameters: int  # that were chosen for it
     extra: tuple[str, ...] = ()  # unknowns of the balance beside the curves, by name
     used: Bool[np.ndarray, " state"] | None = None  # states that are left out are False
+    floor: float = 0.0  # N, 1σ that the force has at any size, in phase and across
 
 
 class BalanceFit(NamedTuple):
@@ -161,6 +162,7 @@ def fit_balance(
     velocity, force = corrected.velocity[at], corrected.force[at]
     sigma = np.where(states.errors[at] > 0, states.errors[at], 1e-4)
     sigma = sigma * np.column_stack([np.ones(len(at)), corrected.stretch[at], np.ones(len(at))])
+    sigma = np.hypot(sigma, np.outer(corrected.floor / np.abs(force), [1.0, 0.0, 1.0]))
     y = 1j * omega * states.constant * force / velocity
     amplitude = np.abs(velocity) / omega
     middle = float(np.mean(omega**2))

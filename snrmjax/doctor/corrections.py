@@ -17,6 +17,7 @@ from snrmjax.doctor.balance_fit import (
     best_balance,
     fit_balance,
 )
+from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.identify.checks.residual_autocorrelation import (
     along_resonance,
     independent_share,
@@ -27,8 +28,9 @@ _LIMITS = (0.79, 0.8, 0.815, 0.83, 0.85, 0.875, 0.9, 0.93, 0.96, 0.985)
 """Limits of a channel over its largest recorded fundamental; that is 4/π of them at most."""
 _SHARES = (0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.88)
 """What is left of a transient at the end of a step, at the mode's own damping."""
-
-
+_FLOORS = (0.02, 0.04, 0.08, 0.16, 0.32)
+"""Noise of the force's cell over the smallest force."""
+_FALLEN = 0.5  # share of a level's force that is missing at resonance, at least
 _REFITTED = 4  # of the best kinds of correction, with families of curves of their own
 
 
@@ -91,6 +93,7 @@ def _candidates(
     yield from _unsettled(states, recorded, base)
     for name in ("frequency_trend", "gain_trend", "force_trend"):
         yield "drift", name, np.nan, (), recorded._replace(extra=(name,))
+    yield from _noisy_force(states, recorded)
     yield from _of_levels(states, recorded, groups)
 
 
@@ -197,6 +200,17 @@ def _unsettled(states: ModeStates, recorded: Corrected, base: BalanceFit) -> Ite
                         parameters=recorded.parameters + 1,
                     ),
                 )
+
+
+def _noisy_force(states: ModeStates, recorded: Corrected) -> Iterator[Candidate]:
+    """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
+    if deepest_fall(states) < _FALLEN:
+        return
+    for share in _FLOORS:
+        floor = share * float(states.force.min())
+        parameters = recorded.parameters + 1
+        noisy = recorded._replace(floor=floor, parameters=parameters)
+        yield "force_dropout", "floor", floor, (), noisy
 
 
 def _of_levels(

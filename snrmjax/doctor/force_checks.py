@@ -3,7 +3,7 @@
 import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates, basis
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, rows_in_words
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, rows_in_words
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
@@ -12,6 +12,8 @@ _DROP = 0.5  # share of a level's force that is missing at resonance
 _HELD = 0.25  # spread of the response within a level, below which it may be controlled
 _BY_ITSELF = 0.7  # its correlation with the mobility, above which it is not
 _SEEN = 0.6  # correlation of force and response, negative
+_AMPLITUDES = 3.0  # largest over smallest, over which a damping is the same or not
+_MORE_DAMPING = 0.3  # relative, from which on a damping is not the linear test's
 _LEAST_HARMONIC = 0.035  # of the force's fundamental
 _CERTAIN = 6.0  # 1σ
 _GAIN = 30.0  # of the criterion
@@ -27,17 +29,12 @@ def dropout_findings(states: ModeStates, where: str) -> list[Finding]:
             continue
         force, size = states.force[mine], np.abs(states.velocity[mine])
         mobility = size / force
-        near = mobility > 0.6 * mobility.max()
-        far = mobility < 0.8 * mobility.max()
         # A controlled amplitude wanders by chance; a weak shaker's still peaks at resonance.
         peaked = np.ptp(size) > 0 and np.corrcoef(np.log(size), np.log(mobility))[0, 1] > _BY_ITSELF
-        if not far.any() or (np.ptp(np.log(size)) < _HELD and not peaked):
+        if np.ptp(np.log(size)) < _HELD and not peaked:
             continue
-        nominal = float(np.quantile(force[far], 0.85))
-        drop = 1 - float(force[near].min()) / nominal
-        log_f, log_m = np.log(force), np.log(mobility)
-        together = np.corrcoef(log_f, log_m)[0, 1] if np.ptp(log_f) > 0 else 0.0
-        if drop > _REMARK and together < -_SEEN:
+        drop, nominal = _fall(force, mobility)
+        if drop > _REMARK:
             said += 1
             if drop > worst:
                 worst = drop
@@ -55,6 +52,71 @@ def dropout_findings(states: ModeStates, where: str) -> list[Finding]:
             "use the measured force of every state (`force_n`), never the nominal one; control the "
             "force, or the response, to keep its amplitude.",
             tuple(rows),
+        )
+    ]
+
+
+def _fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
+    """Share of a level's force that is missing at resonance, and the force beside it in N.
+
+    Zero where the force does not fall as the mobility grows.
+    """
+    near = mobility > 0.6 * mobility.max()
+    far = mobility < 0.8 * mobility.max()
+    log_f, log_m = np.log(force), np.log(mobility)
+    if not far.any() or np.ptp(log_f) == 0 or np.corrcoef(log_f, log_m)[0, 1] > -_SEEN:
+        return 0.0, float(force.max())
+    nominal = float(np.quantile(force[far], 0.85))
+    return 1 - float(force[near].min()) / nominal, nominal
+
+
+def deepest_fall(states: ModeStates) -> float:
+    """The largest share of a level's force that is missing at resonance, whatever is held."""
+    falls = [0.0]
+    for k in range(states.n_levels):
+        mine = np.flatnonzero(states.level == k)
+        if len(mine) >= 5:
+            force = states.force[mine]
+            falls.append(_fall(force, np.abs(states.velocity[mine]) / force)[0])
+    return max(falls)
+
+
+def shaker_damping(
+    states: ModeStates, fit: BalanceFit, model: Structure, where: str
+) -> list[Finding]:
+    """Damping above the linear test's by one amount at all amplitudes, at its own frequency.
+
+    That is what a shaker adds between its drive and the structure, (Bl)²/R of a coil on a voltage;
+    what structures add changes with amplitude. Nothing where the model states no error of its
+    damping.
+    """
+    modes = model.modes
+    one = modes.mode_of_interest
+    own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+    std = float(modes.damping_ratio_std[one])
+    used = fit.used
+    amplitude = np.abs(states.velocity[used]) / states.frequency[used]
+    if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < np.log(_AMPLITUDES):
+        return []
+    times = fit.damping[used] / (2 * own * ratio)
+    excess = float(times.min()) - 1
+    error = float(times.min() * np.hypot(std / ratio, fit.misfit / np.sqrt(used.sum())))
+    low = np.flatnonzero(used)[np.argmin(amplitude)]
+    away = float(np.sqrt(max(fit.stiffness[low], 0.0))) / own - 1
+    if excess < max(_MORE_DAMPING, _CERTAIN * error) or np.ptp(times) > 0.5 * excess:
+        return []
+    if abs(away) > ratio:
+        return []
+    return [
+        Finding(
+            *("volts_as_force", "warning", where),
+            f"the damping is {times.min():.3g} ± {error:.1g} times the model's and more at all "
+            f"amplitudes, the natural frequency the model's within {100 * abs(away):.2g} %: a "
+            "shaker damps so where its drive voltage, or a force on its own side, is taken for the "
+            "force on the structure; an assembly that damps more would look the same.",
+            "measure the force at the structure; if the column is a voltage, call it `drive_v`; if "
+            "it is that force, repeat the linear test on this assembly.",
+            repairs=(Repair(force_unit="V", fit_gain=True),),
         )
     ]
 

@@ -6,15 +6,16 @@ import numpy as np
 
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
 from snrmjax.doctor.findings import Finding, Repair
+from snrmjax.doctor.readings import off_by_frequency
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
 from snrmjax.model.structures import Structure
 
 _SIGMAS = 4.0
 _LEAST = 0.04  # relative, that is spoken of
+_OF_MISFIT = 1.5  # a mode that is missed by a share says its mass no better than that share
 STEEPLY = 0.13  # relative, from which on it is no error of a linear test
 _MOST_ERROR = 0.04  # relative 1σ of the modal mass, beyond which the states do not say it
-_BY_FREQUENCY = 0.15  # relative distance from Ω or 1/Ω
-_ROOT_TWO = 0.02  # relative distance from √2, that is an rms
+_ROOT_TWO = 0.02  # relative distance from √2 that is an rms, at least
 _ALIKE = 0.35  # logarithm of a ratio of stiffness, within which potential and states agree
 
 
@@ -35,8 +36,9 @@ def mass_findings(
     allowed = float(UNSTATED_MODAL_MASS_STD if own is None else own)
     error = float(np.hypot(std / kappa, allowed))
     size = mass_in_words(fit)
-    if abs(off) < max(STEEPLY, _SIGMAS * std / kappa, 2.5 * error):
-        if abs(off) < max(_LEAST, _SIGMAS * std / kappa):
+    unsure = max(_SIGMAS * std / kappa, _OF_MISFIT * fit.misfit)
+    if abs(off) < max(STEEPLY, unsure, 2.5 * error):
+        if abs(off) < max(_LEAST, unsure):
             return []
         return [
             Finding(
@@ -45,7 +47,8 @@ def mass_findings(
                 f"none needed; dividing the shape by {np.sqrt(kappa):.4g} would make them agree.",
             )
         ]
-    if abs(abs(off) - 0.5 * np.log(2)) < max(_ROOT_TWO, 3 * std / kappa):
+    # Within 1σ of the linear test's modal mass: √2 is likelier than any other factor there.
+    if abs(abs(off) - 0.5 * np.log(2)) < max(_ROOT_TWO, 3 * std / kappa, error):
         which = "responses" if off > 0 else "forces"
         columns = "velocity columns" if off > 0 else "`force_n`"
         return [
@@ -57,9 +60,9 @@ def mass_findings(
                 repairs=(_factor(off > 0, 2**0.5),),
             )
         ]
-    by_frequency = _differentiated(off, float(np.log(np.median(states.frequency))), size, where)
-    if by_frequency is not None:
-        return [by_frequency]
+    quantity = off_by_frequency(kappa, float(np.median(states.frequency)))
+    if quantity:
+        return [_differentiated(quantity, size, where)]
     volts, shape = _votes(states, fit, model)
     units = mixed_units(states, fit, model)
     if units:
@@ -96,23 +99,19 @@ def mass_findings(
     ]
 
 
-def _differentiated(off: float, log_omega: float, size: str, where: str) -> Finding | None:
+def _differentiated(quantity: str, size: str, where: str) -> Finding:
     """Amplitudes of an acceleration or displacement whose phases are a velocity's already."""
-    if abs(log_omega) < 10 * _BY_FREQUENCY:
-        return None
-    if abs(off + log_omega) < _BY_FREQUENCY:
+    if quantity == "acceleration":
         return Finding(
             *("acceleration_as_velocity", "error", where),
             f"{size}, 1/Ω of it: the amplitudes are accelerations, the phases those of velocities.",
             "divide the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
         )
-    if abs(off - log_omega) < _BY_FREQUENCY:
-        return Finding(
-            *("displacement_as_velocity", "error", where),
-            f"{size}, Ω of it: the amplitudes are displacements, the phases those of velocities.",
-            "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
-        )
-    return None
+    return Finding(
+        *("displacement_as_velocity", "error", where),
+        f"{size}, Ω of it: the amplitudes are displacements, the phases those of velocities.",
+        "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
+    )
 
 
 class MixedUnit(NamedTuple):

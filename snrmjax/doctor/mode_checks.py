@@ -5,12 +5,14 @@ import numpy as np
 from snrmjax.doctor.balance_fit import BalanceFit, ModeStates
 from snrmjax.doctor.corrections import Remedy, corrections
 from snrmjax.doctor.findings import Finding, Kind, Repair, rows_in_words
+from snrmjax.doctor.force_checks import deepest_fall, shaker_damping
 from snrmjax.doctor.modal_mass import mass_findings
 from snrmjax.doctor.readings import Reading, best_reading, wild_phases
 from snrmjax.model.structures import Structure
 
 _AT_THE_NOISE = 1.12  # times the stated errors: nothing is left to be explained
 _MOST_SCALE, _MOST_MISFIT = 4.0, 0.25  # beyond which a fit says nothing of the modal mass
+_SMALL_MISFIT = 0.04  # relative: whatever errors are stated, it says the modal mass well enough
 _NO_MODE = 0.35  # relative misfit, from which on the phasors are those of no mode
 _EXPLAINED = 2.0  # times the stated errors that a correction may leave
 _EXPLAINED_SHARE = 0.4  # of the misfit as recorded that it may leave otherwise
@@ -21,7 +23,10 @@ _OF_BANDWIDTH = 0.25  # of the damping ratio: likewise
 _MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
 _OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
 _LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between files
+_SAME_MASS = 0.2  # logarithm of the force's change, beyond which levels are not one assembly's
+_LEAST_FLOOR = 0.05  # of the smallest force, that its noise must have to be spoken of
 
+_SCALES = ("rms_for_peak", "shape_not_mass_normalised")
 _OTHER_SIGN = "import again with the other phase sign"
 _REPAIRS = {
     "conjugated": Repair(conjugate=True),
@@ -57,6 +62,16 @@ _MEANINGS: dict[str, tuple[Kind, str, str]] = {
         "displacement_as_velocity",
         "displacements (m)",
         "multiply by iΩ: import again as displacements",
+    ),
+    "acceleration_size": (
+        "acceleration_as_velocity",
+        "amplitudes of accelerations (m/s²) with the phases of velocities",
+        "divide the amplitudes by Ω = 2πf, not the phases, in the laboratory's file",
+    ),
+    "displacement_size": (
+        "displacement_as_velocity",
+        "amplitudes of displacements (m) with the phases of velocities",
+        "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file",
     ),
     "radians_read_as_degrees": (
         "degrees_for_radians",
@@ -98,9 +113,14 @@ def mode_findings(
     if remedy is not None:
         found.append(_mended(states, best.fit, remedy, where, groups))
     fit = best.fit if remedy is None else remedy.fit
-    told = fit.scale < _MOST_SCALE if states.stated else fit.misfit < _MOST_MISFIT
+    told = fit.misfit < _MOST_MISFIT
+    if states.stated:
+        told = fit.scale < _MOST_SCALE or fit.misfit < _SMALL_MISFIT
     if model is not None and not drive and told:
         found += mass_findings(states, fit, model, where)
+        # An rms or another shape leaves the damping as it is.
+        if all(one.severity == "info" or one.kind in _SCALES for one in found):
+            found += shaker_damping(states, fit, model, where)
     return found
 
 
@@ -179,10 +199,20 @@ def _matters(states: ModeStates, one: Remedy, groups: tuple[tuple[int, ...], ...
             strict > 1 and abs(fit.extra[0]) > _MOST_FREQUENCY
         ):
             return False
+        # Bolts that loosen between levels change stiffness and damping, not the modal mass.
+        if strict > 1 and len(fit.extra) > 1 and abs(fit.extra[2]) > _SAME_MASS:
+            return False
         return bool(abs(fit.extra[0]) > max(strict * least, 4 * strict * fit.extra_std[0]))
+    if one.kind == "force_dropout":
+        return noise_floor(one) > _LEAST_FLOOR * float(states.force.min())
     if one.name == "gain_of_level":
         return bool(np.ptp(np.append(fit.extra, 0.0)) > 2 * _LEAST_GAIN_CHANGE)
     return True
+
+
+def noise_floor(one: Remedy) -> float:
+    """Noise of the force's cell in N: as tried, times what is left of the errors' scale."""
+    return one.value * one.fit.scale
 
 
 def _overlap(states: ModeStates, levels: tuple[int, ...]) -> float:
@@ -252,6 +282,18 @@ def _mended(
             f"on: a drive voltage or an amplifier's range{left}",
             "measure the force, or calibrate the drive at each level and divide `force_n` by what "
             "it gives.",
+        )
+    if one.kind == "force_dropout":
+        floor = noise_floor(one)
+        share = 100 * floor / float(states.force.min())
+        return Finding(
+            *("force_dropout", "warning", where),
+            f"at resonance the force falls by up to {100 * deepest_fall(states):.3g} %, into the "
+            f"noise of its cell: states miss a single mode the more the smaller the force, as by "
+            f"about {floor:.2g} N whatever its size, {share:.2g} % of the smallest (criterion "
+            f"smaller by {one.gain:.3g}).",
+            "drive harder at resonance, average longer or use a more sensitive cell; damping is "
+            "no better known than the force there.",
         )
     if one.kind == "unsettled_steps":
         return Finding(

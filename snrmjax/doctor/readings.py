@@ -21,6 +21,7 @@ _RIGHT = 0.12  # relative misfit of phasors that need no other reading
 _FAR_MASS = 8.0  # ratio of modal masses, from which on other readings are tried
 _SIGNS = 4.0  # 1σ, beyond which the sign of the inertia or of the damping counts
 _LATTICE_TURNS = 4
+_BY_FREQUENCY = 0.15  # logarithm of κ over Ω or 1/Ω: amplitudes of another quantity
 _WILD, _SMOOTH = 0.5, 3.0  # mean resultant of steps of phase; how much smoother amplitudes are
 
 
@@ -38,7 +39,9 @@ def best_reading(states: ModeStates, natural_frequency: float | None) -> tuple[R
 
     Readings: `as_recorded`, `conjugated`, `opposite` (180°), `conjugated_opposite`,
     `acceleration`, `displacement`, `radians_read_as_degrees`, `degrees_read_as_radians`.
-    The signs of inertia and damping tell the first four from one another.
+    The signs of inertia and damping tell the first four from one another. `acceleration_size` and
+    `displacement_size`, amplitudes of these with the phases of a velocity, are tried where the
+    modal mass is off by Ω: over a wide band a constant factor in its place leaves a misfit.
     """
     recorded = _read(states, "as_recorded", lambda v, _: v, natural_frequency)
     if agrees(recorded.fit, natural_frequency):
@@ -57,7 +60,11 @@ def best_reading(states: ModeStates, natural_frequency: float | None) -> tuple[R
     best = min(found, key=lambda one: one.criterion)
     if recorded.criterion - best.criterion < _CLEARLY:
         best = recorded
-    return recorded, best
+    sizes = [
+        _read(states, name, change, natural_frequency)
+        for name, change in _sized(states, recorded.fit, natural_frequency)
+    ]
+    return recorded, min([best, *sizes], key=lambda one: one.criterion)
 
 
 def agrees(fit: BalanceFit, natural_frequency: float | None) -> bool:
@@ -85,6 +92,32 @@ def _turned(fit: BalanceFit) -> list[tuple[str, Change]]:
     if damped:
         return [("conjugated", lambda v, _: v.conj())]
     return [("opposite", lambda v, _: -v)]
+
+
+def off_by_frequency(mass: float, frequency: float) -> str:
+    """The quantity, acceleration or displacement, whose size makes the modal mass κ wrong by Ω.
+
+    None of them ("") within a factor of 4.5 of 1 rad/s, where Ω is no telling factor.
+    """
+    log_omega = float(np.log(frequency))
+    if not mass > 0 or abs(log_omega) < 10 * _BY_FREQUENCY:
+        return ""
+    if abs(np.log(mass) + log_omega) < _BY_FREQUENCY:
+        return "acceleration"
+    return "displacement" if abs(np.log(mass) - log_omega) < _BY_FREQUENCY else ""
+
+
+def _sized(
+    states: ModeStates, fit: BalanceFit, natural_frequency: float | None
+) -> list[tuple[str, Change]]:
+    """The reading of amplitudes alone that makes the modal mass that of the model."""
+    if natural_frequency is None:
+        return []
+    quantity = off_by_frequency(fit.mass, float(np.median(states.frequency)))
+    if not quantity:
+        return []
+    power = -1.0 if quantity == "acceleration" else 1.0
+    return [(f"{quantity}_size", lambda v, w: v * w**power)]
 
 
 def _read(

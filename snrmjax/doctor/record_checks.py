@@ -14,9 +14,12 @@ _HARMONIC_LIMIT, _HARMONIC_REMARK = 0.04, 0.015  # of the force's fundamental
 _HIGHEST = 12  # harmonic of the force
 _FLAT = 0.26  # of a mean cycle within 3 % of its extremes; of a sine 0.156
 _FLAT_RUNS = 0.003  # of the samples, in runs of equal extremes
+_PILE, _OVER_OTHERS = 10, 3.0  # equal extremes; their number over that of any other value's
 _MOVING_STEPS = 0.3  # of all: a jump or a slow beat may move single ones
 _FEW_BLOCKS, _FEW_UNSETTLED = 4, 0.08  # of a step, with no scatter of their own to compare with
 _UNSETTLED = 0.03  # relative change of a phasor over the end of a step
+_MOST_STEPS, _TOGETHER = 0.5, 2.0  # of the steps move, by so many times their scatter together
+_ENOUGH_STEPS = 6
 _DROP = 0.5  # of the force at the strongest response
 _LINE = 2e-3  # of the fundamental, that a folded line has at least
 _ABOVE_NOISE = 12.0  # amplitude of a line over the median about it
@@ -99,16 +102,40 @@ def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
     size = max(abs(top), abs(bottom))
     if size == 0:
         return None
-    share = 0.0
+    share, piled = 0.0, 0
     for limit, sign in ((top, 1.0), (bottom, -1.0)):
         at = sign * (limit - x) <= 1e-6 * size
         three = at[2:] & at[1:-1] & at[:-2]
         share += float(three.mean()) if len(three) else 0.0
-    if share < _FLAT_RUNS:
-        return None
-    return _clipping(
-        where, f"{100 * share:.2g} % of the samples stand in a row at {bottom:.4g} or {top:.4g}"
-    )
+        piled += _piled_up(sign * x, at, 2e-6 * size)
+    if share >= _FLAT_RUNS:
+        return _clipping(
+            where, f"{100 * share:.2g} % of the samples stand in a row at {bottom:.4g} or {top:.4g}"
+        )
+    if piled:
+        return _clipping(
+            where,
+            f"{piled} samples, some of them in a row, have exactly the extreme of {bottom:.4g} or "
+            f"{top:.4g}, and no other value so many",
+        )
+    return None
+
+
+def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> int:
+    """Samples at the top of a channel (`at`) where they crowd as no sine's do; else zero.
+
+    A digitised sine crowds in its last count, √n − √(n − 1) of it in the n-th below, at most 2.4
+    times as much as in the next; one that is sampled in step with its cycles, or has no noise,
+    comes back to every value as often. Neighbours at the top are no single peak of many cycles.
+    """
+    number = int(at.sum())
+    if number < _PILE or not np.any(at[1:] & at[:-1]):
+        return 0
+    upper = x[(x > 0.5 * x.max()) & ~at]
+    if not len(upper):
+        return 0
+    elsewhere = np.unique(np.round(upper / width), return_counts=True)[1].max()
+    return number if number > _OVER_OTHERS * elsewhere else 0
 
 
 def _clipping(where: str, evidence: str) -> Finding:
@@ -215,7 +242,7 @@ def _unsettled(
     force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
 ) -> list[Finding]:
     """Steps whose response still moves at their end, more than its blocks scatter."""
-    moving = []
+    moving, over_noise = [], []
     for one in steps:
         cycles = (one.stop - one.start) * one.frequency / (2 * np.pi * rate)
         rows = _middle(one, min(1.0, max(0.3, 5 / cycles)))
@@ -233,11 +260,21 @@ def _unsettled(
         change = float(abs(slope) / abs(z[-1]))
         few = len(v) <= _FEW_BLOCKS
         believed = change > _FEW_UNSETTLED if few else abs(slope) > 6 * noise
-        if change > _UNSETTLED and believed:
-            moving.append((change, one))
+        if change > _UNSETTLED:
+            moving.append((change, one, believed))
+        if not few:
+            over_noise.append(abs(slope) / max(noise, 1e-300))
+    # Among five blocks a transient's own turning passes for scatter, but not in step after step.
+    together = (
+        len(over_noise) >= _ENOUGH_STEPS
+        and len(moving) > _MOST_STEPS * len(steps)
+        and np.median(over_noise) > _TOGETHER
+    )
+    if not together:
+        moving = [one for one in moving if one[2]]
     if len(moving) < max(1, _MOVING_STEPS * len(steps)):
         return []
-    worst, one = max(moving, key=lambda pair: pair[0])
+    worst, one, _ = max(moving, key=lambda found: found[0])
     return [
         Finding(
             *("unsettled_steps", "error", where),

@@ -1,0 +1,171 @@
+"""The doctor's finer rules: near misses of one mode and its records, by exact responses."""
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
+
+import snrmjax as sj
+from snrmjax.doctor.balance_fit import as_recorded, fit_balance
+from snrmjax.doctor.modal_mass import mass_findings
+from snrmjax.doctor.mode_states import mode_states
+from snrmjax.measure import Channel, time_recording
+
+
+def raised(data, structure=None, recordings=()):
+    found = sj.doctor.check_test(data, structure, recordings)
+    return [one.kind for one in found.findings if one.severity != "info"]
+
+
+@pytest.mark.parametrize(
+    ("power", "kind"), [(-1, "displacement_as_velocity"), (1, "acceleration_as_velocity")]
+)
+def test_amplitudes_of_another_quantity_over_a_wide_band(power, kind):
+    """The band is 16 % wide: a constant factor in the place of Ω leaves several per cent."""
+    level, w, force, v = states()
+    assert np.ptp(w) > 0.15 * OMEGA
+    found = sj.doctor.check_test(table(level, w, force, noisy(v) * w**power), model())
+    assert [one.kind for one in found.findings] == [kind]
+    assert "the phases of velocities" in found.findings[0].evidence
+
+
+@pytest.mark.parametrize("factor", [0.96, 1.04])
+def test_an_rms_within_the_error_of_the_modal_mass(factor):
+    """4 % of the modal mass are less than the 5 % (1σ) that a linear test leaves."""
+    level, w, force, v = states()
+    assert raised(table(level, w, force, noisy(v) * factor / 2**0.5), model()) == ["rms_for_peak"]
+    assert raised(table(level, w, factor * force / 2**0.5, noisy(v)), model()) == ["rms_for_peak"]
+
+
+def test_errors_that_were_stated_too_small_hide_no_wrong_scale():
+    """Noise of 0.3 % stated as 0.03 %: the modal mass is known to 1 % all the same."""
+    level, w, force, v = states()
+    stated = {"velocity_std": 3e-4 * np.abs(v), "phase_std": np.full(len(v), 3e-4)}
+    data = table(level, w, force, noisy(v), **stated)
+    assert "shape_not_mass_normalised" in raised(data, model(1.0))
+    assert raised(data, model()) == []
+
+
+def test_a_misfit_of_the_mode_is_no_wrong_scale():
+    level, w, force, v = states()
+    seen = mode_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
+    fit = fit_balance(seen, as_recorded(seen), ("1,2", "1"))._replace(mass=0.83, mass_std=0.026)
+    near, far = (fit._replace(relative=np.full(len(v), size)) for size in (0.01, 0.15))
+    assert {one.severity for one in mass_findings(seen, near, model(), "")} == {"error"}
+    assert all(one.severity == "info" for one in mass_findings(seen, far, model(), ""))
+
+
+def with_damping_std():
+    std = sj.model.LinearModesStd([3e-4 * OMEGA], [0.03 * ZETA])
+    shape = [[SHAPE]], [SHAPE]
+    modes = sj.model.linear_modes([OMEGA], [ZETA], *shape, sensors=("tip",), std=std)
+    return sj.model.structure(modes)
+
+
+def test_the_shakers_own_damping_tells_a_voltage_from_the_force():
+    """U = F + cV: a coil of (Bl)²/R = c, in units of force, that doubles the damping."""
+    level, w, force, v = states()
+    drive = force + 2 * ZETA * OMEGA / SHAPE**2 * v
+    seen = noisy(np.abs(v) * np.exp(1j * np.angle(v / drive)))
+    assert raised(table(level, w, np.abs(drive), seen), with_damping_std()) == ["volts_as_force"]
+    assert raised(table(level, w, force, noisy(v)), with_damping_std()) == []
+    # Damping that grows with the amplitude is the structure's own.
+    grows = force + 4 * ZETA * OMEGA / SHAPE**2 * v * np.sqrt(np.abs(v) / np.abs(v).max())
+    seen = noisy(np.abs(v) * np.exp(1j * np.angle(v / grows)))
+    assert raised(table(level, w, np.abs(grows), seen), with_damping_std()) == []
+
+
+def held_response(floor, seed=0):
+    """Velocities that are held, the force that this takes, and what a noisy cell reads of it."""
+    level, w, _, _ = states()
+    w = OMEGA * (1 + 0.05 * np.linspace(-1, 1, 15))[np.arange(45) % 15]
+    a = np.array([0.3, 0.6, 1.0])[level] * OMEGA / w
+    needed = a * (OMEGA**2 + 0.75 * CUBIC * a**2 - w**2 + 2j * ZETA * OMEGA * w) / SHAPE
+    rng = np.random.default_rng(seed)
+    noise = floor * np.abs(needed).min() * (rng.normal(size=45) + 1j * rng.normal(size=45))
+    read = needed + noise
+    return table(level, w, np.abs(read), noisy(1j * w * a * SHAPE / np.exp(1j * np.angle(read))))
+
+
+def test_a_force_that_falls_into_the_noise_of_its_cell():
+    found = sj.doctor.check_test(held_response(0.15), model()).findings
+    assert [one.kind for one in found] == ["force_dropout"]
+    assert "noise of its cell" in found[0].evidence
+
+
+def test_a_held_response_with_a_good_cell_is_silent():
+    assert raised(held_response(0.0), model()) == []
+
+
+FALLEN = (
+    (1, 42.7442, 0.05098, 0.00713, 0.01351),
+    (1, 42.9107, 0.04713, 0.01356, 0.01495),
+    (1, 43.0773, 0.04206, 0.02313, 0.00879),
+    (1, 43.2439, 0.04249, 0.02223, -0.01055),
+    (1, 43.4105, 0.05014, 0.00845, -0.01413),
+    (1, 43.5771, 0.05273, 0.00435, -0.01122),
+    (2, 43.4859, 0.12995, 0.04701, 0.04216),
+    (2, 43.6525, 0.12342, 0.05954, 0.03346),
+    (2, 43.8191, 0.11718, 0.07213, 0.01217),
+    (2, 43.9857, 0.15415, 0.00660, -0.03073),
+    (2, 44.1522, 0.15672, 0.00327, -0.01770),
+    (2, 44.3188, 0.15733, 0.00240, -0.01532),
+)
+"""Level, Hz, N, m/s: an integrated stepped test up in frequency whose response fell in a step."""
+
+
+def test_a_response_that_fell_is_no_other_assembly_and_no_other_scale():
+    """The other assembly would have 0.6 of the modal mass; κ is off by as much as the misfit."""
+    level, hertz, force, re, im = np.array(FALLEN).T
+    data = sj.measure.steady_states(
+        level.astype(int), 2 * np.pi * hertz, force, re + 1j * im, sensors=("tip",)
+    )
+    std = sj.model.LinearModesStd([2 * np.pi * 0.0086114], [0.00013282])
+    modes = sj.model.linear_modes(
+        [2 * np.pi * 43.053], [0.004445], [[2.6485]], [0.57176], sensors=("tip",), std=std
+    )
+    assert raised(data, sj.model.structure(modes)) == []
+
+
+def stepped_record(cycles, zeta, per_cycle=16, frequencies=12):
+    """Steps over the resonance of one mode, by scipy's exact step between samples."""
+    rate = per_cycle * OMEGA / (2 * np.pi)
+    w = OMEGA * (1 + 1.5 * zeta * np.linspace(-1, 1, frequencies))
+    turn = np.cumsum(np.repeat(w, cycles * per_cycle)) / rate
+    force = np.cos(turn)
+    system = ([1, 0], [1, 2 * zeta * OMEGA, OMEGA**2])
+    v = lsim(system, force, np.arange(len(turn)) / rate)[1]
+    rng = np.random.default_rng(0)
+    return np.stack([force, v / np.abs(v).max()]) + 2e-3 * rng.normal(size=(2, len(v))), rate
+
+
+def recording(samples, rate):
+    return time_recording(
+        samples, [Channel("cell", "force", "N"), Channel("tip", "velocity", "m/s")], rate
+    )
+
+
+def test_a_limit_that_few_samples_reach():
+    """17 samples a cycle and a limit of 97 %: one or two at it, never three in a row."""
+    samples, rate = stepped_record(150, 0.02, 17, frequencies=5)
+    samples[1] = np.clip(samples[1], -0.97, 0.97)
+    assert raised([], None, [recording(samples, rate)]) == ["clipped_channel"]
+
+
+def test_counts_of_a_digitiser_are_no_limit():
+    """100 counts: the last one of a peak is crowded, and so are those next to it."""
+    samples, rate = stepped_record(150, 0.02, 40, frequencies=5)
+    samples[1] = np.round(50 * samples[1]) / 50
+    assert raised([], None, [recording(samples, rate)]) == []
+
+
+def test_transients_that_turn_within_a_few_cycles():
+    """22 cycles at ζ = 0.7 %: e^{−2πζ·22} = 38 % of a change is left at the end."""
+    assert raised([], None, [recording(*stepped_record(22, 0.007))]) == ["unsettled_steps"]
+
+
+def test_noise_in_short_steps_is_no_transient():
+    """20 cycles at ζ = 8 %, settled to 4e-5, under noise of 10 %."""
+    samples, rate = stepped_record(20, 0.08)
+    samples[1] += 0.1 * np.random.default_rng(1).normal(size=samples.shape[1])
+    assert raised([], None, [recording(samples, rate)]) == []
