@@ -77,3 +77,44 @@ def test_a_followed_fundamental_holds_the_same_branch_and_too_fast_a_filter_is_s
     wild = settings._replace(gain=200.0, filter_rate=800.0)
     lost = sj.methods.s_curve(laboratory, omega, np.array([0.3, 0.6]), wild)
     assert np.isnan(lost.force).all()
+
+
+@pytest.fixture(scope="module")
+def linear():
+    shape = 1 / np.sqrt(MASS)
+    modes = sj.model.linear_modes([REST], [RATIO], [[shape]], [shape])
+
+    def at(force_noise, velocity_noise, potential=None):
+        instruments = sj.methods.Instruments(force_noise=force_noise, velocity_noise=velocity_noise)
+        shaker = sj.methods.Shaker(0.1, 0.1)
+        return sj.methods.Laboratory(
+            sj.model.structure(modes, potential), shaker, instruments, 2000.0
+        )
+
+    return at
+
+
+FILTERED = sj.methods.FeedbackSettings(20.0, filter_rate=60.0)
+
+
+def test_a_phase_that_is_left_does_not_move_the_frequency(linear):
+    shape, cubic = 1 / np.sqrt(MASS), 2e6
+    potential = sj.model.polynomial_potential({"1111": cubic * shape**2 / 4}, 1)
+    lab = linear(0.0, 0.0, potential)
+    result = sj.methods.control_based_continuation(lab, np.array([0.8]), FILTERED)
+    # Less than half a degree from the linear mode: the first motion held is the last.
+    shift = 0.375 * cubic * (result.velocity / REST**2) ** 2
+    assert (shift > 3e-5).all()
+    np.testing.assert_allclose(result.natural_frequency / REST - 1, shift, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(result.damping_ratio, RATIO, rtol=2e-4)
+
+
+def test_bands_are_as_wide_as_the_scatter_of_repeated_tests(linear):
+    noisy, targets = linear(0.01, 0.002), np.array([0.3, 0.6])
+    scores = []
+    for seed in range(12):
+        one = sj.methods.control_based_continuation(noisy, targets, FILTERED, seed=seed)
+        scores.append((one.natural_frequency - REST) / one.natural_frequency_std)
+        scores.append((one.damping_ratio - RATIO) / one.damping_ratio_std)
+    # Of 48 normal numbers ±10 %; the larger of two estimates of the noise makes them smaller.
+    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.3

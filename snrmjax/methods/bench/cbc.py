@@ -25,6 +25,12 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
+from snrmjax.methods.bench.held_phasors import (
+    HANN,
+    noise_of_sample,
+    scatter_of_ratio,
+    with_velocity_errors,
+)
 from snrmjax.methods.bench.laboratory import (
     AbstractController,
     Laboratory,
@@ -62,6 +68,8 @@ class HeldMotion(NamedTuple):
     velocity: complex  # m/s
     invasive: float  # higher harmonics of the voltage over its fundamental
     unsteady: float  # change of the velocity between the halves of the record, relative
+    ratio_std: float  # of force over velocity, relative: of either part
+    velocity_std: float  # relative
 
 
 class SCurve(NamedTuple):
@@ -165,7 +173,7 @@ class _Bench:
             # A diverging loop may leave numbers whose squares overflow, or none at all.
             if not np.abs(velocity).max() < _LARGEST * amplitude:
                 self.state, self.higher = None, np.zeros_like(self.higher)
-                return HeldMotion(frequency, *4 * (np.nan,))
+                return HeldMotion(frequency, *6 * (np.nan,))
             moved, drive, pushed = (_harmonics(x, angle) for x in (velocity, voltage, force))
             invasive = float(np.linalg.norm(drive[1:]) / np.abs(drive[0]))
             self.higher = moved[1:]
@@ -176,7 +184,17 @@ class _Bench:
             for part in (slice(self.keep // 2), slice(self.keep // 2, None))
         ]
         unsteady = float(abs(halves[1] - halves[0]) / abs(moved[0]))
-        return HeldMotion(frequency, complex(pushed[0]), complex(moved[0]), invasive, unsteady)
+        # Of noise alone: a Hann window keeps so much of the variance of a mean.
+        share = np.sqrt(2 * HANN / self.keep)
+        noise = [
+            share * noise_of_sample(signal, angle) / abs(size)
+            for signal, size in ((force, pushed[0]), (velocity, moved[0]))
+        ]
+        scatter = np.sqrt(HANN) * scatter_of_ratio(force, velocity, angle)
+        return HeldMotion(
+            *(frequency, complex(pushed[0]), complex(moved[0]), invasive, unsteady),
+            *(max(float(np.hypot(*noise)), float(scatter)), float(noise[1])),
+        )
 
     def holds(self, found: HeldMotion) -> bool:
         """Whether a motion was held, steadily and without invasion."""
@@ -227,11 +245,15 @@ def control_based_continuation(
 ) -> MethodResult:
     """The backbone: at each target amplitude the frequency at which force and velocity agree.
 
+    The phase that is left between them is taken away by the balance of the mode,
+    ω̃² − Ω² + 2iζ̃ω̃Ω = iΩ|Φ_r Φᵀb| F/v.
+
     Arguments: `amplitudes` of the target in m/s, rising. Returns a `MethodResult` with a point an
     amplitude; damping by the balance of power. Amplitudes whose phase was not brought within 0.5°,
     whose feedback kept harmonics of its own beyond `settings.invasive`, or that were not steady
-    within 1 %, are `NOT_LOCKED`.
-    Without 1σ, which the method does not give. `test_seconds` counts everything.
+    within 1 %, are `NOT_LOCKED`. 1σ are those of the noise and of the scatter within a record; a
+    second mode close by or harmonics of the force are not in them. `test_seconds` counts
+    everything.
     Raises `ValueError` for numbers that are not positive.
     """
     targets = _positive("amplitudes", amplitudes)
@@ -240,24 +262,34 @@ def control_based_continuation(
     own = modes.mode_of_interest
     omega = float(modes.natural_frequency[own])
     decay = float(modes.damping_ratio[own]) * omega
-    points = []
+    points, velocity_std = [], []
     for level, size in enumerate(targets, 1):
         found = _resonance(bench, omega, float(size), decay)
         if found is None:
             points.append(MethodPoint(MethodStatus.NOT_LOCKED, level))
+            velocity_std.append(np.nan)
             continue
         omega = found.frequency
-        ratio = (found.force / found.velocity).real
-        points.append(
-            MethodPoint(
-                MethodStatus.FOUND,
-                level,
-                velocity=abs(found.velocity),
-                natural_frequency=omega,
-                damping_ratio=drive_point(modes) * ratio / (2 * omega),
-            )
-        )
+        points.append(_point(level, found, drive_point(modes)))
+        velocity_std.append(found.velocity_std)
+    points = with_velocity_errors(points, np.array(velocity_std))
     return method_result("cbc", points, len(targets), test_seconds=bench.seconds)
+
+
+def _point(level: int, found: HeldMotion, per_force: float) -> MethodPoint:
+    """Both numbers by the balance of the mode in a motion near its resonance."""
+    balance = per_force * found.force / found.velocity  # 2ζ̃ω̃ + (ω̃² − Ω²)/(iΩ)
+    omega = np.sqrt(found.frequency**2 - found.frequency * balance.imag)
+    error = abs(balance) * found.ratio_std
+    return MethodPoint(
+        MethodStatus.FOUND,
+        level,
+        velocity=abs(found.velocity),
+        natural_frequency=float(omega),
+        natural_frequency_std=error / 2,
+        damping_ratio=balance.real / (2 * float(omega)),
+        damping_ratio_std=error / (2 * float(omega)),
+    )
 
 
 def _resonance(bench: _Bench, omega: float, size: float, decay: float) -> HeldMotion | None:

@@ -18,6 +18,12 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
+from snrmjax.methods.bench.held_phasors import (
+    HANN,
+    PARTS,
+    noise_of_sample,
+    with_velocity_errors,
+)
 from snrmjax.methods.bench.laboratory import (
     AbstractController,
     Laboratory,
@@ -29,11 +35,7 @@ from snrmjax.methods.one_sensor import drive_point
 from snrmjax.methods.result import MethodPoint, MethodResult, MethodStatus, method_result
 
 _ORDERS = np.arange(1, 6)  # harmonics that the filters follow beside the mean
-_PARTS = 10  # of a record, for its scatter
-_MOST_HARMONICS = 9  # that a record may have beside its noise
-_HANN = 1.5  # noise bandwidth of a Hann window, over that of none
 _FASTEST, _RATES = 20.0, 20000  # of the loop's spectrum, times its fastest rate, and how many
-_SAME_VELOCITY = 0.02  # relative difference: levels that say nothing of a slope
 _LOCKED_PHASE = np.radians(1.0)  # mean error that counts as locked
 _LOCKED_SCATTER = 0.5  # 1σ of the frequency over the record, in half-power half widths ζω
 
@@ -161,30 +163,8 @@ def phase_locked_loop(
         points.append(held.point)
         velocity_std.append(held.velocity_std)
         state, seconds = held.state, seconds + held.seconds
-    points = _with_velocity_errors(points, np.array(velocity_std))
+    points = with_velocity_errors(points, np.array(velocity_std))
     return method_result("pll", points, len(levels), test_seconds=seconds)
-
-
-def _with_velocity_errors(
-    points: list[MethodPoint], velocity_std: Float[np.ndarray, " level"]
-) -> list[MethodPoint]:
-    """Points whose 1σ hold that their own velocity (1σ relative) is not exact."""
-    found = [k for k, one in enumerate(points) if one.status == MethodStatus.FOUND]
-    at = np.log([points[k].velocity for k in found])
-    order = np.argsort(at)
-    if len(found) < 2 or not np.all(np.diff(at[order]) > _SAME_VELOCITY):
-        return points
-    moved = list(points)
-    curves = np.array([(points[k].natural_frequency, points[k].damping_ratio) for k in found])
-    slopes = np.empty_like(curves)
-    slopes[order] = np.gradient(curves[order], at[order], axis=0)
-    for k, (frequency, ratio) in zip(found, slopes * velocity_std[found, None], strict=True):
-        one = points[k]
-        moved[k] = one._replace(
-            natural_frequency_std=float(np.hypot(one.natural_frequency_std, frequency)),
-            damping_ratio_std=float(np.hypot(one.damping_ratio_std, ratio)),
-        )
-    return moved
 
 
 class PhaseSweep(NamedTuple):
@@ -293,7 +273,7 @@ def lock_in(
     # A Hann window: the record need not hold whole cycles.
     turned = 2 * np.exp(-1j * angle) * np.hanning(keep) / np.hanning(keep).mean()
     period = 1 / laboratory.sampling_rate
-    noise = [_noise(signal, angle) for signal in (force, velocity)]
+    noise = [noise_of_sample(signal, angle) for signal in (force, velocity)]
     locked = _Locked(
         *(frequency, force * turned, velocity * turned, ratio * omega, phase),
         *(np.array(noise), period, rates),
@@ -337,11 +317,11 @@ class _Locked(NamedTuple):
     def velocity_std(self) -> float:
         """1σ of the velocity's mean over the record, relative."""
         seconds = len(self.frequency) * self.period
-        return float(np.sqrt(_HANN * self.densities()[1] / seconds))
+        return float(np.sqrt(HANN * self.densities()[1] / seconds))
 
     def point(self, level: int, per_force: float) -> MethodPoint:
         """Means over the record, and 1σ from its noise and the scatter between its tenths."""
-        parts = np.array_split(np.arange(len(self.frequency)), _PARTS)
+        parts = np.array_split(np.arange(len(self.frequency)), PARTS)
         inner = parts[1:-1]
         each = [np.mean(self.force[k]) / np.mean(self.velocity[k]) for k in inner]
         omega, damping = float(np.mean(self.frequency)), np.real(each)
@@ -351,9 +331,9 @@ class _Locked(NamedTuple):
         # Of phase and of the logarithm of F/v.
         density, seconds = float(np.sum(self.densities())), len(self.frequency) * self.period
         scatter = float(np.std(damping)) / np.sqrt(len(inner) - 1)
-        of_noise = float(np.real(ratio)) * np.sqrt(_HANN * density / seconds)
+        of_noise = float(np.real(ratio)) * np.sqrt(HANN * density / seconds)
         omega_std = max(
-            float(np.hypot(spread, turn) / np.sqrt(_PARTS - 1)),
+            float(np.hypot(spread, turn) / np.sqrt(PARTS - 1)),
             np.sqrt(density) * _carried(self.gains, self.decay, seconds),
         )
         return MethodPoint(
@@ -365,14 +345,6 @@ class _Locked(NamedTuple):
             per_force * float(np.real(ratio)) / (2 * omega),
             per_force * max(scatter, of_noise) / (2 * omega),
         )
-
-
-def _noise(signal: np.ndarray, angle: np.ndarray) -> float:
-    """1σ of a sample: what the harmonics of the drive leave of a record."""
-    turns = angle[:, None] * np.arange(1, _MOST_HARMONICS + 1)
-    design = np.concatenate([np.ones((len(angle), 1)), np.cos(turns), np.sin(turns)], axis=1)
-    solved, *_ = np.linalg.lstsq(design, signal, rcond=None)
-    return float(np.std(signal - design @ solved))
 
 
 def _carried(gains: LoopGains, decay: float, seconds: float) -> float:
