@@ -475,10 +475,11 @@ headline["ours has the smallest error of frequency for at least five of the seve
 #   resonance are off by 6e-5 to 9e-5 in frequency however small the noise, and their bands do not
 #   know it. The inverse SNRM takes the other mode's part away (2e-6).
 # - Where an open loop jumps before resonance, only loops measure the rest. They cost more time of
-#   test for each state, and a controller. **What a phase-locked loop holds is nearer to the truth
-#   than ours on six structures of seven** (0.001 to 0.006 % of frequency), although the noise is
-#   not the same: here it is on samples, of which a loop averages many periods, in the tables on
-#   states. Without a second mode near it is the method to choose for those who have the controller.
+#   test for each state, and a controller. **What a phase-locked loop or control-based continuation
+#   holds is nearer to the truth than ours on six structures of seven** (0.001 to 0.006 % of
+#   frequency), although the noise is not the same: here it is on samples, of which a loop averages
+#   many periods, in the tables on states. Where no second mode is near they are the methods to
+#   choose for those who have the controller.
 # - A state-space model of a multisine (PNLSS) and a submanifold of a decay come as near as ours
 #   from seconds of test, but their bands are too narrow where their polynomials are not the law
 #   (quadratic damping, v|v|).
