@@ -325,6 +325,16 @@ def join_steady_states(*parts: SteadyStates | Iterable[SteadyStates]) -> SteadyS
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *alike)
 
 
+def with_levels_apart(tests: Iterable[SteadyStates]) -> tuple[SteadyStates, ...]:
+    """Tests whose levels follow one another, so that joined no two of them share one."""
+    found, offset = [], 0
+    for test in tests:
+        one = test.renumbered(offset)
+        offset = int(one.level.max())
+        found.append(one)
+    return tuple(found)
+
+
 def _with_harmonics(data: SteadyStates, orders: tuple[int, ...]) -> SteadyStates:
     """The states with room for these harmonics, NaN where they were not recorded."""
     if data.harmonic_order == orders:

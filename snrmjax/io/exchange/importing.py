@@ -25,7 +25,12 @@ from snrmjax.io.laboratory.reading import read_laboratory_file
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.step_counts import StepCounts, joined_counts
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates, join_steady_states, steady_states
+from snrmjax.measure.states import (
+    SteadyStates,
+    join_steady_states,
+    steady_states,
+    with_levels_apart,
+)
 
 
 class Imported(NamedTuple):
@@ -151,6 +156,8 @@ def _records(
             dataclasses.replace(one, level=jnp.full(one.n_states, k + 1))
             for k, one in enumerate(parts)
         ]
+    elif len(parts) > 1:
+        parts = list(with_levels_apart(parts))
     return Imported(_joined(parts), (), used, assumed, tuple(notes))
 
 

@@ -119,12 +119,15 @@ def restated(states: SteadyStates, told: ImportMap) -> SteadyStates:
     if told.phase_sign == "lag":
         phasors = phasors.conj()
     size = np.abs(factors[:, :1])
+    # What is stated is the rms over the harmonics, whose noise is alike in the unit of the columns.
+    noisy = [k for k, order in enumerate(orders) if k and order > 0]
+    floor = np.sqrt(np.mean(np.abs(factors[:, noisy]) ** 2, axis=1, keepdims=True)) if noisy else 1
     changed = dataclasses.replace(
         states,
         velocity=jnp.asarray(phasors[:, :, 0]),
         harmonics=jnp.asarray(phasors[:, :, 1:]),
         velocity_std=states.velocity_std * size,
-        harmonic_std=states.harmonic_std * size,
+        harmonic_std=states.harmonic_std * floor,
     )
     return _with_force(changed, told)
 

@@ -373,9 +373,9 @@ def test_a_map_says_at_a_glance_what_was_assumed(tmp_path):
 
 
 OWN = """level,frequency_hz,force_n,velocity_re_m_s,velocity_im_m_s,velocity_std_m_s,\
-velocity_h3_re_m_s,velocity_h3_im_m_s
-1,49,2,0.3,0.4,0.01,0.03,0.06
-2,50,4,0.6,0,0.02,0,0.09
+velocity_h3_re_m_s,velocity_h3_im_m_s,harmonic_std_m_s
+1,49,2,0.3,0.4,0.01,0.03,0.06,0.003
+2,50,4,0.6,0,0.02,0,0.09,0.005
 """
 
 
@@ -399,6 +399,7 @@ def test_our_own_table_in_other_units_is_restated(tmp_path, words, velocity, thi
     np.testing.assert_allclose(found.velocity[:, 0], velocity * turn * [0.3 + 0.4j, 0.6])
     np.testing.assert_allclose(found.velocity_std[:, 0], abs(velocity) * turn * [0.01, 0.02])
     np.testing.assert_allclose(found.harmonics[:, 0, 0], third * turn * [0.03 + 0.06j, 0.09j])
+    np.testing.assert_allclose(found.harmonic_std[:, 0], abs(third) * turn * [0.003, 0.005])
     np.testing.assert_allclose(found.force, np.array([2, 4]) * force)
 
 

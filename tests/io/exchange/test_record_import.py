@@ -110,17 +110,36 @@ def test_slow_sweeps_become_steady_states(tmp_path, write, name):
     assert np.abs(passed - 1).max() > 0.1
 
 
+def steps(hertz, force, dwell=6.0):
+    """Force and acceleration of steps of so many seconds, settled from the beginning."""
+    pieces = []
+    for f in hertz:
+        turn = HERTZ * f * np.arange(round(dwell * RATE)) / RATE
+        response = force * 1j * HERTZ * f * mobility(HERTZ * f)
+        pieces.append([force * np.cos(turn), (response * np.exp(1j * turn)).real])
+    return np.concatenate(pieces, axis=1)
+
+
+def test_the_map_of_one_file_gives_each_of_several_files_its_own_level(tmp_path):
+    hertz = np.array([9.5, 10.0, 10.5])
+    paths = [tmp_path / f"{name}.mat" for name in ("low", "high")]
+    told = [as_matlab(path, *steps(hertz, f)) for path, f in zip(paths, (10.0, 25.0), strict=True)]
+    imported(paths[0], told[0])
+    out = tmp_path / "both"
+    code, said = run(*paths, "--map", tmp_path / "out" / "map.toml", "--out", out)
+    assert code == 0, said
+    assert read_import_map(out / "map.toml").level == "auto"
+    found = read_steady_states(out / "measured.csv")
+    np.testing.assert_array_equal(found.level, [1, 1, 1, 2, 2, 2])
+    np.testing.assert_allclose(found.force, np.repeat([10.0, 25.0], 3), rtol=1e-5)
+
+
 def test_steps_of_a_tdms_file(tmp_path):
     """Ten steps at two forces, settled from the beginning: whatever is off is the reading's."""
     path = tmp_path / "steps.tdms"
-    hertz, dwell = np.array([9.5, 9.8, 10.0, 10.2, 10.5]), 6.0
-    pieces = []
-    for force in (10.0, 25.0):
-        for f in hertz:
-            turn = HERTZ * f * np.arange(round(dwell * RATE)) / RATE
-            response = force * 1j * HERTZ * f * mobility(HERTZ * f)
-            pieces.append([force * np.cos(turn), (response * np.exp(1j * turn)).real])
-    states, _ = imported(path, as_tdms(path, *np.concatenate(pieces, axis=1)))
+    hertz = np.array([9.5, 9.8, 10.0, 10.2, 10.5])
+    pieces = np.concatenate([steps(hertz, force) for force in (10.0, 25.0)], axis=1)
+    states, _ = imported(path, as_tdms(path, *pieces))
     assert read_import_map(tmp_path / "out" / "map.toml").record == "steps"
     np.testing.assert_array_equal(states.level, np.repeat([1, 2], 5))
     np.testing.assert_allclose(states.frequency, np.tile(hertz, 2) * HERTZ, rtol=1e-6)
