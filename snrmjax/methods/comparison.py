@@ -10,7 +10,7 @@ from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.joint.joint_fit import fit_jointly
 from snrmjax.identify.pointwise.identification import identify_backbone
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.measure.states import SteadyStates, join_steady_states, with_levels_apart
 from snrmjax.methods.record_comparison import RECORD_METHODS, run_record_method, states_of
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.methods.result import (
@@ -178,8 +178,4 @@ def _all_states(
                 why.append(str(error))
     if not found:
         return None, read, why
-    joined, offset = [], 0
-    for one in found:
-        joined.append(one.renumbered(offset) if offset else one)
-        offset = int(np.max(np.asarray(joined[-1].level)))
-    return joined[0] if len(joined) == 1 else join_steady_states(joined), read, why
+    return found[0] if len(found) == 1 else join_steady_states(with_levels_apart(found)), read, why

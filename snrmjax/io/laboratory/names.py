@@ -14,7 +14,7 @@ _ROLES = {
     "real": r"x|\w+[_. ](re|real|x)|re|real|(re|real)[_ ]\w+|in_?phase",
     "imaginary": r"y|\w+[_. ](im|imag|y)|im|imag|(im|imag)[_ ]\w+|quad\w*",
     "drive": r"\w*(drive|volt\w*|source|generator|amplifier|signal)\w*|v_?(in|out|exc)|u",
-    "force": r"\w*(force|kraft|load_?cell|impedance_?head_?f)\w*|f_?n|fexc|f_?amp\w*|lc\w*",
+    "force": r"\w*(force|kraft|load_?cell|hammer|impedance_?head_?f)\w*|f_?n|fexc|f_?amp\w*|lc\w*",
     "coherence": r"\w*coh\w*",
     "velocity": r"\w*(velo\w*|vibrometer|ldv|geschw\w*)|v|vel\w*|\w*_m_s",
     "acceleration": r"\w*(acc\w*|beschl\w*)|a",

@@ -226,8 +226,8 @@ def _imported(path: Path, told: ImportMap) -> Imported:
         return import_files([path], told)
     except ValueError as error:
         raise ValueError(
-            f"{error} `snrmjax import {path}` says how; put the {_MAP} that it then writes beside "
-            "the file."
+            f"{error} `snrmjax import {path}` says how; put the {_MAP} that the import writes "
+            "beside the file."
         ) from error
 
 
@@ -241,13 +241,3 @@ def _linear(held: LaboratoryFile, path: Path) -> tuple[FrequencyResponses, ...]:
             f"and put its {_MAP} beside the file; for linear modes keep the lowest level alone."
         )
     return held.responses
-
-
-def all_states(tables: Sequence[SteadyStates]) -> tuple[SteadyStates, ...]:
-    """The tables with levels of their own, in order."""
-    found, offset = [], 0
-    for states in tables:
-        one = states.renumbered(offset)
-        offset = int(one.level.max())
-        found.append(one)
-    return tuple(found)

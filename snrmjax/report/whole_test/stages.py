@@ -23,7 +23,12 @@ from snrmjax.io.tables import write_steady_states
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import SteppedSineStates, stepped_sine_states
-from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates, join_steady_states
+from snrmjax.measure.states import (
+    UNNAMED_SENSOR,
+    SteadyStates,
+    join_steady_states,
+    with_levels_apart,
+)
 from snrmjax.methods.records.recorded_test import RecordedTest, RecordKind, recorded_test
 from snrmjax.model.structures import Structure
 from snrmjax.report.diagnosis_report import readable_verdict, write_diagnosis
@@ -37,7 +42,7 @@ from snrmjax.report.html import (
 from snrmjax.report.interactive.folded_records import folded_records
 from snrmjax.report.interactive.state_explorer import FoldedRecord, state_explorer
 from snrmjax.report.modal.modal_report import modal_report, modes_sentence, write_modal_tables
-from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles, all_states
+from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
 from snrmjax.report.whole_test.mends import (
     FilesOfTest,
     command_to_go_on,
@@ -119,7 +124,7 @@ def run_whole_test(
     sorted_records = [_sorted(one, modes.model) for one in files.records]
     steps = [_steps(named, one) for named, one in _stepped(files, sorted_records)]
     tables = [one.of_model(modes.model) for one in files.states]
-    parts = all_states([*tables, *(one.states for one in steps)])
+    parts = with_levels_apart([*tables, *(one.states for one in steps)])
     if not parts:
         raise ValueError(
             f"{name} holds no steady states and no record of a stepped sine: the linear modes are "
@@ -239,7 +244,7 @@ def _linear_model(folder: Path, files: TestFiles, request: TestRequest) -> _Mode
     if files.responses:
         source: object = joined_responses([one.responses for one in files.responses])
     elif files.states:
-        source = join_steady_states(all_states([one.states for one in files.states]))
+        source = join_steady_states(with_levels_apart([one.states for one in files.states]))
     else:
         raise ValueError(
             "what are the linear modes? The folder has time records only: put a model.toml or "
@@ -277,8 +282,8 @@ def _sorted(named: NamedRecord, model: Structure) -> RecordedTest:
         return recorded_test(named.record, model.modes)
     except ValueError as error:
         mend = (
-            f" `snrmjax import {named.file}` says what the file holds; put the map.toml that it "
-            "then writes into the folder."
+            f" `snrmjax import {named.file}` says what the file holds and how to "
+            "import it; put the map.toml that the import writes into the folder."
             if "has no channel of motion" in str(error)
             else ""
         )

@@ -6,7 +6,8 @@ import pytest
 from snrmjax.io.exchange.exports import write_matlab
 from snrmjax.io.laboratory.uff.writing import write_uff
 from snrmjax.measure import Channel, frequency_responses, time_recording
-from snrmjax.report.whole_test.folder_contents import all_states, read_test_files
+from snrmjax.measure.states import with_levels_apart
+from snrmjax.report.whole_test.folder_contents import read_test_files
 
 HERTZ = 2 * np.pi
 OWN, RATIO = 50 * HERTZ, 0.01
@@ -61,7 +62,10 @@ def test_every_file_is_read_by_its_content(folder):
     states = found.states[0].of_model(found.model)
     assert states.sensors == ("tip",)
     np.testing.assert_allclose(states.frequency / HERTZ, [49, 50, 49.5])
-    assert [one.level.tolist() for one in all_states([states, states])] == [[1, 1, 2], [3, 3, 4]]
+    assert [one.level.tolist() for one in with_levels_apart([states, states])] == [
+        [1, 1, 2],
+        [3, 3, 4],
+    ]
 
 
 def test_a_map_beside_a_table_of_other_names_is_used(tmp_path):
