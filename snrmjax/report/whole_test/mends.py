@@ -7,15 +7,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from snrmjax.doctor.findings import Checkup, Finding, Repair
-from snrmjax.io.exchange.import_map import files_of_map, read_import_map
+from snrmjax.io.exchange.import_map import ImportMap, ResponseMap, read_import_map
 from snrmjax.io.files import FilePath
 from snrmjax.methods.records.recorded_test import RecordedTest
 from snrmjax.model.structures import Structure
 from snrmjax.report.whole_test.folder_contents import TestFiles
+from snrmjax.report.whole_test.laboratory_files import (
+    MAP,
+    files_behind,
+    force_unit_of_repair,
+    options_of_repair,
+    unit_of_repair,
+)
 
-_MAP = "map.toml"
-_PER_SECOND = {"displacement": "", "velocity": "/s", "acceleration": "/s2"}
-_ACCELERATIONS = ("g", "m/s2")
 _QUOTED = re.compile(r"[^\"$`\\!]+")  # what double quotes keep, in every shell
 
 Words = Sequence[FilePath]
@@ -32,8 +36,8 @@ class FilesOfTest(NamedTuple):
     tables: tuple[Path, ...] = ()
     sources: tuple[Path, ...] = ()
     options: tuple[FilePath, ...] = ()
-    quantities: tuple[str, ...] = ()  # of the responses, as the import takes them
-    phase_unit: str = ""  # likewise
+    first: ImportMap = ImportMap()  # what the options say
+    told: ImportMap = ImportMap()  # the same with how a table of these files was restated since
     model: Path | None = None
     sensors: tuple[str, ...] = ()
     records: tuple[Path, ...] = ()
@@ -48,16 +52,25 @@ def with_sources(where: FilesOfTest, map_file: Path) -> FilesOfTest:
 
     Also with the map itself where the sources are known already.
     """
-    if not map_file.is_file():
+    if where.sources and map_file.is_file():
+        told = read_import_map(map_file)
+        return where._replace(options=("--map", map_file), first=told, told=told)
+    found = None if where.sources else files_behind(map_file)
+    if found is None:
         return where
-    told = read_import_map(map_file)
-    sources = where.sources or files_of_map(map_file)
     return where._replace(
-        sources=sources,
-        options=("--map", map_file) if sources else (),
-        quantities=tuple(one.quantity for one in told.responses),
-        phase_unit=told.phase_unit,
+        sources=found.files,
+        options=("--map", found.map_file),
+        first=found.first,
+        told=found.told,
     )
+
+
+def _beside_its_inputs(mended: Path, inputs: Sequence[Path | None]) -> Path:
+    """A folder for what is mended that holds nothing of what it is mended from: name, name_2, …"""
+    taken = {one.resolve() for one in inputs if one is not None}
+    names = (mended.name, *(f"{mended.name}_{k}" for k in range(2, len(taken) + 3)))
+    return next(one for one in map(mended.with_name, names) if one.resolve() not in taken)
 
 
 def checked_files(
@@ -71,7 +84,7 @@ def checked_files(
     where = FilesOfTest(
         mended, tuple(tables), model=model, sensors=tuple(sensors), records=tuple(records)
     )
-    return where if len(tables) > 1 else with_sources(where, tables[0].parent / _MAP)
+    return where if len(tables) > 1 else with_sources(where, tables[0].parent / MAP)
 
 
 def tested_files(
@@ -82,8 +95,9 @@ def tested_files(
     read = [one.file for one in files.states if one.table is None]
     read += [one.file.partition(": ")[0] for one in files.records]
     own = None if files.model is None else model or folder / files.model_file
+    given = (folder, *(None if one is None else one.parent for one in (model, *tables)))
     where = FilesOfTest(
-        out.with_name(f"{out.name}_mended"),
+        _beside_its_inputs(out.with_name(f"{out.name}_mended"), given),
         () if read else tables,
         () if tables else tuple(folder / one for one in dict.fromkeys(read)),
         model=own,
@@ -93,7 +107,7 @@ def tested_files(
         drive_point=drive_point,
         responses=() if own else tuple(folder / one.file for one in files.responses),
     )
-    return with_sources(where, folder / _MAP) if where.tables or where.sources else where
+    return with_sources(where, folder / MAP) if where.tables or where.sources else where
 
 
 def with_channels(
@@ -104,14 +118,16 @@ def with_channels(
     if where.options or not where.sources or not tests:
         return where
     channels = tests[0].channels
-    known = {one.name: one.quantity for one in files.records[0].record.channels}
+    known = {one.name: one for one in files.records[0].record.channels}
     words: list[FilePath] = ["--force", channels.force or channels.drive or ""]
     for motion in channels.motions:
-        words += ["--response", f"{motion}:{known[motion]}"]
+        words += ["--response", f"{motion}:{known[motion].quantity}"]
     for sensor in channels.sensors:
         words += ["--sensor", sensor]
-    quantities = tuple(known[motion] for motion in channels.motions)
-    return where._replace(options=tuple(words), quantities=quantities)
+    responses = [ResponseMap(one, known[one].quantity, known[one].unit) for one in channels.motions]
+    force = known[channels.force].unit if channels.force else ""
+    told = ImportMap(tuple(responses), force_unit=force)
+    return where._replace(options=tuple(words), first=told, told=told)
 
 
 def with_commands(checkup: Checkup, where: FilesOfTest) -> Checkup:
@@ -177,9 +193,10 @@ def _imported(repair: Repair, where: FilesOfTest) -> list[Words]:
     """The laboratory's files with another unit, or else our own table read as what it is."""
     out: list[FilePath] = ["--out", where.mended]
     table = where.mended / "measured.csv"
-    named = _options_of_files(repair, where) if where.sources else []
+    named = options_of_repair(repair, where.first, where.told) if where.sources else []
     if named:
-        steps: list[Words] = [["import", *where.sources, *where.options, *named, *out]]
+        options = _without_responses(where.options) if "--response" in named else where.options
+        steps: list[Words] = [["import", *where.sources, *options, *named, *out]]
     else:
         first, tables = _as_tables(where)
         own = _options_of_own(repair)
@@ -228,30 +245,17 @@ def command_to_go_on(where: FilesOfTest, *, diagnose: bool) -> str:
     return command_line(("test", *words, "--go-on"))
 
 
-def _options_of_files(repair: Repair, where: FilesOfTest) -> list[str]:
-    """Options of the first import that state a unit by its name; none where it has no name."""
-    kinds = set(where.quantities)
-    if repair.phase_unit:
-        changes = where.phase_unit not in ("", repair.phase_unit)
-        return ["--phase-unit", repair.phase_unit] if changes else []
-    if repair.force_unit:
-        return ["--force-unit", repair.force_unit]
-    if not repair.unit or len(kinds) != 1:
-        return []
-    (kind,) = kinds
-    if repair.unit in _ACCELERATIONS:
-        return ["--unit", repair.unit] if kind == "acceleration" else []
-    return ["--unit", f"{repair.unit}{_PER_SECOND[kind]}"] if kind in _PER_SECOND else []
+def _without_responses(options: Words) -> Words:
+    """Options with their values, less those that name a response."""
+    pairs = zip(options[::2], options[1::2], strict=True)
+    return [word for pair in pairs if pair[0] != "--response" for word in pair]
 
 
 def _options_of_own(repair: Repair) -> list[str]:
     """Options that read our own table as what it is; none where it does not hold enough."""
-    if repair.quantity:
-        return ["--unit", "m/s2" if repair.quantity == "acceleration" else "m"]
-    if repair.conjugate:
-        return ["--phase-sign", "lag"]
     if repair.fit_gain:
         return ["--force-unit", repair.force_unit]
-    if repair.response != 1:
-        return ["--unit", f"{repair.response:.8g} m/s"]
-    return ["--force-unit", f"{repair.force:.8g} N"] if repair.force != 1 else []
+    unit, force_unit = unit_of_repair(repair), force_unit_of_repair(repair)
+    words = ["--unit", unit] if unit else []
+    words += ["--force-unit", force_unit] if force_unit else []
+    return [*words, *(["--phase-sign", "lag"] if repair.conjugate else [])]

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from typer.testing import CliRunner
 import snrmjax as sj
 from snrmjax.cli import app
 from snrmjax.doctor.findings import Checkup, Finding, Repair
+from snrmjax.io.exchange.import_map import ImportMap, ResponseMap
 from snrmjax.report.whole_test import mends
+from snrmjax.report.whole_test.folder_contents import read_test_files
 
 RAW = "Freq [Hz],Load [N],Amp [{}],Phase [deg]\n"
 TOLD = ("--force", "Load", "--frequency", "Freq", "--phase", "Phase", "--sensor", "tip")
@@ -138,7 +141,8 @@ def test_modes_found_here_are_found_again_beside_what_is_mended(tmp_path):
         tmp_path / "mended",
         sources=(tmp_path / "run1.mat",),
         options=("--force", "F"),
-        quantities=("acceleration",),
+        first=(told := ImportMap((ResponseMap("a", "acceleration"),))),
+        told=told,
         folder=tmp_path,
         out=tmp_path / "out",
         responses=(tmp_path / "frf.uff",),
@@ -155,6 +159,52 @@ def test_modes_found_here_are_found_again_beside_what_is_mended(tmp_path):
     model = steps[1][steps[1].index("--out") + 1]
     assert steps[2][steps[2].index("--model") + 1] == model
     assert f"{tmp_path}/mended/" not in model
+
+
+def lock_in_of_g():
+    """A lock-in's amplitudes in g, that an import has taken for velocities in m/s."""
+    _, w, _, v = states()
+    a = noisy(v) * 1j * w / 9.80665
+    written("", np.abs(a), np.degrees(np.angle(a)))
+    run("import", "lock in.csv", *TOLD, "--response", "Amp:velocity:m/s", "--out", "taken")
+    return noisy(v)
+
+
+def test_a_table_that_was_restated_is_mended_from_the_laboratorys_file(folder):
+    """One error was mended in our own table: the next mend says both to the first import."""
+    truth = lock_in_of_g()
+    run("import", "taken/measured.csv", "--unit", "m/s2", "--out", "once")
+    run("check", "once/measured.csv", "--model", "model.toml", "--out", "checked")
+    first = json.loads((folder / "checked" / "check.json").read_text())[0]
+    assert first["kind"] == "wrong_unit"
+    command = pasted(first["mend"])
+    assert command.startswith(
+        'snrmjax import "lock in.csv" --map taken/map.toml --response Amp:acceleration '
+        "--sensor tip --phase Phase --unit g --out once/mended && "
+    )
+    found = sj.read_steady_states("once/mended/measured.csv")
+    np.testing.assert_allclose(found.velocity[:, 0], truth, rtol=1e-6)
+
+
+def test_what_is_mended_never_takes_the_place_of_its_input(folder):
+    """Pasted twice, a command that writes where it reads would scale twice."""
+    level, w, f, v = states()
+    for name in ("out_mended", "out_mended_2"):
+        (folder / name).mkdir()
+        sj.io.write_steady_states(f"{name}/measured.csv", table(level, w, f, noisy(v)))
+    linear = Path("out_mended_2/model.toml")
+    sj.io.write_model(linear, model())
+    place = mends.tested_files(
+        *(Path("out_mended"), read_test_files(Path("out_mended"), linear), linear, None),
+        Path("out"),
+    )
+    assert place.mended == Path("out_mended_3")
+    finding = Finding("wrong_unit", "error", "", "", "", (), (Repair(response=9.80665),))
+    (told,) = mends.with_commands(Checkup((finding,)), place).findings
+    assert (
+        'import out_mended/measured.csv --unit "9.80665 m/s" --out out_mended_3 && '
+        "snrmjax test out_mended_3 --model out_mended_2/model.toml --out out"
+    ) in told.mend
 
 
 @pytest.mark.long
