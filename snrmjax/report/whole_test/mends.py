@@ -1,5 +1,6 @@
 """Mends of findings as commands that can be pasted, with the files of the test and its options."""
 
+import math
 import re
 import shlex
 from collections.abc import Sequence
@@ -132,7 +133,34 @@ def with_channels(
 
 def with_commands(checkup: Checkup, where: FilesOfTest) -> Checkup:
     """The findings with the commands that mend them, each a line of its own."""
-    return Checkup(tuple(_told(one, where) for one in checkup.findings), checkup.notes)
+    told = [_told(one, where) for one in checkup.findings]
+    certain = [one for one in checkup.findings if is_certain(one)]
+    line = _command(_at_once(certain), where, "") if len(certain) > 1 else ""
+    if line:
+        k = checkup.findings.index(certain[0])
+        names = " and ".join(one.kind.replace("_", " ") for one in certain)
+        told[k] = told[k]._replace(mend=f"{names} at once: `{line}`. Alone, {told[k].mend}")
+    return Checkup(tuple(told), checkup.notes)
+
+
+def is_certain(one: Finding) -> bool:
+    """Whether a finding leaves no choice of what all numbers are, and an import can say it."""
+    if one.severity != "error" or len(one.repairs) != 1:
+        return False
+    (repair,) = one.repairs
+    said = repair.quantity or repair.conjugate or repair.response != 1 or repair.force != 1
+    return bool(said) and not repair.fit_gain
+
+
+def _at_once(findings: Sequence[Finding]) -> Repair:
+    """Several findings' repairs as one; each was found with the others' errors mended."""
+    every = [one.repairs[0] for one in findings]
+    return Repair(
+        response=math.prod(one.response for one in every),
+        force=math.prod(one.force for one in every),
+        quantity="".join(one.quantity for one in every),
+        conjugate=any(one.conjugate for one in every),
+    )
 
 
 def _told(one: Finding, where: FilesOfTest) -> Finding:

@@ -46,6 +46,7 @@ from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
 from snrmjax.report.whole_test.mends import (
     FilesOfTest,
     command_to_go_on,
+    is_certain,
     with_channels,
     with_commands,
 )
@@ -339,7 +340,11 @@ def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
     place, go_on = request.place, "--go-on"
     if place is not None:
         go_on = command_to_go_on(place, diagnose=request.diagnose)
-    more = "".join(f" Or {one.evidence} {one.mend}" for one in others)
+    both = [is_certain(first) and is_certain(one) for one in others]
+    more = "".join(
+        f" {'Besides,' if beside else 'Or'} {one.evidence} {one.mend}"
+        for one, beside in zip(others, both, strict=True)
+    )
     raise ValueError(
         f"is this meant? {first.kind.replace('_', ' ')} in {first.where}: {first.evidence} To mend "
         f"it: {first.mend}{more} To go on nevertheless: `{go_on}`."

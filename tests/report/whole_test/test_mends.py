@@ -186,6 +186,27 @@ def test_a_table_that_was_restated_is_mended_from_the_laboratorys_file(folder):
     np.testing.assert_allclose(found.velocity[:, 0], truth, rtol=1e-6)
 
 
+def test_two_errors_are_mended_by_one_command(folder):
+    """Amplitudes in g that were taken for velocities: one import says quantity and unit."""
+    truth = lock_in_of_g()
+    run("check", "taken/measured.csv", "--model", "model.toml", "--out", "checked")
+    found = json.loads((folder / "checked" / "check.json").read_text())
+    assert [one["kind"] for one in found[:2]] == ["acceleration_as_velocity", "wrong_unit"]
+    command = pasted(found[0]["mend"])
+    assert "--response Amp:acceleration --sensor tip --phase Phase --unit g --out" in command
+    assert kinds(folder / "taken" / "mended") == []
+    mended = sj.read_steady_states("taken/mended/measured.csv")
+    np.testing.assert_allclose(mended.velocity[:, 0], truth, rtol=1e-6)
+
+
+def test_two_errors_of_our_own_table_are_mended_by_one_command(folder):
+    level, w, f, v = states()
+    first, *_ = checked(table(level, w, f, noisy(v).conj() / 9.80665), folder)
+    assert first["kind"] == "conjugated_response"
+    assert '--unit "9.80665 m/s" --phase-sign lag' in pasted(first["mend"])
+    assert kinds(folder / "mended") == []
+
+
 def test_what_is_mended_never_takes_the_place_of_its_input(folder):
     """Pasted twice, a command that writes where it reads would scale twice."""
     level, w, f, v = states()
