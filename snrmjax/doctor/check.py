@@ -80,7 +80,8 @@ def _of_table(
     sensor = leading_sensor(data)
     rows = usable_rows(data, sensor)
     name = data.sensors[sensor]
-    where = f"{len(given_levels(data))} levels at {name}"
+    n_levels = len(given_levels(data))
+    where = f"{n_levels} level{'s' if n_levels != 1 else ''} at {name}"
     if rows.sum() < FEWEST:
         notes.append(
             f"{int(rows.sum())} states with force and phase at {name} are too few to look at: "

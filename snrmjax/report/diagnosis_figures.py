@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.diagnose.held_velocity import HeldCurve, at_curve_force
-from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
+from snrmjax.diagnose.search.model_search import DETECTED
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import (
@@ -115,16 +115,17 @@ def misfit_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def candidates_figure(diagnosis: Diagnosis) -> Figure:
-    """What every effect would explain by itself; those nearly as good as the best in vermilion.
+    """What every effect would explain by itself; those of the answer in vermilion.
+
+    With the answer's effects those that the data cannot tell from them.
 
     The bars are the gain of the Bayesian information criterion (Schwarz) over the model as given;
     left of the dashed line an effect is not detected.
     """
     rows = [row for row in diagnosis.table[0][:_SHOWN] if np.isfinite(row.gain)][::-1]
     figure, ((axes,),) = panels(COLUMN, 0.7 + 0.22 * max(len(rows), 3), 1, 1)
-    best = max((row.gain for row in rows), default=0.0)
-    near = [row.gain > max(best - AS_GOOD, DETECTED) for row in rows]
-    colours = [IDENTIFIED if one else MEASURED for one in near]
+    answer = {kind for alike in diagnosis.candidates for kind in alike}
+    colours = [IDENTIFIED if row.kind in answer else MEASURED for row in rows]
     names, gains = [effect_name(row.kind) for row in rows], [row.gain for row in rows]
     axes.barh(names, gains, color=colours, height=0.7)
     axes.axvline(DETECTED, color=SIMULATED, linestyle="--", linewidth=0.8)

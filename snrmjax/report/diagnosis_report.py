@@ -80,7 +80,8 @@ _CAPTIONS = {
     "candidates": (
         "How much better each effect, added alone, makes the model: gain of the Bayesian "
         "information criterion. Left of the dashed line an effect is not detected; vermilion bars "
-        "are about as good as the best."
+        "are effects of the answer, or what the data cannot tell from them. Several effects "
+        "together may explain more than the longest bar."
     ),
 }
 _PROBABILITIES = (

@@ -129,6 +129,7 @@ def test_a_shape_of_another_scale_is_found_anew(folder):
     sj.io.write_model("model.toml", model(1.0))
     one, *_ = checked(table(np.zeros(60, int), w, np.ones(60), noisy(v)), folder)
     assert one["kind"] == "shape_not_mass_normalised"
+    assert one["where"] == "1 level at tip"
     assert "--drive-point tip" in pasted(one["mend"])
     assert kinds(folder / "mended") == []
     found = sj.read_model("mended/model.toml").modes
