@@ -24,6 +24,8 @@ _MOST_FREQUENCY = 0.4  # relative: a larger one is an extrapolated curve
 _OVERLAP = 0.2  # of the states of levels apart, whose amplitudes the others have, too
 _LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between files
 _SAME_MASS = 0.2  # logarithm of the force's change, beyond which levels are not one assembly's
+_OTHER_GAIN = 0.03  # logarithm of a level's force that the others do not share
+_ALIKE = 0.25  # of that, which the others differ among themselves at most
 _LEAST_FLOOR = 0.05  # of the smallest force, that its noise must have to be spoken of
 
 _SCALES = ("rms_for_peak", "shape_not_mass_normalised")
@@ -275,14 +277,7 @@ def _mended(
             repairs=(Repair(apart=True),) if one.levels in groups else (),
         )
     if one.kind == "volts_as_force":
-        gains = ", ".join(f"{np.exp(g):.3g}" for g in fit.extra)
-        return Finding(
-            *("volts_as_force", "error", where),
-            f"the force over that of the first level is off by the factors {gains} at levels 2 and "
-            f"on: a drive voltage or an amplifier's range{left}",
-            "measure the force, or calibrate the drive at each level and divide `force_n` by what "
-            "it gives.",
-        )
+        return _of_gains(one, where, left, groups)
     if one.kind == "force_dropout":
         floor = noise_floor(one)
         share = 100 * floor / float(states.force.min())
@@ -305,6 +300,36 @@ def _mended(
             repairs=(Repair(read_record=True),),
         )
     return _clipping(states, one, where, left)
+
+
+def _of_gains(one: Remedy, where: str, left: str, groups: tuple[tuple[int, ...], ...]) -> Finding:
+    """Forces whose scale is not the same at all levels; by name where a few of them are off."""
+    gains = np.append(0.0, one.fit.extra)  # logarithms
+    common = float(np.median(gains))
+    away = np.abs(gains - common)
+    few = np.flatnonzero(away > _OTHER_GAIN)
+    rest = np.delete(away, few)
+    if not len(few) or 2 * len(few) >= len(gains) or rest.max() > _ALIKE * away[few].min():
+        listed = ", ".join(f"{np.exp(gain):.3g}" for gain in gains[1:])
+        return Finding(
+            *("volts_as_force", "error", where),
+            f"the force over that of the first level is off by the factors {listed} at levels 2 "
+            f"and on: a drive voltage or an amplifier's range{left}",
+            "measure the force, or calibrate the drive at each level and divide `force_n` by what "
+            "it gives.",
+        )
+    said, numbers = [], []
+    for k in few:
+        file = f" (file {groups.index((k,)) + 1})" if (k,) in groups else ""
+        said.append(f"the force of level {k + 1}{file} is {np.exp(gains[k] - common):.3g} times")
+        numbers.append(f"level {k + 1} by {np.exp(gains[k] - common):.3g}")
+    return Finding(
+        *("volts_as_force", "error", where),
+        f"{' and '.join(said)} what the other levels ask for: the range or the calibration of the "
+        f"cell or of its amplifier was another there, or the column is a drive voltage{left}",
+        f"measure again, or divide the force of {' and of '.join(numbers)} in the file that it "
+        "comes from; if the column is a voltage, measure the force.",
+    )
 
 
 def _clipping(states: ModeStates, one: Remedy, where: str, left: str) -> Finding:

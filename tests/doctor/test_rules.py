@@ -1,5 +1,7 @@
 """The doctor's finer rules: near misses of one mode and its records, by exact responses."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.signal import lsim
@@ -53,6 +55,18 @@ def test_a_misfit_of_the_mode_is_no_wrong_scale():
     near, far = (fit._replace(relative=np.full(len(v), size)) for size in (0.01, 0.15))
     assert {one.severity for one in mass_findings(seen, near, model(), "")} == {"error"}
     assert all(one.severity == "info" for one in mass_findings(seen, far, model(), ""))
+
+
+@pytest.mark.parametrize("off", [1, 2, 3])
+def test_a_level_whose_force_is_off_is_named(off):
+    level, w, force, v = states()
+    force = force * np.where(level + 1 == off, 1.25, 1.0)
+    found = sj.doctor.check_test(table(level, w, force, noisy(v)), model()).findings
+    (own,) = (one for one in found if one.kind == "volts_as_force")
+    said = re.search(r"the force of level (\d) is ([\d.]+) times what the other", own.evidence)
+    assert int(said[1]) == off
+    assert float(said[2]) == pytest.approx(1.25, rel=0.05)  # of a mode that bends with amplitude
+    assert f"level {off} by {said[2]}" in own.mend
 
 
 def with_damping_std():
