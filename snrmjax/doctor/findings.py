@@ -49,6 +49,7 @@ class Repair(NamedTuple):
     scale_model: bool = False  # find the model's shapes anew
     apart: bool = False  # identify each table for itself
     read_record: bool = False  # import the time record
+    levels: tuple[int, ...] = ()  # of which alone the force has that factor, from 1
 
 
 class Finding(NamedTuple):
@@ -65,6 +66,12 @@ class Finding(NamedTuple):
     mend: str  # the line or option that mends it
     rows: tuple[int, ...] = ()
     repairs: tuple[Repair, ...] = ()  # that commands can do, the likeliest first
+    title: str = ""  # where the kind is wider than what was found
+
+    @property
+    def name(self) -> str:
+        """What a reader is told first."""
+        return self.title or self.kind.replace("_", " ")
 
     def as_dict(self) -> dict[str, str]:
         """What `check.json` has of it."""

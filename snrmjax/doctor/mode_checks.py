@@ -26,6 +26,7 @@ _LEAST_GAIN_CHANGE = 0.07  # relative: of gain or force along a test or between 
 _SAME_MASS = 0.2  # logarithm of the force's change, beyond which levels are not one assembly's
 _OTHER_GAIN = 0.03  # logarithm of a level's force that the others do not share
 _ALIKE = 0.25  # of that, which the others differ among themselves at most
+_LEAST_RIGHT = 1e-3  # share of a recorded force that acted: none or less has no logarithm
 _LEAST_FLOOR = 0.05  # of the smallest force, that its noise must have to be spoken of
 
 _SCALES = ("rms_for_peak", "shape_not_mass_normalised")
@@ -304,7 +305,8 @@ def _mended(
 
 def _of_gains(one: Remedy, where: str, left: str, groups: tuple[tuple[int, ...], ...]) -> Finding:
     """Forces whose scale is not the same at all levels; by name where a few of them are off."""
-    gains = np.append(0.0, one.fit.extra)  # logarithms
+    right = 1 - np.append(0.0, one.fit.extra)  # share of the recorded force, over the first level's
+    gains = -np.log(np.maximum(right, _LEAST_RIGHT))
     common = float(np.median(gains))
     away = np.abs(gains - common)
     few = np.flatnonzero(away > _OTHER_GAIN)
@@ -327,8 +329,12 @@ def _of_gains(one: Remedy, where: str, left: str, groups: tuple[tuple[int, ...],
         *("volts_as_force", "error", where),
         f"{' and '.join(said)} what the other levels ask for: the range or the calibration of the "
         f"cell or of its amplifier was another there, or the column is a drive voltage{left}",
-        f"measure again, or divide the force of {' and of '.join(numbers)} in the file that it "
-        "comes from; if the column is a voltage, measure the force.",
+        "if the column is a voltage, measure the force; else measure again, or divide the force of "
+        f"{' and of '.join(numbers)} in the file that it comes from.",
+        repairs=tuple(
+            Repair(force=float(np.exp(common - gains[k])), levels=(int(k) + 1,)) for k in few
+        ),
+        title=f"force on another scale at level {' and '.join(str(k + 1) for k in few)}",
     )
 
 

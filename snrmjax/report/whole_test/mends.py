@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from snrmjax.doctor.check import given_levels
 from snrmjax.doctor.findings import Checkup, Finding, Repair
 from snrmjax.io.exchange.import_map import ImportMap, ResponseMap, read_import_map
 from snrmjax.io.files import FilePath
+from snrmjax.measure.states import SteadyStates
 from snrmjax.methods.records.recorded_test import RecordedTest
 from snrmjax.model.structures import Structure
 from snrmjax.report.whole_test.folder_contents import TestFiles
@@ -46,6 +48,7 @@ class FilesOfTest(NamedTuple):
     out: Path | None = None  # of `snrmjax test`
     drive_point: str | None = None
     responses: tuple[Path, ...] = ()  # of which the linear modes are found
+    of_levels: tuple[str, ...] = ()  # the file of each level, where it is known
 
 
 def with_sources(where: FilesOfTest, map_file: Path) -> FilesOfTest:
@@ -127,7 +130,7 @@ def with_channels(
         words += ["--sensor", sensor]
     responses = [ResponseMap(one, known[one].quantity, known[one].unit) for one in channels.motions]
     force = known[channels.force].unit if channels.force else ""
-    told = ImportMap(tuple(responses), force_unit=force)
+    told = ImportMap(tuple(responses), force=channels.force or "", force_unit=force)
     return where._replace(options=tuple(words), first=told, told=told)
 
 
@@ -138,7 +141,7 @@ def with_commands(checkup: Checkup, where: FilesOfTest) -> Checkup:
     line = _command(_at_once(certain), where, "") if len(certain) > 1 else ""
     if line:
         k = checkup.findings.index(certain[0])
-        names = " and ".join(one.kind.replace("_", " ") for one in certain)
+        names = " and ".join(one.name for one in certain)
         told[k] = told[k]._replace(mend=f"{names} at once: `{line}`. Alone, {told[k].mend}")
     return Checkup(tuple(told), checkup.notes)
 
@@ -149,7 +152,7 @@ def is_certain(one: Finding) -> bool:
         return False
     (repair,) = one.repairs
     said = repair.quantity or repair.conjugate or repair.response != 1 or repair.force != 1
-    return bool(said) and not repair.fit_gain
+    return bool(said) and not repair.fit_gain and not repair.levels
 
 
 def _at_once(findings: Sequence[Finding]) -> Repair:
@@ -163,12 +166,30 @@ def _at_once(findings: Sequence[Finding]) -> Repair:
     )
 
 
+def file_of_each_level(names: Sequence[str], parts: Sequence[SteadyStates]) -> tuple[str, ...]:
+    """The file of each level, of files with levels of their own."""
+    both = zip(names, parts, strict=True)
+    return tuple(name for name, part in both for _ in given_levels(part))
+
+
 def _told(one: Finding, where: FilesOfTest) -> Finding:
+    if any(repair.levels for repair in one.repairs):
+        return one._replace(mend=f"{one.mend.rstrip('.')}{_column(one, where)}.")
     sensor = next((name for name in where.sensors if one.where.endswith(f" at {name}")), "")
     lines = [line for each in one.repairs if (line := _command(each, where, sensor))]
     if not lines:
         return one
     return one._replace(mend=f"{one.mend.rstrip('.')}: `{'`, or `'.join(lines)}`.")
+
+
+def _column(one: Finding, where: FilesOfTest) -> str:
+    """Where the forces of a finding's levels lie: no import changes those of some levels alone."""
+    levels = [k for repair in one.repairs for k in repair.levels]
+    if max(levels) > len(where.of_levels):
+        return ""
+    files = " and ".join(dict.fromkeys(where.of_levels[k - 1] for k in levels))
+    column = "force_n" if where.tables else where.first.force
+    return f" (`{column}` in {files})" if column else f" in {files}"
 
 
 def _command(repair: Repair, where: FilesOfTest, sensor: str) -> str:

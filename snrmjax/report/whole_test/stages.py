@@ -46,6 +46,7 @@ from snrmjax.report.whole_test.folder_contents import NamedRecord, TestFiles
 from snrmjax.report.whole_test.mends import (
     FilesOfTest,
     command_to_go_on,
+    file_of_each_level,
     is_certain,
     with_channels,
     with_commands,
@@ -132,12 +133,14 @@ def run_whole_test(
             "all that it tells, as `snrmjax modes` writes them."
         )
     stepped = [named.file for named, one in _stepped(files, sorted_records)]
-    _refuse_doubled([*(one.file for one in files.states), *stepped], parts)
+    names = [*(one.file for one in files.states), *stepped]
+    _refuse_doubled(names, parts)
     data = join_steady_states(parts)
     stage.ends(f"{data.n_states} steady states")
     checkup = check_test(parts, modes.model, [one.record for one in files.records])
     if request.place is not None:
         place = with_channels(request.place, files, sorted_records, modes.model)
+        place = place._replace(of_levels=file_of_each_level(names, parts))
         checkup = with_commands(checkup, place)
     _stop_at_errors(checkup, request)
     write_steady_states(folder / "measured.csv", data)
@@ -346,7 +349,7 @@ def _stop_at_errors(checkup: Checkup, request: TestRequest) -> None:
         for one, beside in zip(others, both, strict=True)
     )
     raise ValueError(
-        f"is this meant? {first.kind.replace('_', ' ')} in {first.where}: {first.evidence} To mend "
+        f"is this meant? {first.name} in {first.where}: {first.evidence} To mend "
         f"it: {first.mend}{more} To go on nevertheless: `{go_on}`."
     )
 
@@ -355,7 +358,7 @@ def _check_sentence(checkup: Checkup) -> str:
     grave = [one for one in checkup.findings if one.severity != "info"]
     if not grave:
         return "check: nothing found"
-    listed = ", ".join(dict.fromkeys(one.kind.replace("_", " ") for one in grave))
+    listed = ", ".join(dict.fromkeys(one.name for one in grave))
     return f"check: {listed}"
 
 
@@ -439,7 +442,7 @@ def _check_section(checkup: Checkup) -> Section:
     header = ("severity", "what", "where", "evidence", "what mends it")
 
     def row(one: Finding) -> tuple[str, ...]:
-        return (one.severity, one.kind.replace("_", " "), one.where, one.evidence, one.mend)
+        return (one.severity, one.name, one.where, one.evidence, one.mend)
 
     rows = [row(one) for one in checkup.findings]
     text = [_check_sentence(checkup).capitalize() + ".", *checkup.notes]

@@ -208,6 +208,22 @@ def test_two_errors_of_our_own_table_are_mended_by_one_command(folder):
     assert kinds(folder / "mended") == []
 
 
+def test_the_file_of_a_level_whose_force_is_off_is_named(tmp_path):
+    """No import changes the force of one level alone: the column and its file are said."""
+    level, w, f, v = states()
+    parts = [table(level[mine], w[mine], f[mine], v[mine]) for mine in (level < 2, level == 2)]
+    place = mends.FilesOfTest(
+        tmp_path / "mended",
+        sources=(tmp_path / "low.mat", tmp_path / "high.mat"),
+        first=ImportMap(force="cell"),
+        of_levels=mends.file_of_each_level(["low.mat", "high.mat"], parts),
+    )
+    repair = Repair(force=0.8, levels=(3,))
+    finding = Finding("volts_as_force", "error", "", "", "Divide it by 1.25.", (), (repair,))
+    (told,) = mends.with_commands(Checkup((finding,)), place).findings
+    assert told.mend == "Divide it by 1.25 (`cell` in high.mat)."
+
+
 def test_what_is_mended_never_takes_the_place_of_its_input(folder):
     """Pasted twice, a command that writes where it reads would scale twice."""
     level, w, f, v = states()
