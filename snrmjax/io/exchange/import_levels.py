@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from snrmjax.io.exchange.import_units import Assumptions
-from snrmjax.measure.recordings.velocity_states import number_levels
+from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
 
 
 class MeasuredPart(NamedTuple):
@@ -53,5 +53,5 @@ def numbered_levels(
     chosen = level or "auto"
     number, note = number_levels(chosen, force, None, frequency)  # type: ignore[arg-type]
     if not level:
-        assumed["level"] = f"{len(np.unique(number))} {note}"
+        assumed["level"] = counted_levels(number, note)
     return number, level or ("force" if "amplitude" in note else "runs")

@@ -12,7 +12,7 @@ from snrmjax.io.laboratory.names import role_of
 from snrmjax.measure.recordings.channels import Channel
 from snrmjax.measure.recordings.frequency_responses import FrequencyResponses
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.recordings.velocity_states import number_levels
+from snrmjax.measure.recordings.velocity_states import counted_levels, number_levels
 
 _HERTZ = 2 * np.pi
 _MOST = 40  # lines of one kind
@@ -75,7 +75,7 @@ def _columns(table: NumberTable) -> list[str]:
         size = np.abs(table.columns[force])
         if np.all(size > 0) and np.isfinite(size).all():
             number, note = number_levels("auto", size, None, np.real(table.columns[frequency]))
-            lines.append(f"    {len(np.unique(number))} levels found: {note}")
+            lines.append(f"    found: {counted_levels(number, note)}")
     lines += [
         f"    {name}: text, {', '.join(list(dict.fromkeys(words))[:4])}"
         for name, words in table.words.items()

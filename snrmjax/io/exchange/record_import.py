@@ -10,7 +10,7 @@ from snrmjax.measure.recordings.channels import Channel, channel_number
 from snrmjax.measure.recordings.step_counts import StepCounts
 from snrmjax.measure.recordings.stepped_sine import stepped_sine_states
 from snrmjax.measure.recordings.time_recording import TimeRecording
-from snrmjax.measure.recordings.velocity_states import Levels
+from snrmjax.measure.recordings.velocity_states import Levels, counted_levels
 from snrmjax.measure.states import UNNAMED_SENSOR, SteadyStates
 from snrmjax.measure.sweeps.slow_sweep import sweep_states
 
@@ -122,7 +122,7 @@ def import_record(
             assumed["record"] = f"{kind}: recognised in the record"
         if not told.level:
             found_by = [note for note in states.notes if note.startswith("levels")]
-            assumed["level"] = f"{len(np.unique(np.asarray(states.level)))} {found_by[0]}"
+            assumed["level"] = counted_levels(np.asarray(states.level), found_by[0])
         if told.level != "auto":  # which is assumed or stated then
             notes = tuple(one for one in notes if not one.startswith("levels"))
         return states, told._replace(record=kind, level=told.level or level), notes, counts

@@ -177,6 +177,16 @@ def number_levels(
     return _runs(frequency), "levels by runs of frequency: the force of a run is not constant"
 
 
+def counted_levels(number: Int[np.ndarray, " state"], note: str) -> str:
+    """How many levels were found by the rule of a note of `number_levels`.
+
+    >>> counted_levels(np.array([1, 1]), "levels by amplitude of the force")
+    '1 level by amplitude of the force'
+    """
+    n = len(np.unique(np.asarray(number)))
+    return f"{n} {note.replace('levels', 'level', 1) if n == 1 else note}"
+
+
 def _number(recording: TimeRecording, name: str, what: str) -> int:
     try:
         return channel_number(recording.channels, name)
