@@ -76,8 +76,8 @@ class SteadyStates(AbstractResult):
         size = np.where(np.asarray(self.measured), np.abs(np.asarray(self.velocity)), np.nan)
         missing = int(np.sum(~np.asarray(self.measured)))
         lines = [
-            f"SteadyStates: {self.n_states} states of {n_levels} level{'s'[: n_levels != 1]} at "
-            f"{', '.join(self.sensors)}",
+            f"SteadyStates: {self.n_states} states of {n_levels} "
+            f"level{'s' if n_levels != 1 else ''} at {', '.join(self.sensors)}",
             f"frequency {spans(np.asarray(self.frequency) / _HERTZ, 'Hz')}, force {load}",
             f"velocity {spans(size, 'm/s')}",
             f"errors stated of {', '.join(stated) or 'nothing'}",
