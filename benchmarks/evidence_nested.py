@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from snrmjax.diagnose.evidence import marginal_of
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, parameter_labels
 from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.effect_fit import (
@@ -27,8 +28,8 @@ from snrmjax.diagnose.misfit.effect_fit import (
     with_errors_passed_on,
 )
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.search.evidence import fitted_answer
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 from snrmjax.model.effect_metadata import MotionScales
@@ -74,9 +75,8 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
     import dynesty
 
     model = read_model(folder / f"{name}.toml")
-    misfit = weighted_misfit(
-        predictions_of(model, read_steady_states(folder / f"{name}.csv", model))
-    )
+    data = read_steady_states(folder / f"{name}.csv", model)
+    misfit = weighted_misfit(with_reference(predictions_of(model, data)))
     scales = scales_of(misfit.predictions)
 
     def fitted() -> EffectFit:
@@ -87,9 +87,17 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
 
     misfit = with_errors_passed_on(misfit, fitted())
     fit = fitted()
-    answer, nothing = (fitted_answer(misfit, one) for one in (fit, baseline_fit(misfit)))
-    one = np.ones(1)
-    laplace, none = (float(each.marginal().log_likelihood(one)[0]) for each in (answer, nothing))
+
+    def log_evidence(one: EffectFit) -> float:
+        """With the noise as it is stated, and sizes of levels' errors as the misfit has them."""
+        marginal = marginal_of(misfit, one)
+        if marginal is None:
+            return -np.inf
+        return marginal.rows.log_likelihood(1.0, marginal.variance)[0] - marginal.penalty
+
+    laplace, none = log_evidence(fit), log_evidence(baseline_fit(misfit))
+    # Of rows made independent, which have the ln determinant and the units of all answers alike.
+    alike = none + 0.5 * misfit.chi_square(misfit.base)
     labels, transform = prior_transform(misfit, kinds)
     calls = 0
 
@@ -118,7 +126,7 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
         "answer": "+".join(kinds),
         "fit": fit.status.value,
         "laplace": round(laplace - none, 2),
-        "nested": round(float(found.logz[-1]) - none, 2),
+        "nested": round(float(found.logz[-1]) + alike - none, 2),
         "nested_std": round(float(found.logzerr[-1]), 2),
         "calls": calls,
         "seconds": round(time.perf_counter() - begin, 1),

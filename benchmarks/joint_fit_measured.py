@@ -80,7 +80,7 @@ def held_out(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
                 (
                     *(level, level in inside, best.velocity / velocity - 1),
                     (best.frequency - frequency) / HERTZ,
-                    np.hypot(best.velocity_std / velocity, float(fit.prior.level[0])),
+                    best.velocity_std / velocity,
                     best.frequency_std / HERTZ,
                 )
             )

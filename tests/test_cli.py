@@ -357,6 +357,9 @@ def test_each_command_starts_in_a_process_of_its_own(files, tmp_path, command, w
         (("--next", "2", "--amplitude", "velocity"), ("--amplitude", "--next", "@velocity")),
         (("--fit", "auto", "--measure", "peak"), ("--measure", "--fit", "fundamental")),
         (("--extrapolate", "2"), ("--extrapolate", "--predict-force")),
+        (("--day-std", "0.1"), ("--day-std", "--predict-force")),
+        (("--self-excited",), ("--self-excited", "--predict-force")),
+        (("--day-std", "5 %", "--predict-force", "1e-5"), ("--day-std", "FREQUENCY", "'5 %'")),
         (("--predict-drive", "0.1"), ("--predict-drive", "--predict-force", "force_n")),
     ],
     ids=lambda value: " ".join(value),
@@ -376,7 +379,7 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     """A new option must be said to belong to one way of identifying, or to both."""
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help"}
-    both |= {"axis"}
+    both |= {"axis", "day_std", "self_excited"}
     points = {"amplitude", "measure", "curve", "knots", "anchor"}
     joint = {"fit", "free", "robust", "further"}
     assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
@@ -498,6 +501,23 @@ def test_a_joint_fit_writes_what_the_contract_says(fitted):
 def test_each_table_of_a_joint_fit_is_written_once(fitted):
     _, written, _ = fitted
     assert sorted(written) == ["backbone.csv", "next.csv", "points.csv", "prediction.csv"]
+
+
+def test_a_prediction_says_where_a_further_level_would_be(fitted):
+    out, _, _ = fitted
+    summary = json.loads((out / "summary.json").read_text())
+    for tip, one in zip(summary["resonances"], summary["resonance_distributions"], strict=True):
+        assert one["force_n"] == tip["force_n"]
+        assert (one["probability"], one["negative_damping"]) == (1.0, 0.0)
+        assert one["quantiles"] == [0.025, 0.16, 0.5, 0.84, 0.975]
+        assert one["holds"] == "a further level's errors"
+        for name in ("frequency_hz", "velocity_m_s"):
+            low, *_, high = one[name]
+            # Exact states: the curves, drawn at 200 amplitudes, are known to their ripple.
+            assert low * (1 - 1e-4) <= tip[name] <= high * (1 + 1e-4)
+    assert "95 % " in (out / "report.html").read_text()
+    table = rows(out / "prediction.csv")
+    assert np.all(table["velocity_std_m_s"] >= 0)
 
 
 def test_predictions_of_a_joint_fit_lie_on_its_own_curves(fitted):

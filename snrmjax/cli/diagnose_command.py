@@ -129,7 +129,7 @@ def diagnose(
             effects = f" ({effects})" if found.verdict.is_answer else f"; best attempt: {effects}"
         say(f"{path.name}: {found.verdict.replace('_', ' ')}{effects}")
         say(f"  {readable_verdict(found)}")
-        say(f"  probabilities: {found.most_probable()}")
+        say(f"  probability: {found.most_probable()}")
         if found.decide_by:
             say(f"  what would decide: {found.decide_by}")
     if not several:

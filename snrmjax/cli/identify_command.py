@@ -8,6 +8,7 @@ import typer
 
 from snrmjax.cli.console import say, staged, warn
 from snrmjax.cli.options import FILES, Out, require_positive
+from snrmjax.identify.prediction.new_level import DayToDay
 from snrmjax.io.models import read_model
 from snrmjax.io.tables import read_steady_states
 
@@ -92,6 +93,23 @@ def identify(
             rich_help_panel=_PREDICTION,
         ),
     ] = 1.5,
+    day_std: Annotated[
+        str | None,
+        typer.Option(
+            help="Predict for another day's test, which differs from this one by so much: relative "
+            "1σ of natural frequency, damping and gain, as 0.001,0.05,0.02.",
+            metavar="FREQUENCY,DAMPING,GAIN",
+            rich_help_panel=_PREDICTION,
+        ),
+    ] = None,
+    self_excited: Annotated[
+        bool,
+        typer.Option(
+            "--self-excited",
+            help="Let extrapolated damping be negative, as no passive structure's is.",
+            rich_help_panel=_PREDICTION,
+        ),
+    ] = False,
     axis: Annotated[
         AmplitudeAxis,
         typer.Option(
@@ -189,13 +207,18 @@ def identify(
     also prediction.csv, with a joint fit fit.json, with --next also next.csv.
     """
     from snrmjax.report import workflow
+    from snrmjax.report.prediction.predictions import Loads
     from snrmjax.report.sampling import SHOWN_AMPLITUDES
 
     given = {name for name in context.params if _was_given(context, name)}
     _check_options(given)
     require_positive("--predict-force", predict_force or (), "N")
     require_positive("--predict-drive", predict_drive or (), "V")
-    loads = workflow.Loads(tuple(predict_force or ()), tuple(predict_drive or ()), extrapolate)
+    loads = Loads(
+        *(tuple(predict_force or ()), tuple(predict_drive or ()), extrapolate),
+        day=None if day_std is None else _day_to_day(day_std),
+        self_excited=self_excited,
+    )
     with staged(out) as folder:
         structure = read_model(model)
         measured = read_steady_states(data, structure)
@@ -247,8 +270,24 @@ def _check_options(given: set[str]) -> None:
             )
     if "robust" in given and not asking:
         raise ValueError("`--robust` belongs to a joint fit: add `--fit auto`, or leave it out.")
-    if "extrapolate" in given and not given & {"predict_force", "predict_drive"}:
+    for name in sorted(given & {"extrapolate", "day_std", "self_excited"}):
+        if given & {"predict_force", "predict_drive"}:
+            break
         raise ValueError(
-            "`--extrapolate` belongs to predictions: add `--predict-force` (N) or, for data with "
-            "a drive voltage, `--predict-drive` (V), or leave it out."
+            f"`--{name.replace('_', '-')}` belongs to predictions: add `--predict-force` (N) or, "
+            "for data with a drive voltage, `--predict-drive` (V), or leave it out."
         )
+
+
+def _day_to_day(text: str) -> DayToDay:
+    """The option `--day-std`."""
+    try:
+        day = DayToDay(*map(float, text.split(",")))
+    except (TypeError, ValueError):
+        day = DayToDay(-1.0)
+    if not all(0 <= one < 1 for one in day):
+        raise ValueError(
+            "`--day-std` takes up to three relative standard deviations from 0 to below 1, "
+            f"FREQUENCY,DAMPING,GAIN as 0.001,0.05,0.02, but is {text!r}."
+        )
+    return day

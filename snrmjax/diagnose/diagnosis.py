@@ -1,19 +1,12 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
-from collections.abc import Callable
-from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.checks.answer_checks import (
-    gain_found,
-    notes_on_found_mass,
-    notes_on_stated_parameters,
-    with_answer_checked,
-)
+from snrmjax.diagnose.answers import Search, best_answer
 from snrmjax.diagnose.checks.cross_validation import (
     held_out_levels,
     held_out_places,
@@ -25,32 +18,29 @@ from snrmjax.diagnose.checks.level_forces import (
     notes_on_level_forces,
     suspected_level_forces,
     with_forces_that_acted,
-    with_level_forces_doubted,
 )
-from snrmjax.diagnose.checks.level_variance import (
-    beyond_random_noise,
-    states_level_errors,
-    with_level_variance,
-)
-from snrmjax.diagnose.checks.verdict import (
-    Verdict,
-    judge,
-    neighbour_noise,
-    tolerated,
+from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
+from snrmjax.diagnose.checks.shared_gains import (
+    gain_found,
+    notes_on_found_mass,
+    notes_on_stated_parameters,
 )
 from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, completed_model
+from snrmjax.diagnose.decide import decide, imitations_of
 from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
-from snrmjax.diagnose.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
 from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
+from snrmjax.diagnose.misfit.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
+from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects, find_effects
+from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -63,8 +53,8 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 _LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is compared
 _LEAST_STATES = 6
 _OTHER_MODE = 0.1  # relative shift of a natural frequency that is no error of a linear test
-_ROUNDS, _NEAR = 4, 0.85  # in search of unstated noise: at most, and share of it that ends them
-_LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
+_FEW = 2  # effects of an answer beside which no law is drawn
+_NEAR_BEST = 6.0  # of Schwarz's criterion
 
 
 @on_one_core
@@ -95,7 +85,7 @@ def diagnose_model(
     forces of single levels explain the data better than any effects, the answer is found beside
     them (`level_forces`); where they explain them as well, they are said first.
 
-    Returns a `Diagnosis`; `checks.verdict.judge` has the rules of its verdict. Raises `ValueError`
+    Returns a `Diagnosis`; `decide.decide` has the rules of its verdict. Raises `ValueError`
     for too few states, an unknown force or sensors other than the model's.
     Validity: steady motions with the period of the force; effects that change the motion
     moderately, so that two of them add up.
@@ -109,14 +99,9 @@ def diagnose_model(
     predictions = predictions_of(model, data, force_gain_std)
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)
-    given, levels_note = model, ""
-    # Beside an unknown gain no joint fit can estimate the level-to-level variance.
+    # Beside an unknown gain nothing says which level's force is off.
     estimable = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
-    silent = not predictions.chosen.noise_stated and not states_level_errors(model)
-    if silent and estimable and predictions.chosen.n_levels > 2:
-        model, levels_note = with_level_variance(model, data)
-        if levels_note:
-            predictions = predictions_of(model, data, force_gain_std)
+    predictions = with_reference(predictions)
     misfit = weighted_misfit(predictions)
     if not np.isfinite(misfit.base).all():
         raise ValueError(
@@ -126,44 +111,32 @@ def diagnose_model(
     scales = scales_of(predictions)
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
-    noise_note = ""
-    search = partial(
-        find_effects, scales=scales, kinds=kinds, further_starts=former.starts if former else {}
-    )
-    rival = None
-    if predictions.chosen.noise_stated:
-        found = as_recorded = search(misfit)
-        if estimable:
-            rival = suspected_level_forces(
-                found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
-            )
-        if rival is not None and rival.is_better:
-            found = search(weighted_misfit(predictions.with_level_forces_free(rival.places)))
-    else:
-        found, size = _with_noise_found(predictions, misfit, search)
-        as_recorded = found
-        noise_note = (
-            f"no noise is stated: the remaining misfit ({100 * size * ASSUMED_ERROR:.2g} % of "
-            f"velocity, {np.degrees(size * ASSUMED_ERROR):.2g}°) is taken as noise, errors of the "
-            "laws included, which the curves of a joint fit follow; so a good fit proves nothing."
+    search = Search(scales, kinds, former.starts if former else {})
+    answered = best_answer(search, predictions, data)
+    found, weights = answered.found, answered.weights
+    as_recorded, rival = found, None
+    if predictions.chosen.noise_stated and estimable:
+        rival = suspected_level_forces(
+            found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
         )
+    if rival is not None and rival.is_better:
+        freed = answered.found.misfit.predictions.with_level_forces_free(rival.places)
+        found, weights = search.answered(freed)[:2]
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
     free = locate_misfit(misfit, found.baseline)
+    weights = weights.with_imitations(len(imitations_of(found, free.parts)))
     neighbours = neighbour_noise(misfit, fit)
     levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
     parameters = _estimates(misfit, fit)
-    judgement = judge(found, neighbours, free.parts, levels)
     errors = {name: one.std for name, one in parameters.items()}
-    judgement = with_answer_checked(judgement, misfit, fit, errors)
     gains = level_gains(misfit, fit)
-    if not gains:
-        judgement = with_level_forces_doubted(judgement, rival)
+    judgement = decide(found, weights, free.parts, levels, errors, None if gains else rival)
     test = None
     # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
         test = recommended_test(found)
     completed = completed_model(
-        model if fit.kinds else given,
+        model,
         misfit.baseline_parameters(fit.rows),
         fit.kinds,
         {name: one.value for name, one in parameters.items()},
@@ -190,10 +163,7 @@ def diagnose_model(
             f"{gain:.3g})."
         )
     notes += notes_on_level_forces(gains, rival, as_recorded)
-    notes += [*judgement.reasons, levels_note, noise_note]
-    if predictions.chosen.noise_stated:
-        scatter, n = float(np.sqrt(neighbours.variance)), predictions.chosen.n_levels
-        notes.append(beyond_random_noise(model, rms_misfit(misfit, fit), scatter, n))
+    notes += [*judgement.reasons, *_notes_on_noise(found.misfit.predictions)]
     if levels is None:
         n = predictions.chosen.n_levels
         notes.append(
@@ -236,9 +206,11 @@ def diagnose_model(
         level_forces=gains,
     )
     known = predictions.chosen.noise_stated and force_gain_std == 0 and not unknown.any()
-    if judgement.verdict is not Verdict.UNKNOWN or not known:
+    # Three effects together can follow most laws: one drawn law may do as well.
+    if not known or not (judgement.verdict is Verdict.UNKNOWN or len(fit.kinds) > _FEW):
         return diagnosis
-    law = law_answer(found, model)
+    # Laws of many knots are drawn with few harmonics.
+    law = law_answer(answered.coarse or found, model)
     return diagnosis if law is None else _with_law(diagnosis, law)
 
 
@@ -295,32 +267,31 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     return excluded
 
 
-def _with_noise_found(
-    predictions: Predictions,
-    misfit: WeightedMisfit,
-    search: Callable[[WeightedMisfit], FoundEffects],
-) -> tuple[FoundEffects, float]:
-    """What is missing, with noise as large as what is left; its size over the assumed one.
-
-    It begins with what no free curves of amplitude explain, and is never below what neighbouring
-    states show.
-    """
-    alone = baseline_fit(misfit)
-    neighbours = neighbour_noise(at_phases_of(misfit, alone), alone)
-    least = max(float(np.sqrt(neighbours.variance)), _LEAST_NOISE)
-    predictions = predictions.with_errors_scaled(least)
-    misfit = weighted_misfit(predictions)
-    free = locate_misfit(misfit, baseline_fit(misfit))
-    factor = float(np.sqrt(max(free.chi_square / max(free.freedom, 1), 1.0)))
-    size = least
-    for _ in range(_ROUNDS):
-        predictions = predictions.with_errors_scaled(factor)
-        size *= factor
-        found = search(weighted_misfit(predictions))
-        factor = max(rms_misfit(found.misfit, found.fit), least / size)
-        if factor > _NEAR:
-            break
-    return found, size
+def _notes_on_noise(predictions: Predictions) -> list[str]:
+    """What is taken for noise, and for errors of levels, where neither is stated."""
+    notes = []
+    if not predictions.chosen.noise_stated:
+        size = ASSUMED_ERROR * predictions.error_scale
+        notes.append(
+            f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
+            f"{np.degrees(size):.2g}°) is taken for it, so a good fit proves nothing."
+        )
+    gain, phase, stiffness, damping = (
+        size if free else 0.0
+        for size, free in zip(predictions.level_sizes, predictions.unstated_levels, strict=True)
+    )
+    parts = [
+        *([f"{100 * gain:.2g} % in gain"] if gain > 0 else []),
+        *([f"{np.degrees(phase):.2g}° in phase"] if phase > 0 else []),
+        *([f"{50 * stiffness:.2g} % in frequency"] if stiffness > 0 else []),
+        *([f"{100 * damping:.2g} % in damping"] if damping > 0 else []),
+    ]
+    if parts:
+        notes.append(
+            f"levels differ by {', '.join(parts)} (1σ), which nobody stated: taken for errors that "
+            "the states of a level share. State them in [measurement] if they are known."
+        )
+    return notes
 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
@@ -417,7 +388,7 @@ def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     notes, rows = [], [row for step in found.table for row in step]
     lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
     behind = [one for one in behind if np.isfinite(one)]
-    near = sum(one < AS_GOOD for one in behind)
+    near = sum(one < _NEAR_BEST for one in behind)
     if behind:
         effect = "all were clearly worse than the best, so the answer does not depend on them."
         if near:

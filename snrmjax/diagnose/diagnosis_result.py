@@ -2,7 +2,6 @@
 
 import textwrap
 from collections.abc import Iterable, Mapping
-from itertools import product
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -11,13 +10,12 @@ from jaxtyping import Float, Int
 
 from snrmjax.diagnose.checks.cross_validation import HeldOut
 from snrmjax.diagnose.checks.level_forces import LevelGain, level_forces_sentence
-from snrmjax.diagnose.checks.probabilities import answer_name
-from snrmjax.diagnose.checks.verdict import Verdict, verdict_sentence
 from snrmjax.diagnose.completed_model import CompletedStatus
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.laws.law_table import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.diagnose.verdict import Verdict, verdict_sentence
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
@@ -127,14 +125,16 @@ class Diagnosis(AbstractResult):
 
     @property
     def probability(self) -> float:
-        """That the answer given is right: its verdict, or one effect of every class."""
+        """That the answer given is right: its verdict, or an answer of effects in its classes."""
         verdict = Verdict(self.verdict)
         if verdict is Verdict.DRAWN:  # what no effect of the library explains
             return self.probabilities.get(Verdict.UNKNOWN.value, 0.0)
         if not verdict.is_answer:
             return self.probabilities.get(verdict.value, 0.0)
-        given = {answer_name(kinds) for kinds in product(*self.candidates)}
-        return float(sum(self.probabilities.get(name, 0.0) for name in given))
+        given = {kind for group in self.candidates for kind in group}
+        return float(
+            sum(p for name, p in self.probabilities.items() if set(name.split("+")) <= given)
+        )
 
     @property
     def completed(self) -> Structure | None:
@@ -153,7 +153,7 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult.summary`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         lines = [f"Diagnosis: {self.verdict_sentence}"]
-        lines += textwrap.wrap(f"probabilities: {self.most_probable()}", _WIDTH)
+        lines += textwrap.wrap(f"probability: {self.most_probable()}", _WIDTH)
         for name, (value, std) in self.parameters.items():
             stated = unit_of(name)
             unit = "" if stated == "1" else stated
@@ -176,14 +176,13 @@ class Diagnosis(AbstractResult):
         return tuple(lines)
 
     def most_probable(self) -> str:
-        """The answers with the largest probabilities, in words; the one given first."""
-        given = f"{probability_in_words(self.probability)} for the answer given"
-        others = [
-            f"{probability_in_words(value)} {name.replace('+', ' with ')}"
+        """The answers with the largest probabilities, each once."""
+        listed = [
+            f"{name.replace('+', ' with ')} {probability_in_words(value)}"
             for name, value in list(self.probabilities.items())[:_LISTED]
             if value >= _LEAST_LISTED
         ]
-        return f"{given}; {', '.join(others)}"
+        return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
 
     def _status(self) -> str:
         """How the fit and those it was compared with ended."""

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.pointwise.missing_resonance import jump_at_resonance
 from snrmjax.measure.states import SteadyStates
@@ -18,7 +17,6 @@ from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
 
 ORDER = 5  # harmonics of the responses
-_MOVED, _SMALLER = 0.5, 0.2  # of the half-power bandwidth; of the velocity
 _REACH = 0.3  # of the measured range of frequencies, added at both ends
 
 
@@ -241,51 +239,3 @@ def _complete(curves: Sequence[ResponseCurve]) -> bool:
     """Whether a response was traced to the upper end of the range of frequencies."""
     main = [curve for curve in curves if curve.branch == "main"]
     return bool(main) and all(curve.status == CurveStatus.UPPER_END for curve in main)
-
-
-def with_resonances_checked(
-    diagnosis: Diagnosis, model: Structure, levels: Sequence[LevelResponse]
-) -> Diagnosis:
-    """The diagnosis with a note where the completed model resonates elsewhere than was measured.
-
-    An answer that does is not `named`: beside it something else acts. Arguments: `model` as it was
-    diagnosed; `levels` from `predict_levels`.
-    """
-    r, j = diagnosis.force_misfit.sensor, model.modes.mode_of_interest
-    constant = abs(float(model.modes.mode_shape[r, j] * model.modes.participation[j]))
-    missed = [row for row in levels if _is_missed(row, constant * diagnosis.answer.force_gain)]
-    if not missed:
-        return diagnosis
-    listed = "; ".join(
-        f"level {row.level} at {_place(row.completed)}, measured at {_place(row.measured)}"
-        for row in missed
-    )
-    note = f"the completed model does not reproduce the measured resonances: {listed}."
-    named = diagnosis.verdict is Verdict.NAMED
-    return dataclasses.replace(
-        diagnosis,
-        verdict=Verdict.AMBIGUOUS if named else diagnosis.verdict,
-        notes=(note, *diagnosis.notes),
-    )
-
-
-def _is_missed(row: LevelResponse, constant: float) -> bool:
-    """Whether a traced response has its resonance elsewhere, or none, by far.
-
-    By more than a fifth of the velocity, or more than half of the half-power bandwidth, which at a
-    phase resonance is the force times the modal constant over the velocity.
-    """
-    measured, found = row.measured, row.completed
-    if not row.complete or not np.isfinite(measured.frequency) or not np.isfinite(row.force):
-        return False
-    if not np.isfinite(found.frequency):
-        return True
-    width = constant * row.force / measured.velocity / (2 * np.pi)
-    moved = abs(found.frequency - measured.frequency) > _MOVED * width
-    return moved or abs(found.velocity / measured.velocity - 1) > _SMALLER
-
-
-def _place(one: PhaseResonance) -> str:
-    if not np.isfinite(one.frequency):
-        return "no frequency"
-    return f"{one.frequency:.5g} Hz with {one.velocity:.3g} m/s"

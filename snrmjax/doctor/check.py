@@ -4,22 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snrmjax.doctor.balance_fit import as_recorded, best_balance
-from snrmjax.doctor.findings import Checkup, Finding, gravest_first
-from snrmjax.doctor.force_checks import dropout_findings, harmonic_findings
-from snrmjax.doctor.mode_checks import mode_findings
-from snrmjax.doctor.mode_states import (
+from snrmjax.doctor.checked_states import (
+    checked_states,
     files_of_levels,
     leading_sensor,
-    mode_states,
     usable_rows,
 )
+from snrmjax.doctor.findings import Checkup, Finding, gravest_first
+from snrmjax.doctor.force_checks import dropout_findings, harmonic_findings
+from snrmjax.doctor.priors import FEWEST_STATES
 from snrmjax.doctor.record_checks import record_findings
+from snrmjax.doctor.table_check import mode_findings
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states
 from snrmjax.model.structures import Structure
-
-FEWEST = 8  # states: fewer say nothing of a mode with curves of its own
 
 
 def check_test(
@@ -29,11 +27,11 @@ def check_test(
 ) -> Checkup:
     """Find errors of import and of the test in tables and records, before identification.
 
-    Near resonance a single mode obeys iΩAF/V = κ(K(a) − Ω² + iΩD(a)), with smooth K and D of the
-    displacement amplitude. What the columns are taken for, or one thing that may have gone wrong
-    with them, is corrected, and its likelihood compared with that of the table as it is; κ, the
-    modal mass over the model's, says whether force, response and shape have one scale. Records
-    are looked at step by step: limits, transients, harmonics of the force, folded frequencies.
+    Near resonance a single mode obeys iΩAF/V = κ(K(a) − Ω² + iΩδ(a)) with smooth curves of the
+    displacement amplitude, whatever they are. Each thing that the columns may be taken for, or that
+    may have gone wrong with the test, is undone and judged by the same posterior as the table as it
+    is (`identify.test_model`): it is named only where one mode fits then, and clearly not as
+    recorded. Records are looked at step by step: limits, transients, harmonics, folded frequencies.
 
     Arguments: `tables` of one structure, each a test of its own (in the order of time); `model` as
     for identification, without which scales and the model's frequency are not looked at;
@@ -82,21 +80,20 @@ def _of_table(
     name = data.sensors[sensor]
     n_levels = len(given_levels(data))
     where = f"{n_levels} level{'s' if n_levels != 1 else ''} at {name}"
-    if rows.sum() < FEWEST:
+    if rows.sum() < FEWEST_STATES:
         notes.append(
             f"{int(rows.sum())} states with force and phase at {name} are too few to look at: "
-            f"{FEWEST} are needed."
+            f"{FEWEST_STATES} are needed."
         )
         return []
     drive = bool(np.all(np.isnan(np.asarray(data.force)[rows])))
     if drive:
         notes.append("the force is declared as a drive voltage: its scale was not looked at.")
-    states = mode_states(data, model, sensor, rows)
-    found = mode_findings(states, model, where, groups, drive)
-    found += dropout_findings(states, where)
+    seen = checked_states(data, model, sensor, rows, groups)
+    found, fit = mode_findings(seen, model, where, drive)
+    found += dropout_findings(seen, where)
     if data.harmonic_order and not any(one.severity == "error" for one in found):
-        fit = best_balance(states, as_recorded(states))
-        found += harmonic_findings(data, states, fit, model, sensor, where)
+        found += harmonic_findings(data, seen, fit, model, sensor, where)
     return found
 
 

@@ -1,8 +1,4 @@
-"""One thing at a time that may have gone wrong with a table, corrected: does a mode fit then?
-
-Every correction has few unknowns; the likelihood of the balance with it, less ln(numbers)/2 for
-each unknown, is compared with that of the table as it is.
-"""
+"""One thing at a time that may have gone wrong with a test, undone, and how one mode fits then."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,132 +6,73 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.balance_fit import (
-    BalanceFit,
-    Corrected,
-    ModeStates,
-    best_balance,
-    fit_balance,
-)
+from snrmjax.doctor.checked_states import CheckedStates
+from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
-    independent_share,
-    residual_autocorrelation,
-)
+from snrmjax.doctor.judgement import Judged, climbed, judge
+from snrmjax.doctor.priors import AS_STATED, FORCE_FALLS, GAIN_MATTERS, SCATTER
+from snrmjax.identify.test_model.states import TestStates
 
-_LIMITS = (0.79, 0.8, 0.815, 0.83, 0.85, 0.875, 0.9, 0.93, 0.96, 0.985)
-"""Limits of a channel over its largest recorded fundamental; that is 4/π of them at most."""
-_SHARES = (0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.88)
-"""What is left of a transient at the end of a step, at the mode's own damping."""
-_FLOORS = (0.02, 0.04, 0.08, 0.16, 0.32)
-"""Noise of the force's cell over the smallest force."""
-_FALLEN = 0.5  # share of a level's force that is missing at resonance, at least
-_REFITTED = 4  # of the best kinds of correction, with families of curves of their own
+_LIMITS = (0.8, 0.85, 0.92)  # of a channel, over its largest recorded fundamental
+_SHARES = (0.2, 0.45, 0.7, 0.85)  # of a transient that are left at the end of a step
+_TREND = 0.5  # of a natural frequency, over its bandwidth: first step of a search
+_WIDEST = 0.1  # a bandwidth over its frequency: of a larger one no drift is told
+_FLOORS = (4.0, 12.0, 40.0)  # noise of the force's cell over that of all else, at the least force
+_WIDE_GAIN = 0.4  # 1σ of a level's gain where forces may have several scales
 
 
-class Remedy(NamedTuple):
-    """A correction and the balance with it."""
+class Correction(NamedTuple):
+    """A table read with one thing undone."""
 
-    kind: str
-    name: str  # what of that kind
-    corrected: Corrected
-    fit: BalanceFit
-    gain: float  # of the criterion over the table as it is, for independent states
-    value: float = np.nan  # the correction's own parameter
-    levels: tuple[int, ...] = ()  # that differ
+    kind: Kind
+    name: str  # which of that kind
+    judged: Judged
+    value: float = np.nan  # its own parameter
+    gains: tuple[float, ...] = ()  # ln of each level's force over what it should be
 
 
-def corrections(
-    states: ModeStates,
-    recorded: Corrected,
-    base: BalanceFit,
-    groups: tuple[tuple[int, ...], ...] = (),
-) -> list[Remedy]:
-    """All corrections whose likelihood says something for them, the best first.
+def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[Correction]:
+    """Each correction with its likeliest parameter.
 
-    Arguments: `recorded` the phasors as they are read; `base` their balance; `groups` the levels
-    of each file, where there are several.
+    What leaves scatter of the states is not looked for where they scatter as they should.
+    Arguments: `states` as they are read; `base` how they fit.
     """
-    share = independent_share(
-        residual_autocorrelation(base.residuals, along_resonance(states.level, states.frequency))
-    )
-    found = []
-    for kind, name, value, levels, corrected in _candidates(states, recorded, base, groups):
-        fit = fit_balance(states, corrected, base.families)
-        found.append(Remedy(kind, name, corrected, fit, 0.0, value, levels))
-    # Of each kind the best with the families of the base, then with its own.
-    best: dict[tuple[str, str], Remedy] = {}
-    for one in found:
-        key = (one.kind, one.name.partition(":")[0])
-        if key not in best or one.fit.criterion < best[key].fit.criterion:
-            best[key] = one
-    rated = []
-    for one in sorted(best.values(), key=lambda one: one.fit.criterion)[:_REFITTED]:
-        fit = one.fit
-        if base.criterion - fit.criterion > 0:
-            fit = best_balance(states, one.corrected, start=base.families)
-        gain = share * (base.criterion - fit.criterion)
-        rated.append(one._replace(fit=fit, gain=float(gain)))
-    return sorted((one for one in rated if one.gain > 0), key=lambda one: -one.gain)
+    yield _drifting(seen, states, base)
+    scattered = base.noise > AS_STATED * seen.noise or not np.isfinite(seen.noise)
+    scattered = scattered and base.misfit > SCATTER
+    gains = base.posterior.level_errors[:, 0]
+    if states.n_levels > 1 and (scattered or np.ptp(gains) > GAIN_MATTERS):
+        yield _of_other_gains(states)
+    if scattered:
+        yield from _clipped(states)
+        yield from _unsettled(seen, states, base)
+        yield from _noisy_force(seen, states)
 
 
-Candidate = tuple[str, str, float, tuple[int, ...], Corrected]
+def _likeliest(tried: list[tuple[float, TestStates, float]]) -> tuple[float, Judged]:
+    """The likeliest of several values, each with states and a Jacobian."""
+    judged = [(value, judge(states, jacobian)) for value, states, jacobian in tried]
+    return max(judged, key=lambda one: one[1].evidence)
 
 
-def _candidates(
-    states: ModeStates,
-    recorded: Corrected,
-    base: BalanceFit,
-    groups: tuple[tuple[int, ...], ...],
-) -> Iterator[Candidate]:
-    yield from _clipped(states, recorded)
-    yield from _unsettled(states, recorded, base)
-    for name in ("frequency_trend", "gain_trend", "force_trend"):
-        yield "drift", name, np.nan, (), recorded._replace(extra=(name,))
-    yield from _noisy_force(states, recorded)
-    yield from _of_levels(states, recorded, groups)
-
-
-def _clipped(states: ModeStates, recorded: Corrected) -> Iterator[Candidate]:
-    """The response cut off at a limit, or the force; states at a hard ceiling left out."""
-    size = np.abs(recorded.velocity)
+def _clipped(states: TestStates) -> Iterator[Correction]:
+    """The response or the force cut off at a limit."""
+    size = np.abs(states.velocity)
+    tried = []
     for limit in _LIMITS:
         true, stretch = unclipped(size, limit * size.max())
-        yield (
-            "clipped_channel",
-            "velocity",
-            limit * float(size.max()),
-            (),
-            recorded._replace(
-                velocity=recorded.velocity * (true / size),
-                stretch=recorded.stretch * stretch,
-                log_jacobian=recorded.log_jacobian + float(np.sum(np.log(stretch))),
-                parameters=recorded.parameters + 1,
-            ),
-        )
-    force = recorded.force
-    for limit in _LIMITS:
-        true, stretch = unclipped(force, limit * force.max())
-        yield (
-            "clipped_channel",
-            "force",
-            limit * float(force.max()),
-            (),
-            recorded._replace(force=true, parameters=recorded.parameters + 1),
-        )
-    for name, values in (("ceiling", size), ("acceleration_ceiling", size * states.frequency)):
-        tolerance = max(1e-6, 3 * float(np.median(states.errors[:, 1])) if states.stated else 1e-3)
-        at_top = values >= values.max() * (1 - tolerance)
-        n = int(at_top.sum())
-        if 3 <= n <= 0.6 * len(values) and len(values) - n >= 8:
-            yield (
-                "clipped_channel",
-                name,
-                float(values.max()),
-                (),
-                recorded._replace(used=~at_top),
-            )
+        errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
+        moved = states._replace(velocity=states.velocity * true / size, errors=errors)
+        tried.append((limit * float(size.max()), moved, float(np.sum(np.log(stretch)))))
+    value, judged = _likeliest(tried)
+    yield Correction("clipped_channel", "velocity", judged, value)
+    force = states.force
+    tried = [
+        (x * float(force.max()), states._replace(force=unclipped(force, x * force.max())[0]), 0.0)
+        for x in _LIMITS
+    ]
+    value, judged = _likeliest(tried)
+    yield Correction("clipped_channel", "force", judged, value)
 
 
 def unclipped(
@@ -149,8 +86,7 @@ def unclipped(
     s = np.concatenate([np.linspace(1.0, 0.05, 400), np.geomspace(0.05, 0.004, 60)[1:]])
     first = (2 / np.pi) * (np.arcsin(s) + s * np.sqrt(1 - s**2)) / s  # over the limit
     above = recorded > limit
-    most = first[-1] * limit
-    inside = np.minimum(recorded, most) / limit
+    inside = np.minimum(recorded, first[-1] * limit) / limit
     true = np.where(above, limit / np.interp(inside, first, s), recorded)
     slope = np.gradient(
         -np.log(s), np.log(np.maximum.accumulate(first) + 1e-12 * np.arange(len(s)))
@@ -159,89 +95,80 @@ def unclipped(
     return true, np.clip(stretch, 1.0, 1e4)
 
 
-def _unsettled(states: ModeStates, recorded: Corrected, base: BalanceFit) -> Iterator[Candidate]:
+def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[Correction]:
     """What is left of the motion of the state before, decaying and turning at the mode's own pace.
 
-    In a frame that turns with the force, V_n = V + (V_{n−1} − V) e^{(−D/2 + i(ω̃ − Ω))T} after a
+    In a frame that turns with the force, V_n = V + (V_{n−1} − V) e^{(−δ/2 + i(ω̃ − Ω))T} after a
     dwell T.
     """
     damping = np.abs(base.damping)
     omega = np.sqrt(np.maximum(base.stiffness, 0.25 * states.frequency**2))
     typical = float(np.median(damping)) / 2
-    if not typical > 0:
-        return
     before = np.full(len(states.level), -1)
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
-        mine = mine[np.argsort(states.order[mine], kind="stable")]
+        mine = mine[np.argsort(seen.order[mine], kind="stable")]
         before[mine[1:]] = mine[:-1]
     first = before < 0
-    for turning in (True, False):
-        for share in _SHARES:
-            dwell = -np.log(share) / typical
-            if turning:
-                left = np.exp((-damping / 2 + 1j * (omega - states.frequency)) * dwell)
-            else:
-                left = np.full(len(before), share + 0j)
-            for start in ("from_the_state_before", "from_rest"):
-                previous = np.where(first, 0.0, recorded.velocity[before])
-                now = np.where(first & (start != "from_rest"), 0.0, left)
-                true = (recorded.velocity - now * previous) / (1 - now)
-                ratio = np.abs(true * (1 - now) / recorded.velocity)
-                yield (
-                    "unsettled_steps",
-                    f"{'turning' if turning else 'lagging'}:{start}",
-                    share,
-                    (),
-                    recorded._replace(
-                        velocity=true,
-                        stretch=recorded.stretch / np.maximum(ratio, 1e-3),
-                        log_jacobian=recorded.log_jacobian,
-                        parameters=recorded.parameters + 1,
-                    ),
-                )
+    tried = []
+    for share in _SHARES:
+        rate = -np.log(share) / typical if typical > 0 else 0.0
+        left = np.exp((-damping / 2 + 1j * (omega - states.frequency)) * rate)
+        left = np.where(first, 0.0, left)
+        true = (states.velocity - left * states.velocity[before]) / (1 - left)
+        stretch = np.abs(states.velocity / (true * (1 - left)))
+        errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
+        moved = states._replace(velocity=true, errors=errors)
+        tried.append((share, moved, 2 * float(np.sum(np.log(stretch)))))
+    value, judged = _likeliest(tried)
+    yield Correction("unsettled_steps", "turning", judged, value)
 
 
-def _noisy_force(states: ModeStates, recorded: Corrected) -> Iterator[Candidate]:
+def _drifting(seen: CheckedStates, states: TestStates, base: Judged) -> Correction:
+    """A natural frequency that changes along the test.
+
+    Frequencies are divided by e^ν(order − ½): then K, Ω² and Ωδ are all those of the middle.
+    """
+    place = seen.order - 0.5
+    width = min(float(np.median(np.abs(base.damping) / states.frequency)), _WIDEST)
+
+    def moved(change: float) -> TestStates:
+        factor = np.exp(change * place)
+        return states._replace(
+            frequency=states.frequency / factor,
+            velocity=states.velocity / factor,
+            force=states.force / factor**2,
+        )
+
+    top = climbed(lambda change: judge(moved(change)), 0.0, _TREND * width, base)
+    return Correction("drift", "frequency", top.judged, top.value)
+
+
+def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[Correction]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
-    if deepest_fall(states) < _FALLEN:
+    if deepest_fall(states) < FORCE_FALLS:
         return
-    for share in _FLOORS:
-        floor = share * float(states.force.min())
-        parameters = recorded.parameters + 1
-        noisy = recorded._replace(floor=floor, parameters=parameters)
-        yield "force_dropout", "floor", floor, (), noisy
+    tried = []
+    least = float(states.force.min())
+    for ratio in _FLOORS:
+        floor = ratio * least / states.force
+        errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
+        tried.append((ratio, states._replace(errors=errors), 0.0))
+    ratio, judged = _likeliest(tried)
+    yield Correction("force_dropout", "floor", judged, ratio * least * judged.noise)
 
 
-def _of_levels(
-    states: ModeStates, recorded: Corrected, groups: tuple[tuple[int, ...], ...]
-) -> Iterator[Candidate]:
-    """Levels that differ from the others: in gain alone, or in the structure's own properties."""
-    n = states.n_levels
-    if n < 2:
-        return
-    apart = {(k,) for k in range(n)} | {tuple(range(k)) for k in range(1, n)} | set(groups)
-    if n > 8:
-        apart = {(k,) for k in range(n)} | set(groups)
-    for some in sorted(apart):
-        if not 0 < len(some) < n:
-            continue
-        which = "+".join(map(str, some))
-        yield (
-            "different_structures",
-            f"levels:{which}",
-            np.nan,
-            some,
-            recorded._replace(
-                extra=tuple(f"{k}:{which}" for k in ("frequency", "damping", "force"))
-            ),
-        )
-        yield (
-            "different_structures",
-            f"frequencies:{which}",
-            np.nan,
-            some,
-            recorded._replace(extra=(f"frequency:{which}",)),
-        )
-    gains = tuple(f"force:{k}" for k in range(1, n))
-    yield "volts_as_force", "gain_of_level", np.nan, (), recorded._replace(extra=gains)
+def _of_other_gains(states: TestStates) -> Correction:
+    """A scale of its own for the force of each level."""
+    gains = np.zeros(states.n_levels)
+    std = (_WIDE_GAIN, *states.level_std[1:])
+    now = states
+    for _ in range(2):
+        free = now._replace(force_is_free=True, level_std=std)
+        step = judge(free).posterior.level_errors[:, 0]
+        gains = gains + step
+        now = states._replace(force=states.force * np.exp(-gains[states.level]))
+    each = np.log(_WIDE_GAIN * np.sqrt(2 * np.pi) / 0.005)  # a gain found to 0.5 %
+    judged = judge(now)
+    judged = judged._replace(evidence=judged.evidence - each * states.n_levels)
+    return Correction("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))

@@ -62,7 +62,7 @@ class Finding(NamedTuple):
     kind: Kind
     severity: Severity
     where: str  # file, level, rows or channel
-    evidence: str  # in numbers, with their errors, and what else would explain it
+    evidence: str  # one fact in numbers
     mend: str  # the line or option that mends it
     rows: tuple[int, ...] = ()
     repairs: tuple[Repair, ...] = ()  # that commands can do, the likeliest first
@@ -135,6 +135,11 @@ def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Findings by severity, otherwise in their order."""
     ranks = get_args(Severity)
     return tuple(sorted(findings, key=lambda one: ranks.index(one.severity)))
+
+
+def percent(share: float) -> str:
+    """A share in per cent."""
+    return f"{100 * share:.2g} %" if share < 0.995 else "100 % or more"
 
 
 def rows_in_words(rows: Sequence[int], most: int = 6) -> str:

@@ -2,61 +2,53 @@
 
 import numpy as np
 
-from snrmjax.doctor.balance_fit import BalanceFit, ModeStates, basis
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, rows_in_words
+from snrmjax.doctor.checked_states import CheckedStates
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent, rows_in_words
+from snrmjax.doctor.judgement import Judged
+from snrmjax.doctor.priors import CERTAIN, FORCE_FALLS, FORCE_HARMONIC, HELD, PER_STATE, TOGETHER
+from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
-_REMARK = 0.2  # likewise, that is a remark
-_DROP = 0.5  # share of a level's force that is missing at resonance
-_HELD = 0.25  # spread of the response within a level, below which it may be controlled
-_BY_ITSELF = 0.7  # its correlation with the mobility, above which it is not
-_SEEN = 0.6  # correlation of force and response, negative
-_AMPLITUDES = 3.0  # largest over smallest, over which a damping is the same or not
-_MORE_DAMPING = 0.3  # relative, from which on a damping is not the linear test's
-_LEAST_HARMONIC = 0.035  # of the force's fundamental
-_CERTAIN = 6.0  # 1σ
-_GAIN = 30.0  # of the criterion
 
-
-def dropout_findings(states: ModeStates, where: str) -> list[Finding]:
+def dropout_findings(seen: CheckedStates, where: str) -> list[Finding]:
     """Levels whose force falls where the response is largest, though the response is not held."""
     rows: list[int] = []
     worst, said = 0.0, 0
+    states = seen.test
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
         if len(mine) < 5:
             continue
-        force, size = states.force[mine], np.abs(states.velocity[mine])
-        mobility = size / force
+        force, mobility = states.force[mine], seen.mobility[mine]
+        size = force * mobility
         # A controlled amplitude wanders by chance; a weak shaker's still peaks at resonance.
-        peaked = np.ptp(size) > 0 and np.corrcoef(np.log(size), np.log(mobility))[0, 1] > _BY_ITSELF
-        if np.ptp(np.log(size)) < _HELD and not peaked:
-            continue
-        drop, nominal = _fall(force, mobility)
-        if drop > _REMARK:
+        peaked = (
+            np.ptp(np.log(size)) > HELD
+            and np.corrcoef(np.log(size), np.log(mobility))[0, 1] > TOGETHER
+        )
+        drop, nominal = fall(force, mobility)
+        if peaked and drop > FORCE_FALLS:
             said += 1
             if drop > worst:
                 worst = drop
-                rows = [int(states.row[j]) for j in mine[force < nominal * (1 - 0.8 * drop)]]
+                rows = [int(seen.row[j]) for j in mine[force < nominal * (1 - 0.8 * drop)]]
     if not said:
         return []
     return [
         Finding(
-            "force_dropout",
-            "warning" if worst > _DROP else "info",
-            where,
-            f"at resonance the force falls by up to {100 * worst:.3g} % of what it is beside it, "
-            f"on {said} of {states.n_levels} levels ({rows_in_words(rows)}): the structure moves "
-            "the shaker.",
-            "use the measured force of every state (`force_n`), never the nominal one; control the "
-            "force, or the response, to keep its amplitude.",
+            *("force_dropout", "warning", where),
+            f"at resonance the force falls by up to {percent(worst)} of what it is beside it, on "
+            f"{said} of {states.n_levels} levels ({rows_in_words(rows)}): the structure moves the "
+            "shaker.",
+            "use the measured force of every state (`force_n`), never the nominal one; or control "
+            "the force.",
             tuple(rows),
         )
     ]
 
 
-def _fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
+def fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
     """Share of a level's force that is missing at resonance, and the force beside it in N.
 
     Zero where the force does not fall as the mobility grows.
@@ -64,67 +56,27 @@ def _fall(force: np.ndarray, mobility: np.ndarray) -> tuple[float, float]:
     near = mobility > 0.6 * mobility.max()
     far = mobility < 0.8 * mobility.max()
     log_f, log_m = np.log(force), np.log(mobility)
-    if not far.any() or np.ptp(log_f) == 0 or np.corrcoef(log_f, log_m)[0, 1] > -_SEEN:
+    if not far.any() or np.ptp(log_f) == 0 or np.corrcoef(log_f, log_m)[0, 1] > -TOGETHER:
         return 0.0, float(force.max())
     nominal = float(np.quantile(force[far], 0.85))
     return 1 - float(force[near].min()) / nominal, nominal
 
 
-def deepest_fall(states: ModeStates) -> float:
+def deepest_fall(states: TestStates) -> float:
     """The largest share of a level's force that is missing at resonance, whatever is held."""
     falls = [0.0]
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
         if len(mine) >= 5:
             force = states.force[mine]
-            falls.append(_fall(force, np.abs(states.velocity[mine]) / force)[0])
+            falls.append(fall(force, np.abs(states.velocity[mine]) / force)[0])
     return max(falls)
-
-
-def shaker_damping(
-    states: ModeStates, fit: BalanceFit, model: Structure, where: str
-) -> list[Finding]:
-    """Damping above the linear test's by one amount at all amplitudes, at its own frequency.
-
-    That is what a shaker adds between its drive and the structure, (Bl)²/R of a coil on a voltage;
-    what structures add changes with amplitude. Nothing where the model states no error of its
-    damping.
-    """
-    modes = model.modes
-    one = modes.mode_of_interest
-    own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
-    std = float(modes.damping_ratio_std[one])
-    used = fit.used
-    amplitude = np.abs(states.velocity[used]) / states.frequency[used]
-    if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < np.log(_AMPLITUDES):
-        return []
-    times = fit.damping[used] / (2 * own * ratio)
-    excess = float(times.min()) - 1
-    error = float(times.min() * np.hypot(std / ratio, fit.misfit / np.sqrt(used.sum())))
-    low = np.flatnonzero(used)[np.argmin(amplitude)]
-    away = float(np.sqrt(max(fit.stiffness[low], 0.0))) / own - 1
-    if excess < max(_MORE_DAMPING, _CERTAIN * error) or np.ptp(times) > 0.5 * excess:
-        return []
-    if abs(away) > ratio:
-        return []
-    return [
-        Finding(
-            *("volts_as_force", "warning", where),
-            f"the damping is {times.min():.3g} ± {error:.1g} times the model's and more at all "
-            f"amplitudes, the natural frequency the model's within {100 * abs(away):.2g} %: a "
-            "shaker damps so where its drive voltage, or a force on its own side, is taken for the "
-            "force on the structure; an assembly that damps more would look the same.",
-            "measure the force at the structure; if the column is a voltage, call it `drive_v`; if "
-            "it is that force, repeat the linear test on this assembly.",
-            repairs=(Repair(force_unit="V", fit_gain=True),),
-        )
-    ]
 
 
 def harmonic_findings(
     data: SteadyStates,
-    states: ModeStates,
-    fit: BalanceFit,
+    seen: CheckedStates,
+    fit: Judged,
     model: Structure | None,
     sensor: int,
     where: str,
@@ -138,36 +90,30 @@ def harmonic_findings(
     for k, order in enumerate(data.harmonic_order):
         if order < 2:
             continue
-        h = np.asarray(data.harmonics)[states.row, sensor, k]
-        std = np.asarray(data.harmonic_std)[states.row, sensor]
+        h = np.asarray(data.harmonics)[seen.row, sensor, k]
+        std = np.asarray(data.harmonic_std)[seen.row, sensor]
         good = np.isfinite(h) & (np.abs(h) > 0)
         if good.sum() < 8:
             continue
-        ratio, error, gain = _of_force(states, fit, model, h, std, order, good)
-        if ratio > _LEAST_HARMONIC and ratio > _CERTAIN * error and gain > _GAIN:
-            found.append((ratio, error, order, gain))
+        ratio, error, gain = _of_force(seen, fit, model, h, std, order, good)
+        if ratio > max(FORCE_HARMONIC, CERTAIN * error) and gain > PER_STATE * good.sum():
+            found.append(f"{100 * ratio:.3g} ± {100 * error:.1g} % of order {order}")
     if not found:
         return []
-    words = ", ".join(
-        f"{100 * ratio:.3g} ± {100 * error:.1g} % of order {order}"
-        for ratio, error, order, _ in found
-    )
     return [
         Finding(
-            FORCE_HARMONICS,
-            "warning",
-            where,
-            f"the force has harmonics, {words} of its fundamental: that part of the response's "
-            f"harmonics keeps its phase to the force (criterion smaller by {found[0][3]:.3g}).",
+            *(FORCE_HARMONICS, "warning", where),
+            f"the force has harmonics, {', '.join(found)} of its fundamental: that part of the "
+            "response's harmonics keeps its phase to the force.",
             "control the harmonics of the force, or put their sizes into the model as an effect on "
-            "the force's spectrum; do not read the harmonics as the structure's.",
+            "the force's spectrum.",
         )
     ]
 
 
 def _of_force(
-    states: ModeStates,
-    fit: BalanceFit,
+    seen: CheckedStates,
+    fit: Judged,
     model: Structure | None,
     h: np.ndarray,
     std: np.ndarray,
@@ -175,13 +121,10 @@ def _of_force(
     good: np.ndarray,
 ) -> tuple[float, float, float]:
     """Size of the force's harmonic over its fundamental, its 1σ, and how much it explains."""
+    states = seen.test
     w = order * states.frequency[good]
     if model is None:
-        own, rate, constant = (
-            float(np.median(fit.stiffness[fit.used])),
-            0.0,
-            1 / max(fit.mass, 1e-12),
-        )
+        own, rate, constant = float(np.median(fit.stiffness)), 0.0, 1.0
     else:
         modes = model.modes
         one = modes.mode_of_interest
@@ -189,22 +132,21 @@ def _of_force(
         rate = 2 * float(modes.damping_ratio[one]) * own**0.5
         constant = states.constant
     mobility = 1j * w * constant / (own - w**2 + 1j * rate * w)
-    size = np.abs(states.velocity[good])
-    turn = np.exp(1j * order * np.angle(states.velocity[good]))
+    size = np.abs(seen.recorded[good])
+    turn = np.exp(1j * order * np.angle(seen.recorded[good]))
     force = states.force[good]
     noise = np.where(np.isfinite(std[good]) & (std[good] > 0), std[good], 1e-3 * size)
     noise = np.hypot(noise, 0.02 * np.abs(h[good]))
     target = h[good] / noise
     made = (mobility * force / noise)[:, None]
     amplitude = size / states.frequency[good]
+    amplitude = amplitude / amplitude.max()
     best: tuple[float, np.ndarray] | None = None
     plain = np.inf
     n = 2 * len(target)
-    for family in (None, f"{order},{order - 1}", "1,1,2", "1,2,4", "s4", "s5"):
-        if family is None:
-            own_part = np.zeros((len(target), 0), dtype=complex)
-        else:
-            own_part = basis(family, amplitude).values * (turn / noise * mobility * size)[:, None]
+    for powers in ((), (0, order - 1), (0, 1, 2), (0, 2, 4), (0, 1, 2, 3), (0, 1, 2, 3, 4)):
+        curves = amplitude[:, None] ** np.array(powers, dtype=float)
+        own_part = curves * (turn / noise * mobility * size)[:, None]
         if 4 * own_part.shape[1] > len(target):
             continue
         for with_force in (False, True):
@@ -221,4 +163,4 @@ def _of_force(
                 plain = min(plain, criterion)
     if best is None:
         return 0.0, np.inf, 0.0
-    return float(best[1][0]), float(best[1][1]), float(plain - best[0])
+    return float(best[1][0]), float(best[1][1]), 0.5 * float(plain - best[0])

@@ -1,179 +1,227 @@
-"""What the recorded phasors may stand for: the reading with which a single mode fits best."""
+"""What recorded phasors may stand for, each reading judged as the table itself is."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
-from snrmjax.doctor.balance_fit import (
-    BalanceFit,
-    Corrected,
-    ModeStates,
-    as_recorded,
-    best_balance,
-)
+from snrmjax.doctor.checked_states import CheckedStates
+from snrmjax.doctor.findings import Finding, Kind, Repair, percent
+from snrmjax.doctor.judgement import Judged, Scale, best_scale, guessed_mass, judge, with_mass
+from snrmjax.doctor.priors import OTHER_SCALE, SCATTER, WILD
+from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
-_CLEARLY = 15.0  # of the criterion, by which another reading must be better than the recorded one
-_FAR_FREQUENCY = 0.3  # 1σ, relative, of ω̃² at small amplitude about the model's
-_RIGHT = 0.12  # relative misfit of phasors that need no other reading
-_FAR_MASS = 8.0  # ratio of modal masses, from which on other readings are tried
-_SIGNS = 4.0  # 1σ, beyond which the sign of the inertia or of the damping counts
 _LATTICE_TURNS = 4
-_BY_FREQUENCY = 0.15  # logarithm of κ over Ω or 1/Ω: amplitudes of another quantity
-_WILD, _SMOOTH = 0.5, 3.0  # mean resultant of steps of phase; how much smoother amplitudes are
+
+Phasors = Complex[np.ndarray, " state"]
+
+
+class Meaning(NamedTuple):
+    """A reading of phasors, and what is said of it."""
+
+    change: Callable[[Phasors, Float[np.ndarray, " state"]], Phasors]  # of V and Ω
+    kind: Kind | None  # None as recorded
+    said: str = ""
+    mend: str = ""
+    repair: Repair | None = None
+    log_jacobian: float = 0.0  # of a recorded phasor's logarithm to the one that is read
+
+
+_SIGN = "import again with the other phase sign, or negate `velocity_im_m_s`."
+AS_RECORDED = Meaning(lambda v, _: v, None)
+OPPOSITE = Meaning(
+    lambda v, _: -v,
+    "shape_not_mass_normalised",
+    "of turned sign: the shape, the sensor or the force has the other one",
+    "negate this sensor's entry of `shape` in the model, or both velocity columns.",
+)
+CONJUGATED = Meaning(
+    lambda v, _: v.conj(),
+    "conjugated_response",
+    "complex conjugates",
+    _SIGN,
+    Repair(conjugate=True),
+)
+CONJUGATED_OPPOSITE = Meaning(
+    lambda v, _: -v.conj(),
+    "conjugated_response",
+    "complex conjugates of turned sign",
+    "negate `velocity_re_m_s`; or import again with the other phase sign, and turn the sensor's.",
+)
+OTHERS = (
+    Meaning(
+        lambda v, w: v / (1j * w),
+        "acceleration_as_velocity",
+        "accelerations (m/s²)",
+        "divide by iΩ: import again as accelerations.",
+        Repair(quantity="acceleration"),
+    ),
+    Meaning(
+        lambda v, w: v * 1j * w,
+        "displacement_as_velocity",
+        "displacements (m)",
+        "multiply by iΩ: import again as displacements.",
+        Repair(quantity="displacement"),
+    ),
+    Meaning(
+        lambda v, _: np.abs(v) * np.exp(1j * _DEGREES * np.angle(v)),
+        "degrees_for_radians",
+        "phases in radians that were read as degrees",
+        "import again with phases in radians.",
+        Repair(phase_unit="rad"),
+        log_jacobian=float(np.log(_DEGREES)),
+    ),
+)
+OF_SIZES = (
+    Meaning(
+        lambda v, w: v / w,
+        "acceleration_as_velocity",
+        "amplitudes of accelerations (m/s²) with the phases of velocities",
+        "divide the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
+    ),
+    Meaning(
+        lambda v, w: v * w,
+        "displacement_as_velocity",
+        "amplitudes of displacements (m) with the phases of velocities",
+        "multiply the amplitudes by Ω = 2πf, not the phases, in the laboratory's file.",
+    ),
+)
+"""Where κ is 1/Ω and Ω of the median state."""
+IN_DEGREES = Meaning(
+    lambda v, _: v,
+    "degrees_for_radians",
+    "phases in degrees that were read as radians",
+    "import again with phases in degrees.",
+    Repair(phase_unit="deg"),
+    log_jacobian=-float(np.log(_DEGREES)),
+)
 
 
 class Reading(NamedTuple):
-    """A way to read the phasors, what the data are then, and how well they agree with a mode."""
+    """A table as it may be meant."""
 
-    name: str
-    corrected: Corrected
-    fit: BalanceFit
-    criterion: float
+    meaning: Meaning
+    states: TestStates
+    judged: Judged
+    mass: float  # κ with which it fits: 1 where the model's does
+
+    @property
+    def log_jacobian(self) -> float:
+        """Of all states."""
+        return len(self.states.level) * self.meaning.log_jacobian
+
+    def best_scale(self) -> Scale:
+        """The likeliest modal mass about the one that fits."""
+        return best_scale(self.states, self.mass, self.judged, self.log_jacobian)
 
 
-def best_reading(states: ModeStates, natural_frequency: float | None) -> tuple[Reading, Reading]:
-    """The phasors as recorded, and the reading with which they agree best with a single mode.
+def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Reading]:
+    """The table as recorded and the reading that beats it, or itself twice.
 
-    Readings: `as_recorded`, `conjugated`, `opposite` (180°), `conjugated_opposite`,
-    `acceleration`, `displacement`, `radians_read_as_degrees`, `degrees_read_as_radians`.
-    The signs of inertia and damping tell the first four from one another. `acceleration_size` and
-    `displacement_size`, amplitudes of these with the phases of a velocity, are tried where the
-    modal mass is off by Ω: over a wide band a constant factor in its place leaves a misfit.
+    Arguments: `known_mass` says whether a model states the modal mass: it is tried first, another
+    scale where that does not fit.
     """
-    recorded = _read(states, "as_recorded", lambda v, _: v, natural_frequency)
-    if agrees(recorded.fit, natural_frequency):
+    mass = guessed_mass(seen.test)
+    recorded = _read(seen, AS_RECORDED, known_mass, mass)
+    sized = _of_sizes(seen, recorded) if known_mass else None
+    if sized is not None:
+        return recorded, sized
+    near = seen.noise if np.isfinite(seen.noise) else 0.0
+    if recorded.judged.damped and recorded.judged.misfit < max(SCATTER, 3 * near):
         return recorded, recorded
-    found = [
-        recorded,
-        _read(states, "acceleration", lambda v, w: v / (1j * w), natural_frequency),
-        _read(states, "displacement", lambda v, w: v * 1j * w, natural_frequency),
-        _read(states, "radians_read_as_degrees", _with_phase(_DEGREES), natural_frequency),
-    ]
-    unwrapped = _read_lattice(states, natural_frequency)
-    found += [] if unwrapped is None else [unwrapped]
-    found += [
-        _read(states, name, change, natural_frequency) for name, change in _turned(found[0].fit)
-    ]
-    best = min(found, key=lambda one: one.criterion)
-    if recorded.criterion - best.criterion < _CLEARLY:
-        best = recorded
-    sizes = [
-        _read(states, name, change, natural_frequency)
-        for name, change in _sized(states, recorded.fit, natural_frequency)
-    ]
-    return recorded, min([best, *sizes], key=lambda one: one.criterion)
+    turned = (CONJUGATED, OPPOSITE, CONJUGATED_OPPOSITE)
+    tried = [recorded, *(_read(seen, one, known_mass, mass) for one in turned)]
+    tried += [_read(seen, one, known_mass, None) for one in OTHERS]
+    if not any(one.judged.fits for one in tried):
+        lattice = _in_degrees(seen, known_mass)
+        tried += [] if lattice is None else [lattice]
+    best = max((one for one in tried if one.judged.damped), key=_evidence, default=recorded)
+    return recorded, best if best.judged.beats(recorded.judged) else recorded
 
 
-def agrees(fit: BalanceFit, natural_frequency: float | None) -> bool:
-    """Whether the phasors as recorded are beyond doubt those of a velocity."""
-    used = fit.used
-    if fit.misfit > _RIGHT or fit.mass < _SIGNS * fit.mass_std or np.any(fit.damping[used] <= 0):
-        return False
-    return _implausible(fit, natural_frequency) < 1 and 1 / _FAR_MASS < fit.mass < _FAR_MASS
+def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
+    """Amplitudes of another quantity with phases of velocities, where these make κ off by Ω."""
+    log_omega = float(np.log(np.median(seen.test.frequency)))
+    for meaning, off in zip(OF_SIZES, (-log_omega, log_omega), strict=True):
+        if abs(off) > 1.0 and abs(np.log(recorded.mass) - off) < OTHER_SCALE:
+            found = _read(seen, meaning, True, 1.0)
+            return found if found.judged.fits else None
+    return None
 
 
-Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
+def _evidence(one: Reading) -> float:
+    return one.judged.evidence
 
 
-def _with_phase(factor: float) -> Change:
-    return lambda v, _: np.abs(v) * np.exp(1j * factor * np.angle(v))
+def misread(recorded: Judged, best: Reading, where: str) -> Finding:
+    """That phasors are something else than what they are taken for."""
+    meaning = best.meaning
+    assert meaning.kind is not None
+    as_they_are = f"{percent(recorded.misfit)} as recorded"
+    if not recorded.damped:
+        as_they_are = "as recorded the mode would gain energy"
+    return Finding(
+        *(meaning.kind, "error", where),
+        f"the responses are {meaning.said}: so read one mode misses a state by "
+        f"{percent(best.judged.misfit)}, {as_they_are}.",
+        meaning.mend,
+        repairs=() if meaning.repair is None else (meaning.repair,),
+    )
 
 
-def _turned(fit: BalanceFit) -> list[tuple[str, Change]]:
-    """The reading that gives inertia and damping the right signs, where these are clear."""
-    if abs(fit.mass) < _SIGNS * fit.mass_std:
-        return []
-    damped = np.median(fit.damping[fit.used] * fit.mass) > 0
-    if fit.mass > 0:
-        return [] if damped else [("conjugated_opposite", lambda v, _: -v.conj())]
-    if damped:
-        return [("conjugated", lambda v, _: v.conj())]
-    return [("opposite", lambda v, _: -v)]
+def _read(seen: CheckedStates, meaning: Meaning, known_mass: bool, mass: float | None) -> Reading:
+    states = seen.read(meaning.change(seen.recorded, seen.test.frequency))
+    return _fitted(meaning, states, known_mass, mass)
 
 
-def off_by_frequency(mass: float, frequency: float) -> str:
-    """The quantity, acceleration or displacement, whose size makes the modal mass κ wrong by Ω.
-
-    None of them ("") within a factor of 4.5 of 1 rad/s, where Ω is no telling factor.
-    """
-    log_omega = float(np.log(frequency))
-    if not mass > 0 or abs(log_omega) < 10 * _BY_FREQUENCY:
-        return ""
-    if abs(np.log(mass) + log_omega) < _BY_FREQUENCY:
-        return "acceleration"
-    return "displacement" if abs(np.log(mass) - log_omega) < _BY_FREQUENCY else ""
-
-
-def _sized(
-    states: ModeStates, fit: BalanceFit, natural_frequency: float | None
-) -> list[tuple[str, Change]]:
-    """The reading of amplitudes alone that makes the modal mass that of the model."""
-    if natural_frequency is None:
-        return []
-    quantity = off_by_frequency(fit.mass, float(np.median(states.frequency)))
-    if not quantity:
-        return []
-    power = -1.0 if quantity == "acceleration" else 1.0
-    return [(f"{quantity}_size", lambda v, w: v * w**power)]
-
-
-def _read(
-    states: ModeStates, name: str, change: Change, natural_frequency: float | None
+def _fitted(
+    meaning: Meaning, states: TestStates, known_mass: bool, mass: float | None = None
 ) -> Reading:
-    changed = change(states.velocity, states.frequency) - states.beside
-    corrected = as_recorded(states)._replace(velocity=changed)
-    fit = best_balance(states, corrected)
-    return Reading(name, corrected, fit, fit.criterion + _implausible(fit, natural_frequency))
+    """With the model's modal mass, or with the guessed one where that has more evidence."""
+    jacobian = len(states.level) * meaning.log_jacobian
+    first = Reading(meaning, states, judge(states, jacobian), 1.0) if known_mass else None
+    if first is not None and meaning is not AS_RECORDED and first.judged.fits:
+        return first
+    mass = guessed_mass(states) if mass is None else mass
+    size = abs(mass) if np.isfinite(mass) else 1.0
+    if first is not None and abs(np.log(size)) < OTHER_SCALE:
+        return first
+    other = Reading(meaning, states, judge(with_mass(states, size), jacobian), size)
+    if first is None or (other.judged.damped and other.judged.gain(first.judged) > 0):
+        return other
+    return first
 
 
-def _implausible(fit: BalanceFit, natural_frequency: float | None) -> float:
-    """What speaks against a fit beside its residuals: signs and the model's frequency."""
-    used = fit.used
-    square = 0.0
-    if fit.mass_std > 0:
-        square += min(fit.mass / fit.mass_std, 0.0) ** 2
-    damping = fit.damping[used] * np.sign(fit.mass)
-    square += 4 * np.sum(damping < 0)
-    if natural_frequency is not None and fit.mass != 0:
-        ratio = np.median(fit.stiffness[used]) / natural_frequency**2 - 1
-        square += (ratio / _FAR_FREQUENCY) ** 2
-    return float(min(square, 1e6))
-
-
-def _read_lattice(states: ModeStates, natural_frequency: float | None) -> Reading | None:
+def _in_degrees(seen: CheckedStates, known_mass: bool) -> Reading | None:
     """Phases in degrees that were read as radians: wrapped dozens of times, 6.3° apart.
 
     A mode's amplitudes say where each phase lies to some degrees; the wrapped one says it exactly.
     """
-    recorded = np.angle(states.velocity)
-    guess = _phases_of_amplitudes(states)
+    recorded = np.angle(seen.recorded)
+    guess = _phases_of_amplitudes(seen)
     if guess is None:
         return None
     spacing = 2 * np.pi / _DEGREES
-    corrected = as_recorded(states)
-    fit = None
+    found = None
     for _ in range(_LATTICE_TURNS):
         nearest = np.round((guess - recorded / _DEGREES) / spacing)
         phase = recorded / _DEGREES + spacing * nearest
-        velocity = np.abs(states.velocity) * np.exp(1j * phase) - states.beside
-        corrected = as_recorded(states)._replace(velocity=velocity, parameters=0)
-        fit = best_balance(states, corrected)
+        states = seen.read(np.abs(seen.recorded) * np.exp(1j * phase))
+        if found is not None and np.allclose(states.velocity, found.states.velocity):
+            break
+        found = _fitted(IN_DEGREES, states, known_mass)
         # The phase that the curves have at this amplitude and frequency.
-        guess = -np.angle(fit.predicted / (1j * states.frequency)) if fit.mass > 0 else guess
-    if fit is None:
-        return None
-    criterion = fit.criterion + _implausible(fit, natural_frequency)
-    # A phase on the lattice was chosen for each state: a density of one in the spacing.
-    criterion += 2 * len(states.level) * np.log(spacing / (2 * np.pi)) * -1.0
-    return Reading("degrees_read_as_radians", corrected, fit, float(criterion))
+        omega, judged = states.frequency, found.judged
+        stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
+        guess = np.pi / 2 - np.angle(stiffness)
+    return found
 
 
-def _phases_of_amplitudes(states: ModeStates) -> Float[np.ndarray, " state"] | None:
+def _phases_of_amplitudes(seen: CheckedStates) -> Float[np.ndarray, " state"] | None:
     """Phases by cos φ in proportion to |V|/F, positive below each level's largest."""
-    mobility = np.abs(states.velocity) / states.force
+    states, mobility = seen.test, seen.mobility
     phase = np.zeros(len(mobility))
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
@@ -186,22 +234,22 @@ def _phases_of_amplitudes(states: ModeStates) -> Float[np.ndarray, " state"] | N
     return phase
 
 
-def wild_phases(states: ModeStates) -> bool:
-    """Whether phases jump at random from state to state where the amplitudes are smooth.
-
-    By neighbours in frequency on a level.
-    """
-    turns, steps = [], []
+def wild_phases(seen: CheckedStates) -> Finding | None:
+    """Phases that jump at random from state to state where the amplitudes are smooth."""
+    states = seen.test
+    turns, steps = [np.zeros(0)], [np.zeros(0)]
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
         mine = mine[np.argsort(states.frequency[mine])]
-        if len(mine) < 4:
-            continue
-        v = states.velocity[mine]
-        turns.append(np.exp(1j * np.diff(np.angle(v))))
-        steps.append(np.abs(np.diff(np.log(np.abs(v / states.force[mine])))))
-    if not turns:
-        return False
+        turns.append(np.exp(1j * np.diff(np.angle(states.velocity[mine]))))
+        steps.append(np.abs(np.diff(np.log(seen.mobility[mine]))))
     turn, step = np.concatenate(turns), np.concatenate(steps)
-    scattered = abs(turn.mean()) < max(_WILD, _SMOOTH / np.sqrt(len(turn)) * 0.5)
-    return bool(len(turn) >= 8 and scattered and np.median(step) < 0.4)
+    if len(turn) < 8 or abs(turn.mean()) > WILD or np.median(step) > WILD:
+        return None
+    return Finding(
+        *("degrees_for_radians", "error", ""),
+        f"phases jump at random from state to state (mean of e^iΔφ {abs(turn.mean()):.2f}) where "
+        "amplitudes are smooth, as phases in degrees do that were read as radians.",
+        IN_DEGREES.mend,
+        repairs=(Repair(phase_unit="deg"),),
+    )

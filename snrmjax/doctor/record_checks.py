@@ -3,28 +3,27 @@
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair
+from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, percent
+from snrmjax.doctor.force_checks import fall
+from snrmjax.doctor.priors import (
+    CERTAIN,
+    FLAT_TOP,
+    FOLDED_LINE,
+    FORCE_FALLS,
+    FORCE_HARMONIC,
+    PILED_UP,
+    STEPS_MOVE,
+    STILL_MOVING,
+)
 from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 
 _MOST = 2**23  # samples of a channel that are looked at
 _FEWEST_CYCLES = 3.5  # of a step
-_HARMONIC_LIMIT, _HARMONIC_REMARK = 0.04, 0.015  # of the force's fundamental
-_HIGHEST = 12  # harmonic of the force
-_FLAT = 0.26  # of a mean cycle within 3 % of its extremes; of a sine 0.156
-_FLAT_RUNS = 0.003  # of the samples, in runs of equal extremes
-_PILE, _OVER_OTHERS = 10, 3.0  # equal extremes; their number over that of any other value's
-_MOVING_STEPS = 0.3  # of all: a jump or a slow beat may move single ones
-_FEW_BLOCKS, _FEW_UNSETTLED = 4, 0.08  # of a step, with no scatter of their own to compare with
-_UNSETTLED = 0.03  # relative change of a phasor over the end of a step
-_MOST_STEPS, _TOGETHER = 0.5, 2.0  # of the steps move, by so many times their scatter together
-_ENOUGH_STEPS = 6
-_DROP = 0.5  # of the force at the strongest response
-_LINE = 2e-3  # of the fundamental, that a folded line has at least
-_ABOVE_NOISE = 12.0  # amplitude of a line over the median about it
+_HIGHEST, _FOLDED = 12, 60  # harmonic of the force; one whose image is looked for
+_FEW_BLOCKS = 4  # of a step, which have no scatter of their own to compare with
 _MAINS = (50.0, 60.0)  # Hz
-_FOLDED = 60  # highest harmonic whose image is looked for
 
 
 def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]:
@@ -108,17 +107,12 @@ def _flat_runs(x: Float[np.ndarray, " sample"], where: str) -> Finding | None:
         three = at[2:] & at[1:-1] & at[:-2]
         share += float(three.mean()) if len(three) else 0.0
         piled += _piled_up(sign * x, at, 2e-6 * size)
-    if share >= _FLAT_RUNS:
-        return _clipping(
-            where, f"{100 * share:.2g} % of the samples stand in a row at {bottom:.4g} or {top:.4g}"
-        )
-    if piled:
-        return _clipping(
-            where,
-            f"{piled} samples, some of them in a row, have exactly the extreme of {bottom:.4g} or "
-            f"{top:.4g}, and no other value so many",
-        )
-    return None
+    if share < PILED_UP and not piled:
+        return None
+    said = f"{percent(share)} of the samples stand in a row"
+    if share < PILED_UP:
+        said = f"{piled} samples, more than at any other value, stand"
+    return _clipping(where, f"{said} at {bottom:.4g} or {top:.4g}")
 
 
 def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> int:
@@ -129,13 +123,11 @@ def _piled_up(x: Float[np.ndarray, " sample"], at: np.ndarray, width: float) -> 
     comes back to every value as often. Neighbours at the top are no single peak of many cycles.
     """
     number = int(at.sum())
-    if number < _PILE or not np.any(at[1:] & at[:-1]):
-        return 0
     upper = x[(x > 0.5 * x.max()) & ~at]
-    if not len(upper):
+    if number < CERTAIN or not np.any(at[1:] & at[:-1]) or not len(upper):
         return 0
     elsewhere = np.unique(np.round(upper / width), return_counts=True)[1].max()
-    return number if number > _OVER_OTHERS * elsewhere else 0
+    return number if number > 0.5 * CERTAIN * elsewhere else 0
 
 
 def _clipping(where: str, evidence: str) -> Finding:
@@ -190,7 +182,7 @@ def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> F
         flat = float(np.mean(np.abs(mean) > 0.97 * np.abs(mean).max()))
         if best is None or flat > best:
             best = flat
-    if best is None or best < _FLAT:
+    if best is None or best < FLAT_TOP:
         return None
     return _clipping(
         where, f"{100 * best:.3g} % of a mean cycle lies within 3 % of its extremes, of a sine 16 %"
@@ -198,27 +190,16 @@ def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> F
 
 
 def _harmonics(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[Finding]:
-    """Harmonics of the force, the median over the steps and the largest."""
-    ratios = []
-    for one in steps:
-        rows = _middle(one)
-        spectrum = _lines(x, rows, one.frequency, rate)
-        ratios.append(spectrum[1:] / max(spectrum[0], 1e-300))
-    table = np.array(ratios)
-    worst = table.max(axis=0)
-    order = int(np.nanargmax(worst)) if np.isfinite(worst).any() else 0
-    largest, median = float(worst[order]), float(np.median(table[:, order]))
-    if not largest > _HARMONIC_REMARK:
+    """The largest harmonic of the force."""
+    spectra = [_lines(x, _middle(one), one.frequency, rate) for one in steps]
+    worst = np.max([own[1:] / max(own[0], 1e-300) for own in spectra], axis=0)
+    order = int(np.argmax(worst))
+    if not worst[order] > FORCE_HARMONIC:
         return []
-    severe = largest > _HARMONIC_LIMIT
     return [
         Finding(
-            FORCE_HARMONICS,
-            "warning" if severe else "info",
-            where,
-            f"harmonic {order + 2} of the force is {100 * largest:.3g} % of its fundamental "
-            f"(median over {len(steps)} steps {100 * median:.2g} %; limit "
-            f"{100 * _HARMONIC_LIMIT:.2g} %).",
+            *(FORCE_HARMONICS, "warning", where),
+            f"harmonic {order + 2} of the force is {percent(worst[order])} of its fundamental.",
             "lower the amplifier's distortion or control the harmonics; else put them into the "
             "model as an effect on the force's spectrum.",
         )
@@ -259,29 +240,24 @@ def _unsettled(
         noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
         change = float(abs(slope) / abs(z[-1]))
         few = len(v) <= _FEW_BLOCKS
-        believed = change > _FEW_UNSETTLED if few else abs(slope) > 6 * noise
-        if change > _UNSETTLED:
+        # Without a scatter of its own a step must move by more.
+        believed = change > 2.5 * STILL_MOVING if few else abs(slope) > CERTAIN * noise
+        if change > STILL_MOVING:
             moving.append((change, one, believed))
         if not few:
             over_noise.append(abs(slope) / max(noise, 1e-300))
     # Among five blocks a transient's own turning passes for scatter, but not in step after step.
-    together = (
-        len(over_noise) >= _ENOUGH_STEPS
-        and len(moving) > _MOST_STEPS * len(steps)
-        and np.median(over_noise) > _TOGETHER
-    )
-    if not together:
+    together = len(over_noise) >= CERTAIN and np.median(over_noise) > CERTAIN / 3
+    if not (together and 2 * len(moving) > len(steps)):
         moving = [one for one in moving if one[2]]
-    if len(moving) < max(1, _MOVING_STEPS * len(steps)):
+    if len(moving) < max(1, STEPS_MOVE * len(steps)):
         return []
     worst, one, _ = max(moving, key=lambda found: found[0])
     return [
         Finding(
             *("unsettled_steps", "error", where),
-            f"in {len(moving)} of {len(steps)} steps the response over the force still moves by up "
-            f"to {100 * worst:.3g} % at the end of the step (worst at "
-            f"{one.frequency / (2 * np.pi):.5g} Hz, {one.start / rate:.4g} to "
-            f"{one.stop / rate:.4g} s).",
+            f"in {len(moving)} of {len(steps)} steps the response over the force still moves at "
+            f"the end, by up to {percent(worst)} (from {one.start / rate:.4g} s on).",
             "dwell longer, 5/(ζω) a step; or import this record, whose unsettled steps are left "
             "out.",
             repairs=(Repair(read_record=True),),
@@ -292,29 +268,18 @@ def _unsettled(
 def _dropped(
     force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
 ) -> list[Finding]:
-    """Force that falls where the response over it is strongest."""
+    """Force that falls where the response over it is strongest, in a record of one level."""
     if len(steps) < 5:
         return []
-    rows = [_middle(one) for one in steps]
-    f = np.array([np.std(force[r]) for r in rows]) * np.sqrt(2)
-    v = np.array([np.std(x[r]) for r in rows]) * np.sqrt(2)
-    mobility = v / f
-    far = mobility < 0.8 * mobility.max()
-    near = mobility > 0.6 * mobility.max()
-    if not far.any() or np.ptp(np.log(v)) < 0.25:
-        return []
-    # Levels are told by the force: only one level a record is judged.
-    if np.std(np.log(f[far])) > 0.25:
-        return []
-    nominal = float(np.quantile(f[far], 0.85))
-    drop = 1 - float(f[near].min()) / nominal
-    if drop < _DROP or np.corrcoef(np.log(f), np.log(mobility))[0, 1] > -0.6:
+    f, v = (np.array([np.std(c[_middle(one)]) for one in steps]) * 2**0.5 for c in (force, x))
+    drop, nominal = fall(f, v / f)
+    if drop < FORCE_FALLS or np.ptp(np.log(v)) < 0.25:
         return []
     return [
         Finding(
             *("force_dropout", "warning", where),
-            f"the force falls from {nominal:.4g} to {f[near].min():.4g} N, by {100 * drop:.3g} %, "
-            "where the response is strongest.",
+            f"the force falls from {nominal:.4g} N by {percent(drop)} where the response is "
+            "strongest.",
             "use the measured force of every step, or control the force.",
         )
     ]
@@ -340,10 +305,10 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
         width = max(16, len(spectrum) // 64)
         for k in np.flatnonzero(away[1:-1]) + 1:
             size = float(spectrum[k])
-            if size < _LINE * fundamental or size < max(spectrum[k - 1], spectrum[k + 1]):
+            if size < FOLDED_LINE * fundamental or size < max(spectrum[k - 1], spectrum[k + 1]):
                 continue
             around = spectrum[max(0, k - width) : k + width][away[max(0, k - width) : k + width]]
-            if size < _ABOVE_NOISE * float(np.median(around)):
+            if size < 2 * CERTAIN * float(np.median(around)):
                 continue
             f = float(hertz[k])
             if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in _MAINS):

@@ -9,7 +9,7 @@ from .calibrate.inverse_force import InverseForce, inverse_force
 from .curves.families import FAMILIES
 from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
-from .inference.fitted_response import FittedResponse, fitted_response
+from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
 from .inference.located_points import FittedPoint, LocatedStatus
 from .inference.optimal_design import (
     AdviceStatus,
@@ -65,6 +65,8 @@ from .pointwise.points_result import BackbonePoints
 from .pointwise.prediction import predict_response, resonance_by_fixed_point, resonances
 from .pointwise.prediction_result import PredictedResponse, Resonance
 from .pointwise.snrm import nonlinear_mode_velocity, reference_sensor, snrm_velocity
+from .prediction.new_level import ON_THE_CURVES, DayToDay, LevelTrend, NewLevel, new_level
+from .prediction.resonance_distribution import ResonanceDistribution
 from .scaling.request import ModesRequest, find_modes, scale_of
 from .scaling.scale import (
     AddedMassTest,
@@ -80,6 +82,7 @@ from .scaling.scaled_modes import ScaledModes
 
 __all__ = [
     "FAMILIES",
+    "ON_THE_CURVES",
     "AddedMassTest",
     "AdviceStatus",
     "AmplitudeDependence",
@@ -95,6 +98,7 @@ __all__ = [
     "ComparedBands",
     "Contribution",
     "Contributions",
+    "DayToDay",
     "DecayModes",
     "DrivePoint",
     "FailedRival",
@@ -109,10 +113,12 @@ __all__ = [
     "InverseForce",
     "JointFit",
     "KnownShape",
+    "LevelTrend",
     "LinearModalFit",
     "LocatedStatus",
     "MeasuredBackbone",
     "ModesRequest",
+    "NewLevel",
     "NextMeasurement",
     "NextMeasurements",
     "NoiseEstimate",
@@ -120,6 +126,7 @@ __all__ = [
     "PredictedResponse",
     "Profile",
     "Resonance",
+    "ResonanceDistribution",
     "Rival",
     "ScaledModes",
     "SelectionStatus",
@@ -151,9 +158,11 @@ __all__ = [
     "invert_phasor",
     "joined_responses",
     "levels_by_velocity",
+    "new_level",
     "next_measurements",
     "nonlinear_mode_velocity",
     "predict_response",
+    "predicted_resonance",
     "profile",
     "reference_sensor",
     "relative_to_base",

@@ -11,6 +11,7 @@ from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
+from snrmjax.identify.prediction.resonance_distribution import QUANTILES, ResonanceDistribution
 from snrmjax.io.files import FilePath, write_atomically
 from snrmjax.io.tables import write_table
 from snrmjax.io.units import HERTZ
@@ -149,11 +150,14 @@ def write_prediction(
     responses: Sequence[PredictedResponse],
     *,
     drives: Sequence[float | None] = (),
+    velocity_stds: Sequence[np.ndarray] = (),
 ) -> None:
     """Write predicted responses at the backbone's sensor; isolated parts follow the main curve.
 
     Arguments: `drives` are the drive voltages of the responses in V where the force is known as
-    one: a column `drive_v` has them. Raises `ValueError` when the file cannot be written.
+    one: a column `drive_v` has them; `velocity_stds` 1σ of each response's velocity amplitude at
+    fixed frequency in m/s, of a further level: a column `velocity_std_m_s`.
+    Raises `ValueError` when the file cannot be written.
     """
     force = np.concatenate([np.full(len(c.frequency), c.force) for c in responses])
     velocity = np.concatenate([c.velocity for c in responses])
@@ -168,7 +172,8 @@ def write_prediction(
             "velocity_im_m_s": velocity.imag,
             "stable": np.concatenate([c.stable for c in responses]),
         }
-        | ({"drive_v": volts} if volts else {}),
+        | ({"drive_v": volts} if volts else {})
+        | ({"velocity_std_m_s": np.concatenate(velocity_stds)} if velocity_stds else {}),
     )
 
 
@@ -234,6 +239,20 @@ def summarise_resonance(resonance: Resonance) -> dict:
         "frequency_hz": resonance.frequency / HERTZ,
         "damping_ratio": resonance.damping_ratio,
         "beyond_the_data": resonance.continued,
+    }
+
+
+def summarise_distribution(found: ResonanceDistribution) -> dict:
+    """Whether a further level has its resonance in a range, and where, in units of the files."""
+    return {
+        "force_n": found.force,
+        "largest_amplitude_ratio": found.largest_amplitude_ratio,
+        "probability": found.probability,
+        "quantiles": list(QUANTILES),
+        "frequency_hz": (found.frequency / HERTZ).tolist(),
+        "velocity_m_s": found.velocity.tolist(),
+        "negative_damping": found.negative_damping,
+        "holds": found.holds,
     }
 
 

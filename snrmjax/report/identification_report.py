@@ -11,7 +11,6 @@ from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.identify.pointwise.prediction import (
-    LARGEST_AMPLITUDE_RATIO,
     PredictedResponse,
     Resonance,
 )
@@ -71,6 +70,7 @@ class ComparedResponses(NamedTuple):
     predicted: Sequence[PredictedResponse] = ()
     resonances: Sequence[Resonance] = ()
     simulated: Sequence[ResponseCurve] = ()
+    further: Sequence[str] = ()  # where a level that was not measured has its resonances
 
 
 def identification_report(
@@ -97,10 +97,10 @@ def identification_report(
     shown = [ReportFigure(figures["backbone"], caption)]
     sections = [Section("Backbone and damping", (), shown)]
     if responses is not None and "prediction" in figures:
-        predicted, resonances, simulated = responses
+        predicted, resonances, simulated, further_levels = responses
         table = resonance_table(backbone, resonances, simulated, [c.force for c in predicted])
         shown = [ReportFigure(figures["prediction"], RESPONSE_CAPTION)]
-        sections.append(Section("Predicted responses", (), shown, [table]))
+        sections.append(Section("Predicted responses", further_levels, shown, [table]))
     return Report(
         title=title,
         done=[*(done or {}).items(), ("program", f"snrmjax {version('snrmjax')}")],
@@ -266,15 +266,12 @@ def resonance_table(
     for force, one in sorted(pairs, key=lambda pair: pair[0]):
         row = [f"{force / load.size:.4g}"]
         if one is None:
-            rows.append([*row, "none found", *[""] * (len(header) - 2)])
+            rows.append([*row, "not in range", *[""] * (len(header) - 2)])
             continue
         row += [f"{one.velocity / unit.size:.4g}", f"{one.frequency / HERTZ:.5g}"]
         row += [f"{100 * one.damping_ratio:.3g}", "yes" if one.continued else "no"]
         rows.append(row + (_beside(one, simulated, backbone.sensor, unit) if simulated else []))
-    caption = (
-        "Phase resonances: here the mode moves in phase with the force. Resonances are looked for "
-        f"up to {LARGEST_AMPLITUDE_RATIO:g} times the largest measured amplitude."
-    )
+    caption = "Phase resonances: here the mode moves in phase with the force."
     if simulated:
         caption += " Differences are the prediction minus the nearest one of harmonic balance."
     return ReportTable(header, rows, caption)

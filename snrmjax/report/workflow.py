@@ -1,11 +1,12 @@
 """What the commands do with a table of steady states: identify, predict, and write all of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -13,25 +14,18 @@ from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
 from snrmjax.identify.inference.agreement import compare_with_pointwise
 from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
-from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
 from snrmjax.identify.inference.optimal_design import (
     AdviceStatus,
     NextMeasurements,
     next_measurements,
 )
-from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
+from snrmjax.identify.inference.pointwise_view import identification_of_fit
 from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues, CurveFamily
+from snrmjax.identify.pointwise.backbone import BackboneValues, CurveFamily
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
 from snrmjax.identify.pointwise.identification import Identification, identify_backbone
-from snrmjax.identify.pointwise.missing_resonance import why_no_resonance
-from snrmjax.identify.pointwise.prediction import (
-    LARGEST_AMPLITUDE_RATIO,
-    PredictedResponse,
-    Resonance,
-    predict_response,
-    resonances,
-)
+from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
+from snrmjax.identify.prediction.notes import notes_on_negative_damping, where_in_words
 from snrmjax.io import joint_results, results
 from snrmjax.io.files import write_summary
 from snrmjax.io.units import HERTZ
@@ -48,11 +42,21 @@ from snrmjax.report.joint_report import (
     reported_fit,
     with_joint_fit,
 )
+from snrmjax.report.prediction.predictions import (
+    Loads,
+    Prediction,
+    notes_on_predictions,
+    predictions_of_fit,
+    predictions_of_points,
+    require_drive,
+)
 from snrmjax.report.sampling import VELOCITY, ShownAmplitude
 from snrmjax.report.simulation_figures import normal_mode_figure
 from snrmjax.report.style import PrintedFigure
 from snrmjax.simulate.solutions.forced_response import ResponseCurve
 from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
+
+_DRAWN = 100  # amplitudes of curves that are looked at for negative damping
 
 
 @dataclass(frozen=True)
@@ -74,32 +78,6 @@ class JointFitSettings:
     free: tuple[str, ...] = ()
     robust: bool = False
     further: int = 0  # measurements to advise
-
-
-@dataclass(frozen=True)
-class Loads:
-    """The forces for which responses are predicted, and how far curves are continued."""
-
-    forces: tuple[float, ...] = ()  # N
-    drives: tuple[float, ...] = ()  # V, where the force is known as a drive voltage
-    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
-
-
-class Prediction(NamedTuple):
-    """What the identified curves predict under one force."""
-
-    force: float  # N
-    resonances: list[Resonance]
-    responses: list[PredictedResponse]
-    drive: float | None = None  # V, where the force is known as a drive voltage
-    banded: tuple[FittedResponse, ...] = ()  # the same of a joint fit, with 1σ
-
-    @property
-    def load(self) -> str:
-        """The force in words, and its drive voltage where the force is known as one."""
-        if self.drive is None:
-            return f"{self.force:g} N"
-        return f"{self.drive:.5g} V ({self.force:.4g} N)"
 
 
 class Findings(NamedTuple):
@@ -137,7 +115,7 @@ def identify_by_points(
     `identify_backbone` and `predict_response` raise.
     """
     if loads.drives:
-        _require_drive(data)
+        require_drive(data)
     check_phases(data, "an identification")
     check_force(data, "an identification state by state")
     try:
@@ -152,17 +130,15 @@ def identify_by_points(
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error
-    backbone, ratio = found.fit.backbone, loads.largest_amplitude_ratio
-    predictions = tuple(
-        Prediction(
-            force,
-            resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
-            predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
-        )
-        for force in dict.fromkeys(loads.forces)
+    backbone = found.fit.backbone
+    predictions = predictions_of_points(found, model, loads)
+    reach = (loads.largest_amplitude_ratio if predictions else 1.0) * float(backbone.largest)
+    drawn = backbone.values(jnp.linspace(float(backbone.smallest), reach, _DRAWN))
+    notes = (*doubt(data, model, found.points), *found.notes)
+    notes += (
+        *notes_on_negative_damping(drawn),
+        *notes_on_predictions(predictions, backbone, data),
     )
-    doubts = doubt(data, model, found.points)
-    notes = (*doubts, *found.notes, *notes_on_predictions(predictions, ratio, backbone, data))
     words = {
         "amplitude": f"{settings.amplitude}, {settings.measure}",
         "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
@@ -180,7 +156,7 @@ def identify_jointly(
     force, and what `fit_jointly` and `fitted_response` raise.
     """
     if loads.drives:
-        _require_drive(data)
+        require_drive(data)
     names = settings.families.split(",")
     if len(names) > 2:
         raise ValueError(
@@ -196,18 +172,7 @@ def identify_jointly(
     )
     data = corrected_states(data, fit)
     found = identification_of_fit(data, fit)
-    asked: list[tuple[float, float | None]] = [
-        (force, float(fit.recorded_force(np.asarray(force))) if fit.drive_known_only else None)
-        for force in dict.fromkeys(loads.forces)
-    ]
-    asked += [
-        (float(fit.force_of_drive(np.asarray(drive))), drive)
-        for drive in dict.fromkeys(loads.drives)
-    ]
-    ratio, predictions = loads.largest_amplitude_ratio, []
-    for force, drive in asked:
-        banded = fitted_response(fit, force, largest_amplitude_ratio=ratio)
-        predictions.append(Prediction(force, *without_bands(fit, banded), drive, tuple(banded)))
+    predictions, trends = predictions_of_fit(fit, loads)
     advice = next_measurements(fit, settings.further) if settings.further else None
     agreement = compare_with_pointwise(data, model, fit)
     doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
@@ -221,7 +186,12 @@ def identify_jointly(
             f"({float(np.exp(fit.unknowns.log_force_gain)):.4g} N/V ± {100 * std:.2g} %); if the "
             "model's modal mass is wrong, so is the gain."
         )
-    notes += notes_on_predictions(predictions, ratio, found.fit.backbone, data)
+    reach = (
+        np.linspace(0.0, loads.largest_amplitude_ratio if predictions else 1.0, _DRAWN)
+        * fit.largest[0]
+    )
+    notes += notes_on_negative_damping(fitted_values(fit, displacement=reach))
+    notes += (*trends, *notes_on_predictions(predictions, found.fit.backbone, data))
     notes += advice.notes if advice else ()
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
         notes.append(
@@ -236,39 +206,8 @@ def identify_jointly(
     fitted = reported_fit(fit, tuple(advice or ()), agreement)
     ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
-    fields = (data, model, found, tuple(predictions), tuple(dict.fromkeys(notes)), values, words)
+    fields = (data, model, found, predictions, tuple(dict.fromkeys(notes)), values, words)
     return Findings(*fields, fitted, advice)
-
-
-def _require_drive(data: SteadyStates) -> None:
-    if np.any(np.isfinite(np.asarray(data.force))):
-        raise ValueError(
-            "`--predict-drive` is for data with a drive voltage (`drive_v`), but these have the "
-            "force in newtons (`force_n`): use `--predict-force`."
-        )
-
-
-def notes_on_predictions(
-    predictions: Sequence[Prediction], ratio: float, backbone: Backbone, data: SteadyStates
-) -> list[str]:
-    """Sentences on forces without a resonance, with several, or with one beyond the data."""
-    notes = []
-    for one in predictions:
-        if not one.resonances:
-            notes.append(
-                f"no resonance at {one.load} up to {ratio:g} times the largest measured amplitude: "
-                f"{why_no_resonance(backbone, data, one.force, ratio)}. `--extrapolate` looks "
-                "farther, on curves that no measurement supports there."
-            )
-        elif any(each.continued for each in one.resonances):
-            notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")
-        notes += [f"response at {one.load}: {each.note}" for each in one.responses if each.note]
-        if len(one.resonances) > 1:
-            notes.append(
-                f"{len(one.resonances)} resonances at {one.load}: damping that falls with "
-                "amplitude allows several."
-            )
-    return notes
 
 
 def headline(found: Findings) -> list[str]:
@@ -286,6 +225,7 @@ def headline(found: Findings) -> list[str]:
             place = f"{each.frequency / HERTZ:.5g} Hz, {each.velocity:.3g} m/s"
             damped = f"{100 * each.damping_ratio:.3g} % of critical damping"
             lines.append(f"resonance at {one.load}: {place}, {damped}")
+        lines.append(f"resonance at {one.load} {where_in_words(one.further)}")
     for advised in found.advice or ():
         force, drive = advised.force, advised.drive
         load = f"force {force:.4g} N" if drive is None else f"drive {drive:.4g} V"
@@ -382,7 +322,10 @@ def findings_report(
         title=title,
         done=done,
         notes=found.notes,
-        responses=ComparedResponses(found.responses, found.resonances, found.simulated),
+        responses=ComparedResponses(
+            *(found.responses, found.resonances, found.simulated),
+            [f"Resonance at {p.load}: {where_in_words(p.further)}." for p in found.predictions],
+        ),
         further=further,
     )
     return report if found.fitted is None else with_joint_fit(report, found.fitted.fit)
@@ -404,7 +347,9 @@ def write_findings(
     results.write_points(folder / "points.csv", found.identification)
     if found.predictions:
         drives = [one.drive for one in found.predictions for _ in one.responses]
-        results.write_prediction(folder / "prediction.csv", found.responses, drives=drives)
+        stds = [b.velocity_std for one in found.predictions for b in one.banded]
+        given = (folder / "prediction.csv", found.responses)
+        results.write_prediction(*given, drives=drives, velocity_stds=stds)
     summary: dict[str, object] = {"program": "snrmjax", "version": version("snrmjax"), **done}
     if found.fitted is None:
         results.write_backbone(folder / "backbone.csv", found.identification)
@@ -423,6 +368,11 @@ def write_findings(
         results.summarise_resonance(each) | ({} if one.drive is None else {"drive_v": one.drive})
         for one in found.predictions
         for each in one.resonances
+    ]
+    summary["resonance_distributions"] = [
+        results.summarise_distribution(one.further)
+        | ({} if one.drive is None else {"drive_v": one.drive})
+        for one in found.predictions
     ]
     summary["notes"] = list(found.notes)
     write_summary(folder / "summary.json", summary)

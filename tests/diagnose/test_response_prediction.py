@@ -1,7 +1,6 @@
 """Responses that models predict for a test, against closed forms of a linear mode."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from truths import one_mode
 
 import snrmjax as sj
-from snrmjax.diagnose.checks.verdict import Verdict
 from snrmjax.diagnose.held_velocity import holds_response
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
@@ -22,7 +20,6 @@ from snrmjax.diagnose.response_prediction import (
     measured_resonance,
     responses,
     simulated_resonance,
-    with_resonances_checked,
 )
 from snrmjax.model.effects import EFFECTS, make_effect
 from snrmjax.report.diagnosis.resonance_table import resonance_in_words
@@ -163,13 +160,9 @@ def test_coarse_states_of_one_branch_are_no_jump():
     assert found.frequency == pytest.approx(50.0, rel=1e-4)
 
 
-def test_a_resonance_in_a_jump_is_not_missed():
+def test_a_jump_past_a_resonance_is_said_in_its_place():
     nothing = PhaseResonance(np.nan, np.nan, jump=(61.8, 62.1))
     assert "jump past it, 61.8" in resonance_in_words(nothing, unit_for([1.0], "m/s"))
-    row = LevelResponse(3, 1.0, nothing, nothing, nothing, False)
-    answer = SimpleNamespace(force_gain=1.0)
-    seen = SimpleNamespace(force_misfit=SimpleNamespace(sensor=0), answer=answer)
-    assert with_resonances_checked(seen, linear(), [row]) is seen
 
 
 def test_a_force_that_drops_at_resonance_holds_no_response():
@@ -231,43 +224,3 @@ def test_a_response_that_ends_early_is_said():
     assert [row.complete for row in rows] == [True, False]
     (note,) = _incomplete(rows)
     assert "level 1 were not traced to the end" in note
-
-
-@dataclasses.dataclass
-class Told:
-    """What the check of resonances takes of a diagnosis."""
-
-    verdict: Verdict
-    notes: tuple
-    force_misfit: SimpleNamespace
-    answer: SimpleNamespace
-
-
-@pytest.mark.parametrize(
-    ("found", "named"),
-    [
-        ((50.0, 1.0), True),
-        ((50.2, 1.1), True),  # a fifth of the half-power bandwidth of 1 Hz
-        ((50.6, 1.0), False),
-        ((50.0, 0.75), False),
-        ((50.0, 1 / 60), False),
-        ((np.nan, np.nan), False),
-    ],
-)
-def test_an_answer_that_resonates_elsewhere_is_not_named(found, named):
-    """At 1 m/s the mode's half-power bandwidth is twice its damping ratio times 50 Hz: 1 Hz."""
-    force = 2 * ZETA * OMEGA / SHAPE**2  # that of 1 m/s
-    nothing = PhaseResonance(np.nan, np.nan)
-    row = LevelResponse(
-        *(3, force, PhaseResonance(50.0, 1.0), nothing, nothing, False),
-        completed=PhaseResonance(*found),
-    )
-    given = Told(Verdict.NAMED, (), SimpleNamespace(sensor=0), SimpleNamespace(force_gain=1.0))
-    told = with_resonances_checked(given, linear(), [row])
-    assert told.verdict is (Verdict.NAMED if named else Verdict.AMBIGUOUS)
-    assert len(told.notes) == (not named)
-    if not named:
-        assert "level 3" in told.notes[0]
-        assert "measured at 50 Hz with 1 m/s" in told.notes[0]
-    not_traced = row._replace(complete=False)
-    assert with_resonances_checked(given, linear(), [not_traced]).verdict is Verdict.NAMED

@@ -56,7 +56,7 @@ def said(data, structure):
 )
 def test_a_wrong_unit_or_phase_sign_is_named_with_its_size_and_its_mend(change, named):
     (note,) = said(few(change), model())
-    said_too = ("the lowest level has", "the model 60 Hz and 2 %", "To mend it: ", "snrmjax check")
+    said_too = ("To mend it: ", "snrmjax check")
     for word in (*named, *said_too):
         assert word in note
 
@@ -139,7 +139,7 @@ def test_an_identification_without_points_says_why():
 def test_the_note_comes_first():
     data = few(lambda w, f, v: (f, v / 9.80665))
     found = identify_by_points(data, model(), CurveSettings(), Loads())
-    assert found.notes[0].startswith(said(data, model())[0].split("; the lowest")[0])
+    assert found.notes[0] == said(data, model())[0]
 
 
 @pytest.mark.long

@@ -8,9 +8,9 @@ from scipy.signal import lsim
 from truths.one_mode import CUBIC, OMEGA, SHAPE, ZETA, model, noisy, states, table
 
 import snrmjax as sj
-from snrmjax.doctor.balance_fit import as_recorded, fit_balance
-from snrmjax.doctor.modal_mass import mass_findings
-from snrmjax.doctor.mode_states import mode_states
+from snrmjax.doctor.checked_states import checked_states
+from snrmjax.doctor.judgement import Scale, judge, with_mass
+from snrmjax.doctor.scale_findings import is_other_scale
 from snrmjax.measure import Channel, time_recording
 
 
@@ -48,13 +48,13 @@ def test_errors_that_were_stated_too_small_hide_no_wrong_scale():
     assert raised(data, model()) == []
 
 
-def test_a_misfit_of_the_mode_is_no_wrong_scale():
+def test_an_unsure_modal_mass_is_no_wrong_scale():
     level, w, force, v = states()
-    seen = mode_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
-    fit = fit_balance(seen, as_recorded(seen), ("1,2", "1"))._replace(mass=0.83, mass_std=0.026)
-    near, far = (fit._replace(relative=np.full(len(v), size)) for size in (0.01, 0.15))
-    assert {one.severity for one in mass_findings(seen, near, model(), "")} == {"error"}
-    assert all(one.severity == "info" for one in mass_findings(seen, far, model(), ""))
+    seen = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
+    right, wrong = judge(seen.test), judge(with_mass(seen.test, 1.5))
+    assert is_other_scale(Scale(right, 1.5, 0.01), wrong)
+    assert not is_other_scale(Scale(right, 1.5, 0.1), wrong)
+    assert not is_other_scale(Scale(right, 1.1, 0.01), wrong)
 
 
 @pytest.mark.parametrize("off", [1, 2, 3])

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.doubts import Doubt
-from snrmjax.diagnose.checks.patterns import UNLIKELY
-from snrmjax.diagnose.checks.verdict import Judgement, Verdict
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import FREE_LEVEL_FORCE_STD, WeightedMisfit
@@ -59,6 +58,16 @@ class LevelForces(NamedTuple):
             f"{self.names} again"
         )
 
+    @property
+    def doubt(self) -> Doubt:
+        """That they explain the data as well."""
+        beside = f" beside {' and '.join(self.kinds)}" if self.kinds else ""
+        return Doubt(
+            f"a force of {self.names} that is recorded in a wrong scale{beside} explains these "
+            "data as well.",
+            self.remedy,
+        )
+
 
 class _Beside(NamedTuple):
     """A fit beside gains of the forces of levels."""
@@ -91,7 +100,7 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
         return None
     best = min(tried, key=lambda one: one.criterion)
     lead, chance = own - best.criterion, chi_square_p_value(best.square / noise, best.n_free)
-    if lead < -AS_GOOD or chance < UNLIKELY:
+    if lead < -AS_GOOD or chance < priors.REJECTED:
         return None
     levels = tuple(int(misfit.level_numbers[place]) for place in best.places)
     return LevelForces(best.places, levels, best.kinds, lead)
@@ -110,23 +119,6 @@ def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
         std = FREE_LEVEL_FORCE_STD * misfit.noise.shared_std(fit.slopes, first + k)
         gains[int(misfit.level_numbers[place])] = LevelGain(value, std)
     return gains
-
-
-def with_level_forces_doubted(judgement: Judgement, rival: LevelForces | None) -> Judgement:
-    """An answer that gains of levels explain as well is ambiguous, and they are offered first."""
-    if rival is None or not judgement.verdict.is_answer:
-        return judgement
-    beside = f" beside {' and '.join(rival.kinds)}" if rival.kinds else ""
-    doubt = Doubt(
-        f"a force of {rival.names} that is recorded in a wrong scale{beside} explains these data "
-        "as well.",
-        rival.remedy,
-    )
-    return judgement._replace(
-        verdict=Verdict.AMBIGUOUS,
-        reasons=(doubt.reason, *judgement.reasons),
-        open_questions=(doubt, *judgement.open_questions),
-    )
 
 
 def notes_on_level_forces(

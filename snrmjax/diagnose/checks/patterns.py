@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import fdtrc, ndtr
 
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.evidence import hat_functions
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 
-UNLIKELY = 1e-3
+UNLIKELY = priors.REJECTED
 _OF_AMPLITUDE, _OF_TEST = 6, 8  # knots of free curves
 _RESOLUTION = 1e-6  # of singular values: directions that an answer has already
 
@@ -155,14 +157,6 @@ def along(
             some: Int[np.ndarray, " state"] = np.flatnonzero(level[states] == number)
             keys: Sequence[float] = chosen.rows[states[some]] if of_test else phase[states[some]]
             yield values[some[np.argsort(keys, kind="stable")]]
-
-
-def hat_functions(
-    where: Float[np.ndarray, " state"], knots: int
-) -> Float[np.ndarray, "state knot"]:
-    """Piecewise linear curves with equally many states between any two knots."""
-    at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
-    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
 
 
 def _basis(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row any"]:

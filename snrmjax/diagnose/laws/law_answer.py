@@ -16,8 +16,8 @@ from snrmjax.diagnose.checks.cross_validation import (
     held_out_places,
     rows_of_level,
 )
+from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
 from snrmjax.diagnose.checks.patterns import UNLIKELY, left_curve, pattern
-from snrmjax.diagnose.checks.verdict import neighbour_noise, refuted_by_levels, tolerated
 from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
 from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
 from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind
@@ -91,7 +91,8 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
         levels = HeldOutLevels(*pairs)
         # The top one is predicted by extrapolation, of which a law of any shape promises nothing.
         inner = levels.inner
-        if refuted_by_levels(HeldOutLevels(inner, inner), doubted=False) is not None:
+        worse = inner.after > inner.before and inner.p_value < UNLIKELY
+        if worse or inner.uncertain_p_value < UNLIKELY / 2:
             return None
     laws = tuple(drawn_tables(fit))
     effects = law_effects(fit, fit.secants)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.diagnose.misfit.predictions import Predictions
-from snrmjax.diagnose.misfit.programs import HARMONICS, ComparedMotion
+from snrmjax.diagnose.misfit.programs import ComparedMotion
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation
 from snrmjax.identify.calibrate.calibration_states import CalibrationStates
 from snrmjax.identify.calibrate.inverse_force import StateWithErrors, residual_columns
@@ -95,6 +95,7 @@ def law_columns(
     states = [np.asarray(part) for part in p.states]
     found = by_blocks(answered, _BLOCK, *states, *near)
     columns, by_secant, by_value, by_error = (part[:, p.own_columns] for part in found[:4])
+    columns = columns if p.offset is None else columns + p.offset
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     phasors = p.sizes.phasors(columns[None])[0]
     by_baseline = by_value[:, :, [names.index(name) for name in (*stated, *linear)]]
@@ -186,14 +187,14 @@ class _DrawnBalance(HarmonicBalance):
 
     def _motion(self, point: Array) -> tuple[Array, Array]:
         """q and q̇ of the mode of interest at time samples."""
-        basis = harmonic_basis(HARMONICS, _SAMPLES)
+        basis = harmonic_basis((self.n_coefficients - 1) // 2, _SAMPLES)
         x = self.coefficients(point)[:, self.model.modes.mode_of_interest]
         slope = jnp.asarray(basis.synthesis @ basis.derivative) @ x
         return jnp.asarray(basis.synthesis) @ x, point[-1] * self.frequency_scale * slope
 
     def _on_mode(self, force: Float[Array, "time *kind"]) -> Float[Array, "equation *kind"]:
         """Scaled balance of a force on the mode of interest."""
-        basis = harmonic_basis(HARMONICS, _SAMPLES)
+        basis = harmonic_basis((self.n_coefficients - 1) // 2, _SAMPLES)
         unit = self.frequency_scale**2 * self.displacement_scale
         added = jnp.tensordot(jnp.asarray(basis.analysis), force, axes=1) / unit
         every = jnp.tensordot(added, jnp.asarray(self.model.own_mode), axes=0)
@@ -253,8 +254,8 @@ def _law_columns(
 
 def _largest(motion: PrescribedMotion, point: Array) -> Float[Array, " two"]:
     """Largest |q| and |q̇| of the mode of interest over the motion."""
-    basis = harmonic_basis(HARMONICS, _SAMPLES)
     balance = motion.balance
+    basis = harmonic_basis((balance.n_coefficients - 1) // 2, _SAMPLES)
     j = balance.model.modes.mode_of_interest
     x = point[:-2].reshape(balance.n_coefficients, -1)[:, j] * balance.displacement_scale
     q = jnp.asarray(basis.synthesis) @ x

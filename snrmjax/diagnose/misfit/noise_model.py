@@ -21,6 +21,7 @@ class NoiseModel(NamedTuple):
     whiten: Float[np.ndarray, "state column column"]
     known: Bool[np.ndarray, "state column"]
     covariance: SharedCovariance
+    shared_kind: Int[np.ndarray, " shared"]  # of the levels' errors by kind; −1: of no level
     state: Int[np.ndarray, " row"]
     column: Int[np.ndarray, " row"]
 
@@ -90,15 +91,13 @@ def noise_model(
     phase = measured.by_error[:, :, n_sensors + 1 :].sum(axis=2)
     member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
     slopes = (gain, phase, *np.moveaxis(by_linear, 2, 0))
-    parts = [
-        std * slope[:, :, None] * member[:, None, :]
-        for slope, std in zip(slopes, level_std, strict=True)
-        if std > 0
-    ]
+    kinds = [k for k, std in enumerate(level_std) if std > 0]
+    parts = [level_std[k] * slopes[k][:, :, None] * member[:, None, :] for k in kinds]
     every = np.concatenate([baseline, *parts], axis=2)
+    shared_kind = np.append(np.full(baseline.shape[2], -1), np.repeat(kinds, levels)).astype(int)
     own = np.asarray(whitened_columns(measured.whiten, every))[known]
     state, column = np.nonzero(known)
-    return NoiseModel(measured.whiten, known, shared_covariance(own), state, column)
+    return NoiseModel(measured.whiten, known, shared_covariance(own), shared_kind, state, column)
 
 
 def chi_square_p_value(chi_square: float, freedom: int) -> float:

@@ -22,6 +22,7 @@ from snrmjax.identify.calibrate.calibration_states import (
     calibration_states,
     state_whitener,
 )
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
@@ -96,6 +97,7 @@ class Predictions:
     """Predictions of one model for one set of data; `predictions_of` makes them."""
 
     model: Structure
+    given: Structure  # the same, with the errors of levels that were stated
     chosen: ComparedColumns
     sizes: Sizes
     states: CalibrationStates  # with room for harmonics that were not measured
@@ -106,6 +108,13 @@ class Predictions:
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
     motions: programs.Stored
+    reference: Any = None  # `misfit.reference.Reference`, once it is known
+    level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
+    unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
+    # What is added to the columns where levels were corrected for errors that count as shared ones.
+    offset: Float[np.ndarray, "state column"] | None = None
+    added: tuple[np.ndarray, np.ndarray] | None = None  # to log velocities and phases, by levels
+    error_scale: float = 1.0  # of errors over those that were stated or assumed
     free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
     def with_level_forces_free(self, places: tuple[int, ...]) -> "Predictions":
@@ -116,7 +125,7 @@ class Predictions:
         """The same with all errors of force, velocities and phases so many times larger."""
         states = self.chosen.states
         scaled = self.chosen._replace(states=states._replace(error=factor * states.error))
-        return dataclasses.replace(self, chosen=scaled)
+        return dataclasses.replace(self, chosen=scaled, error_scale=factor * self.error_scale)
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "Predictions":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -155,6 +164,8 @@ class Predictions:
         columns, slopes = self._in_turn(group, values, steps)
         slopes = slopes / length[:, None, None]
         force_slopes = slopes[:, :, 0] + 1j * slopes[:, :, 1]
+        if self.offset is not None:
+            columns = columns + self.offset
         compared = self.sizes.compared(columns, slopes)
         return Predicted(*compared, self.sizes.phasors(columns), force_slopes)
 
@@ -231,17 +242,21 @@ class Predictions:
 
 
 def predictions_of(
-    model: Structure, data: SteadyStates, force_gain_std: float = 0.0
+    model: Structure,
+    data: SteadyStates,
+    force_gain_std: float = 0.0,
+    *,
+    harmonics: int = programs.HARMONICS,
 ) -> Predictions:
     """Predictions of a model for measured states, ready to be evaluated.
 
     The baseline's motions are found here. `force_gain_std` is the relative 1σ of a gain that all
-    forces share.
+    forces share; `harmonics` are those of the motions.
     """
     model = dataclasses.replace(model, name="")  # its name would be a part of the programs
-    chosen = calibration_states(model, data, programs.HARMONICS)
+    chosen = _with_errors_of_force(calibration_states(model, data, programs.HARMONICS))
     columns, orders, own_columns = _widened(chosen)
-    compared = programs.ComparedMotion(chosen.sensors, orders, programs.HARMONICS)
+    compared = programs.ComparedMotion(chosen.sensors, orders, harmonics)
 
     def motions(*rows: Array) -> tuple[Array, Array]:
         return programs.grown(model, CalibrationStates(*rows), compared)
@@ -253,6 +268,7 @@ def predictions_of(
     every: list[Any] = columns
     return Predictions(
         model=model,
+        given=model,
         chosen=chosen,
         sizes=sizes_of(chosen),
         states=CalibrationStates(*every),
@@ -267,6 +283,17 @@ def predictions_of(
         group=_all_effects(model, _scales(model, chosen)),
         motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
     )
+
+
+def _with_errors_of_force(chosen: ComparedColumns) -> ComparedColumns:
+    """States whose force errs by a share of the velocity's error where none is stated.
+
+    Beside a steep curve an error of amplitude shows itself in the frequency: without any error of
+    the force the damping of such a state would be exact.
+    """
+    error = np.array(chosen.states.error)
+    error[:, 0] = np.where(error[:, 0] > 0, error[:, 0], FORCE_TO_VELOCITY * error[:, 1])
+    return chosen._replace(states=chosen.states._replace(error=jnp.asarray(error)))
 
 
 def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:

@@ -36,6 +36,9 @@ from snrmjax.simulate.balance.prescribed_motion import Secants, nothing_of, star
 HARMONICS = 5
 """Of the motions: three that are compared, and two more that influence those."""
 
+MANY_HARMONICS = 25
+"""Of the motions where these leave more than noise: stops and sliders have no last one."""
+
 COMPARED = (2, 3)
 """Harmonics that the programs hold, measured or not."""
 
@@ -140,7 +143,8 @@ def missed(
             mine = trials.place[number - 1] == jnp.arange(len(names))
             changed = with_parameters(model, names, values + (length @ along) * mine)
             added = changed.effects[own:]
-            forces = [_quick(added[k], quick=quick) for k in forces_of(added)]
+            order = compared.harmonic_order
+            forces = [_quick(added[k], order, quick=quick) for k in forces_of(added)]
             rest = [e for k, e in enumerate(added) if k not in forces_of(added)]
             changed = dataclasses.replace(changed, effects=(*changed.effects[:own], *rest))
             erring = StateWithErrors(measured, 1.0, trials.by_error @ along)
@@ -198,7 +202,7 @@ class _ForcedBalance(HarmonicBalance):
         self, mine: list[int], n_samples: int, x: Float[Array, " coefficient"], omega: Array
     ) -> Float[Array, " coefficient"]:
         """Coefficients of some of the forces over the cycle of a mode's coefficients."""
-        basis = harmonic_basis(HARMONICS, n_samples)
+        basis = harmonic_basis((self.n_coefficients - 1) // 2, n_samples)
         q = jnp.asarray(basis.synthesis) @ x
         v = omega * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
         force = jnp.zeros_like(q)
@@ -224,9 +228,9 @@ def _samples(force: AbstractForce) -> int:
     return 128 if isinstance(force, AbstractMemoryless) else 256
 
 
-def _quick(effect: AbstractEffect, *, quick: bool) -> AbstractForce:
+def _quick(effect: AbstractEffect, harmonics: int, *, quick: bool) -> AbstractForce:
     if isinstance(effect, AbstractInternalResonance):
-        return _Resonance(effect)
+        return _Resonance(effect, harmonics)
     force = cast(AbstractForce, effect)  # one of `forces_of`
     return _Quick(force) if quick and force.has_quick_formula() else force
 
@@ -248,21 +252,20 @@ class _Resonance(AbstractForce):
 
     kind: ClassVar[str] = "resonance"
     effect: AbstractInternalResonance
+    harmonics: int = eqx.field(static=True)
 
     def cycle_force(
         self, displacement: Float[Array, " time"], velocity: Float[Array, " time"]
     ) -> Float[Array, " time"]:
         mode, q, n = self.effect, displacement, self.effect.order
-        basis = harmonic_basis(HARMONICS, q.shape[0])
+        basis = harmonic_basis(self.harmonics, q.shape[0])
         slope = jnp.asarray(basis.synthesis @ basis.derivative) @ (jnp.asarray(basis.analysis) @ q)
         omega = jnp.sqrt(jnp.sum(velocity**2) / jnp.sum(slope**2))
         load = displacement_phasors((jnp.asarray(basis.analysis) @ q**n)[:, None])[:, 0]
         own = 2 * jnp.pi * jnp.asarray(mode.frequency_hz)
-        rate = jnp.arange(HARMONICS + 1) * omega
+        rate = jnp.arange(self.harmonics + 1) * omega
         stiffness = own**2 - rate**2 + 2j * mode.damping_ratio * own * rate
         answer = -mode.coefficient * load / stiffness
-        parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)[jnp.array(_KEPT)]
+        parts = jnp.stack([answer.real, -answer.imag], axis=1).reshape(-1)
+        parts = jnp.concatenate([parts[:1], parts[2:]])  # the mean has no sine
         return n * mode.coefficient * q ** (n - 1) * (jnp.asarray(basis.synthesis) @ parts)
-
-
-_KEPT = (0, *range(2, 2 * HARMONICS + 2))  # the mean has no sine

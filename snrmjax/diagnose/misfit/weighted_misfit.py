@@ -10,6 +10,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
 from snrmjax.diagnose.misfit.noise_model import NoiseModel, noise_model
 from snrmjax.diagnose.misfit.predictions import Group, Predicted, Predictions
+from snrmjax.diagnose.misfit.reference import passed_on_by
 from snrmjax.identify.calibrate.calibration_states import ComparedColumns
 from snrmjax.model.structures import Structure
 
@@ -207,6 +208,10 @@ def _weighted(
     passed_on: ErrorPropagation,
     starts: StartChanges,
 ) -> WeightedMisfit:
+    if predictions.reference is not None:
+        n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
+        by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
+        passed_on = passed_on._replace(by_error=by_error)
     measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]

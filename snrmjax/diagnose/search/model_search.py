@@ -51,16 +51,14 @@ class TriedEffect(NamedTuple):
 
 
 class FoundEffects(NamedTuple):
-    """The effects that a search found."""
+    """The effects that a search found: the best by Schwarz's criterion, until evidence is known."""
 
     misfit: WeightedMisfit  # with errors passed on as the answer passes them
     fit: EffectFit
     baseline: EffectFit
-    classes: tuple[
-        tuple[str, ...], ...
-    ]  # of every effect: itself, then those that fit equally well
     table: tuple[tuple[TriedEffect, ...], ...]  # of every step
     considered: tuple[EffectFit, ...] = ()  # all fits under the errors of `misfit`
+    classes: tuple[tuple[str, ...], ...] = ()  # of every effect: itself, then those as probable
 
     @property
     def p_value(self) -> float:
@@ -75,7 +73,7 @@ def find_effects(
     kinds: tuple[str, ...],
     further_starts: Mapping[str, tuple[float, ...]] | None = None,
 ) -> FoundEffects:
-    """Add effects one by one while Schwarz's criterion falls by `DETECTED`, at most three.
+    """Fit effects one by one, in pairs, and a third where no pair explains the misfit.
 
     A close linear mode has three parameters of its own and could follow a part of most laws: it
     is not searched for, but an answer that it could have caused is compared with it.
@@ -92,10 +90,55 @@ def find_effects(
     return found
 
 
+def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> FoundEffects:
+    misfit, singles, rows = _tried(misfit, every, baseline_fit(misfit))
+    nothing, table = baseline_fit(misfit), [rows]
+    best = _best(misfit, [nothing, *singles])
+    considered = [nothing, *singles]
+    if _gain(misfit, nothing, best) <= DETECTED:
+        return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
+    pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
+    if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
+        pairs += _pairs(misfit, every, most=len(best.values))
+    if _is_below(misfit, best, _DOUBTFUL):
+        pairs += _pairs(misfit, every)
+    pair = _best(misfit, [best, *pairs])
+    considered += pairs
+    if pair is best or _gain(misfit, best, pair) <= DETECTED:
+        return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
+    # Errors are passed on as by both. Each is chosen again beside the other one.
+    misfit = with_errors_passed_on(misfit, pair)
+    nothing = baseline_fit(misfit)
+    alone = [fit_effect(misfit, _also_from(every[kind], pair)) for kind in pair.kinds]
+    others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
+    considered = [nothing, *alone]
+    considered += fit_effects(misfit, [(_from(every, fit), nothing) for fit in others])
+    for kind, other in zip(pair.kinds, reversed(alone), strict=True):
+        rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
+        begun = unfitted(misfit, _where(every, pair, other.kinds[0]))
+        jobs = [(_where(every, pair, kind), start) for start in (begun, other)]
+        fits = fit_effects(misfit, [*((c, other) for c in rivals), *jobs])
+        table.append(_table(misfit, other, fits))
+        considered += fits
+    best = _best(misfit, considered)
+    if _is_below(misfit, best, _REFUTED) and len(best.kinds) < _MOST:
+        thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
+        table.append(_table(misfit, best, thirds))
+        considered += thirds
+        third = _best(misfit, [best, *thirds])
+        best = third if _gain(misfit, best, third) > DETECTED else best
+    return FoundEffects(misfit, best, nothing, tuple(table), tuple(considered))
+
+
+def refitted(misfit: WeightedMisfit, scales: MotionScales, fit: EffectFit) -> EffectFit:
+    """The same effects fitted to another misfit, from where they were."""
+    return _only(misfit, {kind: candidate(kind, scales) for kind in fit.kinds}, fit, fit.kinds)
+
+
 def _compared_with(
     found: FoundEffects, close: EffectCandidate, every: dict[str, EffectCandidate]
 ) -> FoundEffects:
-    """The answer, or a close mode where that fits better; where it fits equally well, both.
+    """The answer beside others with a close mode.
 
     The mode is fitted in place of all effects, in place of the linear ones, and beside an answer
     that does not fit. It is not compared where nothing was found, nor with a single nonlinearity
@@ -116,45 +159,9 @@ def _compared_with(
     fits = [one for one in fit_effects(misfit, jobs) if np.isfinite(one.chi_square)]
     if not fits:
         return found
-    best = _simplest(misfit, fits)
-    gain, table = _gain(misfit, fit, best), (*found.table, _table(misfit, found.baseline, [best]))
-    found = found._replace(table=table, considered=(*found.considered, *fits))
-    if gain > AS_GOOD:
-        return _replaced(found, close, every, best)
-    if gain < -AS_GOOD or set(fit.kinds) <= set(best.kinds):
-        return found
-    place = fit.kinds.index(alike[0]) if alike else 0
-    wider = (*found.classes[place], close.kind)
-    classes = tuple(wider if k == place else own for k, own in enumerate(found.classes))
-    return found._replace(classes=classes)
-
-
-def _replaced(
-    found: FoundEffects, close: EffectCandidate, every: dict[str, EffectCandidate], best: EffectFit
-) -> FoundEffects:
-    """The answer with a close mode, with errors passed on by it; other effects are chosen again.
-
-    The former answer where the new one no longer fits with its own propagation of errors.
-    """
-    misfit, pool = with_errors_passed_on(found.misfit, best), every | {close.kind: close}
-    beside = _only(misfit, pool, best, best.kinds[:-1])
-    mine = fit_effect(misfit, _where(pool, best, close.kind), beside)
-    if _is_below(misfit, mine, _REFUTED) and found.p_value > _REFUTED:
-        return found
-    classes, table, considered = [], list(found.table), [baseline_fit(misfit), mine]
-    for kind in best.kinds[:-1]:
-        rivals = found.classes[found.fit.kinds.index(kind)][1:]
-        rest = _only(misfit, pool, mine, [other for other in mine.kinds if other != kind])
-        jobs = [(_where(pool, mine, kind), rest)]
-        jobs += [(every[name], rest) for name in rivals if name not in rest.kinds]
-        fits = fit_effects(misfit, jobs) if rivals else []
-        considered += fits
-        classes.append(_class(misfit, fits, kind, at=-1) if rivals else (kind,))
-        if rivals:
-            table.append(_table(misfit, rest, fits))
-    classes.append((close.kind,))
-    nothing = considered[0]
-    return FoundEffects(misfit, mine, nothing, tuple(classes), tuple(table), tuple(considered))
+    best = _best(misfit, [fit, *fits])
+    table = (*found.table, _table(misfit, found.baseline, fits))
+    return found._replace(fit=best, table=table, considered=(*found.considered, *fits))
 
 
 def _only(
@@ -165,79 +172,6 @@ def _only(
     for kind in kinds:
         found = fit_effect(misfit, _where(every, fit, kind), found)
     return found
-
-
-def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> FoundEffects:
-    before = baseline_fit(misfit)
-    misfit, singles, rows = _tried(misfit, every, before)
-    nothing = baseline_fit(misfit)
-    table = [rows]
-    best = _simplest(misfit, singles) if singles else nothing
-    if _gain(misfit, nothing, best) <= DETECTED:
-        return FoundEffects(misfit, nothing, nothing, (), tuple(table), (nothing, *singles))
-    pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
-    simple_pairs: list[EffectFit] = []
-    if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
-        simple_pairs = _pairs(misfit, every, most=len(best.values))
-    if _is_below(misfit, best, _DOUBTFUL):
-        pairs += _pairs(misfit, every)
-    lowest = min(singles, key=lambda fit: fit.criterion(misfit.n_rows))
-    pair = min(pairs, key=lambda fit: fit.criterion(misfit.n_rows), default=lowest)
-    single = _gain(misfit, lowest, pair) <= DETECTED
-    own_class = _class(misfit, singles, best.kinds[0])
-    considered = [nothing, *singles, *pairs, *simple_pairs]
-    of_one = FoundEffects(misfit, best, nothing, (own_class,), tuple(table), tuple(considered))
-    if single:
-        as_simple = _simplest(misfit, [best, *simple_pairs])
-        if as_simple is best:
-            return of_one
-        pair = as_simple
-    misfit = with_errors_passed_on(misfit, pair)
-    nothing = baseline_fit(misfit)
-    alone = [_alone(misfit, every, kind, pair) for kind in pair.kinds]
-    considered = [nothing, *alone]
-    simple = min(alone, key=lambda fit: fit.criterion(misfit.n_rows))
-    if _gain(misfit, simple, fit_effect(misfit, *_rest(every, simple, pair))) <= DETECTED:
-        # One effect explains what two seemed to: no start had come near it.
-        others = [f for f in singles if f.kinds != simple.kinds]
-        fits = fit_effects(misfit, [(_from(every, f), nothing) for f in others])
-        one = _simplest(misfit, [simple, *fits])
-        answers = (_class(misfit, [simple, *fits], one.kinds[0]),)
-        considered += fits
-        return FoundEffects(misfit, one, nothing, answers, tuple(table), tuple(considered))
-    # Each is chosen again beside the other: the first beside the second, then the reverse.
-    classes: list[tuple[str, ...]] = []
-    kind, other = pair.kinds[0], alone[1]
-    for place in range(2):
-        rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
-        fits = fit_effects(misfit, [(c, other) for c in rivals])
-        # Beside the other one fitted alone the pair itself may be far away.
-        begun = unfitted(misfit, _where(every, pair, other.kinds[0]))
-        own = fit_effects(misfit, [(_where(every, pair, kind), start) for start in (begun, other)])
-        fits.append(min(own, key=lambda fit: fit.criterion(misfit.n_rows)))
-        table.append(_table(misfit, other, fits))
-        considered += fits
-        pair = _simplest(misfit, fits)
-        classes.append(_class(misfit, fits, pair.kinds[1], at=1))
-        if place == 0:
-            kind, chosen = pair.kinds
-            other = alone[0] if chosen == alone[0].kinds[0] else _alone(misfit, every, chosen, pair)
-    if single:  # one effect with more parameters fits equally well as both
-        best = fit_effect(misfit, _from(every, best))
-        considered.append(best)
-        if _gain(misfit, best, pair) < AS_GOOD and best.kinds[0] not in classes[0]:
-            classes[0] = (*classes[0], *best.kinds)
-    if _is_below(misfit, pair, _REFUTED) and of_one.p_value > _REFUTED:
-        return of_one  # with errors passed on by itself the pair no longer fits
-    if _is_below(misfit, pair, _REFUTED):
-        thirds = fit_effects(misfit, [(c, pair) for c in _promising(misfit, every, pair)])
-        considered += thirds
-        third = min(thirds, key=lambda fit: fit.criterion(misfit.n_rows), default=pair)
-        if _gain(misfit, pair, third) > DETECTED:
-            table.append(_table(misfit, pair, thirds))
-            pair = _simplest(misfit, thirds)
-            classes.append(_class(misfit, thirds, pair.kinds[2], at=2))
-    return FoundEffects(misfit, pair, nothing, tuple(classes), tuple(table), tuple(considered))
 
 
 def _pairs(
@@ -311,20 +245,6 @@ def _where(every: dict[str, EffectCandidate], pair: EffectFit, kind: str) -> Eff
     return every[kind]._replace(starts=(pair.of_kind(kind),))
 
 
-def _alone(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], kind: str, pair: EffectFit
-) -> EffectFit:
-    return fit_effect(misfit, _also_from(every[kind], pair))
-
-
-def _rest(
-    every: dict[str, EffectCandidate], first: EffectFit, pair: EffectFit
-) -> tuple[EffectCandidate, EffectFit]:
-    """The other one of a pair, and the fit beside which it is fitted."""
-    (kind,) = set(pair.kinds) - set(first.kinds)
-    return _also_from(every[kind], pair), first
-
-
 def _from(every: dict[str, EffectCandidate], fit: EffectFit) -> EffectCandidate:
     """A candidate that begins where a fit to it ended."""
     return every[fit.kinds[-1]]._replace(starts=(tuple(fit.values.tolist()),))
@@ -334,31 +254,15 @@ def _gain(misfit: WeightedMisfit, before: EffectFit, after: EffectFit) -> float:
     return before.criterion(misfit.n_rows) - after.criterion(misfit.n_rows)
 
 
-def _simplest(misfit: WeightedMisfit, fits: list[EffectFit]) -> EffectFit:
-    """Of the fits that are equally good as the best, one with the fewest parameters.
-
-    A further mode or a threshold can be placed where the data deviate by chance; a criterion that
-    counts parameters does not account for the choice of the place.
-    """
-    fits = [fit for fit in fits if np.isfinite(fit.criterion(misfit.n_rows))]
-    if not fits:
+def _best(misfit: WeightedMisfit, fits: Sequence[EffectFit]) -> EffectFit:
+    """The fit with the smallest criterion."""
+    finite = [fit for fit in fits if np.isfinite(fit.criterion(misfit.n_rows))]
+    if not finite:
         raise ValueError(
             "no trial fit of an effect has a finite misfit: the model is too far from the data to "
             "be compared."
         )
-    least = min(fit.criterion(misfit.n_rows) for fit in fits)
-    near = [fit for fit in fits if fit.criterion(misfit.n_rows) <= least + AS_GOOD]
-    return min(near, key=lambda fit: (len(fit.values), fit.criterion(misfit.n_rows)))
-
-
-def _class(
-    misfit: WeightedMisfit, fits: list[EffectFit], kind: str, at: int = 0
-) -> tuple[str, ...]:
-    """The kinds that fit equally well as one, itself first."""
-    order = sorted(fits, key=lambda fit: fit.criterion(misfit.n_rows))
-    least = order[0].criterion(misfit.n_rows)
-    near = [f.kinds[at] for f in order if f.criterion(misfit.n_rows) < least + AS_GOOD]
-    return (kind, *(name for name in near if name != kind))
+    return min(finite, key=lambda fit: fit.criterion(misfit.n_rows))
 
 
 def _table(

@@ -108,15 +108,23 @@ class StateWithErrors(NamedTuple):
     factor: Complex[Array, ""] | float  # of all velocities
     error: Float[Array, " input"]  # of the logarithms of force and velocities, and of the phases
 
-    def velocities(self) -> tuple[Complex[Array, " sensor"], Complex[Array, "sensor harmonic"]]:
-        """Fundamentals and harmonics freed of the errors, in m/s."""
-        state, n = self.state, self.state.velocity.shape[0]
-        own = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
-        return state.velocity * own, state.harmonics * own[:, None]
+    def velocity(self) -> Complex[Array, " sensor"]:
+        """Fundamentals freed of the errors, in m/s."""
+        n = self.state.velocity.shape[0]
+        own = jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        return self.state.velocity * self.factor * own
+
+    def harmonics(self, orders: tuple[int, ...]) -> Complex[Array, "sensor harmonic"]:
+        """Harmonics freed of the errors, in m/s: a phase is an error of time, h times as large."""
+        n = self.state.velocity.shape[0]
+        factor = self.factor * jnp.exp(self.error[1 : n + 1] + 1j * self.error[n + 1 :])
+        size = jnp.abs(factor)
+        turn = (factor / size)[:, None] ** np.array(orders, dtype=int)
+        return self.state.harmonics * size[:, None] * turn
 
     def motion(self, model: Structure, sensor: int, harmonic_order: int) -> PrescribedMotion:
         """The equations of its motion."""
-        return state_motion(model, self.state, self.velocities()[0][0], sensor, harmonic_order)
+        return state_motion(model, self.state, self.velocity()[0], sensor, harmonic_order)
 
 
 def residual_columns(
@@ -134,7 +142,7 @@ def residual_columns(
     measured velocity.
     """
     state = erring.state
-    velocity, harmonics = erring.velocities()
+    velocity, harmonics = erring.velocity(), erring.harmonics(orders)
     force, seen = motion.recorded(point)
     seen = seen[:, np.array(sensors)]
     higher = seen[np.array(orders, dtype=int)].T - harmonics

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from enum import StrEnum
 from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
@@ -37,6 +38,22 @@ _BOUNDS: dict[str, _Bounds] = {
         np.radians(5), np.radians(30), "Add states on both sides of resonance"
     ),
 }
+
+
+class Determination(StrEnum):
+    """How well data determine an unknown of the instruments."""
+
+    WELL = "well"
+    HARDLY = "hardly"
+    NOT_AT_ALL = "not_at_all"
+
+
+def force_gain_determined(std: float) -> Determination:
+    """How well a force gain is known, by the 1σ of its logarithm."""
+    bounds = _BOUNDS["force_gain"]
+    if std < bounds.doubted:
+        return Determination.WELL
+    return Determination.HARDLY if std < bounds.refused else Determination.NOT_AT_ALL
 
 
 def force_gain_undetermined(std: float, farthest: float) -> str:

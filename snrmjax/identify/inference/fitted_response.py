@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.inference.fitted_curves import as_backbone, values_at_displacement
 from snrmjax.identify.inference.forced_motion import banded_curve
 from snrmjax.identify.inference.located_points import (
     FittedPoint,
@@ -12,15 +12,27 @@ from snrmjax.identify.inference.located_points import (
     located,
     turns,
 )
+from snrmjax.identify.joint.force_balance import with_deviations
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
     predict_response,
     resonances,
 )
+from snrmjax.identify.prediction.new_level import NewLevel, new_level
+from snrmjax.identify.prediction.resonance_distribution import (
+    KnownCurves,
+    ResonanceDistribution,
+    amplitudes_to,
+    covariance_root,
+    other_modes,
+    resonance_distribution,
+)
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
+_CURVES = ("backbone", "damping")
+_LEAST = 0.1  # of a rival's weight, that the family taken has
 
 
 class FittedResponse(AbstractResult):
@@ -91,22 +103,25 @@ def fitted_response(
     to_frequency: float = np.inf,
     points_per_side: int = 200,
     largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
+    of: NewLevel | None = None,
 ) -> list[FittedResponse]:
     """Response curves under a force with bands, and its resonances and folds with theirs.
 
     Bands come from the implicit function theorem on the curve's own equation
     |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude for the frequency, at fixed frequency for the
     velocity, along both equations of a resonance and of a fold. They include what the choice among
-    families leaves open: what rivals say of the same points.
+    families leaves open: what rivals say of the same points. They are those of a further level:
+    they also hold by how much one level differs from another.
 
     Arguments: `force` in N, frequencies in rad/s; curves end at `largest_amplitude_ratio` times
-    the largest measured amplitude, beyond which the fitted curves are extrapolated.
+    the largest measured amplitude, beyond which the fitted curves are extrapolated; `of` the level
+    that is predicted where it is not `new_level`'s (`ON_THE_CURVES`: the mode itself).
     Returns the connected curves, the main one first; resonances and folds with the first curve
     that has them; the `note` of each says where it extrapolates.
     Raises `ValueError` for a force or a ratio that is not positive.
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
-    rough = as_backbone(fit, **ratio)
+    rough, level = as_backbone(fit, **ratio), new_level(fit, force) if of is None else of
     settings = {"from_frequency": from_frequency, "to_frequency": to_frequency, **ratio}
     curves = predict_response(rough, fit.modes, force, points_per_side=points_per_side, **settings)
     tips = [
@@ -116,9 +131,9 @@ def fitted_response(
     ]
     answer = []
     for number, curve in enumerate(curves):
-        band = banded_curve(fit, force, curve.amplitude, curve.frequency)
+        band = banded_curve(fit, force, curve.amplitude, curve.frequency, level)
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
-        points = [located(fit, force, place, largest_amplitude_ratio) for place in places]
+        points = [located(fit, force, place, largest_amplitude_ratio, level) for place in places]
         good = [one for one in points if one.status == LocatedStatus.LOCATED]
         missing = tuple(one for one in points if one.status != LocatedStatus.LOCATED)
         answer.append(
@@ -148,4 +163,51 @@ def _note_on(missing: tuple[FittedPoint, ...], force: float) -> str:
     return (
         f"{len(missing)} resonances or folds under {force:g} N could not be located ({listed}) and "
         "have no band."
+    )
+
+
+def predicted_resonance(
+    fit: JointFit,
+    force: float,
+    *,
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO,
+    of: NewLevel | None = None,
+    self_excited: bool = False,
+) -> ResonanceDistribution:
+    """Whether a further level has its resonance within a range of amplitudes, and where.
+
+    Curves are drawn from the fit and from its rivals, each as often as it weighs, with a further
+    level's errors (`new_level`). Beyond the data the bands widen with what they leave open.
+
+    Arguments: `force` in N, looked for up to `largest_amplitude_ratio` times the largest measured
+    amplitude; `of` the level where it is not `new_level`'s; `self_excited` allows negative damping.
+    """
+    new = new_level(fit, force) if of is None else of
+    amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)
+
+    def known(one: JointFit, weight: float) -> KnownCurves:
+        values, slopes, _ = values_at_displacement(one, amplitude)
+        root = covariance_root(one.covariance)
+        load, names = force, one.names()
+        by_load = -float(one.prior.linear[-1]) * root[-1]
+        if new.drive is not None:
+            load = float(one.force_of_drive(np.array(new.drive)))
+            offset = float(one.unknowns.force_offset * np.min(np.asarray(one.data.force)))
+            by = {"force_gain": 1 - offset / load}
+            by["force_offset"] = float(np.min(np.asarray(one.data.force))) / load
+            by_load = by_load + sum(by[n] * root[names.index(n)] for n in by if n in names)
+        constant = abs(float(one.problem.constant_of(one.unknowns)))
+        return KnownCurves(weight, values, slopes @ root, constant * load, by_load)
+
+    rivals = fit.families.rivals
+    left = {kind: 1 - sum(r.weight for r in rivals if r.curve == kind) for kind in _CURVES}
+    odds = [one.weight / max(left[one.curve], one.weight * _LEAST) for one in rivals]
+    modes = with_deviations(fit.modes, fit.unknowns.linear, fit.prior.linear)
+    return resonance_distribution(
+        *(force, amplitude),
+        [known(fit, 1.0), *(known(r.fit, weight) for r, weight in zip(rivals, odds, strict=True))],
+        *(new, other_modes(modes, fit.data.sensor, force)),
+        ratio=largest_amplitude_ratio,
+        gain_of_force=bool(fit.prior.gain_of_force > 0),
+        self_excited=self_excited,
     )

@@ -7,11 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
+from scipy.linalg import block_diag
 
 from snrmjax.identify.inference.fitted_curves import beyond_estimation
-from snrmjax.identify.joint.force_balance import Unknowns, log_modal_mass, with_deviations
+from snrmjax.identify.joint.force_balance import (
+    LEVEL_ERRORS,
+    Unknowns,
+    log_modal_mass,
+    with_deviations,
+)
 from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
@@ -23,61 +30,85 @@ _ONTO_THE_CURVE = 4  # steps
 class ForcedMotion(eqx.Module):
     """A fit's curves under one force; amplitude X and frequency Ω are free.
 
-    The response curve is where |(ω̃² − Ω²) + iΩδ| X = |A|F.
+    The response curve is where |(ω̃² − Ω²) + iΩδ| X = |A|F. The unknowns are the fit's, then the
+    errors (`LEVEL_ERRORS`) of the level that is predicted: zero, with `level_std` as their 1σ.
     """
 
     unravel: Unravel
     modes: LinearModes
     linear_std: Float[Array, " deviation"]
     constant: Float[Array, ""]  # A, 1/kg, with the model's modal mass
-    force: Float[Array, ""]  # N
+    force: Float[Array, ""]  # N, or what the test records of it
+    recorded: Float[Array, ""]  # 1 where it is a record, whose gain may err; else 0
+    smallest: Float[Array, ""]  # record, that an offset is relative to
+    gain_of_force: Float[Array, ""]  # see `PriorStd`
+    level_std: Float[Array, " error"]
     sensor: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, fit: JointFit, force: float) -> "ForcedMotion":
-        """A fit under a force in N."""
+    def of(cls, fit: JointFit, force: float, new: NewLevel = ON_THE_CURVES) -> "ForcedMotion":
+        """A fit under a force in N, or under the record that `new` gives."""
         return cls(
             unravel=fit.packed().unravel,
             modes=fit.modes,
             linear_std=fit.prior.linear,
             constant=fit.problem.modal_constant,
-            force=jnp.asarray(float(force)),
+            force=jnp.asarray(float(force) if new.drive is None else new.drive),
+            recorded=jnp.asarray(float(new.drive is not None)),
+            smallest=jnp.min(fit.data.force),
+            gain_of_force=fit.prior.gain_of_force,
+            level_std=jnp.asarray(new.std),
             sensor=fit.data.sensor,
         )
 
+    def with_level(self, vector: Array) -> Array:
+        """The fit's unknowns, followed by the level's errors."""
+        return jnp.append(vector, jnp.zeros_like(self.level_std))
+
+    def split(self, vector: Array) -> tuple[Unknowns, Array]:
+        """All unknowns of the fit, and the level's errors."""
+        return self.unravel(vector[: -len(LEVEL_ERRORS)]), vector[-len(LEVEL_ERRORS) :]
+
     def excess(self, vector: Array, x: Array, omega: Array) -> Float[Array, "*batch"]:
         """|(ω̃² − Ω²) + iΩδ|² X²/load² − 1."""
-        squared, damping = curves_at(self.unravel(vector), x, omega)
+        squared, damping = self.curves(vector, x, omega)
         size = (squared - omega**2) ** 2 + (omega * damping) ** 2
         return size * (x / self.load_of(vector)) ** 2 - 1.0
 
     def load_of(self, vector: Array) -> Float[Array, ""]:
         """|A|F in m/s², with the fit's modal mass."""
-        return jnp.abs(self._constant_of(self.unravel(vector))) * self.force
+        return jnp.abs(self._constant_of(self.split(vector)[0])) * self.force_of(vector)
+
+    def force_of(self, vector: Array) -> Float[Array, ""]:
+        """The force in N."""
+        unknowns, level = self.split(vector)
+        gain = jnp.exp(unknowns.log_force_gain + self.gain_of_force * level[0])
+        true = self.force * gain + unknowns.force_offset * self.smallest
+        return jnp.where(self.recorded > 0, true, self.force)
+
+    def curves(self, vector: Array, x: Array, omega: Array) -> tuple[Array, Array]:
+        """ω̃² and 2ζ̃ω̃ of the level's motion of displacement x at a frequency."""
+        unknowns, level = self.split(vector)
+        squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+        speed = x * omega
+        return (
+            squared(squared.amplitude(x, speed)) * (1 + level[2]),
+            damping(damping.amplitude(x, speed)) * (1 + level[3]),
+        )
 
     def _constant_of(self, unknowns: Unknowns) -> Float[Array, ""]:
         """A in 1/kg with the fit's modal mass."""
         return self.constant * jnp.exp(-log_modal_mass(unknowns, self.linear_std))
 
     def velocity(self, vector: Array, x: Array, omega: Array) -> Complex[Array, "*batch"]:
-        """Velocity at the fit's sensor, residual modes included."""
-        unknowns, force = self.unravel(vector), self.force
-        squared, damping = curves_at(unknowns, x, omega)
+        """Velocity at the fit's sensor as the level records it, residual modes included."""
+        (unknowns, level), force = self.split(vector), self.force_of(vector)
+        squared, damping = self.curves(vector, x, omega)
         constant = self._constant_of(unknowns)
         own = 1j * omega * constant * force / (squared - omega**2 + 1j * omega * damping)
         linear = with_deviations(self.modes, unknowns.linear, self.linear_std)
         rest = residual_velocity(linear, omega, jnp.broadcast_to(force, omega.shape))
-        return own + rest[..., self.sensor]
-
-
-def curves_at(unknowns: Unknowns, x: Array, omega: Array) -> tuple[Array, Array]:
-    """ω̃² and 2ζ̃ω̃ of a motion of displacement x at a frequency."""
-    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
-    speed = x * omega
-    return (
-        squared(squared.amplitude(x, speed)),
-        damping(damping.amplitude(x, speed)),
-    )
+        return (own + rest[..., self.sensor]) * jnp.exp((1 - self.gain_of_force) * level[0])
 
 
 class BandedCurve(NamedTuple):
@@ -102,16 +133,17 @@ class _Banded(NamedTuple):
 
 
 def banded_curve(
-    fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray
+    fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray, new: NewLevel
 ) -> BandedCurve:
     """The points of a response curve that are nearest to some, with bands."""
 
     def banded(one: JointFit, x: np.ndarray, omega: np.ndarray, steps: int) -> _Banded:
-        program, motion = one.packed(), ForcedMotion.of(one, force)
-        covariance = jnp.asarray(program.padded_covariance(one.covariance))
-        count = np.array(steps)
+        program, motion = one.packed(), ForcedMotion.of(one, force, new)
+        own, level = program.padded_covariance(one.covariance), np.diag(new.std**2)
+        covariance = jnp.asarray(block_diag(own, level))
+        count, vector = np.array(steps), motion.with_level(program.vector)
         found = by_blocks(
-            lambda x, omega: _bands(motion, program.vector, covariance, x, omega, count),
+            lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
             *(_BLOCK, np.asarray(x), np.asarray(omega)),
         )
         return _Banded(*found)

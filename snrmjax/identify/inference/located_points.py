@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.inference.fitted_curves import as_backbone, beyond_estimation
-from snrmjax.identify.inference.forced_motion import ForcedMotion, curves_at
+from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.prediction import predict_response, resonances
+from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
 
@@ -88,12 +89,19 @@ class Place(NamedTuple):
 class _Solved(NamedTuple):
     values: np.ndarray  # frequency, velocity, displacement
     slopes: np.ndarray  # of them by the fit's unknowns
+    by_level: np.ndarray  # and by the level's errors
+
+    def variance(self, fit: JointFit) -> np.ndarray:
+        """That of the fit's unknowns."""
+        return np.einsum("op,pq,oq->o", self.slopes, fit.covariance, self.slopes)
 
 
-def located(fit: JointFit, force: float, place: Place, ratio: float) -> FittedPoint:
+def located(
+    fit: JointFit, force: float, place: Place, ratio: float, new: NewLevel = ON_THE_CURVES
+) -> FittedPoint:
     """The resonance or fold near a place; rivals' are looked for up to `ratio` of the data."""
     largest = fit.largest[0] * (1 + 1e-9)
-    found = _solved(fit, force, place)
+    found = _solved(fit, force, place, new)
     if found is None:
         return FittedPoint(
             force=force,
@@ -105,17 +113,16 @@ def located(fit: JointFit, force: float, place: Place, ratio: float) -> FittedPo
             kind=place.kind,
             status=LocatedStatus.NOT_LOCATED,
         )
-    values, slopes = found
-    variance = np.einsum("op,pq,oq->o", slopes, fit.covariance, slopes)
-    widened, without = variance, 0
+    values, variance = found.values, found.variance(fit)
+    widened, without = variance + found.by_level**2 @ new.std**2, 0
     near = Place(place.kind, float(values[2]), float(values[0]))
     for rival in fit.families.rivals:
-        answer = _of_a_rival(rival.fit, force, near, ratio)
+        answer = _of_a_rival(rival.fit, force, near, ratio, new)
         if answer is None:
             without += 1
             continue
-        own = np.einsum("op,pq,oq->o", answer.slopes, rival.fit.covariance, answer.slopes)
-        shift = beyond_estimation(rival.weight, values, variance, answer.values, own)
+        given = (rival.weight, values, variance, answer.values, answer.variance(rival.fit))
+        shift = beyond_estimation(*given)
         widened = widened + shift**2
     (omega, speed, x), std = values, np.sqrt(widened)
     return FittedPoint(
@@ -137,11 +144,15 @@ def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
     return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
 
 
-def _of_a_rival(rival: JointFit, force: float, place: Place, ratio: float) -> _Solved | None:
+def _of_a_rival(
+    rival: JointFit, force: float, place: Place, ratio: float, new: NewLevel
+) -> _Solved | None:
     """A rival's resonance or fold that corresponds to one of the fit, and its slopes."""
-    near = _solved(rival, force, place)
+    near = _solved(rival, force, place, new)
     if near is not None:
         return near
+    if new.drive is not None:
+        force = float(rival.force_of_drive(np.array(new.drive)))
     rough = as_backbone(rival, largest_amplitude_ratio=ratio)
     if place.kind == "resonance":
         tips = resonances(rough, rival.modes, force, largest_amplitude_ratio=ratio)
@@ -150,7 +161,7 @@ def _of_a_rival(rival: JointFit, force: float, place: Place, ratio: float) -> _S
         curves = predict_response(rough, rival.modes, force, largest_amplitude_ratio=ratio)
         starts = [turn for c in curves for turn in turns(c.frequency, c.amplitude)]
     for start in sorted(starts, key=lambda one: abs(np.log(one.amplitude / place.amplitude))):
-        found = _solved(rival, force, start)
+        found = _solved(rival, force, start, new)
         if found is not None:
             return found
     return None
@@ -169,13 +180,17 @@ def point_slopes(
     return found.slopes[:2]
 
 
-def _solved(fit: JointFit, force: float, place: Place) -> _Solved | None:
+def _solved(
+    fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
+) -> _Solved | None:
     """Frequency, velocity and displacement of a point, and their slopes by the unknowns."""
-    program = fit.packed()
+    program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
     unit = jnp.array([place.amplitude, place.frequency])
-    given = (ForcedMotion.of(fit, force), program.vector, unit, np.array(place.kind == "fold"))
-    values, slopes, good = _point_with_slopes(*given)
-    return _Solved(np.asarray(values), np.asarray(slopes)[:, program.own]) if bool(good) else None
+    vector, is_fold = motion.with_level(program.vector), np.array(place.kind == "fold")
+    values, slopes, good = map(np.asarray, _point_with_slopes(motion, vector, unit, is_fold))
+    if not good:
+        return None
+    return _Solved(values, slopes[:, program.own], slopes[:, len(program.vector) :])
 
 
 @compiled
@@ -187,8 +202,13 @@ def _point_with_slopes(
         excess, slope = jax.jvp(
             lambda x: motion.excess(vector, x, omega), (x,), (jnp.ones_like(x),)
         )
-        squared, damping = curves_at(motion.unravel(vector), x, omega)
-        resonance = [squared / omega**2 - 1, omega * damping * x / motion.load_of(vector) - 1]
+        squared, damping = motion.curves(vector, x, omega)
+        # Where the level's record is in phase, the motion itself lags by the error of its phase.
+        phase = motion.split(vector)[1][1]
+        resonance = [
+            squared / omega**2 - 1 + damping / omega * jnp.tan(phase),
+            omega * damping * x / (jnp.cos(phase) * motion.load_of(vector)) - 1,
+        ]
         return jnp.where(is_fold, jnp.stack([excess, slope * x]), jnp.stack(resonance))
 
     def step(_: int, point: Array) -> Array:

@@ -1,15 +1,13 @@
-"""Why identified curves have no resonance under a force, and what was measured near it."""
+"""Phase resonances that the states of a level enclose, and jumps past them."""
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.measure.states import SteadyStates
 
-_AMPLITUDES = 200
 _SAME_FORCE = 0.05  # relative difference of a level's force from the one that was asked for
 _ONE_BRANCH = np.radians(45.0)  # of phase, that states beside a resonance may be apart
 _STEEPER = 2.0  # times as steep as beside it, from which on tan φ jumps
@@ -82,38 +80,11 @@ def _slope(tangent: Float[np.ndarray, " 2"], frequency: Float[np.ndarray, " 2"])
     return float(tangent[1] - tangent[0]) / step if step else -np.inf
 
 
-def why_no_resonance(
-    backbone: Backbone, data: SteadyStates, force: float, largest_amplitude_ratio: float
-) -> str:
-    """What force resonances need on identified curves, and whether one was measured at this force.
-
-    Arguments: `data` with forces in newtons; `force` in N; curves are looked at up to
-    `largest_amplitude_ratio` times the largest measured amplitude.
-    """
-    reach = largest_amplitude_ratio * float(backbone.largest)
-    needed = _forces(backbone, reach * np.linspace(0.0, 1.0, _AMPLITUDES))
-    known = needed[np.isfinite(needed)]
-    said = ""
-    if known.size:
-        said = f"there these curves need {known.min():.4g} to {known.max():.4g} N"
+def level_in_resonance(
+    data: SteadyStates, backbone: Backbone, force: float
+) -> MeasuredResonance | None:
+    """The phase resonance of the level whose force is about this one in N; None without one."""
     sensor, sign = data.sensors.index(backbone.sensor), np.sign(float(backbone.modal_constant))
     every = measured_resonances(data, sensor, sign)
     near = min(every, key=lambda one: abs(one.force / force - 1), default=None)
-    if near is None or abs(near.force / force - 1) > _SAME_FORCE:
-        return said
-    amplitude = near.velocity
-    if backbone.argument == "displacement":
-        amplitude /= _HERTZ * near.frequency
-    own = float(_forces(backbone, np.array([amplitude]))[0])
-    return (
-        f"{said}. One was measured: level {near.level} has it at {near.frequency:.5g} Hz, "
-        f"{near.velocity:.3g} m/s and {near.force:.4g} N, and for that amplitude the curves need "
-        f"{own:.4g} N: they miss this level, and what they predict under a force is as uncertain"
-    )
-
-
-def _forces(backbone: Backbone, amplitude: np.ndarray) -> np.ndarray:
-    """Forces of phase resonances of these amplitudes, N."""
-    at = jnp.asarray(amplitude)
-    speed, damping = np.asarray(backbone.velocity(at)), np.asarray(backbone.modal_damping(at))
-    return speed * damping / abs(float(backbone.modal_constant))
+    return None if near is None or abs(near.force / force - 1) > _SAME_FORCE else near

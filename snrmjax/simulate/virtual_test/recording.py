@@ -194,8 +194,9 @@ def _with_errors(
         1j * errors.phase * normal(keys[1], n, n_sensors)
     )
     factor = shared[:, None] * own
+    size = np.abs(factor)  # a phase is an error of time: h times as large of harmonic h
     harmonics = (
-        np.stack([velocity[:, h] * factor for h in keep_harmonics], axis=2)
+        np.stack([velocity[:, h] * size * (factor / size) ** h for h in keep_harmonics], axis=2)
         if keep_harmonics
         else None
     )

@@ -13,9 +13,7 @@ from snrmjax.diagnose.checks.level_forces import (
     level_gains,
     suspected_level_forces,
     with_forces_that_acted,
-    with_level_forces_doubted,
 )
-from snrmjax.diagnose.checks.verdict import Judgement, Verdict
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
@@ -73,17 +71,13 @@ def test_of_two_levels_nothing_says_which_is_wrong():
     assert suspected_level_forces(searched(rescaled(data, level=1))[1], 1.0) is None
 
 
-def test_an_answer_that_a_gain_explains_as_well_is_open_and_the_gain_is_said_first():
-    rival = LevelForces((2,), (3,), (), 1.0)
+def test_a_gain_that_explains_as_much_is_a_doubt():
+    rival = LevelForces((2,), (3,), ("quadratic_damping",), 1.0)
     assert not rival.is_better
-    named = Judgement(Verdict.NAMED, ("a reason.",))
-    found = with_level_forces_doubted(named, rival)
-    assert found.verdict is Verdict.AMBIGUOUS
-    assert found.reasons[0].startswith("a force of level 3 that is recorded in a wrong scale ")
-    assert found.open_questions[0].decide_by.endswith("or measure level 3 again")
-    nothing = Judgement(Verdict.NOTHING_MISSING)
-    assert with_level_forces_doubted(nothing, rival) is nothing
-    assert with_level_forces_doubted(named, None) is named
+    assert rival.doubt.reason.startswith("a force of level 3 that is recorded in a wrong scale ")
+    assert "beside quadratic_damping" in rival.doubt.reason
+    assert rival.doubt.decide_by.endswith("or measure level 3 again")
+    assert not rival.doubt.refutes
 
 
 @pytest.mark.long

@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from truths.made_up_misfits import noise_of
 
 from snrmjax.diagnose.checks.patterns import left_curve, pattern
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 
 LEVELS, PER_LEVEL, DAMPING = 5, 16, 0.01
 N = LEVELS * PER_LEVEL
@@ -35,8 +34,6 @@ def misfit_of(phase_unknown=False):
     # One unit of ω₀² adds 1, one of damping adds iΩ.
     parts = np.stack([np.ones(N), 1j * omega], axis=1)
     by_linear = np.einsum("sij,jsk->sik", whiten, np.stack([parts.real, parts.imag]))
-    state, column = np.repeat(np.arange(N), 2), np.tile([0, 1], N)
-    known = np.ones((N, 2), dtype=bool)
     shared = 0.002 * by_linear.reshape(2 * N, 2)[:, :1]  # of the linear test
     velocity = (SIZE * np.exp(1j * ANGLE))[:, None]
     chosen = SimpleNamespace(
@@ -46,7 +43,7 @@ def misfit_of(phase_unknown=False):
         phase_unknown=np.full((N, 1), phase_unknown),
     )
     return SimpleNamespace(
-        noise=NoiseModel(whiten, known, shared_covariance(shared), state, column),
+        noise=noise_of(whiten, shared),
         predictions=SimpleNamespace(chosen=chosen),
         level_numbers=np.arange(1, LEVELS + 1),
         by_linear=by_linear.reshape(2 * N, 2),

@@ -16,6 +16,7 @@ from truths.growing_damping import (
 )
 
 import snrmjax as sj
+from snrmjax.diagnose.decide import most_probable
 from snrmjax.diagnose.design.design_points import (
     DesignPoints,
     Rows,
@@ -24,6 +25,7 @@ from snrmjax.diagnose.design.design_points import (
 )
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, discriminating_test
 from snrmjax.diagnose.design.recommendation import recommendation
+from snrmjax.diagnose.evidence import weights_of
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
@@ -103,6 +105,7 @@ def test_the_measurement_that_was_asked_for_leaves_the_truth(ambiguous, truth):
 def test_where_no_measurement_would_settle_it_that_is_said():
     predictions = predictions_of(linear_model(), measured())
     found = find_effects(weighted_misfit(predictions), scales_of(predictions), tuple(THIRD))
+    found = most_probable(found, weights_of(found))
     test = discriminating_test(found, (0,))
     weak = test._replace(expected_gain=0.5 * test.needed_gain)
     said = recommendation(found, weak, [], phases=True)

@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from truths.made_up_misfits import noise_of
 
 from snrmjax.diagnose.checks.doubts import doubts
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 from snrmjax.diagnose.search.locating import locate_misfit, power_of_amplitude, power_of_answer
 
 AMPLITUDE = np.log(np.array([0.12, 0.3, 0.5, 0.7, 0.85, 1.0]))
@@ -83,13 +82,8 @@ def test_quadratic_softening_has_the_power_of_its_own_motion():
     size, change = pairs[:, 0], pairs[:, 1] - 1
     n = len(size)
     by_linear = np.tile(np.eye(2), (n, 1)) / 1e-3
-    known, state = np.ones((n, 2), dtype=bool), np.repeat(np.arange(n), 2)
-    noise = NoiseModel(
-        np.tile(np.eye(2) / 1e-3, (n, 1, 1)), known, shared_covariance(np.zeros((2 * n, 0))),
-        state, np.tile([0, 1], n),
-    )  # fmt: skip
     misfit = SimpleNamespace(
-        noise=noise,
+        noise=noise_of(np.tile(np.eye(2) / 1e-3, (n, 1, 1))),
         by_linear=by_linear,
         baseline=SimpleNamespace(
             force=np.ones(n, dtype=complex), force_by_linear=np.zeros((n, 2), dtype=complex)

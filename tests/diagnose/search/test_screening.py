@@ -4,10 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from truths.made_up_misfits import noise_of
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate
-from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
 from snrmjax.diagnose.search.screening import screened_pairs
 
 N = 60
@@ -15,13 +14,8 @@ N = 60
 
 def made_up(columns, base):
     """Evidence in which a candidate's starts change all rows by given columns."""
-    empty = np.zeros((N, 0))
-    whiten, known = np.ones((N, 1, 1)), np.ones((N, 1), dtype=bool)
-    noise = NoiseModel(
-        whiten, known, shared_covariance(empty), np.arange(N), np.zeros(N, dtype=int)
-    )
     return SimpleNamespace(
-        noise=noise,
+        noise=noise_of(np.ones((N, 1, 1))),
         base=base,
         n_rows=N,
         start_changes=lambda c: np.stack(columns[c.kind])[:, :, None],

@@ -14,6 +14,7 @@ import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.inference.located_points import point_slopes
 from snrmjax.identify.joint.fitting import FitStatus
+from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import write_next
 
 FORCE = 2.2  # N: folds are there
@@ -111,7 +112,7 @@ def test_folds_are_where_the_frequency_turns(exact_fit):
 
 @pytest.mark.parametrize("kind", ["resonance", "fold"])
 def test_slopes_of_points_are_central_differences(fit, kind):
-    curve = sj.identify.fitted_response(fit, FORCE)[0]
+    curve = sj.identify.fitted_response(fit, FORCE, of=ON_THE_CURVES)[0]
     best = max(curve.resonances if kind == "resonance" else curve.folds, key=lambda p: p.velocity)
     slopes = point_slopes(fit, FORCE, kind, best)
     vector = np.asarray(fit.vector()[0])
@@ -120,7 +121,7 @@ def test_slopes_of_points_are_central_differences(fit, kind):
         values = []
         for sign in (1, -1):
             there = moved(fit, vector + sign * step * np.eye(len(vector))[k])
-            one = sj.identify.fitted_response(there, FORCE)[0]
+            one = sj.identify.fitted_response(there, FORCE, of=ON_THE_CURVES)[0]
             points = one.resonances if kind == "resonance" else one.folds
             near = max(points, key=lambda p: p.velocity)
             values.append([near.frequency, near.velocity])

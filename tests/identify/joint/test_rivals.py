@@ -14,6 +14,7 @@ from snrmjax.identify.inference.fitted_curves import as_backbone, beyond_estimat
 from snrmjax.identify.inference.sensitivity import contributions
 from snrmjax.identify.joint.joint_fit import FamilyChoice, Rival
 from snrmjax.identify.joint.ranking import _weights
+from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
 
 FORCE = 2.2  # N
@@ -170,10 +171,14 @@ def test_rivals_add_up_in_any_order(fit):
 
 @pytest.mark.parametrize("factor", [1.05, 1.3, 1.6])
 def test_a_resonance_is_as_uncertain_as_its_rival_is_far(fit, factor):
-    mine = sj.identify.fitted_response(by_estimation_alone(fit), FORCE)[0].resonances[0]
-    wide = sj.identify.fitted_response(against(fit, factor), FORCE)[0].resonances[0]
+    mine = sj.identify.fitted_response(by_estimation_alone(fit), FORCE, of=ON_THE_CURVES)[
+        0
+    ].resonances[0]
+    wide = sj.identify.fitted_response(against(fit, factor), FORCE, of=ON_THE_CURVES)[0].resonances[
+        0
+    ]
     rival = against(fit, factor).families.rivals[0].fit
-    theirs = sj.identify.fitted_response(rival, FORCE)[0].resonances[0]
+    theirs = sj.identify.fitted_response(rival, FORCE, of=ON_THE_CURVES)[0].resonances[0]
     apart = (theirs.velocity - mine.velocity) ** 2
     excess = apart - abs(theirs.velocity_std**2 - mine.velocity_std**2)
     expected = np.sqrt(mine.velocity_std**2 + 0.25 * excess)

@@ -70,7 +70,7 @@ def test_a_first_fit_that_used_up_its_steps_is_no_start(monkeypatch):
     """It may have ended anywhere: here with gains of levels that no test has."""
     whole, starts = joint_fit.fitted, []
 
-    def lost(start, problem, components, settings):
+    def lost(start, problem, components, settings, *new):
         found = whole(start, problem, components, settings)
         if settings.rounds != joint_fit._ROUGHLY:
             starts.append(np.asarray(start.level))
@@ -168,7 +168,7 @@ def test_resonances_and_folds_that_are_not_located_are_counted_and_said(monkeypa
     assert before.note == ""
     whole = located_points._solved
 
-    def lost(one, force, place):
+    def lost(one, force, place, *new):
         return None if place.kind == "fold" else whole(one, force, place)
 
     monkeypatch.setattr(located_points, "_solved", lost)

@@ -1,4 +1,4 @@
-"""What is said where identified curves have no resonance, or states no points."""
+"""Phase resonances that states enclose, and what is said where states have no points."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import pytest
 from truths.exact_states import CONSTANT, OMEGA, SHAPE, damping, exact, modes, squared, stated
 
 import snrmjax as sj
-from snrmjax.identify.pointwise.missing_resonance import measured_resonances, why_no_resonance
+from snrmjax.identify.pointwise.missing_resonance import level_in_resonance, measured_resonances
 from snrmjax.identify.pointwise.prediction import resonances
 
 TIP = 2e-3  # m, the largest displacement at resonance
@@ -27,24 +27,15 @@ def needed(displacement):
     return displacement * omega * damping(displacement * omega) / CONSTANT
 
 
-def test_a_measured_resonance_that_the_curves_lack_is_shown(identified):
+def test_a_measured_resonance_that_the_curves_lack_is_found(identified):
     backbone, data = identified
     recorded = 4 * needed(TIP)
     assert resonances(backbone, modes(), recorded) == []
-    said = why_no_resonance(backbone, data, recorded, 1.5)
-    # Beyond the data the curves go on straight.
-    most = float(said.split(" to ")[1].split(" N")[0])
-    assert most == pytest.approx(needed(1.5 * TIP), rel=0.05)
-    assert "level 4 has it" in said
-    assert f"{np.sqrt(squared(TIP)) / (2 * np.pi):.5g} Hz" in said
-    own = float(said.split("the curves need ")[1].split(" N")[0])
-    assert own == pytest.approx(needed(TIP), rel=2e-3)  # between nine states of a level
-
-
-def test_without_a_measured_one_the_range_of_forces_is_said(identified):
-    said = why_no_resonance(*identified, 100.0, 1.5)
-    assert said.startswith("there these curves need 0 to ")
-    assert "measured" not in said
+    near = level_in_resonance(data, backbone, 1.03 * recorded)
+    assert near.level == 4
+    assert near.force == pytest.approx(recorded, rel=1e-9)  # a state lies there
+    assert near.frequency == pytest.approx(np.sqrt(squared(TIP)) / (2 * np.pi), rel=1e-9)
+    assert level_in_resonance(data, backbone, 2 * recorded) is None
 
 
 def test_levels_on_one_side_have_no_resonance():

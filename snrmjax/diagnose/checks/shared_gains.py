@@ -1,4 +1,4 @@
-"""Whether an answer means anything: known parameters, a known gain, and the measured forces."""
+"""Gains that an answer moves: of the force, of the modal mass, of what the model states."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -6,17 +6,19 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose.checks.doubts import Doubt
-from snrmjax.diagnose.checks.probabilities import without_effects
-from snrmjax.diagnose.checks.verdict import Judgement, Verdict
 from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.identify.checks.instruments import REMEDY_OF_GAIN, force_gain_undetermined
+from snrmjax.identify.checks.instruments import (
+    REMEDY_OF_GAIN,
+    Determination,
+    force_gain_determined,
+    force_gain_undetermined,
+)
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.library.confusions import FORCE_OR_SENSOR_GAIN, SIZE_OF_RESPONSE
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD
 
-_MISSED = 0.25  # of a level's force, rms, by which a completed model does not reproduce the test
 _PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
 _MOVED_GAIN = 0.05  # of its logarithm, by which a right law moves a gain that smooth curves gave
 _FAR_MASS = 3.0  # of 1σ of a modal mass of which none is stated, beyond which it is no reason
@@ -87,38 +89,18 @@ def notes_on_found_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ..
     )
 
 
-def with_answer_checked(
-    judgement: Judgement, misfit: WeightedMisfit, fit: EffectFit, std: Mapping[str, float]
-) -> Judgement:
-    """The verdict after a look at what the answer says of the structure.
+def doubts_on_gains(
+    misfit: WeightedMisfit, fit: EffectFit, std: Mapping[str, float]
+) -> list[Doubt]:
+    """Reasons to doubt an answer by what it says of instruments and structure.
 
-    `unknown` where the gain of the force is not determined or has moved far from its first value,
-    or where the completed model needs other forces than acted for the motions that were measured;
-    `ambiguous` where an effect's strength is smaller than its own 1σ, or where a gain stands for
-    what an error of the modal mass, of which none is stated, could be as well.
-
-    Arguments: `std` of the effects' parameters by name. Verdicts that give no answer stay.
+    A gain of the force that the data do not determine, or that has moved far from its first value;
+    a strength smaller than its own 1σ; and a gain that stands for what an error of the modal mass,
+    of which none is stated, could be as well. Arguments: `std` of the effects' parameters by name.
     """
-    if not judgement.verdict.is_answer:
-        return judgement
-    every = [_on_gain(misfit, fit), _on_forces(misfit, fit), *_on_strengths(fit, std)]
-    every += _on_modal_mass(misfit, fit)
-    found = [one for one in every if one is not None]
-    refuted = [one for one in found if one.refutes]
-    if refuted:
-        reasons = tuple(one.reason for one in refuted)
-        open_questions = (*refuted, *judgement.open_questions)
-        return Judgement(
-            Verdict.UNKNOWN,
-            (*reasons, *judgement.reasons),
-            open_questions,
-            without_effects(judgement.probabilities),
-        )
-    if not found:
-        return judgement
-    reasons = (*judgement.reasons, *(one.reason for one in found))
-    open_questions = (*judgement.open_questions, *found)
-    return Judgement(Verdict.AMBIGUOUS, reasons, open_questions, judgement.probabilities)
+    of_gain = _on_gain(misfit, fit)
+    found = [] if of_gain is None else [of_gain]
+    return [*found, *_on_strengths(fit, std), *_on_modal_mass(misfit, fit)]
 
 
 def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
@@ -143,7 +125,7 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
         return Doubt(reason, _remedy())
     if not said:
         return None
-    if "cannot" in said:
+    if force_gain_determined(gain.std) is Determination.NOT_AT_ALL:
         return Doubt(said, _remedy(), refutes=True)
     reason = "the force gain, which these data hardly determine, may be a part of the answer."
     return Doubt(reason, _remedy())
@@ -151,35 +133,6 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
 
 def _remedy() -> str:
     return f"{REMEDY_OF_GAIN[0].lower()}{REMEDY_OF_GAIN[1:]}"
-
-
-def _on_forces(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
-    """That the completed model does not reproduce the forces of the test."""
-    missed = missed_forces(misfit, fit)
-    worst = max(missed, key=lambda level: missed[level])
-    if missed[worst] < _MISSED:
-        return None
-    reason = (
-        "the completed model does not reproduce the measured responses: for the motions of level "
-        f"{worst} it needs forces that differ from those that acted by {100 * missed[worst]:.0f} % "
-        "(root mean square)."
-    )
-    return Doubt(reason, "state the noise of a repeated test and check the model", refutes=True)
-
-
-def missed_forces(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, float]:
-    """By level: relative misfit (rms) of the force that the completed model needs.
-
-    Less the errors that states share: those of levels, of the baseline's own parameters and of a
-    free gain, at their most likely values. Over the force that acted by that gain.
-    """
-    noise, gain = misfit.noise, gain_found(misfit, fit)
-    rows = np.zeros(noise.known.shape)
-    rows[noise.state, noise.column] = noise.without_shared(fit.rows)
-    columns = np.einsum("sij,sj->si", np.linalg.pinv(noise.whiten), rows)[:, :2]
-    left = np.sum(columns**2, axis=1) / (1.0 if gain is None else gain.value) ** 2
-    level = np.asarray(misfit.predictions.level_numbers)
-    return {int(k): float(np.sqrt(np.mean(left[level == k]))) for k in np.unique(level)}
 
 
 def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:

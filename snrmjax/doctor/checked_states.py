@@ -1,24 +1,55 @@
-"""Tables of steady states as the doctor looks at them: one mode at the sensor that moves most."""
+"""Tables of steady states as the check looks at them: one mode at the sensor that moves most."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Complex, Float, Int
 
-from snrmjax.doctor.balance_fit import UNSTATED, ModeStates
+from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.modes import residual_velocity
 from snrmjax.model.structures import Structure
 
 
-def mode_states(
-    data: SteadyStates, model: Structure | None, sensor: int, rows: Bool[np.ndarray, " state"]
-) -> ModeStates:
+class CheckedStates(NamedTuple):
+    """States of one sensor, and what an error of import or of the test may depend on."""
+
+    test: TestStates  # as recorded, without what moves beside the mode
+    row: Int[np.ndarray, " state"]  # in the table
+    beside: Complex[np.ndarray, " state"]  # m/s, of the other modes
+    order: Float[np.ndarray, " state"]  # of the test, 0 to 1
+    noise: float  # stated 1σ of velocities, relative; NaN where none is
+    files: tuple[tuple[int, ...], ...]  # levels of each table, where there are several
+
+    @property
+    def recorded(self) -> Complex[np.ndarray, " state"]:
+        """Phasors as they stand in the table, with the sign of the mode."""
+        return self.test.velocity + self.beside
+
+    @property
+    def mobility(self) -> Float[np.ndarray, " state"]:
+        """|V|/F."""
+        return np.abs(self.test.velocity) / self.test.force
+
+    def read(self, velocity: Complex[np.ndarray, " state"]) -> TestStates:
+        """The states with other phasors in the place of the recorded ones."""
+        return self.test._replace(velocity=velocity - self.beside)
+
+
+def checked_states(
+    data: SteadyStates,
+    model: Structure | None,
+    sensor: int,
+    rows: Bool[np.ndarray, " state"],
+    files: tuple[tuple[int, ...], ...] = (),
+) -> CheckedStates:
     """Some rows of a table at one sensor, with what the model says of its mode.
 
-    Without a model the modal constant is one and the other modes are taken to be still.
+    Without a model the modal constant is one and the other modes are taken to be still. Errors
+    count by their proportions: their common size is always found from the states.
     """
     at = np.flatnonzero(rows)
     # As NumPy's: nothing compiles for the table's own number of states.
@@ -39,20 +70,21 @@ def mode_states(
             ]
         gain, phase, frequency, damping = model.level_stds
         own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
-        stds = (gain, phase, frequency / own, damping / max(ratio, 1e-6))
+        stds = (gain, phase, 2 * frequency / own, damping / max(ratio, 1e-6))
     sign = -1.0 if constant < 0 else 1.0
-    errors = np.asarray(relative_errors(some))[:, sensor]
-    stated = bool(np.all(np.isfinite(errors)))
-    if not stated:
-        errors = np.tile([0.0, UNSTATED, UNSTATED], (len(at), 1))
+    errors, stated = state_errors(np.asarray(relative_errors(some))[:, sensor])
+    noise = float(np.median(errors[:, 1:])) if stated else np.nan
+    if stated:
+        errors = errors / noise
     order = np.asarray(some.order)
     if not np.all(np.isfinite(order)):
         order = np.linspace(0.0, 1.0, len(at))
     level = np.unique(np.asarray(some.level), return_inverse=True)[1]
-    return ModeStates(
-        *(at, level, omega, force, sign * velocity, sign * beside, order, errors, stated),
-        *(abs(constant) or 1.0, stds),
+    test = TestStates(
+        *(level, omega, force, sign * (velocity - beside), errors, False),
+        *(abs(constant) or 1.0, stds, 0.0),
     )
+    return CheckedStates(test, at, sign * beside, order, noise, files)
 
 
 def usable_rows(data: SteadyStates, sensor: int) -> Bool[np.ndarray, " state"]:

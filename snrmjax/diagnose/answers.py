@@ -1,0 +1,146 @@
+"""Answers under some errors: what a search finds, weighed, and found again where it misfits."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose import evidence, priors
+from snrmjax.diagnose.checks.cross_validation import rms_misfit
+from snrmjax.diagnose.checks.neighbours import neighbour_noise
+from snrmjax.diagnose.decide import most_probable
+from snrmjax.diagnose.misfit.effect_fit import at_phases_of, baseline_fit
+from snrmjax.diagnose.misfit.level_errors import at_level_errors, with_harmonics
+from snrmjax.diagnose.misfit.predictions import Predictions
+from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
+from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
+from snrmjax.diagnose.search.model_search import FoundEffects, find_effects, refitted
+from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.effect_base import AbstractHysteresis, AbstractKinked
+from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effects import EFFECTS
+
+_NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
+_WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
+_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
+_CORRECTIONS, _BETTER = 2, 0.9  # of large errors of levels: at most, and share of χ² that is left
+_BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
+_LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
+
+
+class Answered(NamedTuple):
+    """What a search found under some errors, with the most probable answer first."""
+
+    found: FoundEffects
+    weights: evidence.Weights
+    coarse: FoundEffects | None = None  # what was found with few harmonics, where many were taken
+
+    @property
+    def log_weight(self) -> float:
+        """ln of the prior odds times the evidence of the most probable answer."""
+        return self.weights.answers[0].log_weight
+
+
+class Search(NamedTuple):
+    """What is looked for, and from where."""
+
+    scales: MotionScales
+    kinds: tuple[str, ...]
+    further_starts: Mapping[str, tuple[float, ...]]
+
+    def among(self, answered: Answered, n: int) -> "Search":
+        """A search among the effects of the `n` best answers so far."""
+        answers = answered.weights.answers[:n]
+        near = {kind for one in answers for kind in one.kinds}
+        return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
+
+    def found(self, misfit: WeightedMisfit) -> FoundEffects:
+        """The effects that explain a misfit."""
+        return find_effects(misfit, self.scales, self.kinds, self.further_starts)
+
+    def answered(self, predictions: Predictions) -> Answered:
+        """What is missing; where no noise is stated, with noise as large as what is left.
+
+        That begins with what smooth curves of amplitude leave, and is never below what
+        neighbouring states show.
+        """
+        misfit, least = weighted_misfit(predictions), 0.0
+        stated, reference = predictions.chosen.noise_stated, predictions.reference
+        if not stated:
+            alone = baseline_fit(misfit)
+            least = float(np.sqrt(neighbour_noise(at_phases_of(misfit, alone), alone).variance))
+            size = least
+            if reference is not None:
+                size = reference.posterior.hyper.noise / ASSUMED_ERROR
+            size, least = max(size, _LEAST_NOISE), max(min(least, size), _LEAST_NOISE)
+            misfit = weighted_misfit(predictions.with_errors_scaled(size / predictions.error_scale))
+        found = self.found(misfit)
+        for _ in range(0 if stated else _ROUNDS):
+            size = misfit.predictions.error_scale
+            factor = max(rms_misfit(found.misfit, found.fit), least / size)
+            if _NEAR < factor < 1 / _NEAR:
+                break
+            misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
+            found = self.found(misfit)
+        weights = evidence.weights_of(found)
+        return Answered(most_probable(found, weights), weights)
+
+
+def best_answer(search: Search, predictions: Predictions, data: SteadyStates) -> Answered:
+    """The most probable answer, refined where it leaves more than noise.
+
+    First to a higher order; then with errors of levels that nobody stated.
+    """
+    answered = search.answered(predictions)
+    if leaves_more_than_noise(answered):
+        answered = refined(answered, search.among(answered, _NEAR_ANSWERS), data)
+    if leaves_more_than_noise(answered) and levels_may_differ(predictions):
+        now = (answered.coarse or answered.found).misfit.predictions
+        near = search.among(answered, _NEAR_ANSWERS)
+        apart = refined(near.answered(with_unstated_level_errors(now)), near, data)
+        if apart.log_weight + np.log(priors.LEVELS_APART) > answered.log_weight:
+            return apart
+    return answered
+
+
+def refined(answered: Answered, search: Search, data: SteadyStates) -> Answered:
+    """An answer that leaves more than noise, found again to a higher order.
+
+    At the levels' most likely errors, where these are large; and with many harmonics, since kinks
+    and slip have no last one.
+    """
+    for _ in range(_CORRECTIONS):
+        found = answered.found
+        predictions = at_level_errors(found.misfit, found.fit.rows, data)
+        if predictions is None or not leaves_more_than_noise(answered):
+            break
+        again = search.answered(predictions)
+        if again.found.fit.chi_square > _BETTER * found.fit.chi_square:
+            break
+        answered = again
+    found = answered.found
+    kinked = any(issubclass(EFFECTS[kind], _WITHOUT_LAST_HARMONIC) for kind in found.fit.kinds)
+    if not kinked or not leaves_more_than_noise(answered):
+        return answered
+    many = with_harmonics(found.misfit.predictions, data, MANY_HARMONICS)
+    winner = refitted(weighted_misfit(many), search.scales, found.fit)
+    if winner.chi_square > _BETTER * found.fit.chi_square:
+        return answered
+    return search.among(answered, _NEAREST_ANSWERS).answered(many)._replace(coarse=found)
+
+
+def leaves_more_than_noise(answered: Answered) -> bool:
+    """Whether the most probable answer leaves more than noise, or than smooth curves leave."""
+    predictions = answered.found.misfit.predictions
+    if predictions.chosen.noise_stated or predictions.reference is None:
+        return answered.found.p_value < priors.REJECTED
+    size = ASSUMED_ERROR * predictions.error_scale
+    return bool(size > _BEYOND_CURVES * predictions.reference.posterior.hyper.noise)
+
+
+def levels_may_differ(predictions: Predictions) -> bool:
+    """Whether errors of levels that nobody stated, and smooth curves hide, may be in the way."""
+    stated = all(std > 0 for std in predictions.given.level_stds)
+    return predictions.reference is not None and predictions.chosen.n_levels > 1 and not stated

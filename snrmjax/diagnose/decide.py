@@ -1,0 +1,163 @@
+"""The verdict: the one place where it is decided, from posteriors and predictive checks.
+
+Probabilities are those of `evidence.weights_of`. Checks can refute what they cannot prove: a law
+that contradicts a power of amplitude in the data, a level that was left out of the fit and missed,
+a gain of the force that the data do not determine. What they refute keeps a small share of its
+probability; the rest is that of a law outside the library.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.checks.cross_validation import HeldOutLevels
+from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways
+from snrmjax.diagnose.checks.doubts import Doubt, doubts, grows, part_of, wider_than_measured
+from snrmjax.diagnose.checks.level_forces import LevelForces
+from snrmjax.diagnose.checks.patterns import left_curve, pattern
+from snrmjax.diagnose.checks.predicted_levels import missed_levels
+from snrmjax.diagnose.checks.shared_gains import doubts_on_gains
+from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
+from snrmjax.diagnose.search.locating import Located, power_of_answer
+from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.diagnose.verdict import Verdict
+
+
+class Judgement(NamedTuple):
+    """A verdict, its reasons, and what stays open."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    open_questions: tuple[Doubt, ...]
+    probabilities: Mapping[str, float]
+
+
+def most_probable(found: FoundEffects, weights: Weights) -> FoundEffects:
+    """What a search found, with the most probable answer, and of every effect its class.
+
+    To the class of an effect belong those in its place in answers whose odds to the best one are
+    `AS_GOOD` or better; answers of other sizes count for the effect that they lack, or for the
+    first.
+    """
+    best = weights.answers[0]
+    rivals = [
+        one
+        for one in weights.answers[1:]
+        if one.log_weight > best.log_weight + np.log(priors.AS_GOOD) and one.kinds
+    ]
+    classes = [[kind] for kind in best.fit.kinds]
+    for one in rivals if classes else ():
+        lost = [k for k, kind in enumerate(best.fit.kinds) if kind not in one.kinds]
+        for kind in sorted(one.kinds - best.kinds):
+            group = classes[lost[0] if lost else 0]
+            if kind not in group:
+                group.append(kind)
+    return found._replace(fit=best.fit, classes=tuple(tuple(group) for group in classes))
+
+
+def decide(
+    found: FoundEffects,
+    weights: Weights,
+    located: tuple[Located, ...],
+    levels: HeldOutLevels | None,
+    errors: Mapping[str, float],
+    rival: LevelForces | None,
+) -> Judgement:
+    """The verdict. The first rule that applies decides.
+
+    1. `noise_rejected`: noise of another size than stated is more probable than all else, and what
+       is left has no pattern.
+    2. `unknown`: a law outside the library has a probability of `NO_ANSWER` or more.
+    3. `none`: that is the most probable answer.
+    4. `unknown`: a check refutes the answer.
+    5. `ambiguous`: several effects are as good, or a check leaves a question open.
+    6. `named`.
+
+    Arguments: `located` are the parts of the misfit before any effect was named; `levels` are None
+    where there are too few to leave one out; `errors` are 1σ of the answer's parameters; `rival`
+    are gains of the forces of levels that explain the data as well.
+    """
+    probabilities = weights.probabilities()
+    misfit, fit = found.misfit, found.fit
+    structure = pattern(misfit, fit) if found.p_value < priors.REJECTED else None
+    of_noise, outside = probabilities.get(NOISE_REJECTED, 0.0), probabilities.get(UNKNOWN, 0.0)
+    if of_noise > 0.5 and structure is None:
+        return Judgement(Verdict.NOISE_REJECTED, (_of_noise(found),), (), probabilities)
+    if outside + (of_noise if structure is not None else 0.0) >= priors.NO_ANSWER:
+        left = structure or left_curve(misfit, fit)
+        reasons = ("no effect of the library explains what is left.", *([left] if left else []))
+        return Judgement(Verdict.UNKNOWN, reasons, (), _without_noise(probabilities))
+    if not fit.kinds:
+        return Judgement(Verdict.NOTHING_MISSING, (), (), probabilities)
+    every = imitations_of(found, located)
+    every += doubts_on_gains(misfit, fit, errors)
+    every += missed_levels(levels, found, doubted=any(not one.identical for one in every))
+    if rival is not None:
+        every.append(rival.doubt)
+    if not every and outside > priors.NO_DOUBT:
+        every.append(_outside(found, outside))
+    reasons = tuple(one.reason for one in every)
+    if any(one.refutes for one in every):
+        return Judgement(Verdict.UNKNOWN, reasons, tuple(every), _refuted(probabilities))
+    unclear = every or any(len(group) > 1 for group in found.classes)
+    verdict = Verdict.AMBIGUOUS if unclear else Verdict.NAMED
+    return Judgement(verdict, reasons, tuple(every), probabilities)
+
+
+def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Doubt]:
+    """What a law outside the library could do as well as the answer."""
+    misfit, fit = found.misfit, found.fit
+    if not fit.kinds:
+        return []
+    part = part_of(fit.kinds)
+    stepped = np.asarray(misfit.predictions.chosen.states.frequency)
+    return doubts(
+        fit.kinds,
+        located,
+        misfit.predictions.chosen.orders,
+        frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind)),
+        power_of_answer(misfit, found.baseline, fit, part) if part else None,
+        frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0),
+        frozenset(k for k in fit.kinds if wider_than_measured(k, fit.of_kind(k)[1:], stepped)),
+    )
+
+
+def _refuted(probabilities: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities where the answers given are refuted: most of theirs is that of `unknown`."""
+    kept = {name: p for name, p in probabilities.items() if name in (NONE, NOISE_REJECTED)}
+    others = {
+        name: priors.OPEN * p
+        for name, p in probabilities.items()
+        if name not in (NONE, NOISE_REJECTED, UNKNOWN)
+    }
+    found = {**kept, **others}
+    found[UNKNOWN] = 1.0 - sum(found.values())
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def _without_noise(probabilities: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities where what is left has a pattern, and so is no noise of any size."""
+    found = {name: p for name, p in probabilities.items() if name != NOISE_REJECTED}
+    found[UNKNOWN] = 1.0 - sum(p for name, p in found.items() if name != UNKNOWN)
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def _of_noise(found: FoundEffects) -> str:
+    """Why the noise is not as stated, in words."""
+    n = found.misfit.n_rows - len(found.fit.values)
+    times = float(np.sqrt(found.fit.chi_square / n))
+    size = "overstated" if times < 1 else "understated"
+    return f"the misfit is {times:.2g} times the stated noise, without a pattern: it is {size}."
+
+
+def _outside(found: FoundEffects, probability: float) -> Doubt:
+    """The doubt that a misfit leaves which is small, but smooth as that of another law."""
+    curve = left_curve(found.misfit, found.fit)
+    said = "what is left is small, but smoother than noise." if curve is None else curve
+    return Doubt(
+        f"a law outside the library has a probability of {100 * probability:.0f} %: {said}",
+        "widen the range of levels at both ends and record the second and third harmonics",
+        identical=True,
+    )

@@ -1,0 +1,357 @@
+"""Evidence of answers: how probable each makes the data, whatever its parameters are.
+
+Laplace's approximation about the best fit. The priors are, of a strength, a Cauchy distribution
+about zero with the strength from which a fit begins as its scale, which changes the dynamic
+stiffness by `VISIBLE_CHANGE`, and of every other parameter a flat one between its bounds. The
+baseline's parameters, the errors of levels and a discrepancy are linear and marginalised exactly;
+the sizes of noise, of levels' errors and of the discrepancy by their most likely values and
+Laplace's approximation, each answer with its own.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import logsumexp
+
+from snrmjax.diagnose import priors
+from snrmjax.diagnose.misfit.candidates import candidate
+from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.predictions import scales_of
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
+from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
+from snrmjax.identify.test_model.linear_gaussian import LinearRows, most_likely
+from snrmjax.identify.test_model.priors import (
+    LEVELS,
+    UNSTATED_NOISE,
+    FlatSize,
+    HalfNormalSize,
+)
+from snrmjax.model.effect_metadata import MotionScales
+from snrmjax.model.effects import EFFECTS, effect_parameters
+
+NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
+
+_AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
+_BESIDE = 6  # answers that are compared with themselves beside a discrepancy
+_NOISES = 57  # of the noise's logarithm, that are summed over
+
+
+class Weighed(NamedTuple):
+    """An answer with the logarithm of its prior odds times its evidence."""
+
+    kinds: frozenset[str]
+    fit: EffectFit
+    log_weight: float
+
+
+class Weights(NamedTuple):
+    """All answers that were considered, the most probable first, and what else there is."""
+
+    answers: tuple[Weighed, ...]
+    unknown: float  # logarithms of weights
+    noise_rejected: float
+
+    def with_imitations(self, n: int) -> "Weights":
+        """With so many laws outside the library that are known to act like the best answer."""
+        best = self.answers[0]
+        if not n or not best.kinds:
+            return self
+        more = np.log(n * priors.IMITATION) + best.log_weight
+        return self._replace(unknown=float(np.logaddexp(self.unknown, more)))
+
+    def probabilities(self) -> dict[str, float]:
+        """Of every answer by its name, the largest first; they add up to one."""
+        logs = {answer_name(one.kinds): one.log_weight for one in self.answers}
+        logs |= {UNKNOWN: self.unknown, NOISE_REJECTED: self.noise_rejected}
+        logs = {name: value for name, value in logs.items() if np.isfinite(value)}
+        total = logsumexp(list(logs.values()))
+        found = {name: float(np.exp(value - total)) for name, value in logs.items()}
+        return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def answer_name(kinds: Iterable[str]) -> str:
+    """The name of an answer: its effects in alphabetic order, joined by `+`; `none` without any."""
+    return "+".join(sorted(kinds)) or NONE
+
+
+class Marginal(NamedTuple):
+    """An answer, linear about its best fit: all that is unknown, with prior variances.
+
+    Rows are those of `WeightedMisfit`, each in units of its own state's noise.
+    """
+
+    rows: LinearRows
+    variance: Float[np.ndarray, " unknown"]  # at the sizes that the misfit's noise has
+    group: Int[np.ndarray, " unknown"]  # whose size counts: of `_Sizes`, −1 where it is known
+    penalty: float  # of a fit that had not ended
+
+
+class _Sizes(NamedTuple):
+    """Sizes over those of the misfit's noise: of levels' errors, of a discrepancy, of noise."""
+
+    densities: tuple[
+        HalfNormalSize | FlatSize | None, ...
+    ]  # of levels' four, then of a discrepancy
+    bounds: tuple[tuple[float, float], ...]
+    noise: tuple[Callable[[np.ndarray], np.ndarray], ...]  # ln priors on a grid: right, wrong
+    noise_bounds: tuple[float, float]
+
+
+def weights_of(found: FoundEffects) -> Weights:
+    """All answers that a search considered, weighed.
+
+    `unknown` has the weight of answers beside a discrepancy of unknown size, and of laws that act
+    like one. `noise_rejected` has that
+    of all answers with noise of another size, where noise is stated.
+    """
+    misfit = found.misfit
+    sizes = _sizes_of(misfit)
+    best: dict[frozenset[str], Weighed] = {}
+    marginals: dict[frozenset[str], Marginal] = {}
+    wrong: dict[frozenset[str], float] = {}
+    for fit in (found.baseline, found.fit, *found.considered):
+        marginal = marginal_of(misfit, fit)
+        if marginal is None:
+            continue
+        kinds = frozenset(fit.kinds)
+        evidence = log_evidence(marginal, sizes)
+        weight = _log_prior(len(kinds)) + evidence.right
+        if kinds not in best or weight > best[kinds].log_weight:
+            best[kinds], marginals[kinds] = Weighed(kinds, fit, weight), marginal
+            wrong[kinds] = _log_prior(len(kinds)) + evidence.wrong
+    answers = tuple(sorted(best.values(), key=lambda one: -one.log_weight))
+    unknown = [np.log(priors.UNNAMED) + one.log_weight for one in answers if one.kinds]
+    directions = list(discrepancies(misfit))
+    for one in answers[:_BESIDE]:
+        prior = np.log(priors.DISCREPANCY / len(directions)) + _log_prior(len(one.kinds))
+        for columns in directions:
+            beside = with_discrepancy(misfit, one.fit, marginals[one.kinds], columns)
+            unknown.append(prior + log_evidence(beside, sizes).right)
+    rejected = float(np.log(priors.WRONG_NOISE) + logsumexp(list(wrong.values())))
+    return Weights(answers, float(logsumexp(unknown)), rejected)
+
+
+def marginal_of(misfit: WeightedMisfit, fit: EffectFit) -> Marginal | None:
+    """A fit with the priors of its parameters; None where it has no motion."""
+    noise = misfit.noise
+    arms = _arms(misfit, fit)
+    if not (np.all(np.isfinite(fit.rows)) and np.all(np.isfinite(arms))):
+        return None
+    design = np.concatenate([arms, noise.shared], axis=1)
+    group = np.concatenate([np.full(arms.shape[1], -1), noise.shared_kind])
+    variance = np.ones(design.shape[1])
+    left, own = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
+    promised = 0.0
+    if own.shape[1]:
+        step = np.linalg.lstsq(own, left, rcond=1e-10)[0]
+        promised = float(np.sum((own @ step) ** 2))
+    # The most likely parameters are the fit's; what more a linear step promises is not believed.
+    penalty = 0.5 * promised if promised > _AGAIN else 0.0
+    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), variance, group, penalty)
+
+
+def with_discrepancy(
+    misfit: WeightedMisfit, fit: EffectFit, alone: Marginal, columns: Float[np.ndarray, "row any"]
+) -> Marginal:
+    """An answer beside a discrepancy in some directions, of the size of noise for unit values."""
+    design = np.concatenate([_arms(misfit, fit), misfit.noise.shared, columns], axis=1)
+    n = columns.shape[1]
+    return Marginal(
+        LinearRows.of(design, fit.rows, _units(misfit)),
+        np.append(alone.variance, np.ones(n)),
+        np.append(alone.group, np.full(n, 4)),
+        alone.penalty,
+    )
+
+
+class Evidence(NamedTuple):
+    """ln p of the data, for noise as it is stated to be and for noise stated wrong."""
+
+    right: float
+    wrong: float
+
+
+def _units(misfit: WeightedMisfit) -> float:
+    """ln of the units of all rows, so that answers under other noise can be compared."""
+    return -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
+
+
+def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
+    """ln p of the data, whatever the sizes are, as far as the priors allow.
+
+    Sizes of levels' errors and of a discrepancy by Laplace's approximation about the most likely
+    ones, the noise by a sum over its logarithm there.
+    """
+    used = np.unique(model.group[model.group >= 0])
+    member = model.group[:, None] == used
+    densities = [sizes.densities[place] for place in used]
+
+    def likelihood(point: np.ndarray) -> tuple[float, np.ndarray]:
+        variance = model.variance * np.exp(2 * (member @ point[1:]))
+        value, by_scale, by_variance = model.rows.log_likelihood(np.exp(point[0]), variance)
+        return value, np.append(by_scale, 2 * (by_variance @ member))
+
+    def with_priors(point: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slopes = likelihood(point)
+        for k, density in enumerate(densities, 1):
+            if density is not None:
+                own, slope = density.log_density(point[k])
+                value, slopes[k] = value + own, slopes[k] + slope
+        return value, slopes
+
+    bounds = [sizes.noise_bounds, *(sizes.bounds[place] for place in used)]
+    found = most_likely(with_priors, np.zeros(len(bounds)), bounds)
+    others = np.linalg.inv(found.covariance)[1:, 1:]
+    volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
+    top = with_priors(found.point)[0] - likelihood(found.point)[0]
+    grid = np.linspace(*sizes.noise_bounds, _NOISES)
+    logs = np.array([likelihood(np.append(one, found.point[1:]))[0] for one in grid])
+    logs += volume + top - model.penalty
+    return Evidence(*(float(logsumexp(logs + prior(grid))) for prior in sizes.noise))
+
+
+def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any"]]:
+    """Smooth misfits that a law outside the library may leave, one column a value of theirs.
+
+    Stiffness and damping as functions of the amplitude; every harmonic as one; the stiffness as a
+    function of the order of the test; any force that is smooth along a level. With unit normal
+    values a set has the size of the noise.
+    """
+    chosen, noise = misfit.predictions.chosen, misfit.noise
+    velocity = np.asarray(chosen.states.velocity)[:, 0]
+    phase = np.angle(velocity)
+    amplitude = hat_functions(np.log(np.abs(velocity)), 6)[noise.state]
+    order = np.argsort(np.argsort(chosen.rows)).astype(float)
+    of_test = hat_functions(order, 8)[noise.state]
+    linear = misfit.by_linear
+    yield _scaled(np.concatenate([linear[:, [k]] * amplitude for k in (0, 1)], axis=1))
+    harmonics = list(_harmonics(misfit, phase, amplitude))
+    if harmonics:
+        yield _scaled(np.concatenate(harmonics, axis=1))
+    yield _scaled(linear[:, [0]] * of_test)
+    yield _scaled(_along_levels(misfit, phase))
+
+
+def hat_functions(
+    where: Float[np.ndarray, " state"], knots: int
+) -> Float[np.ndarray, "state knot"]:
+    """Piecewise linear curves with equally many states between any two knots."""
+    at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
+    return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
+
+
+def _harmonics(
+    misfit: WeightedMisfit, phase: Float[np.ndarray, " state"], amplitude: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Of every harmonic both parts, at phases that turn with the fundamental."""
+    noise, chosen = misfit.noise, misfit.predictions.chosen
+    n_sensors = len(chosen.sensors)
+    for place, number in enumerate(chosen.orders):
+        first = 2 * (n_sensors + place)
+        for turn in (1.0, 1j):
+            unit = turn * np.exp(1j * number * phase)
+            columns = np.zeros(noise.known.shape)
+            columns[:, first], columns[:, first + 1] = unit.real, unit.imag
+            yield noise.noise_units(columns[None])[0][:, None] * amplitude
+
+
+def _along_levels(misfit: WeightedMisfit, phase: Float[np.ndarray, " state"]) -> np.ndarray:
+    noise, level = misfit.noise, np.asarray(misfit.predictions.chosen.states.level)
+    parts = []
+    for number in np.unique(level):
+        mine = level == number
+        curves = np.zeros((len(level), 4))
+        curves[mine] = hat_functions(phase[mine], 4)
+        parts += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
+    return np.concatenate(parts, axis=1)
+
+
+def _scaled(columns: np.ndarray) -> np.ndarray:
+    """Columns that together have the size of the noise where they act."""
+    size = np.sqrt(np.sum(columns**2, axis=1))
+    acts = size > 0
+    return columns / np.sqrt(np.mean(size[acts] ** 2)) if acts.any() else columns
+
+
+def _sizes_of(misfit: WeightedMisfit) -> _Sizes:
+    """Priors of the sizes, over what they are in the misfit's noise."""
+    predictions = misfit.predictions
+    free = predictions.unstated_levels
+    levels = [
+        HalfNormalSize(prior.scale / size) if is_free and size > 0 else None
+        for prior, size, is_free in zip(LEVELS, predictions.level_sizes, free, strict=True)
+    ]
+    ends = [
+        (np.log(1e-3), np.log(1e3)) if density is not None else (0.0, 0.0) for density in levels
+    ]
+    low, high = np.log(priors.DISCREPANCY_SIZES)
+    flat = FlatSize(low, high)
+    own = (_right_noise, _wrong_noise), (-priors.MOST_NOISE, priors.MOST_NOISE)
+    if not predictions.chosen.noise_stated:
+        taken = ASSUMED_ERROR * predictions.error_scale
+        unstated = UNSTATED_NOISE._replace(median=UNSTATED_NOISE.median / taken)
+
+        def of_logarithm(logs: np.ndarray) -> np.ndarray:
+            return _normalised(np.array([unstated.log_density(one)[0] for one in logs]))
+
+        own = (of_logarithm, lambda logs: np.full(len(logs), -np.inf)), (-2.5, 2.5)
+    return _Sizes((*levels, flat), (*ends, (low, high)), *own)
+
+
+def _right_noise(logs: np.ndarray) -> np.ndarray:
+    density = -0.5 * (logs / priors.RIGHT_NOISE) ** 2
+    return _normalised(np.where(_tolerated(logs), density, -np.inf))
+
+
+def _wrong_noise(logs: np.ndarray) -> np.ndarray:
+    return _normalised(np.where(_tolerated(logs), -np.inf, 0.0))
+
+
+def _tolerated(logs: np.ndarray) -> np.ndarray:
+    low, high = priors.TOLERATED_NOISE
+    return (logs >= low) & (logs <= high)
+
+
+def _normalised(logs: np.ndarray) -> np.ndarray:
+    return np.asarray(logs - logsumexp(logs))
+
+
+def _log_prior(n_effects: int) -> float:
+    """ln of the prior odds of one answer with so many effects to none."""
+    return float(np.log(priors.EFFECTS[n_effects]) - np.log(comb(len(EFFECTS), n_effects)))
+
+
+def _arms(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, "row parameter"]:
+    """Slopes by an answer's parameters, times the width of their priors."""
+    if not fit.kinds:
+        return np.zeros((misfit.n_rows, 0))
+    scales = scales_of(misfit.predictions)
+    law = coordinates(fit.labels, scales.amplitude)
+    width = np.zeros(len(fit.values))
+    for kind in fit.kinds:
+        mine = [k for k, label in enumerate(fit.labels) if label.startswith(f"{kind}.")]
+        width[mine] = _widths(kind, law.inward(fit.values)[mine], scales)
+    return law.slopes(fit.values, fit.slopes) * width
+
+
+def _widths(
+    kind: str, at: Float[np.ndarray, " parameter"], scales: MotionScales
+) -> Float[np.ndarray, " parameter"]:
+    """1σ of normal priors about a fit that are as high there as the stated priors."""
+    one = candidate(kind, scales)
+    law = coordinates([f"{kind}.{name}" for name in effect_parameters(kind)], scales.amplitude)
+    starts = np.abs(law.inward(np.array(one.starts)))
+    lower, upper = np.array(one.lower), np.array(one.upper)
+    scale = np.median(starts, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    sides = np.where(lower == 0, 2.0, 1.0)
+    height = sides / (np.pi * scale * (1 + (at / scale) ** 2))
+    flat = np.isfinite(upper - lower)
+    flat[0] = False
+    height[flat] = 1 / (upper - lower)[flat]
+    return 1 / (np.sqrt(2 * np.pi) * height)

@@ -1,0 +1,159 @@
+"""The measured states by themselves, without any law: how errors move them, and their sizes.
+
+The posterior of a test (`identify.test_model`) follows any smooth law. Its slopes weigh the misfit
+of every candidate alike, so that none is favoured by what it would pass on itself, and a model that
+lacks most of the stiffness does not take the weights from the data.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from snrmjax.diagnose.misfit.predictions import Predictions
+from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
+from snrmjax.identify.test_model.priors import LEVELS
+from snrmjax.identify.test_model.states import TestStates, state_errors
+from snrmjax.model.modes import residual_velocity
+
+_FEWEST = 6  # states with a phase
+
+
+class Reference(NamedTuple):
+    """What smooth curves make of the states that have phases."""
+
+    posterior: TestPosterior
+    rows: np.ndarray  # of the compared states, that have a phase
+    by_velocity: Complex[np.ndarray, " state"]  # relative change of the needed force: of log |V|
+    by_phase: Complex[np.ndarray, " state"]  # of the phase
+
+
+def reference_of(predictions: Predictions) -> Reference | None:
+    """Smooth curves through the compared states; None where too few have phases."""
+    chosen = predictions.chosen
+    rows = np.flatnonzero(~chosen.phase_unknown[:, 0])
+    if len(rows) < _FEWEST:
+        return None
+    states = test_states_of(predictions, rows)
+    found = fit_test(states)
+    amplitude = states.amplitude * np.exp(found.corrections[:, 1])
+    curves = found.curves(amplitude)
+    mass, omega = found.modal_mass[0], states.frequency
+    slope = mass * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
+    z = 1j * omega * states.constant * states.force / states.velocity
+    ones = np.ones(len(rows), dtype=complex)
+    return Reference(found, rows, ones + slope / z, 1j * ones)
+
+
+def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
+    """Some of the compared states as the model of a test sees them."""
+    chosen, model = predictions.chosen, predictions.model
+    modes, sensor = model.modes, chosen.sensors[0]
+    j = modes.mode_of_interest
+    columns = [np.asarray(a)[rows] for a in chosen.states]
+    states = type(chosen.states)(*columns)
+    beside: Array = residual_velocity(modes, states.frequency, states.force)
+    constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
+    n_sensors = states.velocity.shape[1]
+    stated = np.asarray(states.error)[:, [0, 1, 1 + n_sensors]]
+    errors, _ = state_errors(stated)
+    if not chosen.noise_stated:
+        errors = np.tile([errors[0, 0] / errors[0, 1], 1.0, 1.0], (len(rows), 1))
+    gain, phase, frequency, damping = predictions.given.level_stds
+    own = float(modes.natural_frequency[j])
+    ratio = float(modes.damping_ratio[j])
+    mass_std = 0.0 if modes.modal_mass_std is None else float(modes.modal_mass_std[j])
+    return TestStates(
+        level=np.asarray(states.level),
+        frequency=np.asarray(states.frequency),
+        force=np.asarray(states.force),
+        velocity=np.sign(constant)
+        * (np.asarray(states.velocity)[:, 0] - np.asarray(beside)[:, sensor]),
+        errors=errors,
+        stated=chosen.noise_stated,
+        constant=abs(constant),
+        level_std=(gain, phase, 2 * frequency / own, damping / ratio if ratio > 0 else 0.0),
+        mass_std=float(np.hypot(mass_std or 0.05, predictions.force_gain_std)),
+        force_is_free=predictions.force_gain_std > 0,
+    )
+
+
+def with_reference(predictions: Predictions) -> Predictions:
+    """The predictions weighed by what the states show by themselves.
+
+    Levels that differ beside smooth curves get errors of the size that these leave them.
+    """
+    reference = reference_of(predictions)
+    if reference is None:
+        return predictions
+    found = reference.posterior
+    sizes = [
+        size if differs else 0.0
+        for size, differs in zip(found.hyper.level_std, found.differing, strict=True)
+    ]
+    return _with_levels(dataclasses.replace(predictions, reference=reference), sizes)
+
+
+def as_weighed(predictions: Predictions, other: Predictions) -> Predictions:
+    """Predictions of the same states weighed as others of them are."""
+    return dataclasses.replace(
+        predictions,
+        model=other.model,
+        reference=other.reference,
+        level_sizes=other.level_sizes,
+        unstated_levels=other.unstated_levels,
+    )
+
+
+def with_unstated_level_errors(predictions: Predictions) -> Predictions:
+    """The predictions with errors of levels of all kinds that nobody stated.
+
+    Few levels may lie on one smooth curve however they differ: a law then says what the curve
+    could not.
+    """
+    found = predictions.reference.posterior
+    sizes = [
+        max(size, prior.scale) for size, prior in zip(found.hyper.level_std, LEVELS, strict=True)
+    ]
+    return _with_levels(predictions, sizes)
+
+
+def _with_levels(predictions: Predictions, sizes: Sequence[float]) -> Predictions:
+    """With errors of levels of these sizes (1σ of `LEVEL_ERRORS`), where none is stated."""
+    found, model = predictions.reference.posterior, predictions.given
+    curves = found.curves(found.states.amplitude)
+    omega = float(np.sqrt(np.median(np.abs(curves.squared_frequency))))
+    damping = float(np.median(np.abs(curves.modal_damping))) / (2 * omega)
+    gain, phase, stiffness, dissipation = sizes
+    fields = {
+        "level_gain_std": gain,
+        "level_phase_std": phase,
+        "level_frequency_std": 0.5 * stiffness * omega,
+        "level_damping_std": dissipation * damping,
+    }
+    free = tuple(
+        not stated > 0 and size > 0 for stated, size in zip(model.level_stds, sizes, strict=True)
+    )
+    new: dict[str, Any] = {
+        name: jnp.asarray(fields[name]) for name, own in zip(fields, free, strict=True) if own
+    }
+    return dataclasses.replace(
+        predictions,
+        model=dataclasses.replace(model, **new),
+        level_sizes=tuple(sizes),
+        unstated_levels=free,
+    )
+
+
+def passed_on_by(
+    reference: Reference, by_error: Float[np.ndarray, "state column input"], n_sensors: int
+) -> Float[np.ndarray, "state column input"]:
+    """Derivatives of the columns by the states' errors, those of the force by the reference."""
+    changed = by_error.copy()
+    for place, slope in ((1, reference.by_velocity), (1 + n_sensors, reference.by_phase)):
+        changed[reference.rows, 0, place] = slope.real
+        changed[reference.rows, 1, place] = slope.imag
+    return changed

@@ -1,0 +1,63 @@
+"""What a diagnosis takes for likely, and where it decides: every number with its reason.
+
+Priors of curves, levels and noise are those of every test (`identify.test_model.priors`).
+"""
+
+import numpy as np
+
+# --- hypotheses: odds against a model that lacks nothing
+
+EFFECTS = (1.0, 0.44, 0.033, 0.0034)
+"""Of none, one, two, three effects of the library, all kinds together: who asks has seen a misfit,
+and structures with one nonlinearity are the rule."""
+
+DISCREPANCY = 0.1
+"""Of an answer beside a misfit that no effect of the library explains, to that answer."""
+
+IMITATION = 0.4
+"""Of a law outside the library that is known to act like an answer, to that answer."""
+
+UNNAMED = 0.004
+"""The same where no such law is known."""
+
+LEVELS_APART = 0.4
+"""Of levels that differ by more than was stated, to levels that do not: temperature and clamps."""
+
+WRONG_NOISE = 0.5
+"""Of noise that is stated wrong, to noise stated right."""
+
+RIGHT_NOISE = 0.2
+"""1σ of the logarithm of noise over stated noise: deviations of ten readings are good to 20 %."""
+
+TOLERATED_NOISE = (-0.38, 0.22)
+"""Of that logarithm, overstated and understated: √2 (0.35) lies between the error of a phasor and
+that of its parts; of noise understated by more than a quarter effects would be named."""
+
+MOST_NOISE = float(np.log(4.0))
+"""The largest wrong statement considered: a factor of four, either way."""
+
+LEVEL_FORCE = 0.3
+"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
+
+# --- sizes that are integrated over
+
+DISCREPANCY_SIZES = (0.3, 100.0)
+"""Root-mean-square size of a discrepancy in units of noise, between which its logarithm is flat."""
+
+# --- decisions
+
+NO_ANSWER = 0.9
+"""Probability of a law outside the library from which on nothing is named: a wrong name costs nine
+times as much as an open question."""
+
+NO_DOUBT = 0.1
+"""The same up to which an answer is named without a word."""
+
+AS_GOOD = 0.05
+"""Odds to the best answer down to which another one belongs to the class: 95 % of the posterior."""
+
+REJECTED = 1e-3
+"""Probability by chance below which a check refutes: some thirty checks are made of a test."""
+
+OPEN = 0.1
+"""Share of their probability that refuted answers keep: checks rest on approximations too."""

@@ -1,0 +1,84 @@
+"""What the check takes for likely, and what it takes to say otherwise: every number that decides.
+
+Relative sizes and natural logarithms where nothing else is said. Errors of states, levels and
+curves have their priors in `identify.test_model.priors`.
+"""
+
+FITS_WELL = 0.06
+"""Relative error of a state, up to which a hypothesis fits in itself: single modes leave 1 to 5 %
+of measured beams, and twelve states pay for their curves with as much."""
+
+SCATTER = 0.012
+"""Relative error of a state that needs no error of the test: analysers and levels leave it."""
+
+PER_STATE = 0.35
+"""ln of the density of one state, by which a hypothesis must beat the table as recorded: errors smaller
+by a sixth. Four times that, half the errors, where it leaves more than `SCATTER`: what a single mode
+leaves of real structures moves by less."""
+
+CLEARLY = 12.0
+"""ln of the odds, before priors, of what is said: e¹², after twenty hypotheses that are each true
+in one table of a hundred, leaves one wrong answer in about a hundred."""
+
+AS_STATED = 1.15
+"""Noise over the stated one, up to which nothing is left to be explained: ten states tell no more."""
+
+FEWEST_STATES = 8
+"""Of a table that is looked at: fewer say nothing of curves of their own."""
+
+OTHER_SCALE = 0.125
+"""|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
+
+MASS_TOLD = 0.05
+"""1σ of ln κ, at most, with which states say it."""
+
+SAME_FACTOR = 0.05
+"""|ln| within which a factor is √2, a unit's or Ω: 1σ of a linear test's modal mass."""
+
+MOVED_MATTERS = 0.25
+"""Change of a natural frequency over its bandwidth, from which on it bends curves."""
+
+GAIN_MATTERS = 0.1
+"""Change of a gain between levels or along a test, beyond instruments' few per cent."""
+
+FORCE_FALLS = 0.5
+"""Share of a level's force that is missing at resonance, or of a response's: half is lost."""
+
+HELD = 0.05
+"""Spread of ln |V| within a level whose response is controlled."""
+
+TOGETHER = 0.6
+"""Correlation of the logarithms of force, mobility and response where one makes the other."""
+
+WILD = 0.5
+"""Mean resultant of steps of phase that are at random, and the step of ln mobility of smooth ones."""
+
+FAR_FREQUENCY, FAR_DAMPING = 0.05, 3.0
+"""Of the lowest level from the linear mode, relative and as a ratio: beyond any drift."""
+
+BAND = 1.96
+"""1σ of a 95 % band."""
+
+MORE_DAMPING = 0.3
+"""Relative, over the linear test's at all amplitudes: mounting alone changes some 10 %."""
+
+FORCE_HARMONIC = 0.04
+"""Of the force's fundamental: amplifiers and good controllers stay below 2 %."""
+
+CERTAIN = 6.0
+"""1σ of what is told by many neighbouring states, lines or steps."""
+
+STILL_MOVING = 0.03
+"""Change of the response over the force at the end of a step: damping is off as much."""
+
+STEPS_MOVE = 0.3
+"""Share of steps that must: a jump or a slow beat may move single ones."""
+
+FLAT_TOP = 0.26
+"""Share of a mean cycle within 3 % of its extremes; a sine has 0.156."""
+
+PILED_UP = 0.003
+"""Share of samples in runs of three at exactly the extreme of their channel."""
+
+FOLDED_LINE = 2e-3
+"""Of the fundamental: a line between harmonics from which on it is one of the drive's."""

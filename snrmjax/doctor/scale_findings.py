@@ -1,0 +1,200 @@
+"""The modal mass that a table asks for over the model's: rms, units, volts, another shape."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.doctor.findings import Finding, Repair, Severity, percent
+from snrmjax.doctor.judgement import Judged, Scale
+from snrmjax.doctor.priors import CERTAIN, MASS_TOLD, MORE_DAMPING, OTHER_SCALE, SAME_FACTOR
+from snrmjax.identify.test_model.states import TestStates
+from snrmjax.model.structures import Structure
+
+
+def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
+    """Whether the states tell a modal mass that is no linear test's, better than the model's."""
+    told = scale.std < MASS_TOLD and abs(np.log(scale.mass)) > OTHER_SCALE
+    return told and scale.judged.beats(as_modelled)
+
+
+def scale_findings(
+    scale: Scale, as_modelled: Judged, model: Structure, where: str
+) -> list[Finding]:
+    """What makes the modal mass another one.
+
+    κ is V_recorded/F_recorded upside down against the truth: an rms force makes it 1/√2, an rms
+    response √2. Other factors are two units', a force in volts or a shape of another scale.
+    """
+    kappa = scale.mass
+    own = f"the states ask for {kappa:.4g} ± {kappa * scale.std:.1g} times the model's modal mass"
+    both = percent(scale.judged.misfit), percent(as_modelled.misfit)
+    size = f"{own} (a state is missed by {both[0]} so, with the model's by {both[1]})"
+    off = float(np.log(kappa))
+    near = float(np.hypot(SAME_FACTOR, 3 * scale.std))
+    if abs(abs(off) - 0.5 * np.log(2)) < near:
+        columns, repair = "velocity columns", Repair(response=2**0.5)
+        if off < 0:
+            columns, repair = "`force_n`", Repair(force=2**0.5)
+        return [
+            Finding(
+                *("rms_for_peak", "error", where),
+                f"{size}, {'√2' if off > 0 else '1/√2'}: {'responses' if off > 0 else 'forces'} "
+                "are rms, not peak.",
+                f"multiply the {columns} by √2 = 1.41421.",
+                repairs=(repair,),
+            )
+        ]
+    states, stiffness = scale.judged.states, scale.judged.stiffness
+    bend = _bend(states, stiffness, model)
+    right = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
+    units = [one for one in _MIXED_UNITS if abs(off - np.log(one.mass)) < near]
+    units = [one for one in units if not (right and one.column == "response")]
+    found = [_wrong_unit(own, units, where)] if units else []
+    severity: Severity = "warning" if units else "error"
+    size = "if the units are right" if units else size
+    volts = Finding(
+        "volts_as_force",
+        severity,
+        where,
+        f"{size}: the force column may be a drive voltage of {kappa:.3g} V per N.",
+        "if it is a voltage, call the column `drive_v` and leave its gain to the identification.",
+        repairs=(Repair(force_unit="V", fit_gain=True),),
+    )
+    shape = Finding(
+        "shape_not_mass_normalised",
+        severity,
+        where,
+        f"{size}: the shape of the model may not be mass-normalised.",
+        f"if so, divide `shape` and `participation` of the model by {np.sqrt(kappa):.4g} each, or "
+        "find the modes anew, scaled by the sensor at the force.",
+        repairs=(Repair(scale_model=True),),
+    )
+    of_force, of_shape = _signs(scale.judged, model, bend)
+    return [*found, *[volts] * (of_force >= of_shape), *[shape] * (of_shape >= of_force)]
+
+
+class MixedUnit(NamedTuple):
+    """Numbers of one unit that were read as another's, and what the modal mass then becomes."""
+
+    column: str  # "response" or "force"
+    unit: str  # of the numbers
+    taken_for: str
+    mass: float  # over the model's
+
+    @property
+    def words(self) -> str:
+        """The mistake."""
+        return f"the {self.column} in {self.unit}, taken for {self.taken_for}"
+
+    @property
+    def repair(self) -> Repair:
+        """Reading with the right unit."""
+        unit = _WRITTEN.get(self.unit, self.unit)
+        if self.column == "force":
+            return Repair(force=1 / self.mass, force_unit=unit)
+        return Repair(response=self.mass, unit=unit)
+
+
+# The likely one first: a number of the small unit read as one of the large, then the reverse.
+_SIZES = (
+    *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
+    *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
+    *(("force", "mN", "N", 1e-3), ("force", "kN", "N", 1e3), ("force", "pounds", "N", 4.4482216)),
+)
+_WRITTEN = {"m/s²": "m/s2", "µm": "um", "inches": "in", "pounds": "lbf"}
+
+
+def _every_mix_up() -> tuple[MixedUnit, ...]:
+    """κ is force over response: upside down for a force, and where both units change places."""
+    taken, swapped = [], []
+    for column, unit, other, size in _SIZES:
+        mass = size if column == "response" else 1 / size
+        taken.append(MixedUnit(column, unit, other, mass))
+        swapped.append(MixedUnit(column, other, unit, 1 / mass))
+    return (*taken, *swapped)
+
+
+_MIXED_UNITS = _every_mix_up()
+
+
+def _wrong_unit(size: str, units: list[MixedUnit], where: str) -> Finding:
+    words = ", or ".join(one.words for one in units)
+    right = ", or ".join(f"{one.column}s in {one.unit}" for one in units)
+    return Finding(
+        *("wrong_unit", "error", where),
+        f"{size}: the factor {units[0].mass:.4g} of {words}.",
+        f"import again, {right}.",
+        repairs=tuple(one.repair for one in units),
+    )
+
+
+def _signs(fit: Judged, model: Structure, bend: float | None) -> tuple[int, int]:
+    """What else speaks for a force that is none, and for a shape of another scale."""
+    modes = model.modes
+    one = modes.mode_of_interest
+    column = np.abs(np.asarray(modes.mode_shape)[:, one])
+    plain = abs(column.max() - 1) < 1e-6 or abs(np.linalg.norm(column) - 1) < 1e-6
+    agrees = bend is not None and abs(np.log(bend)) < OTHER_SCALE * 3
+    rate = 2 * float(modes.natural_frequency[one] * modes.damping_ratio[one])
+    damped = rate > 0 and float(np.min(fit.damping)) > (1 + MORE_DAMPING) * rate
+    return int(agrees) + int(damped), int(plain) + int(bend is not None and not agrees)
+
+
+def _bend(states: TestStates, stiffness: np.ndarray, model: Structure) -> float | None:
+    """The measured growth of stiffness over that of the model's potential; None if both are small.
+
+    K(a) − ω² = (2/π) ∫ f(a cos β) cos β dβ / a of the potential's own force, a = |V|/(Ω Φ).
+    """
+    modes = model.modes
+    one = modes.mode_of_interest
+    terms = [
+        (len(m), float(c))
+        for m, c in zip(model.potential.monomials, model.potential.coefficient, strict=True)
+        if set(m) == {one}
+    ]
+    if not terms:
+        return None
+    q = states.amplitude / float(np.max(np.abs(np.asarray(modes.mode_shape)[:, one])))
+    beta = 2 * np.pi * (np.arange(64) + 0.5) / 64
+    x = q[:, None] * np.cos(beta)
+    force = sum(degree * c * x ** (degree - 1) for degree, c in terms)
+    own = float(modes.natural_frequency[one]) ** 2
+    predicted = 2 * np.mean(force * np.cos(beta), axis=1) / q / own
+    measured = stiffness / own - 1
+    if np.ptp(measured) < 0.01 or np.ptp(predicted) < 1e-6:
+        return None
+    slope = float(np.polyfit(predicted, measured, 1)[0])
+    return slope if slope > 0 else None
+
+
+def shaker_damping(fit: Judged, model: Structure, where: str) -> list[Finding]:
+    """Damping above the linear test's by one amount at all amplitudes, at its own frequency.
+
+    That is what a shaker adds between its drive and the structure, (Bl)²/R of a coil on a voltage;
+    what structures add changes with amplitude. Nothing where the model states no error of its
+    damping.
+    """
+    modes = model.modes
+    one = modes.mode_of_interest
+    own, ratio = float(modes.natural_frequency[one]), float(modes.damping_ratio[one])
+    std = float(modes.damping_ratio_std[one])
+    amplitude = fit.states.amplitude
+    if not std > 0 or not ratio > 0 or np.ptp(np.log(amplitude)) < 1.0:
+        return []
+    times = fit.damping / (2 * own * ratio)
+    excess = float(times.min()) - 1
+    away = float(np.sqrt(max(fit.stiffness[np.argmin(amplitude)], 0.0))) / own - 1
+    certain = CERTAIN * times.min() * std / ratio
+    if excess < max(MORE_DAMPING, certain) or np.ptp(times) > 0.5 * excess or abs(away) > ratio:
+        return []
+    return [
+        Finding(
+            *("volts_as_force", "warning", where),
+            f"the damping is {times.min():.3g} times the model's and more at all amplitudes, at "
+            f"the model's natural frequency within {percent(abs(away))}: a shaker damps so where "
+            "its drive is taken for the force.",
+            "measure the force at the structure, or call a voltage `drive_v`; if it is that force, "
+            "repeat the linear test on this assembly.",
+            repairs=(Repair(force_unit="V", fit_gain=True),),
+        )
+    ]

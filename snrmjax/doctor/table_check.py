@@ -1,0 +1,206 @@
+"""What one mode says of a table: how it is meant, its scale, and what went wrong with the test."""
+
+import numpy as np
+
+from snrmjax.doctor.checked_states import CheckedStates
+from snrmjax.doctor.corrections import Correction, corrections
+from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
+from snrmjax.doctor.force_checks import deepest_fall
+from snrmjax.doctor.judgement import Judged, judge, with_mass
+from snrmjax.doctor.priors import CLEARLY, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS
+from snrmjax.doctor.readings import best_reading, misread, wild_phases
+from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
+from snrmjax.identify.test_model.states import TestStates
+from snrmjax.model.structures import Structure
+
+_NO_MODE = 1.0  # misfit beyond which nothing that is small can have gone wrong
+
+
+def mode_findings(
+    seen: CheckedStates, model: Structure | None, where: str, drive: bool
+) -> tuple[list[Finding], Judged]:
+    """Findings of one sensor's states, and how they fit with those undone.
+
+    `drive` says that forces are declared to be volts: then their scale and phase say nothing.
+    """
+    known_mass = model is not None and not drive
+    recorded, best = best_reading(seen, known_mass)
+    found: list[Finding] = []
+    if best is not recorded and not drive:
+        found.append(misread(recorded.judged, best, where))
+        if best.meaning.kind == "degrees_for_radians":
+            return found, best.judged
+    elif not best.judged.fits and (wild := wild_phases(seen)) is not None and not drive:
+        return [wild._replace(where=where)], best.judged
+    states, base = with_mass(best.states, best.mass), best.judged
+    instead = None
+    if model is not None and not drive:
+        as_modelled = base if best.mass == 1.0 else judge(best.states, best.log_jacobian)
+        scale = best.best_scale()
+        if is_other_scale(scale, as_modelled):
+            # What bends a test may pass for another modal mass, where it explains more.
+            instead = _likeliest(seen, best.states, as_modelled)
+            if instead is None or instead.judged.evidence < scale.judged.evidence:
+                instead = None
+                found += scale_findings(scale, as_modelled, model, where)
+                states, base = scale.judged.states, scale.judged
+        if instead is not None or as_modelled.gain(base) > -CLEARLY:
+            states, base = best.states, as_modelled
+    plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
+    apart = _different_structures(seen, states, base, where)
+    if apart is not None:
+        return [*found, apart], base
+    first = instead or _likeliest(seen, states, base)
+    if first is not None:
+        found.append(_mended(seen, states, base, first, where))
+        base = first.judged
+    if model is not None and not drive and plain:
+        found += shaker_damping(base, model, where)
+    return found, base
+
+
+def _likeliest(seen: CheckedStates, states: TestStates, base: Judged) -> Correction | None:
+    """The likeliest of all believed corrections."""
+    if base.misfit > _NO_MODE:
+        return None
+    told = [one for one in corrections(seen, states, base) if _believed(one, base, states)]
+    return max(told, key=lambda one: one.judged.evidence, default=None)
+
+
+def _believed(one: Correction, base: Judged, states: TestStates) -> bool:
+    """Whether a correction is likely, and large enough to be spoken of."""
+    judged = one.judged
+    if one.kind == "force_dropout":
+        # Its noise is no misfit, but a force within it is none.
+        told = judged.noise < FITS_WELL and one.value < states.force.min()
+        return told and judged.damped and judged.gain(base) > CLEARLY
+    if one.kind == "drift":
+        width = float(np.median(base.damping / states.frequency))
+        if abs(one.value) < MOVED_MATTERS * width:
+            return False
+    if one.kind == "volts_as_force" and np.ptp(one.gains) < GAIN_MATTERS:
+        return False
+    return judged.beats(base)
+
+
+def _different_structures(
+    seen: CheckedStates, states: TestStates, base: Judged, where: str
+) -> Finding | None:
+    """Files, or levels before and after one, that are likelier of a structure each."""
+    groups = list(seen.files)
+    if len(groups) < 2:
+        return None
+    parts = []
+    for levels in groups:
+        mine = np.isin(states.level, levels)
+        if mine.sum() < 4:
+            return None
+        some = states.some(mine)
+        parts.append(judge(some._replace(level=np.searchsorted(levels, some.level))))
+    gain = sum(one.evidence for one in parts) - base.evidence
+    if gain < CLEARLY or not all(one.fits for one in parts):
+        return None
+    # Where both moved: of no two amplitudes a difference is one of structures.
+    low = max(float(one.states.amplitude.min()) for one in parts)
+    high = min(float(one.states.amplitude.max()) for one in parts)
+    if low > high:
+        return None
+    at = np.array([np.sqrt(low * high)])
+    frequency = np.array([one.posterior.curves(at).squared_frequency[0] for one in parts]) ** 0.5
+    width = float(np.median(base.damping / states.frequency))
+    change = frequency / frequency[0] - 1
+    far = int(np.argmax(np.abs(change)))
+    if not abs(change[far]) > MOVED_MATTERS * width:
+        return None
+    return Finding(
+        *("different_structures", "error", where),
+        f"at equal amplitude the natural frequency of file {far + 1} is {100 * change[far]:.3g} % "
+        f"from file 1's (odds e^{gain:.0f} for structures apart).",
+        "identify them apart: one call and one model for each structure or assembly.",
+        repairs=(Repair(apart=True),),
+    )
+
+
+def _mended(
+    seen: CheckedStates, states: TestStates, base: Judged, one: Correction, where: str
+) -> Finding:
+    left = (
+        f"; so read a state is missed by {percent(one.judged.misfit)}, not {percent(base.misfit)}."
+    )
+    if one.kind == "drift":
+        return Finding(
+            *("drift", "warning", where),
+            f"from the first to the last state the natural frequency changes by "
+            f"{100 * one.value:.3g} %{left}",
+            "repeat a level at the end of the test, let the temperature settle, or correct along "
+            "`order`.",
+        )
+    if one.kind == "volts_as_force":
+        return _of_gains(one, where, left, seen.files)
+    if one.kind == "force_dropout":
+        return Finding(
+            *("force_dropout", "warning", where),
+            f"at resonance the force falls by {percent(deepest_fall(states))} into the noise of "
+            f"its cell, about {one.value:.2g} N, {percent(one.value / states.force.min())} of the "
+            "smallest.",
+            "drive harder at resonance, average longer or use a more sensitive cell.",
+        )
+    if one.kind == "unsettled_steps":
+        return Finding(
+            *("unsettled_steps", "error", where),
+            f"about {percent(one.value)} of a change is left at the end of a step{left}",
+            "dwell longer, 5/(ζω) a step; or import the time record, whose unsettled steps are "
+            "left out.",
+            repairs=(Repair(read_record=True),),
+        )
+    return _clipping(seen, states, one, where, left)
+
+
+def _of_gains(
+    one: Correction, where: str, left: str, files: tuple[tuple[int, ...], ...]
+) -> Finding:
+    """Forces whose scale is not the same at all levels; by name where a few of them are off."""
+    gains = np.array(one.gains)
+    away = np.abs(gains - np.median(gains))
+    few = np.flatnonzero(away > 0.5 * GAIN_MATTERS)
+    if not len(few) or 2 * len(few) >= len(gains):
+        listed = ", ".join(f"{factor:.3g}" for factor in np.exp(gains[1:] - gains[0]))
+        return Finding(
+            *("volts_as_force", "error", where),
+            f"the force over that of the first level is off by the factors {listed} at levels 2 "
+            f"and on{left}",
+            "measure the force, or calibrate the drive at each level.",
+        )
+    factors = np.exp(gains - np.median(np.delete(gains, few)))
+    names = [
+        f"level {k + 1}" + (f" (file {files.index((k,)) + 1})" if (k,) in files else "")
+        for k in few
+    ]
+    said = [
+        f"the force of {name} is {factors[k]:.3g} times" for name, k in zip(names, few, strict=True)
+    ]
+    numbers = [f"level {k + 1} by {factors[k]:.3g}" for k in few]
+    return Finding(
+        *("volts_as_force", "error", where),
+        f"{' and '.join(said)} what the other levels ask for{left}",
+        "if the column is a voltage, measure the force; else another range or calibration was set "
+        f"there: divide the force of {' and of '.join(numbers)} in the file that it comes from.",
+        repairs=tuple(Repair(force=float(1 / factors[k]), levels=(int(k) + 1,)) for k in few),
+        title=f"force on another scale at level {' and '.join(str(k + 1) for k in few)}",
+    )
+
+
+def _clipping(
+    seen: CheckedStates, states: TestStates, one: Correction, where: str, left: str
+) -> Finding:
+    force = one.name == "force"
+    size = states.force if force else np.abs(states.velocity)
+    rows = tuple(int(seen.row[k]) for k in np.flatnonzero(size > one.value * 0.999))
+    return Finding(
+        *("clipped_channel", "error", where),
+        f"the {'force' if force else 'response'} is cut off at about {one.value:.4g} "
+        f"{'N' if force else 'm/s'} in {len(rows)} states ({rows_in_words(rows)}){left}",
+        "lower the channel's gain or range and measure these states again; leave them out until "
+        "then.",
+        rows,
+    )

@@ -1,0 +1,1 @@
+"""What an identification predicts of a level that was not measured."""

@@ -1,0 +1,90 @@
+"""Errors of a level that was not measured: as levels differ, with their trend, on another day."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import linregress
+
+from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
+from snrmjax.identify.joint.joint_fit import JointFit
+
+_FEWEST = 3  # levels, of which a straight line leaves something
+_CHANCE = 0.05  # of a trend where levels differ at random
+
+
+class DayToDay(NamedTuple):
+    """By how much another day's test of the same structure differs, relative, 1σ."""
+
+    frequency: float = 0.0
+    damping: float = 0.0
+    gain: float = 0.0  # of velocities over forces
+
+
+class LevelTrend(NamedTuple):
+    """One kind of levels' errors that changes steadily with their force: a law, not chance."""
+
+    kind: str  # of `LEVEL_ERRORS`
+    first: float  # the straight line at the smallest force; relative, or rad
+    last: float  # at the largest
+    there: float  # at the force of the prediction
+    p_value: float
+
+
+class NewLevel(NamedTuple):
+    """What a level may err in beside the fitted curves, 1σ each, and how its force is known."""
+
+    std: Float[np.ndarray, " error"]  # of `LEVEL_ERRORS`
+    drive: float | None = None  # the record (N or V) of the force; None: the force itself is given
+    trends: tuple[LevelTrend, ...] = ()
+    another_day: bool = False  # whether `std` holds another day's errors too
+
+
+ON_THE_CURVES = NewLevel(np.zeros(len(LEVEL_ERRORS)))
+"""No level at all: the force in newtons moves the fitted mode itself."""
+
+
+def new_level(
+    fit: JointFit, force: float, *, as_recorded: bool = False, day: DayToDay | None = None
+) -> NewLevel:
+    """The errors of one further level under a force, as large as the fit's levels have them.
+
+    An error that changes steadily with the levels' force counts as large as its straight line has
+    it there.
+
+    Arguments: `force` in N; `as_recorded` where not the force is given but what the test records of
+    it, whose gain then errs too; `day` what another day's test differs by.
+    """
+    std = np.array(fit.prior.level, dtype=float)
+    trends = _trends(fit, force) if fit.data.n_levels >= _FEWEST else ()
+    for one in trends:
+        place = LEVEL_ERRORS.index(one.kind)
+        std[place] = np.hypot(std[place], one.there)
+    record = float(fit.recorded_force(np.array(force))) if as_recorded else None
+    return NewLevel(further_std(std, day), record, trends, day is not None)
+
+
+def further_std(
+    level: Sequence[float] | np.ndarray, day: DayToDay | None
+) -> Float[np.ndarray, " error"]:
+    """1σ of `LEVEL_ERRORS` of a level of this test, or of another day's."""
+    if day is None:
+        return np.array(level, dtype=float)
+    return np.hypot(level, [day.gain, 0.0, 2 * day.frequency, day.damping])
+
+
+def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:
+    found, level = [], np.asarray(fit.data.level)
+    known = fit.force_of_drive(np.asarray(fit.data.force))
+    size = np.array([np.median(known[level == k]) for k in range(fit.data.n_levels)])
+    if not np.ptp(size) > 0:
+        return ()
+    deviation = np.asarray(fit.unknowns.level * fit.prior.level)
+    for kind, own in zip(LEVEL_ERRORS, deviation.T, strict=True):
+        line = linregress(size, own) if np.any(own != 0) else None
+        if line is not None and line.pvalue < _CHANCE:
+            places = (size.min(), size.max(), force)
+            first, last, there = (float(line.intercept + line.slope * at) for at in places)
+            found.append(LevelTrend(kind, first, last, there, float(line.pvalue)))
+    return tuple(found)

@@ -1,0 +1,239 @@
+"""A resonance under a force that was not measured, as a distribution: whether, and where."""
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.pointwise.backbone import BackboneFit
+from snrmjax.identify.pointwise.curve_fit import between_knots_on_host, linearised_on_host
+from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
+from snrmjax.identify.prediction.new_level import DayToDay, NewLevel, further_std
+from snrmjax.model.modes import LinearModes, residual_velocity
+from snrmjax.numerics.result import AbstractResult, Variable
+
+QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
+_HERTZ = 2 * np.pi  # rad/s
+_DRAWS = 4000
+_POINTS = 201  # amplitudes of each drawn curve
+# One law in so many ends with the data: damping stays what it was at the largest amplitude.
+_HELD = 20
+_FEWEST = 40  # draws with a resonance, of which quantiles are told
+
+
+class ResonanceDistribution(AbstractResult):
+    """Whether a further level has a phase resonance within a range of amplitudes, and where.
+
+    Frequency and velocity are quantiles of those draws that have one. The others reach the end of
+    the range and ask for more force still: their resonance lies beyond, and is not denied.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("quantile",)
+
+    force: float  # N
+    drive: float | None  # what the test records of it, where that was asked for
+    largest_amplitude_ratio: float  # the range, in largest measured amplitudes
+    probability: float  # that the resonance lies within the range
+    frequency: Float[np.ndarray, " quantile"]  # rad/s, at `QUANTILES`
+    velocity: Float[np.ndarray, " quantile"]  # m/s, as the level would record it
+    negative_damping: float  # share of the curves left out: no passive structure has them
+    another_day: bool  # whether the errors are another day's too
+
+    @property
+    def holds(self) -> str:
+        """Which errors the quantiles hold, in words."""
+        more = " and another day's" if self.another_day else ""
+        return f"a further level's errors{more}"
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        hertz, speed = self.frequency[[0, 2, -1]] / _HERTZ, self.velocity[[0, 2, -1]]
+        return (
+            f"ResonanceDistribution under {self.force:.4g} N, with {self.holds}",
+            f"probability {self.probability:.3g} within {self.largest_amplitude_ratio:g} times the "
+            "largest measured amplitude",
+            f"frequency {hertz[1]:.6g} Hz, 95 % {hertz[0]:.6g} to {hertz[2]:.6g} Hz",
+            f"velocity {speed[1]:.4g} m/s, 95 % {speed[0]:.4g} to {speed[2]:.4g} m/s",
+            f"{100 * self.negative_damping:.2g} % of the curves left out: negative damping",
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`."""
+        per = ("quantile",)
+        return {
+            "quantile": Variable(per, np.array(QUANTILES), "1", "share below"),
+            "frequency_hz": Variable(per, self.frequency / _HERTZ, "Hz", "frequency"),
+            "velocity_m_s": Variable(per, self.velocity, "m/s", "velocity"),
+        }
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        names = ("force", "largest_amplitude_ratio", "probability", "negative_damping")
+        return {name: getattr(self, name) for name in names} | {"holds": self.holds}
+
+
+class KnownCurves(NamedTuple):
+    """Both curves along amplitudes, as one family has them, with independent errors of 1σ each."""
+
+    weight: float
+    values: Float[np.ndarray, "point curve"]  # ω̃² and 2ζ̃ω̃
+    errors: Float[np.ndarray, "point curve error"]
+    load: float  # |A|F, m/s²
+    load_errors: Float[np.ndarray, " error"]  # of its logarithm
+
+
+def amplitudes_to(largest: float, ratio: float) -> Float[np.ndarray, " point"]:
+    """Amplitudes of drawn curves, closer to one another the smaller they are."""
+    return ratio * largest * np.linspace(0.0, 1.0, _POINTS)[1:] ** 2
+
+
+def resonance_distribution(
+    force: float,
+    amplitude: Float[np.ndarray, " point"],
+    curves: Sequence[KnownCurves],
+    new: NewLevel,
+    other: Callable[[Float[np.ndarray, " draw"]], Complex[np.ndarray, " draw"]],
+    *,
+    ratio: float = LARGEST_AMPLITUDE_RATIO,
+    gain_of_force: bool = False,
+    of_velocity: bool = False,
+    self_excited: bool = False,
+) -> ResonanceDistribution:
+    """Draw curves, a further level's errors with them, and look where each has its resonance.
+
+    A level whose phase errs by ψ records its resonance where tan ψ = (Ω² − ω̃²)/(Ωδ), and then
+    needs X Ω δ/cos ψ = |A|F; the smallest such amplitude is taken. Beyond the data the damping of a
+    passive structure stays positive: draws that fall below zero before they have a resonance are
+    left out; one law in twenty ends with the data, and damping stays as it is there.
+
+    Arguments: `force` in N; `amplitude` up to `ratio` times the largest measured one, velocities if
+    `of_velocity`; `other` is the velocity of the other modes in units of the mode's own direction;
+    with `gain_of_force` a level's gain is that of its recorded force, else of its velocity.
+    """
+    rng, edge = np.random.default_rng(0), int(np.searchsorted(amplitude, amplitude[-1] / ratio))
+    weights = np.cumsum([one.weight for one in curves])
+    counts = np.diff(np.round(_DRAWS * np.append(0.0, weights / weights[-1]))).astype(int)
+    drawn = []
+    for one, count in zip(curves, counts, strict=True):
+        gain, phase, stiffness, loss = (new.std * rng.normal(size=(count, len(new.std)))).T
+        error = rng.normal(size=(count, one.errors.shape[-1]))
+        squared, damping = (one.values.T[k] + error @ one.errors[:, k].T for k in range(2))
+        damping[::_HELD, edge:] = damping[::_HELD, edge, None]
+        of_force = gain if gain_of_force and new.drive is not None else 0 * gain
+        load = one.load * np.exp(error @ one.load_errors + of_force) * np.cos(phase)
+        squared, damping = squared * np.exp(stiffness)[:, None], damping * np.exp(loss)[:, None]
+        with np.errstate(invalid="ignore"):
+            natural = np.sqrt(squared)
+        omega = natural + 0.5 * damping * np.tan(phase)[:, None]
+        speed = (amplitude / natural if of_velocity else amplitude) * omega
+        root = _Root.of(speed * damping / load[:, None])
+        passive = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
+        recorded = np.exp(0 * gain if gain_of_force else gain)
+        drawn.append((root.at(omega), root.at(speed, at_rest=0.0), recorded, passive))
+    at, own, recorded, kept = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    known = np.isfinite(at)
+    quantiles = np.full((2, len(QUANTILES)), np.nan)
+    if known.sum() >= _FEWEST:
+        total = recorded * np.abs(own + other(np.where(known, at, np.nanmedian(at))))
+        quantiles = np.quantile([at[known], total[known]], QUANTILES, axis=1).T
+    return ResonanceDistribution(
+        force=force,
+        drive=new.drive,
+        largest_amplitude_ratio=ratio,
+        probability=float(known.sum() / max(kept.sum(), 1)),
+        frequency=quantiles[0],
+        velocity=quantiles[1],
+        negative_damping=float(1 - kept.mean()),
+        another_day=new.another_day,
+    )
+
+
+class _Root(NamedTuple):
+    """Where rows that start at zero first reach one, between two amplitudes."""
+
+    place: np.ndarray  # of the first amplitude beyond
+    share: np.ndarray  # of the way back from there
+    found: np.ndarray
+
+    @classmethod
+    def of(cls, needed: Float[np.ndarray, "draw point"]) -> "_Root":
+        rows, place = np.arange(len(needed)), np.argmax(needed >= 1, axis=1)
+        here = needed[rows, place] - 1
+        before = np.where(place > 0, needed[rows, place - 1], 0.0) - 1
+        return cls(place, here / (here - before), here >= 0)
+
+    def at(
+        self, values: Float[np.ndarray, "draw point"], at_rest: float | None = None
+    ) -> Float[np.ndarray, " draw"]:
+        rows = np.arange(len(values))
+        here, before = values[rows, self.place], values[rows, np.maximum(self.place - 1, 0)]
+        if at_rest is not None:
+            before = np.where(self.place > 0, before, at_rest)
+        return np.where(self.found, here + self.share * (before - here), np.nan)
+
+
+def resonance_of_points(
+    fit: BackboneFit,
+    modes: LinearModes,
+    force: float,
+    level_stds: tuple[float, float, float, float],
+    *,
+    day: DayToDay | None = None,
+    ratio: float = LARGEST_AMPLITUDE_RATIO,
+    self_excited: bool = False,
+) -> ResonanceDistribution:
+    """`resonance_distribution` of curves through points, with what their levels scatter by.
+
+    Arguments: `force` in N; `level_stds` are stated, as `Structure.level_stds` has them; `day` what
+    another day's test differs by; `ratio` and `self_excited` as `resonance_distribution` has them.
+    """
+    backbone = fit.backbone
+    amplitude = amplitudes_to(float(backbone.largest), ratio)
+    values, parts = [], []
+    for curve, covariance in (
+        (backbone.squared_frequency, backbone.squared_frequency_covariance),
+        (backbone.modal_damping, backbone.modal_damping_covariance),
+    ):
+        value, slopes = linearised_on_host(curve, amplitude)
+        between = between_knots_on_host(curve, amplitude)[:, None]
+        values.append(value)
+        parts.append(np.hstack([slopes @ covariance_root(np.asarray(covariance)), between]))
+    first, second = (part.shape[1] for part in parts)
+    errors = np.zeros((len(amplitude), 2, first + second))
+    errors[:, 0, :first], errors[:, 1, first:] = parts
+    # Levels scatter by so much in absolute terms: relative to where the data end.
+    end = backbone.values(jnp.asarray(backbone.largest)[None])
+    frequency = np.hypot(fit.level_frequency_std, level_stds[2]) / end.natural_frequency[0]
+    damping = np.hypot(fit.level_damping_std, level_stds[3]) / abs(end.damping_ratio[0])
+    std = further_std([*level_stds[:2], 2 * frequency, damping], day)
+    load = abs(float(backbone.modal_constant)) * force
+    curves = KnownCurves(1.0, np.stack(values, 1), errors, load, np.zeros(first + second))
+    return resonance_distribution(
+        *(force, amplitude, [curves], NewLevel(std, another_day=day is not None)),
+        other_modes(modes, modes.sensors.index(backbone.sensor), force),
+        of_velocity=backbone.argument == "velocity",
+        ratio=ratio,
+        self_excited=self_excited,
+    )
+
+
+def other_modes(
+    modes: LinearModes, sensor: int, force: float
+) -> Callable[[Float[np.ndarray, " draw"]], Complex[np.ndarray, " draw"]]:
+    """Velocity of the other modes at frequencies, in the direction of the mode's own motion."""
+    j = modes.mode_of_interest
+    sign = np.sign(float(modes.mode_shape[sensor, j] * modes.participation[j]))
+
+    def velocity(frequency: np.ndarray) -> np.ndarray:
+        load = jnp.full(frequency.shape, force)
+        return sign * np.asarray(residual_velocity(modes, jnp.asarray(frequency), load))[:, sensor]
+
+    return velocity
+
+
+def covariance_root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A matrix R with RRᵀ the covariance, which may be singular."""
+    size, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(size, 0.0))

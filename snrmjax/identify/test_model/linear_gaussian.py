@@ -1,0 +1,129 @@
+"""A linear Gaussian model, marginalised: its likelihood by noise and prior variances, with slopes.
+
+Rows r = H x + e with x ~ N(0, diag v) and e ~ N(0, s²). H is made triangular once, however many
+rows there are, and each evaluation factors a matrix of the size of the unknowns.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+_STEP = 1e-4  # of a logarithm, for second derivatives
+_ROUNDING = 1e-12  # of the diagonal: rounding must not make a matrix singular
+_STEPS = 60  # of the search for the most likely hyperparameters, at most
+
+
+class LinearRows(NamedTuple):
+    """Rows of unit variance where the noise is as stated, as far as a likelihood sees them.
+
+    By H = QR: c = Qᵀr, and what no unknowns explain. Nothing is then a difference of large numbers,
+    however wide the priors and small the noise.
+    """
+
+    triangle: Float[np.ndarray, "direction unknown"]  # R
+    along: Float[np.ndarray, " direction"]  # c
+    across: float  # |r − Qc|²
+    n_rows: int
+    offset: float = 0.0  # ln of the Jacobian from the rows to what was recorded
+
+    @classmethod
+    def of(
+        cls,
+        design: Float[np.ndarray, "row unknown"],
+        rows: Float[np.ndarray, " row"],
+        offset: float = 0.0,
+    ) -> "LinearRows":
+        """Of a design H and rows r."""
+        directions, triangle = np.linalg.qr(design)
+        along = directions.T @ rows
+        left = rows - directions @ along
+        return cls(triangle, along, float(left @ left), len(rows), offset)
+
+    def posterior(
+        self, scale: float, variance: Float[np.ndarray, " unknown"]
+    ) -> tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, "unknown unknown"]]:
+        """Mean and covariance of the unknowns."""
+        by_root = self.triangle * np.sqrt(variance)
+        inverse = _inverse(np.eye(len(variance)) + by_root.T @ by_root / scale**2)[0]
+        covariance = np.sqrt(variance)[:, None] * inverse * np.sqrt(variance)
+        of_rows = _inverse(by_root @ by_root.T + scale**2 * np.eye(len(by_root)))[0]
+        return np.sqrt(variance) * (by_root.T @ (of_rows @ self.along)), covariance
+
+    def log_likelihood(
+        self, scale: float, variance: Float[np.ndarray, " unknown"]
+    ) -> tuple[float, float, Float[np.ndarray, " unknown"]]:
+        """ln p of the rows, and its slopes by ln s and by the logarithms of the variances."""
+        by_root = self.triangle * np.sqrt(variance)
+        n, m = self.n_rows, len(by_root)
+        inverse, log_det = _inverse(by_root @ by_root.T + scale**2 * np.eye(m))
+        weighed = inverse @ self.along
+        square = float(self.along @ weighed) + self.across / scale**2
+        value = -0.5 * (n * np.log(2 * np.pi) + (n - m) * np.log(scale**2) + log_det + square)
+        pull = by_root.T @ weighed
+        by_variance = 0.5 * (pull**2 - np.sum(by_root * (inverse @ by_root), axis=0))
+        by_scale = (
+            scale**2 * (float(weighed @ weighed) - float(np.trace(inverse)))
+            + self.across / scale**2
+            - (n - m)
+        )
+        return value + self.offset, by_scale, by_variance
+
+
+class MostLikely(NamedTuple):
+    """The most likely hyperparameters and the evidence, by Laplace's approximation about them."""
+
+    point: Float[np.ndarray, " hyper"]  # logarithms
+    log_evidence: float
+    covariance: Float[np.ndarray, "hyper hyper"]
+
+
+Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarray, " hyper"]]]
+
+
+def most_likely(
+    objective: Objective,
+    start: Float[np.ndarray, " hyper"],
+    bounds: list[tuple[float, float]],
+) -> MostLikely:
+    """Maximise ln p (likelihood times prior, with slopes) and integrate about the maximum."""
+    point, n = maximised(objective, start, bounds), len(start)
+    hessian = np.zeros((n, n))
+    for k, unit in enumerate(_STEP * np.eye(n)):
+        hessian[k] = (objective(point - unit)[1] - objective(point + unit)[1]) / (2 * _STEP)
+    values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+    values = np.maximum(values, 1e-2)  # flat or at a bound: as wide as a prior may be
+    covariance = (vectors / values) @ vectors.T
+    volume = 0.5 * (n * np.log(2 * np.pi) - float(np.sum(np.log(values))))
+    return MostLikely(point, objective(point)[0] + volume, covariance)
+
+
+def maximised(
+    objective: Objective, start: Float[np.ndarray, " hyper"], bounds: list[tuple[float, float]]
+) -> Float[np.ndarray, " hyper"]:
+    """The most likely point between bounds."""
+
+    def downhill(point: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slopes = objective(point)
+        return -value, -slopes
+
+    found = minimize(
+        downhill,
+        np.clip(start, [low for low, _ in bounds], [high for _, high in bounds]),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": _STEPS, "ftol": 1e-9, "gtol": 1e-3},
+    )
+    return np.asarray(found.x)
+
+
+def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
+    """Inverse and ln determinant of a positive definite matrix, in units that make it even."""
+    size = np.sqrt(np.diagonal(matrix))
+    factor = np.linalg.cholesky(matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix)))
+    root = np.linalg.inv(factor) / size
+    log_det = 2 * float(np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(size)))
+    return root.T @ root, log_det

@@ -1,0 +1,96 @@
+"""What is taken for likely before a test is seen: every prior with its unit and its reason.
+
+Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-normal distribution
+of the size itself; those of curves and noise are medians of lognormal ones.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+_LOG_ROOT = 0.5 * np.log(2 * np.pi)
+
+
+class LogNormalSize(NamedTuple):
+    """A positive number whose logarithm is normal."""
+
+    median: float
+    spread: float  # 1σ of the logarithm
+
+    def log_density(self, log_value: float) -> tuple[float, float]:
+        """ln p of the logarithm, and its slope."""
+        step = (log_value - np.log(self.median)) / self.spread
+        return -0.5 * step**2 - np.log(self.spread) - _LOG_ROOT, -step / self.spread
+
+
+class HalfNormalSize(NamedTuple):
+    """A positive number: a normal one without its sign."""
+
+    scale: float
+
+    def log_density(self, log_value: float) -> tuple[float, float]:
+        """ln p of the logarithm, and its slope."""
+        square = np.exp(2 * (log_value - np.log(self.scale)))
+        return log_value - np.log(self.scale) - 0.5 * square + np.log(2) - _LOG_ROOT, 1.0 - square
+
+
+class FlatSize(NamedTuple):
+    """A positive number whose logarithm is anywhere between two ends."""
+
+    low: float  # of the logarithm
+    high: float
+
+    def log_density(self, log_value: float) -> tuple[float, float]:
+        """ln p of the logarithm, and its slope."""
+        return -float(np.log(self.high - self.low)), 0.0
+
+
+STATED_NOISE = LogNormalSize(1.0, 0.1)
+"""Noise over the stated one: standard deviations from ten readings are good to some 20 %, and a
+laboratory states the mean of many."""
+
+UNSTATED_NOISE = LogNormalSize(0.004, 1.2)
+"""Relative noise of velocities, rad of phases, where none is stated: analysers reach 0.05 %, hand
+evaluation some 3 %."""
+
+FORCE_TO_VELOCITY = 0.1
+"""Error of a force of which none is stated, over that of the velocity: calibrated load cells."""
+
+LEVEL_GAIN = HalfNormalSize(0.02)
+"""Relative: drift of conditioners and of a shaker's coupling between levels."""
+
+LEVEL_PHASE = HalfNormalSize(0.01)
+"""rad: 0.6°, a filter's or a controller's between levels."""
+
+LEVEL_STIFFNESS = HalfNormalSize(0.004)
+"""Relative, of ω̃²: 0.2 % of frequency, some 10 K of temperature in metals, or a joint's seat."""
+
+LEVEL_DAMPING = HalfNormalSize(0.05)
+"""Relative: joints and clamps that are opened between levels repeat to some 10 %."""
+
+LEVELS = (LEVEL_GAIN, LEVEL_PHASE, LEVEL_STIFFNESS, LEVEL_DAMPING)
+"""In the order of `LEVEL_ERRORS`."""
+
+LEVELS_DIFFER = 5.41
+"""Of −2 ln p, from which on levels are said to differ: 1 %, one-sided, as four kinds are tried."""
+
+CURVE_CONSTANT = 1.0
+"""Of the mean of both curves, over ω² and over the typical damping: nothing is assumed."""
+
+CURVE_SLOPES = 1.0
+"""Of their terms in a and a²: changes as large as the curves themselves."""
+
+CURVE_PROCESS = LogNormalSize(0.01, 1.5)
+"""Size of what is smooth but no parabola, over the same."""
+
+CURVE_LENGTH = LogNormalSize(0.7, 0.4)
+"""Length over which that changes, over the measured range of log amplitude."""
+
+DISCREPANCY = HalfNormalSize(0.02)
+"""Of Ωδ: what a single mode leaves off resonance. Measured beams show 1 to 5 %."""
+
+DISCREPANCY_LENGTH = np.radians(30.0)
+"""Phase over which a discrepancy changes."""
+
+STUDENT_FREEDOM = 4.0
+"""Degrees of freedom of noise with outliers, on request: one state in 20 beyond three times 1σ."""

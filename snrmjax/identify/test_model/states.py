@@ -1,0 +1,66 @@
+"""Measured states as the model of a test sees them: the motion of one mode, and its errors."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+
+STATE_ERRORS = ("force", "velocity", "phase")
+"""What every state errs in by itself: logarithms of force and velocity, and the phase in rad."""
+
+LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
+"""What all states of a level may have in common, relative or in rad."""
+
+
+class TestStates(NamedTuple):
+    """States of one mode, with all that moves beside it taken away.
+
+    With X = V/(iΩ) and the modal constant A a state says Z = FA/X = κ(K(a) − Ω² + iΩδ(a)), where
+    κ is the modal mass over the model's; δ = 2ζ̃ω̃ and K = ω̃² belong to the amplitude a = |X|.
+    """
+
+    level: Int[np.ndarray, " state"]  # 0, 1, …
+    frequency: Float[np.ndarray, " state"]  # rad/s
+    force: Float[np.ndarray, " state"]  # N, or V where only the drive is known
+    velocity: Complex[np.ndarray, " state"]  # m/s
+    errors: Float[np.ndarray, "state input"]  # 1σ of `STATE_ERRORS`; in parts where not stated
+    stated: bool  # whether these were
+    constant: float  # A, 1/kg
+    level_std: tuple[float, float, float, float]  # stated 1σ of `LEVEL_ERRORS`; zero: not stated
+    mass_std: float  # relative 1σ of κ; zero where it is known
+    force_is_free: bool = False  # whether a gain of the force is: a level's gain is then its own
+
+    @property
+    def n_levels(self) -> int:
+        """How many levels."""
+        return int(self.level.max(initial=-1)) + 1
+
+    @property
+    def amplitude(self) -> Float[np.ndarray, " state"]:
+        """Displacement amplitudes, m."""
+        return np.abs(self.velocity) / self.frequency
+
+    def some(self, keep: Bool[np.ndarray, " state"]) -> "TestStates":
+        """Some of the states, their levels as they were counted."""
+        rows = {
+            name: getattr(self, name)[keep]
+            for name in ("level", "frequency", "force", "velocity", "errors")
+        }
+        return self._replace(**rows)
+
+
+def state_errors(
+    stated: Float[np.ndarray, "state input"],
+) -> tuple[Float[np.ndarray, "state input"], bool]:
+    """1σ of every state's errors, and whether they are stated.
+
+    Where a state has none, all get parts of one unknown size. A force of which no error is stated
+    gets a share of the velocity's: without any, a state near a fold would be exact in one
+    direction.
+    """
+    known = bool(np.all(np.isfinite(stated)) and np.all(stated[:, 1:] > 0))
+    errors = stated.copy() if known else np.tile([0.0, 1.0, 1.0], (len(stated), 1))
+    errors[:, 0] = np.where(errors[:, 0] > 0, errors[:, 0], FORCE_TO_VELOCITY * errors[:, 1])
+    return errors, known

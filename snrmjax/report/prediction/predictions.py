@@ -1,0 +1,150 @@
+"""Predictions of identified curves under the forces that were asked for, and notes on them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from snrmjax.identify.inference.fitted_response import (
+    FittedResponse,
+    fitted_response,
+    predicted_resonance,
+)
+from snrmjax.identify.inference.pointwise_view import without_bands
+from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.pointwise.missing_resonance import level_in_resonance
+from snrmjax.identify.pointwise.prediction import (
+    LARGEST_AMPLITUDE_RATIO,
+    PredictedResponse,
+    Resonance,
+    predict_response,
+    resonances,
+)
+from snrmjax.identify.prediction.new_level import DayToDay, new_level
+from snrmjax.identify.prediction.notes import notes_on_resonance, notes_on_trends
+from snrmjax.identify.prediction.resonance_distribution import (
+    ResonanceDistribution,
+    resonance_of_points,
+)
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.structures import Structure
+
+
+@dataclass(frozen=True)
+class Loads:
+    """The forces for which responses are predicted, how far curves are continued, and when."""
+
+    forces: tuple[float, ...] = ()  # N
+    drives: tuple[float, ...] = ()  # V, where the force is known as a drive voltage
+    largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+    day: DayToDay | None = None  # of another day's test
+    self_excited: bool = False  # negative damping is possible
+
+
+class Prediction(NamedTuple):
+    """What the identified curves predict under one force."""
+
+    force: float  # N
+    resonances: list[Resonance]
+    responses: list[PredictedResponse]
+    further: ResonanceDistribution  # of the resonance of a level that was not measured
+    drive: float | None = None  # V, where the force is known as a drive voltage
+    banded: tuple[FittedResponse, ...] = ()  # the same of a joint fit, with 1σ
+
+    @property
+    def load(self) -> str:
+        """The force in words, and its drive voltage where the force is known as one."""
+        if self.drive is None:
+            return f"{self.force:g} N"
+        return f"{self.drive:.5g} V ({self.force:.4g} N)"
+
+
+def predictions_of_points(
+    found: Identification, model: Structure, loads: Loads
+) -> tuple[Prediction, ...]:
+    """What curves through points predict."""
+    backbone, ratio = found.fit.backbone, loads.largest_amplitude_ratio
+    return tuple(
+        Prediction(
+            force,
+            resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+            predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
+            resonance_of_points(
+                found.fit,
+                model.modes,
+                force,
+                model.level_stds,
+                day=loads.day,
+                ratio=ratio,
+                self_excited=loads.self_excited,
+            ),
+        )
+        for force in dict.fromkeys(loads.forces)
+    )
+
+
+def predictions_of_fit(
+    fit: JointFit, loads: Loads
+) -> tuple[tuple[Prediction, ...], tuple[str, ...]]:
+    """What a joint fit predicts, and notes on trends of its levels, by which bands are wider."""
+    asked: list[tuple[float, float | None, bool]] = []
+    for force in dict.fromkeys(loads.forces):
+        record = float(fit.recorded_force(np.array(force))) if fit.drive_known_only else None
+        asked.append((force, record, False))
+    for drive in dict.fromkeys(loads.drives):
+        asked.append((float(fit.force_of_drive(np.array(drive))), drive, True))
+    found: list[Prediction] = []
+    notes: list[str] = []
+    for force, record, as_recorded in asked:
+        new, ratio = (
+            new_level(fit, force, as_recorded=as_recorded, day=loads.day),
+            loads.largest_amplitude_ratio,
+        )
+        banded = fitted_response(fit, force, largest_amplitude_ratio=ratio, of=new)
+        further = predicted_resonance(
+            fit, force, largest_amplitude_ratio=ratio, of=new, self_excited=loads.self_excited
+        )
+        plain = without_bands(fit, banded)
+        found.append(Prediction(force, *plain, further, record, tuple(banded)))
+        notes += notes_on_trends(new.trends, found[-1].load)
+    return tuple(found), tuple(notes)
+
+
+def require_drive(data: SteadyStates) -> None:
+    """Raise `ValueError` for data whose force is known in newtons."""
+    if np.any(np.isfinite(np.asarray(data.force))):
+        raise ValueError(
+            "`--predict-drive` is for data with a drive voltage (`drive_v`), but these have the "
+            "force in newtons (`force_n`): use `--predict-force`."
+        )
+
+
+def notes_on_predictions(
+    predictions: Sequence[Prediction], backbone: Backbone, data: SteadyStates
+) -> list[str]:
+    """Sentences on forces whose resonance lies beyond the range or the data, or is one of several.
+
+    Where the curves have none within the range, but a level of that force was measured in
+    resonance, this is said too.
+    """
+    notes = []
+    for one in predictions:
+        notes += notes_on_resonance(one.further, one.load)
+        near = None if one.resonances else level_in_resonance(data, backbone, one.force)
+        if near is not None:
+            notes.append(
+                f"level {near.level} has its resonance under {near.force:.4g} N, measured at "
+                f"{near.frequency:.5g} Hz, {near.velocity:.3g} m/s: the curves miss this level."
+            )
+        if any(each.continued for each in one.resonances):
+            notes.append(f"the resonance at {one.load} lies beyond the measured amplitudes.")
+        notes += [f"response at {one.load}: {each.note}" for each in one.responses if each.note]
+        if len(one.resonances) > 1:
+            notes.append(
+                f"{len(one.resonances)} resonances at {one.load}: damping that falls with "
+                "amplitude allows several."
+            )
+    return notes

@@ -1,0 +1,58 @@
+"""Noise that neighbouring states show, of made-up rows whose noise and order are known."""
+
+import numpy as np
+import pytest
+from truths.made_up_misfits import (
+    ANGLE,
+    LEVELS,
+    N_STATES,
+    PER_LEVEL,
+    fit_to,
+    misfit_of,
+    noise,
+)
+
+from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
+
+
+def test_the_order_of_rows_does_not_change_the_noise_of_neighbours():
+    rows = noise() + 3 * np.repeat(np.sin(np.pi * ANGLE), 2)
+    shuffled = np.random.default_rng(2).permutation(N_STATES)
+    mixed = rows.reshape(-1, 2)[shuffled].reshape(-1)
+    found = neighbour_noise(misfit_of(shuffled), fit_to(mixed))
+    assert found == pytest.approx(neighbour_noise(misfit_of(), fit_to(rows)), rel=1e-12)
+    assert found.variance == pytest.approx(1.0, abs=3 * found.std)
+
+
+def test_its_error_is_the_scatter_of_many_sets():
+    found = [neighbour_noise(misfit_of(), fit_to(noise(seed))) for seed in range(200)]
+    scatter = np.std([one.variance for one in found])
+    assert np.mean([one.std for one in found]) == pytest.approx(scatter, rel=0.2)
+
+
+def test_errors_that_all_share_are_no_noise_of_neighbours():
+    """A shared error ten times as large as the noise, that alternates from state to state."""
+    alternating = np.repeat((-1.0) ** np.arange(N_STATES), 2)[:, None]
+    rows = noise() + 10 * alternating[:, 0]
+    shared = neighbour_noise(misfit_of(shared=10 * alternating), fit_to(rows))
+    assert shared.variance == pytest.approx(1.0, abs=3 * shared.std)
+    assert neighbour_noise(misfit_of(), fit_to(rows)).variance > 100
+
+
+def test_what_is_smooth_in_the_order_of_the_test_is_no_noise_where_phases_are_guessed():
+    """Phases of a wrong model shuffle the states: neighbours then differ by more than noise."""
+    shuffled = np.random.default_rng(3).permutation(PER_LEVEL)
+    order = (np.arange(LEVELS)[:, None] * PER_LEVEL + shuffled).reshape(-1)
+    smooth = 5 * np.repeat(np.tile(np.linspace(-1.0, 1.0, PER_LEVEL) ** 2, LEVELS), 2)
+    fit = fit_to(smooth + noise())
+    known, guessed = (misfit_of(order, phase_unknown=k) for k in (False, True))
+    assert neighbour_noise(known, fit).variance > 2
+    assert neighbour_noise(guessed, fit).variance == pytest.approx(1.0, abs=0.3)
+    # Noise that is larger than stated is so in every order.
+    assert neighbour_noise(guessed, fit_to(2 * noise())).variance == pytest.approx(4.0, rel=0.3)
+
+
+def test_noise_stated_a_little_too_small_is_tolerated_and_more_is_not():
+    assert tolerated(0.5) == 1.0
+    assert tolerated(1.4) == 1.4
+    assert tolerated(1e3) < 2.0

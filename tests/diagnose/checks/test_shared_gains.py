@@ -1,0 +1,208 @@
+"""Whether an answer is doubted that says something of gains: of the force, of the modal mass."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+from truths.balanced_sets import balanced, linear_model, quadratic
+from truths.exact_states import GAIN, driven, modes
+
+import snrmjax as sj
+from snrmjax.diagnose.checks.shared_gains import (
+    doubts_on_gains,
+    gain_found,
+    modal_mass_found,
+    notes_on_found_mass,
+    notes_on_stated_parameters,
+)
+from snrmjax.diagnose.diagnosis import excluded_kinds
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit
+from snrmjax.diagnose.misfit.predictions import predictions_of
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+
+WRONG = 1.06  # the model's modal mass over the true one
+
+
+def model_of(known):
+    """The linear mode, `known` for certain."""
+    model = linear_model()
+    none = np.zeros(1)
+    own = dataclasses.replace(model.modes, natural_frequency_std=none, damping_ratio_std=none)
+    return dataclasses.replace(model, modes=own) if known else model
+
+
+def misfit_of(factor, force_gain_std=0.0, change=np.zeros_like, *, known=True):
+    """A linear mode's test, its forces recorded too small by a factor."""
+    data = balanced(change, per_level=5)
+    data = eqx.tree_at(lambda d: d.force, data, data.force / factor)
+    data = dataclasses.replace(data, force_std=0.003 * data.force)
+    return weighted_misfit(predictions_of(model_of(known), data, force_gain_std))
+
+
+def test_a_free_gain_is_found_with_its_error():
+    """Its 1σ is where χ², its prior's part too, has risen by 1."""
+    misfit = misfit_of(1.5, force_gain_std=1.0)
+    gain = gain_found(misfit, baseline_fit(misfit))
+    assert gain.value == pytest.approx(1.5, rel=0.02)
+    moved = np.linspace(0.4, 0.6, 5)
+    risen = [np.sum((misfit.base + misfit.noise.shared[:, 0] * g) ** 2) + g**2 for g in moved]
+    curvature = np.polyfit(moved, risen, 2)[0]
+    assert gain.std == pytest.approx(curvature**-0.5 / 1.5, rel=0.01)
+    certain = misfit_of(1.0)
+    assert gain_found(certain, baseline_fit(certain)) is None
+    assert doubts_on_gains(certain, baseline_fit(certain), {}) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "refutes", "word"),
+    [
+        (1.02, None, ""),
+        (1.2, False, "moves the force gain by +20 %"),
+        (5.0, True, "force gain cannot be determined"),
+    ],
+)
+def test_an_answer_that_moves_the_gain_is_doubted_and_one_that_moves_it_far_refuted(
+    factor, refutes, word
+):
+    """Smooth curves of amplitude had given the gain of 1."""
+    misfit = misfit_of(factor, force_gain_std=1.0)
+    found = doubts_on_gains(misfit, baseline_fit(misfit), {})
+    assert [one.refutes for one in found] == ([] if refutes is None else [refutes])
+    if found:
+        assert word in found[0].reason
+        assert "added mass" in found[0].decide_by
+
+
+@pytest.mark.parametrize("std", [5.0, 30.0])
+def test_an_effect_smaller_than_its_error_is_doubted(std):
+    misfit = misfit_of(1.0, change=quadratic)
+    label = "quadratic_damping.coefficient"
+    fit = baseline_fit(misfit)._replace(
+        kinds=("quadratic_damping",), labels=(label,), values=np.array([18.0])
+    )
+    found = doubts_on_gains(misfit, fit, {label: std})
+    assert len(found) == (std > 18.0)
+    if found:
+        assert not found[0].refutes
+        assert "18 with a 1σ of 30, larger than itself" in found[0].reason
+
+
+def test_a_stated_error_that_is_exceeded_is_said():
+    """Forces larger by a half ask for a damping ratio far beyond its 1σ of 1 %."""
+    misfit = misfit_of(1.5, known=False)
+    (note,) = notes_on_stated_parameters(misfit, baseline_fit(misfit))
+    assert "mode_1.damping_ratio" in note
+    misfit = misfit_of(1.0, known=False)
+    assert notes_on_stated_parameters(misfit, baseline_fit(misfit)) == ()
+
+
+@pytest.mark.parametrize(("std", "kept"), [(0.05, True), (1.0, False)])
+def test_nothing_that_the_force_drives_is_looked_for_beside_a_free_gain(std, kept):
+    """A far mode beside a force of no size is a model that stands still, and fits anything."""
+    left_out = excluded_kinds(linear_model(), std, phases=True)
+    assert ({"residual_mode", "close_mode"} <= left_out) is not kept
+
+
+@pytest.mark.long
+def test_a_gain_near_resonance_is_kept_and_doubted():
+    data = driven(8)
+    silent = np.full(data.n_states, np.nan)
+    data = dataclasses.replace(data, velocity_std=silent[:, None], phase_std=silent[:, None])
+    model = sj.model.structure(modes())
+    found = sj.diagnose_model(model, data)
+    assert "residual_mode" not in found.effects
+    (note,) = (one for one in found.notes if "determine the force gain" in one)
+    assert "within 8° of resonance" in note
+    assert found.verdict is not sj.diagnose.Verdict.NAMED
+    gain = np.median(np.asarray(found.data.force) / np.asarray(data.drive))
+    assert gain * found.answer.force_gain == pytest.approx(GAIN, rel=0.3)
+
+
+def wrong_mass(std, wrong=WRONG):
+    """The linear mode with a wrong modal mass, of which this relative 1σ is stated."""
+    model = linear_model()
+    changed = dataclasses.replace(
+        model.modes,
+        participation=model.modes.participation / wrong,
+        modal_mass_std=None if std is None else np.array([std]),
+    )
+    return dataclasses.replace(model, modes=changed)
+
+
+def states():
+    data = balanced(np.zeros_like, per_level=5)
+    return dataclasses.replace(data, force_std=0.003 * data.force)
+
+
+def misfit_of_mass(std, wrong=WRONG, force_gain_std=0.0):
+    return weighted_misfit(predictions_of(wrong_mass(std, wrong), states(), force_gain_std))
+
+
+def true_mass():
+    modes = linear_model().modes
+    return 1 / abs(float(modes.mode_shape[0, 0] * modes.participation[0]))
+
+
+def test_a_stated_error_of_the_modal_mass_lets_the_data_find_it():
+    misfit = misfit_of_mass(0.05)
+    fit = baseline_fit(misfit)
+    found = modal_mass_found(misfit, fit)
+    assert abs(found.value - true_mass()) < 3 * found.std
+    assert found.std < 0.01 * true_mass()
+    assert found.model == pytest.approx(WRONG * true_mass(), rel=1e-12)
+    # A baseline whose mass is known for certain misses the same states by far more.
+    certain = misfit_of_mass(None)
+    left, missed = misfit.chi_square(fit.rows), certain.chi_square(baseline_fit(certain).rows)
+    assert left < 1.5 * misfit.n_rows
+    assert missed > left + 50
+    (note,) = notes_on_found_mass(misfit, fit)
+    assert "stated: 5 %" in note
+    assert "gain of the force or of the sensor does the same" in note
+
+
+def test_a_modal_mass_beyond_its_stated_error_is_said():
+    misfit = misfit_of_mass(0.02)
+    (note,) = notes_on_found_mass(misfit, baseline_fit(misfit))
+    assert "check the linear test" in note
+
+
+def test_the_right_mass_and_a_free_gain_take_no_word():
+    misfit = misfit_of_mass(0.05, wrong=1.0)
+    assert notes_on_found_mass(misfit, baseline_fit(misfit)) == ()
+    # A free gain of all forces is one with the mass: only one of them is free.
+    free = misfit_of_mass(0.05, force_gain_std=1.0)
+    assert modal_mass_found(free, baseline_fit(free)) is None
+
+
+@pytest.mark.parametrize(
+    ("std", "gain", "doubted"),
+    [
+        (None, 0.06, True),
+        (None, 0.3, False),  # no modal mass of a linear test is wrong by that
+        (0.01, 0.06, False),  # the fit has had the mass's own error
+    ],
+)
+@pytest.mark.parametrize("kind", ["force_gain_error", "sensor_gain_error"])
+def test_a_gain_that_may_be_the_modal_mass_is_doubted(kind, std, gain, doubted):
+    misfit = misfit_of_mass(std, wrong=1.0)
+    label = f"{kind}.gain"
+    fit = baseline_fit(misfit)._replace(kinds=(kind,), labels=(label,), values=np.array([gain]))
+    found = doubts_on_gains(misfit, fit, {label: 0.001})
+    assert len(found) == doubted
+    if doubted:
+        assert "may be the modal mass" in found[0].reason
+        assert f"{true_mass() / 1.06:.4g} kg" in found[0].reason
+        assert "added mass" in found[0].decide_by
+        assert not found[0].refutes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("std", "verdict"), [(0.05, "none"), (None, "ambiguous")])
+def test_a_wrong_modal_mass_is_never_named(std, verdict):
+    found = sj.diagnose_model(wrong_mass(std), states())
+    assert found.verdict == verdict
+    if std is None:
+        assert any("may be the modal mass" in note for note in found.notes)
+    else:
+        assert found.effects == ()

@@ -1,0 +1,150 @@
+"""What the measured states show by themselves, against the curves and errors that made them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from truths.balanced_sets import (
+    OMEGA,
+    PARTICIPATION,
+    SHAPE,
+    ZETA,
+    balanced,
+    linear_model,
+    quadratic,
+)
+
+import snrmjax as sj
+from snrmjax.diagnose.misfit.predictions import predictions_of
+from snrmjax.diagnose.misfit.reference import (
+    as_weighed,
+    reference_of,
+    with_reference,
+    with_unstated_level_errors,
+)
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY, LEVELS
+from snrmjax.numerics.blocks import on_one_core
+
+N_LEVELS, SHIFT, SEED = 6, 4e-3, 3
+referred = on_one_core(with_reference)
+
+
+def silent(data):
+    """The states without any word of their noise."""
+    nothing = np.full((data.n_states, 1), np.nan)
+    return dataclasses.replace(
+        data, velocity_std=nothing, phase_std=nothing, force_std=nothing[:, 0]
+    )
+
+
+def predicted(model=None, *, shift=SHIFT, change=quadratic, stated=False):
+    """Predictions for a mode whose natural frequency differs from level to level."""
+    data = balanced(change, seed=SEED, levels=N_LEVELS, shift=shift)
+    return predictions_of(model or linear_model(), data if stated else silent(data))
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_levels_differ_by_what_was_put_in(stated):
+    found = referred(predicted(stated=stated))
+    put_in = 2 * SHIFT * np.random.default_rng([SEED, 1]).normal(size=N_LEVELS)
+    # Known but for the mean and a smooth change with amplitude.
+    assert found.level_sizes[2] == pytest.approx(np.std(put_in, ddof=1), rel=0.35)
+    assert found.unstated_levels == (False, False, True, False)
+    gain, phase, frequency, damping = found.model.level_stds
+    assert gain == phase == damping == 0
+    # K of a level moves by twice its natural frequency.
+    assert frequency == pytest.approx(0.5 * found.level_sizes[2] * OMEGA, rel=0.02)
+    assert found.given.level_stds == (0, 0, 0, 0)
+
+
+def test_levels_that_agree_get_no_errors():
+    found = referred(predicted(shift=0.0))
+    assert found.level_sizes == (0.0,) * 4
+    assert found.unstated_levels == (False,) * 4
+    assert found.model.level_stds == found.given.level_stds
+    apart = with_unstated_level_errors(found)
+    assert apart.unstated_levels == (True,) * 4
+    for size, prior in zip(apart.level_sizes, LEVELS, strict=True):
+        assert size >= prior.scale
+    assert min(apart.model.level_stds) > 0
+
+
+def test_stated_errors_of_levels_are_kept():
+    std = 2 * SHIFT * OMEGA
+    model = linear_model(level_frequency_std=std)
+    found = referred(predicted(model, stated=True))
+    assert not found.unstated_levels[2]
+    assert found.model.level_stds[2] == pytest.approx(std)
+    assert with_unstated_level_errors(found).model.level_stds[2] == pytest.approx(std)
+
+
+def test_errors_of_whole_levels_are_told_by_their_kind():
+    noise = weighted_misfit(referred(predicted())).noise
+    kinds = noise.shared_kind.tolist()
+    # Natural frequency and damping ratio of the linear test, then one error a level.
+    assert kinds == [-1, -1] + [2] * N_LEVELS
+
+
+@pytest.mark.parametrize("missing", [0.0, 24.0])
+def test_errors_are_passed_on_as_the_true_law_passes_them(missing):
+    """A damping three times the model's: its force doubles the slopes by the velocity."""
+
+    def more(velocity):
+        return missing + 0.0 * velocity
+
+    predictions = referred(predicted(shift=0.0, change=more, stated=True))
+    states, reference = predictions.chosen.states, predictions.reference
+    velocity, omega = np.asarray(states.velocity)[:, 0], np.asarray(states.frequency)
+    # Of a linear law the needed force grows with the velocity, and turns with it.
+    needed = OMEGA**2 - omega**2 + 1j * omega * (2 * ZETA * OMEGA + missing)
+    measured = np.asarray(states.force) * SHAPE * PARTICIPATION * 1j * omega / velocity
+    np.testing.assert_allclose(reference.by_phase, 1j)
+    assert np.median(np.abs(measured / needed - 1)) < 0.02  # noise of 1 % and 0.7°
+    assert np.abs(reference.by_velocity - 1).max() < 0.05
+    misfit = weighted_misfit(predictions)
+    # Noise is then the noise that made the states, whatever the baseline lacks.
+    left = misfit.noise.noise_units(misfit.baseline.columns[None])[0]
+    law = misfit.by_linear[:, 1] * missing / (2 * OMEGA)  # to first order in ζ it is exact
+    assert np.mean((left + law) ** 2) == pytest.approx(1.0, abs=0.35)
+
+
+def test_few_states_have_no_reference():
+    data = balanced(quadratic, levels=1, per_level=7)
+    silenced = np.pi * (np.arange(7) < 2)[:, None] + 0.012
+    few = dataclasses.replace(data, phase_std=silenced)
+    predictions = predictions_of(linear_model(), few)
+    assert reference_of(predictions) is None
+    assert with_reference(predictions) is predictions
+
+
+def test_a_sensor_without_phases_is_no_hindrance():
+    data = balanced(quadratic, seed=SEED, levels=N_LEVELS, shift=SHIFT)
+    velocity = np.asarray(data.velocity)
+    modes = sj.model.linear_modes(
+        *([OMEGA], [ZETA], [[SHAPE], [0.5 * SHAPE]], [PARTICIPATION]), sensors=("one", "other")
+    )
+    two = sj.measure.steady_states(
+        *(np.asarray(data.level), np.asarray(data.frequency), np.asarray(data.force)),
+        np.concatenate([velocity, 0.5 * velocity], axis=1),
+        phase_std=np.tile([np.nan, np.pi], (data.n_states, 1)),
+        sensors=("one", "other"),
+    )
+    found = referred(predictions_of(sj.model.structure(modes), two))
+    assert found.reference.posterior.differing == (False, False, True, False)
+
+
+def test_other_predictions_of_the_same_states_are_weighed_alike():
+    one, again = referred(predicted()), predicted()
+    same = as_weighed(again, one)
+    assert same.reference is one.reference
+    assert same.level_sizes == one.level_sizes
+    assert same.model.level_stds == one.model.level_stds
+    assert same.motions is again.motions
+
+
+def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
+    error = np.asarray(predicted().chosen.states.error)
+    np.testing.assert_allclose(error[:, 0], FORCE_TO_VELOCITY * error[:, 1])
+    error = np.asarray(predicted(stated=True).chosen.states.error)
+    np.testing.assert_allclose(error[:, 0], 0.003, rtol=0.02)

@@ -1,0 +1,162 @@
+"""Errors of a level that was not measured: finite differences, and levels left out."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from truths import joint_fits
+from truths.exact_states import CONSTANT, GAIN, TRUE, damping, driven, modes, squared
+from truths.levels_with_errors import drawn_levels, measured
+
+import snrmjax as sj
+from snrmjax.identify.prediction.new_level import DayToDay, LevelTrend, NewLevel, new_level
+from snrmjax.identify.prediction.notes import notes_on_trends
+
+FORCE = 1.5  # N, below the folds
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """Known curves of five levels, which agree."""
+    return joint_fits.exact_fit()
+
+
+def with_levels(fit, std, deviations=None):
+    """The fit with levels that differ by 1σ of so much, and have some deviations."""
+    prior = dataclasses.replace(fit.prior, level=jnp.asarray(std))
+    scattering = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, prior=prior))
+    if deviations is None:
+        return scattering
+    return eqx.tree_at(lambda f: f.unknowns.level, scattering, jnp.asarray(deviations))
+
+
+def bisected(force, stiffness=0.0, loss=0.0, phase=0.0):
+    """Ω and velocity where a level with such errors records its resonance."""
+    low, high = 0.0, 5e-3
+    for _ in range(100):
+        x = 0.5 * (low + high)
+        omega, own = np.sqrt(squared(x) * (1 + stiffness)), squared(x) * (1 + stiffness)
+        for _ in range(20):
+            lost = damping(x * omega) * (1 + loss)
+            omega = np.sqrt(own + omega * lost * np.tan(phase))
+        needed = x * omega * lost / np.cos(phase) / CONSTANT
+        low, high = (x, high) if needed < force else (low, x)
+    return np.array([omega, x * omega])
+
+
+@pytest.mark.parametrize(
+    ("kind", "error"), [(0, None), (1, "phase"), (2, "stiffness"), (3, "loss")]
+)
+def test_a_resonance_holds_the_levels_errors(fit, kind, error):
+    std = 0.02 * (np.arange(4) == kind)
+    tip = sj.identify.fitted_response(fit, FORCE, of=NewLevel(std))[0].resonances[0]
+    step = 1e-5
+    if error is None:  # the gain of a record of the velocity
+        slope = np.array([0.0, tip.velocity])
+    else:
+        ends = [bisected(FORCE, **{error: sign * step}) for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step)
+    own = sj.identify.fitted_response(fit, FORCE, of=sj.identify.ON_THE_CURVES)[0].resonances[0]
+    expected = np.hypot(0.02 * slope, [own.frequency_std, own.velocity_std])
+    # Bisection to 1e-15 over a step of 1e-5.
+    np.testing.assert_allclose([tip.frequency_std, tip.velocity_std], expected, rtol=1e-6)
+
+
+def test_a_distribution_of_small_errors_is_the_band(fit):
+    level = NewLevel(np.array([0.01, 0.01, 0.004, 0.02]))
+    tip = sj.identify.fitted_response(fit, FORCE, of=level)[0].resonances[0]
+    one = sj.identify.predicted_resonance(fit, FORCE, of=level)
+    for drawn, value, std in (
+        (one.frequency, tip.frequency, tip.frequency_std),
+        (one.velocity, tip.velocity, tip.velocity_std),
+    ):
+        assert drawn[2] == pytest.approx(value, abs=0.06 * std)  # 3·1.25/sqrt(4000)
+        assert (drawn[3] - drawn[1]) / 1.989 == pytest.approx(std, rel=0.05)  # 2·0.9945
+    assert one.probability == 1.0
+
+
+def test_a_band_along_a_response_holds_the_levels_errors(fit):
+    std = np.array([0.0, 0.0, 0.0, 0.05])
+    wide, plain = (
+        sj.identify.fitted_response(fit, FORCE, of=NewLevel(one))[0] for one in (std, 0 * std)
+    )
+    tip = int(np.argmax(np.abs(plain.velocity)))
+    extra = np.sqrt(wide.velocity_std**2 - plain.velocity_std**2) / np.abs(plain.velocity)
+    # At the tip of nearly linear damping the velocity falls with it, far off it does not.
+    assert 0.03 < extra[tip] < 0.06
+    assert extra[10] < 0.01
+
+
+def test_a_record_of_the_force_brings_the_gain(fit):
+    driven_fit = sj.fit_jointly(driven(60), modes(), **TRUE)
+    force = 2.0
+    given, recorded = (new_level(driven_fit, force, as_recorded=one) for one in (False, True))
+    assert given.drive is None
+    assert recorded.drive == pytest.approx(force / GAIN, rel=0.02)
+    alone, wide = (
+        sj.identify.fitted_response(driven_fit, force, of=one)[0].resonances[0]
+        for one in (given, recorded)
+    )
+    assert wide.frequency == pytest.approx(alone.frequency, rel=1e-9)
+    # Damping and gain are known together: what the drive leaves open is less than the force does.
+    drawn = sj.identify.predicted_resonance(driven_fit, force, of=recorded)
+    half = 0.5 * (drawn.velocity[3] - drawn.velocity[1])
+    assert half == pytest.approx(wide.velocity_std, rel=0.06)
+    assert wide.velocity_std != pytest.approx(alone.velocity_std, rel=0.01)
+
+
+def test_another_day_adds_its_own_errors(fit):
+    some = with_levels(fit, [0.01, 0.0, 0.004, 0.03])
+    day = DayToDay(frequency=0.001, damping=0.04, gain=0.02)
+    one = new_level(some, FORCE, day=day)
+    expected = np.hypot([0.01, 0, 0.004, 0.03], [0.02, 0, 0.002, 0.04])
+    np.testing.assert_allclose(one.std, expected, rtol=1e-12)
+    assert one.another_day
+    assert not new_level(some, FORCE).another_day
+    said = sj.identify.predicted_resonance(some, FORCE, of=one).holds
+    assert said == "a further level's errors and another day's"
+
+
+def test_levels_that_rise_with_their_force_are_a_law(fit):
+    level = np.asarray(fit.data.level)
+    force = np.array([np.median(np.asarray(fit.data.force)[level == k]) for k in range(5)])
+    rising = np.zeros((5, 4))
+    rising[:, 0] = 2.0 * (force - force.mean()) + 0.01 * np.array([1, -1, 0, 1, -1])
+    rising[:, 3] = [1, -1, 0.5, -0.5, 0.2]
+    some = with_levels(fit, [0.02, 0.0, 0.0, 0.05], rising)
+    one = new_level(some, 2 * force.max())
+    (trend,) = one.trends
+    line = np.polynomial.Polynomial.fit(force, 0.02 * rising[:, 0], 1)
+    assert trend.kind == "gain"
+    assert trend.there == pytest.approx(line(2 * force.max()), rel=1e-9)
+    assert trend.last - trend.first == pytest.approx(0.02 * 2 * np.ptp(force), rel=0.02)
+    assert trend.p_value < 1e-4
+    assert one.std[0] == pytest.approx(np.hypot(0.02, trend.there), rel=1e-9)
+    assert one.std[3] == pytest.approx(0.05)
+
+
+def test_a_trend_is_said_with_its_numbers():
+    (said,) = notes_on_trends([LevelTrend("gain", -0.03, 0.032, 0.077, 0.04)], "0.45 V")
+    assert "+6.2 % in gain from the smallest" in said
+    assert "p = 0.04" in said
+    assert "+7.7 % in gain at 0.45 V" in said
+    assert notes_on_trends([], "1 N") == []
+
+
+@pytest.mark.long
+def test_left_out_levels_lie_inside_their_bands():
+    """One of six levels, the top one too, predicted by the others' fit: 100 tests."""
+    inside = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        levels = drawn_levels(rng)
+        out, data = int(rng.integers(6)), measured(levels, rng)
+        fit = sj.fit_jointly(data.select(np.asarray(data.level) != out), modes(), **TRUE)
+        one = sj.identify.predicted_resonance(fit, levels[out].force)
+        pair = zip((one.frequency, one.velocity), levels[out].resonance(), strict=True)
+        inside.append([each[0] < value < each[-1] for each, value in pair])
+    share = np.mean(inside, axis=0)
+    # Binomial: 2 % of 100. Student's factor for five levels widens beyond 95 %.
+    assert np.all((share >= 0.90) & (share <= 0.99))

@@ -1,0 +1,189 @@
+"""The posterior of a test, against curves and errors that made its states."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from truths.exact_states import CONSTANT, damping, squared
+
+from snrmjax.identify.test_model import states as measured
+from snrmjax.identify.test_model.posterior import fit_test
+from snrmjax.numerics.blocks import on_one_core
+
+LEVELS, PER_LEVEL, NOISE, SPREAD = 6, 15, 0.005, 0.005
+fitted = on_one_core(fit_test)
+
+
+def loss(x):
+    """δ(a) of a displacement amplitude: it grows with the velocity of resonance."""
+    return damping(x * np.sqrt(squared(x)))
+
+
+class Made(NamedTuple):
+    """States, what made them and what was found."""
+
+    states: measured.TestStates
+    stiffness: np.ndarray  # relative deviation of ω̃² of every level
+    gain: np.ndarray
+
+    def fit(self, **settings):
+        return fitted(self.states, **settings)
+
+
+def made(seed, *, spread=SPREAD, gain=0.0, noise=NOISE, stated=True, outliers=0, tips=(2e-4, 2e-3)):
+    """Levels of states within 50° of resonance, hardening by 30 %: nothing is solved for them.
+
+    The natural frequency of levels differs by `spread` (1σ, relative), their gain by `gain`.
+    """
+    rng = np.random.default_rng(seed)
+    stiffness, gains = 2 * spread * rng.normal(size=LEVELS), gain * rng.normal(size=LEVELS)
+    rows = []
+    for level, tip in enumerate(np.geomspace(*tips, LEVELS)):
+        for phase in np.radians(np.linspace(-50, 50, PER_LEVEL)):
+            x = tip * np.cos(phase)
+            own = squared(x) * (1 + stiffness[level])
+            # (ω̃² − Ω²) = Ωδ tan φ, solved for Ω.
+            b = 0.5 * loss(x) * np.tan(phase)
+            omega = -b + np.sqrt(b**2 + own)
+            needed = (own - omega**2 + 1j * omega * loss(x)) * x / CONSTANT
+            rows.append((level, omega, abs(needed), 1j * omega * x * abs(needed) / needed))
+    level, omega, force, velocity = (np.array(column) for column in zip(*rows, strict=True))
+    n = len(level)
+    std = np.tile([0.1 * noise, noise, noise], (n, 1))
+    own = std * rng.normal(size=(n, 3))
+    own[rng.choice(n, outliers, replace=False)] *= 15
+    level = level.real.astype(int)
+    velocity = velocity * np.exp(own[:, 1] + 1j * own[:, 2] + gains[level])
+    errors = std if stated else std / noise
+    states = measured.TestStates(
+        *(level, omega.real, force.real * np.exp(own[:, 0]), velocity),
+        *(errors, stated, CONSTANT, (0.0,) * 4, 0.05),
+    )
+    return Made(states, stiffness, gains)
+
+
+AT = np.geomspace(1.5e-4, 2e-3, 20)
+
+
+def off(found, at=AT):
+    """Errors of both curves in their 1σ, and relative."""
+    curves = found.curves(at)
+    truth = np.stack([squared(at), loss(at)], axis=1)
+    values = np.stack([curves.squared_frequency, curves.modal_damping], axis=1)
+    std = np.sqrt(np.einsum("nii->ni", curves.covariance))
+    return (values - truth) / std, values / truth - 1, std / truth
+
+
+@pytest.fixture(scope="module")
+def known():
+    return made(0)
+
+
+@pytest.fixture(scope="module")
+def found(known):
+    return known.fit()
+
+
+def test_curves_levels_and_noise_are_those_that_made_the_states(known, found):
+    in_std, relative, band = off(found)
+    assert np.abs(in_std).max() < 3
+    assert np.abs(relative).max() < 0.01
+    assert band[:, 0].max() < 0.005  # half of what levels differ by: their mean is not known
+    assert band[:, 1].max() < 0.02
+    # 180 rows say the noise to 5 %.
+    assert found.hyper.noise == pytest.approx(1.0, abs=0.15)
+    assert np.mean(found.residuals**2) == pytest.approx(1.0, abs=0.25)
+    mass, std = found.modal_mass
+    assert abs(mass - 1) < 3 * std < 0.02
+    assert found.differing == (False, False, True, False)
+    said = found.level_errors[:, 2]
+    # All levels but for their mean and what a smooth curve follows too: of six.
+    assert np.corrcoef(said, known.stiffness)[0, 1] > 0.99
+    assert np.std(said - known.stiffness) < 0.1 * np.std(known.stiffness)
+    assert found.hyper.level_std[2] == pytest.approx(np.std(known.stiffness, ddof=1), rel=0.35)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_bands_hold_the_curves_of_other_tests_too(seed):
+    in_std, _, _ = off(made(seed).fit())
+    assert np.abs(in_std).max() < 3.3
+    assert np.sqrt(np.mean(in_std**2)) < 1.6
+
+
+def test_levels_that_agree_are_not_said_to_differ():
+    found = made(3, spread=0.0).fit()
+    assert found.differing == (False,) * 4
+    assert off(found)[2].max() < 0.02
+
+
+def test_a_gain_of_levels_is_told_from_their_stiffness():
+    test = made(1, spread=0.0, gain=0.03)
+    found = test.fit()
+    assert found.differing[0]
+    assert not found.differing[2]
+    assert np.corrcoef(found.level_errors[:, 0], test.gain)[0, 1] > 0.95
+
+
+def test_stated_errors_of_levels_are_kept(known):
+    stated = known.states._replace(level_std=(0.0, 0.0, 0.01, 0.0))
+    found = fitted(stated)
+    assert found.hyper.level_std[2] == pytest.approx(0.01, rel=1e-12)
+    assert not found.differing[2]  # by no more than is stated
+
+
+def test_noise_that_nobody_stated_is_found(known, found):
+    silent = made(0, stated=False).fit()
+    assert silent.hyper.noise == pytest.approx(NOISE, rel=0.15)
+    both = [one.curves(AT).squared_frequency for one in (silent, found)]
+    # The size of noise that is stated is found too: the curves are the same.
+    np.testing.assert_allclose(*both, rtol=2e-4)
+
+
+def test_units_and_the_order_of_rows_change_nothing(known, found):
+    states, n = known.states, len(known.states.level)
+    order = np.random.default_rng(4).permutation(n)
+    rows = {
+        name: getattr(states, name)[order]
+        for name in ("level", "frequency", "force", "velocity", "errors")
+    }
+    shuffled = fitted(states._replace(**rows))
+    scaled = fitted(states._replace(velocity=1e3 * states.velocity, force=1e3 * states.force))
+    both = found.curves(AT)
+    for one, length in ((shuffled, 1.0), (scaled, 1e3)):
+        curves = one.curves(length * AT)
+        # The search for sizes ends at a slope of 1e-3: curves change by far less than their band.
+        for name in ("squared_frequency", "modal_damping"):
+            np.testing.assert_allclose(getattr(curves, name), getattr(both, name), rtol=1e-3)
+        assert one.hyper.noise == pytest.approx(found.hyper.noise, rel=1e-3)
+
+
+def test_outliers_are_left_aside_on_request():
+    test = made(5, outliers=4)
+    plain, robust = (off(test.fit(robust=one))[1] for one in (False, True))
+    clean = off(made(5).fit())[1]
+    assert np.abs(robust).max() < 2 * np.abs(clean).max() < np.abs(plain).max()
+
+
+def test_slopes_of_curves_are_finite_differences(found):
+    step = 1e-5
+    ends = [found.curves(AT * np.exp(sign * step)) for sign in (1, -1)]
+    slopes = found.curves(AT).slopes
+    for k, name in enumerate(("squared_frequency", "modal_damping")):
+        change = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * step)
+        np.testing.assert_allclose(slopes[:, k], change, rtol=1e-5, atol=1e-5 * np.ptp(change))
+
+
+def test_a_single_state_is_no_test(known):
+    with pytest.raises(ValueError, match="at least two states, not 1"):
+        fit_test(known.states.some(np.arange(len(known.states.level)) == 3))
+
+
+def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
+    stated = np.array([[np.nan, 0.01, 0.02], [0.003, 0.01, 0.02]])
+    stated[0, 0] = 0.0
+    errors, known = measured.state_errors(stated)
+    assert known
+    assert errors == pytest.approx(np.array([[0.001, 0.01, 0.02], [0.003, 0.01, 0.02]]))
+    errors, known = measured.state_errors(np.array([[0.0, np.nan, 0.02], [0.003, 0.01, 0.02]]))
+    assert not known
+    assert errors == pytest.approx(np.tile([0.1, 1.0, 1.0], (2, 1)))
