@@ -57,7 +57,7 @@ class Test(NamedTuple):
     states: States
     off: dict[str, np.ndarray]  # errors of the levels; the last is the further level's
     plan: dict[str, str]
-    further: States  # resonance of the further level with its own frequency error, and without
+    further: States  # resonance of the further level as it would be recorded, and the nominal one
 
 
 def drawn_share(name: str, turn: int, rng) -> float:
@@ -214,8 +214,9 @@ def drawn_test(rng, name: str, share: float, errors: Errors | None = None) -> Te
     if np.bincount(level[keep], minlength=n).min() < 5:
         raise ArithmeticError("a level without states")
     pair = np.array([stiffness[n], 1.0])
-    start = guessed(curve, np.full(2, extra), np.zeros(2), pair)
-    further = solved(law, damping, pair, np.zeros(2), start, "force")
+    recorded = np.array([-off["phase"][n], 0.0])
+    start = guessed(curve, np.full(2, extra), recorded, pair)
+    further = solved(law, damping, pair, recorded, start, "force")
     if not (further.good & start.good).all():
         raise ArithmeticError("no further level")
     return Test(law, damping, errors, curve, level[keep], states.of(keep), off, plan, further)
@@ -340,8 +341,8 @@ def _write(folder: Path, name: str, test: Test, share: float, rng) -> None:
         "extra_level": points(nominal) | {
             "force_n": newton * float(further.force[0]), "where": test.plan["where"],
             "recorded_frequency_hz": hz * float(further.w[0]),
-            "true_velocity_m_s": points(further)["velocity_m_s"][0],
-            "gain": float(off["gain"][-1]), "phase_rad": float(off["phase"][-1]),
+            "recorded_velocity_m_s": points(further)["velocity_m_s"][0] * (1 + off["gain"][-1]),
+            "errors": {key: float(value[-1]) for key, value in off.items()},
         },
         "true_velocity": np.stack([exact.real, exact.imag], 1).tolist(),
     }  # fmt: skip

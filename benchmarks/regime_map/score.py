@@ -13,8 +13,8 @@ line a set, and sets that are there are not asked again: an interrupted run goes
   "none" where the law changes χ² by less than 15 (`chi_squared` of the key).
 - wrong: answered and not honest. "further": the truth is in a class, beside an effect that is not.
 - frequency, damping: share of five points of the true backbone inside the 95 % bands of a joint
-  fit; next, next speed: resonance of a level that was not measured, predicted from its force; its
-  own frequency error is in the truth, and in the band as far as the fit knows of such errors.
+  fit; next, next speed: is the resonance of a level that was not measured, as that level would
+  record it, inside what is predicted from its force? predicted: the probability that it is reached.
 """
 
 import argparse
@@ -94,19 +94,20 @@ def identified(sj, model, data, key: dict) -> dict:
                                                      * true["frequency_hz"])))),
         "off_damping": float(np.max(np.abs(damping / true["damping_ratio"]))),
     }  # fmt: skip
-    curve = sj.identify.fitted_response(fit, extra["force_n"], points_per_side=60)
-    tips = [tip for one in curve for tip in one.resonances]
-    if not tips:
-        return answer | {"next": None, "next speed": None}
-    tip = tips[0]
-    at = tip.velocity / tip.frequency
-    new, old = (np.asarray(values(at, of_a_new_level=yes).natural_frequency_std)[0]
-                for yes in (True, False))  # fmt: skip
-    std = np.sqrt(tip.frequency_std**2 + new**2 - old**2)
-    speed = extra.get("true_velocity_m_s", extra["velocity_m_s"][0])
+    tip = sj.identify.predicted_resonance(fit, extra["force_n"])
+    if not tip.probability > 0:
+        return answer | {"predicted": 0.0, "next": None, "next speed": None}
+
+    def place(true: float, quantiles) -> float:
+        """Below and above the 95 % band it is beyond −1 and 1."""
+        low, middle, high = np.asarray(quantiles)[[0, 2, -1]]
+        return float((true - middle) / ((high if true > middle else low) - middle) *
+                     np.sign(true - middle))  # fmt: skip
+
     return answer | {
-        "next": float((tip.frequency - hertz * extra["recorded_frequency_hz"]) / std),
-        "next speed": float((tip.velocity - speed) / tip.velocity_std),
+        "predicted": float(tip.probability),
+        "next": place(hertz * extra["recorded_frequency_hz"], tip.frequency),
+        "next speed": place(extra["recorded_velocity_m_s"], tip.velocity),
     }
 
 
@@ -135,11 +136,11 @@ def inside(answer: dict, _: dict) -> dict[str, float]:
     if "error" in answer:
         return {"error": 1.0}
     score: dict[str, float] = {}
-    for name in ("frequency", "damping", "next", "next speed"):
+    for name, most in (("frequency", _BAND), ("damping", _BAND), ("next", 1), ("next speed", 1)):
         off = np.abs(np.array([answer[name]], float).ravel())
-        score[name] = np.mean(off <= _BAND) if np.isfinite(off).all() else np.nan
-    return score | {"predicted": float(answer["next"] is not None),
-                    "converged": float(answer["converged"]), "error": 0.0}  # fmt: skip
+        score[name] = np.mean(off <= most) if np.isfinite(off).all() else np.nan
+    further = {name: float(answer[name]) for name in ("predicted", "converged")}
+    return score | further | {"error": 0.0}
 
 
 _QUESTIONS = {
@@ -255,7 +256,7 @@ def draw_maps(rows: list[tuple[dict, dict, dict]], shown: tuple[str, ...], file:
                     text = f"{100 * cells[i, j]:.0f} %\nof {len(here)}"
                     panel.text(j, i, text, ha="center", va="center", fontsize=8)
             colours = "Reds" if head == "wrong" else "RdYlGn"
-            panel.imshow(cells, alpha=0.6, vmin=0, vmax=1, cmap=colours, aspect="auto", origin="lower")
+            panel.imshow(cells, colours, vmin=0, vmax=1, alpha=0.6, aspect="auto", origin="lower")
             panel.set_xticks(np.arange(len(edges)) - 0.5, [f"{edge:g}" for edge in edges])
             panel.set_yticks(range(len(_DECADES)), _DECADES)
             panel.set(xlabel=label, title=head)

@@ -21,7 +21,7 @@ _FLOORS = (4.0, 12.0, 40.0)  # noise of the force's cell over that of all else, 
 _WIDE_GAIN = 0.4  # 1σ of a level's gain where forces may have several scales
 
 
-class Correction(NamedTuple):
+class TestCorrection(NamedTuple):
     """A table read with one thing undone."""
 
     kind: Kind
@@ -31,7 +31,7 @@ class Correction(NamedTuple):
     gains: tuple[float, ...] = ()  # ln of each level's force over what it should be
 
 
-def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[Correction]:
+def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """Each correction with its likeliest parameter.
 
     What leaves scatter of the states is not looked for where they scatter as they should.
@@ -55,7 +55,7 @@ def _likeliest(tried: list[tuple[float, TestStates, float]]) -> tuple[float, Jud
     return max(judged, key=lambda one: one[1].evidence)
 
 
-def _clipped(states: TestStates) -> Iterator[Correction]:
+def _clipped(states: TestStates) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
     size = np.abs(states.velocity)
     tried = []
@@ -65,14 +65,14 @@ def _clipped(states: TestStates) -> Iterator[Correction]:
         moved = states._replace(velocity=states.velocity * true / size, errors=errors)
         tried.append((limit * float(size.max()), moved, float(np.sum(np.log(stretch)))))
     value, judged = _likeliest(tried)
-    yield Correction("clipped_channel", "velocity", judged, value)
+    yield TestCorrection("clipped_channel", "velocity", judged, value)
     force = states.force
     tried = [
         (x * float(force.max()), states._replace(force=unclipped(force, x * force.max())[0]), 0.0)
         for x in _LIMITS
     ]
     value, judged = _likeliest(tried)
-    yield Correction("clipped_channel", "force", judged, value)
+    yield TestCorrection("clipped_channel", "force", judged, value)
 
 
 def unclipped(
@@ -95,7 +95,7 @@ def unclipped(
     return true, np.clip(stretch, 1.0, 1e4)
 
 
-def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[Correction]:
+def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """What is left of the motion of the state before, decaying and turning at the mode's own pace.
 
     In a frame that turns with the force, V_n = V + (V_{n−1} − V) e^{(−δ/2 + i(ω̃ − Ω))T} after a
@@ -121,10 +121,10 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         moved = states._replace(velocity=true, errors=errors)
         tried.append((share, moved, 2 * float(np.sum(np.log(stretch)))))
     value, judged = _likeliest(tried)
-    yield Correction("unsettled_steps", "turning", judged, value)
+    yield TestCorrection("unsettled_steps", "turning", judged, value)
 
 
-def _drifting(seen: CheckedStates, states: TestStates, base: Judged) -> Correction:
+def _drifting(seen: CheckedStates, states: TestStates, base: Judged) -> TestCorrection:
     """A natural frequency that changes along the test.
 
     Frequencies are divided by e^ν(order − ½): then K, Ω² and Ωδ are all those of the middle.
@@ -141,10 +141,10 @@ def _drifting(seen: CheckedStates, states: TestStates, base: Judged) -> Correcti
         )
 
     top = climbed(lambda change: judge(moved(change)), 0.0, _TREND * width, base)
-    return Correction("drift", "frequency", top.judged, top.value)
+    return TestCorrection("drift", "frequency", top.judged, top.value)
 
 
-def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[Correction]:
+def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[TestCorrection]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
     if deepest_fall(states) < FORCE_FALLS:
         return
@@ -155,10 +155,10 @@ def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[Correction
         errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
         tried.append((ratio, states._replace(errors=errors), 0.0))
     ratio, judged = _likeliest(tried)
-    yield Correction("force_dropout", "floor", judged, ratio * least * judged.noise)
+    yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
 
 
-def _of_other_gains(states: TestStates) -> Correction:
+def _of_other_gains(states: TestStates) -> TestCorrection:
     """A scale of its own for the force of each level."""
     gains = np.zeros(states.n_levels)
     std = (_WIDE_GAIN, *states.level_std[1:])
@@ -171,4 +171,4 @@ def _of_other_gains(states: TestStates) -> Correction:
     each = np.log(_WIDE_GAIN * np.sqrt(2 * np.pi) / 0.005)  # a gain found to 0.5 %
     judged = judge(now)
     judged = judged._replace(evidence=judged.evidence - each * states.n_levels)
-    return Correction("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))
+    return TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))

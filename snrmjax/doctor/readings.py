@@ -158,7 +158,8 @@ def _evidence(one: Reading) -> float:
 def misread(recorded: Judged, best: Reading, where: str) -> Finding:
     """That phasors are something else than what they are taken for."""
     meaning = best.meaning
-    assert meaning.kind is not None
+    if meaning.kind is None:
+        raise ValueError("the table as recorded is no misreading of itself.")
     as_they_are = f"{percent(recorded.misfit)} as recorded"
     if not recorded.damped:
         as_they_are = "as recorded the mode would gain energy"

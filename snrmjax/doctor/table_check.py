@@ -3,7 +3,7 @@
 import numpy as np
 
 from snrmjax.doctor.checked_states import CheckedStates
-from snrmjax.doctor.corrections import Correction, corrections
+from snrmjax.doctor.corrections import TestCorrection, corrections
 from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged, judge, with_mass
@@ -59,7 +59,7 @@ def mode_findings(
     return found, base
 
 
-def _likeliest(seen: CheckedStates, states: TestStates, base: Judged) -> Correction | None:
+def _likeliest(seen: CheckedStates, states: TestStates, base: Judged) -> TestCorrection | None:
     """The likeliest of all believed corrections."""
     if base.misfit > _NO_MODE:
         return None
@@ -67,7 +67,7 @@ def _likeliest(seen: CheckedStates, states: TestStates, base: Judged) -> Correct
     return max(told, key=lambda one: one.judged.evidence, default=None)
 
 
-def _believed(one: Correction, base: Judged, states: TestStates) -> bool:
+def _believed(one: TestCorrection, base: Judged, states: TestStates) -> bool:
     """Whether a correction is likely, and large enough to be spoken of."""
     judged = one.judged
     if one.kind == "force_dropout":
@@ -122,7 +122,7 @@ def _different_structures(
 
 
 def _mended(
-    seen: CheckedStates, states: TestStates, base: Judged, one: Correction, where: str
+    seen: CheckedStates, states: TestStates, base: Judged, one: TestCorrection, where: str
 ) -> Finding:
     left = (
         f"; so read a state is missed by {percent(one.judged.misfit)}, not {percent(base.misfit)}."
@@ -157,7 +157,7 @@ def _mended(
 
 
 def _of_gains(
-    one: Correction, where: str, left: str, files: tuple[tuple[int, ...], ...]
+    one: TestCorrection, where: str, left: str, files: tuple[tuple[int, ...], ...]
 ) -> Finding:
     """Forces whose scale is not the same at all levels; by name where a few of them are off."""
     gains = np.array(one.gains)
@@ -191,7 +191,7 @@ def _of_gains(
 
 
 def _clipping(
-    seen: CheckedStates, states: TestStates, one: Correction, where: str, left: str
+    seen: CheckedStates, states: TestStates, one: TestCorrection, where: str, left: str
 ) -> Finding:
     force = one.name == "force"
     size = states.force if force else np.abs(states.velocity)

@@ -82,13 +82,21 @@ KINDS = (
     ("response", "force", "words", "repair"),
     [
         (1 / 9.80665, 1, "the response in g, taken for m/s²", ("g", "")),
-        (9.80665, 1, "the response in m/s², taken for g", ("m/s2", "")),
+        pytest.param(
+            *(9.80665, 1, "the response in m/s², taken for g", ("m/s2", "")), marks=pytest.mark.long
+        ),
         (1e3, 1, "the response in mm, taken for m", ("mm", "")),
-        (1e6, 1, "the response in µm, taken for m", ("um", "")),
-        (39.3701, 1, "the response in inches, taken for m", ("in", "")),
+        pytest.param(
+            *(1e6, 1, "the response in µm, taken for m", ("um", "")), marks=pytest.mark.long
+        ),
+        pytest.param(
+            *(39.3701, 1, "the response in inches, taken for m", ("in", "")), marks=pytest.mark.long
+        ),
         (1, 1e3, "the force in mN, taken for N", ("", "mN")),
         (1, 1 / 4.44822, "the force in pounds, taken for N", ("", "lbf")),
-        (1, 4.44822, "the force in N, taken for pounds", ("", "N")),
+        pytest.param(
+            *(1, 4.44822, "the force in N, taken for pounds", ("", "N")), marks=pytest.mark.long
+        ),
     ],
 )
 def test_units_that_were_mixed_up_come_first(response, force, words, repair):

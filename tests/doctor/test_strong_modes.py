@@ -43,7 +43,7 @@ def table(level, w, force, v):
     return steady_states(level, w, force, v, sensors=("tip",))
 
 
-@pytest.mark.parametrize("shift", [0.02, 0.15, 0.35])
+@pytest.mark.parametrize("shift", [0.02, pytest.param(0.15, marks=pytest.mark.long), 0.35])
 @pytest.mark.parametrize("apart", [1.0, APART])
 def test_hardening_by_tens_and_hundreds_of_bandwidths_is_no_error(shift, apart):
     """A bandwidth is 0.12 %: resonances move by 16 to 290 of them, levels by up to 7."""

@@ -74,7 +74,7 @@ def hyper_at(point: np.ndarray) -> Hyper:
     )
 
 
-def start_of(states: TestStates, discrepancy: bool) -> np.ndarray:
+def starting_point(states: TestStates, discrepancy: bool) -> np.ndarray:
     """The point from which the most likely one is looked for."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
     process = [priors.CURVE_PROCESS.median, priors.CURVE_LENGTH.median]

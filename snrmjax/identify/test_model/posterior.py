@@ -36,7 +36,7 @@ from snrmjax.identify.test_model.hyper import (
     objective_of,
     places_of,
     prior_variances,
-    start_of,
+    starting_point,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
     LinearRows,
@@ -52,6 +52,7 @@ _ROUNDS = 6
 _WITHOUT_PROCESS, _AS_RECORDED = 2, 2  # rounds until curves are free, until states are corrected
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
 _FARTHEST = 0.3  # relative or rad, of a state's correction
+_LINEAR = 0.5  # relative or rad, of a level's error, that a straight line reaches
 _SIGMAS = 4.0  # of a level's error, at which the problem is made straight at most
 
 
@@ -150,7 +151,7 @@ def fit_test(
     smooth = mean
     stated = np.array(states.level_std[:2])
     farthest = _SIGMAS * np.where(stated > 0, stated, [one.scale for one in priors.LEVELS[:2]])
-    start = start_of(states, discrepancy)
+    start = starting_point(states, discrepancy)
     point, found = start, None
     for k in range(rounds):
         problem = _Problem(
@@ -164,10 +165,16 @@ def fit_test(
         if k == 0:  # and no level differs from another yet
             bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
         objective = objective_of(this.equations, states, basis, places)
-        best = most_likely(objective, point if k > _WITHOUT_PROCESS else start, bounds)
-        point, hyper = best.point, hyper_at(best.point)
-        variance = prior_variances(hyper, basis, places, states)[0]
-        mean, covariance = this.equations.posterior(hyper.noise, variance)
+        begin = point if k > _WITHOUT_PROCESS else start
+        for _ in range(2):
+            best = most_likely(objective, begin, bounds)
+            point, hyper = best.point, hyper_at(best.point)
+            variance = prior_variances(hyper, basis, places, states)[0]
+            mean, covariance = this.equations.posterior(hyper.noise, variance)
+            if np.max(np.abs(mean[places.levels[:, :2]])) < _LINEAR:
+                break
+            # A gain of two would be a turned sign: no straight line goes that far.
+            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
         # Slopes of curves that bend as they like would let errors of amplitude explain all.
         variance[places.processes] = 0.0
         smooth = this.equations.posterior(hyper.noise, variance)[0]

@@ -227,9 +227,10 @@ def test_level_errors_are_shared_within_a_level():
     # 20 draws: 1/√40 = 16 % of the standard deviation, three of them.
     assert np.std(np.abs(ratio[:, 0])) == pytest.approx(0.1, rel=0.5)
     assert np.std(np.angle(ratio[:, 0])) == pytest.approx(0.2, rel=0.5)
-    # The same gain and turn for the harmonics of a state; nothing is stated for single rows.
+    # The same gain for the harmonics of a state, and twice the turn for the second: an error of
+    # time. Nothing is stated for single rows.
     own = np.asarray(noisy.harmonics / truth.harmonics)[:, 0, 0].reshape(20, 4)
-    np.testing.assert_allclose(own, ratio, rtol=1e-12)
+    np.testing.assert_allclose(own, ratio**2 / np.abs(ratio), rtol=1e-12)
     assert np.all(np.isnan(noisy.velocity_std))
     np.testing.assert_array_equal(noisy.force, truth.force)
 
