@@ -197,11 +197,11 @@ def shared_by_both(
     old: WeightedMisfit, new: WeightedMisfit, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
     """Errors shared by measured states and a further test: the baseline's, not the levels'."""
-    stated = sum(std > 0 for std in old.model.level_stds)
     parts = old.noise.shared, new.noise.shared[kept]
-    own = [stated * misfit.predictions.chosen.n_levels for misfit in (old, new)]
-    common = [part[:, : part.shape[1] - n] for part, n in zip(parts, own, strict=True)]
-    apart = [part[:, part.shape[1] - n :] for part, n in zip(parts, own, strict=True)]
+    of_levels = [misfit.noise.shared_kind >= 0 for misfit in (old, new)]
+    common = [part[:, ~mine] for part, mine in zip(parts, of_levels, strict=True)]
+    apart = [part[:, mine] for part, mine in zip(parts, of_levels, strict=True)]
+    own = [part.shape[1] for part in apart]
     blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
     return np.concatenate(
         [
