@@ -36,9 +36,6 @@ that of its parts; of noise understated by more than a quarter effects would be 
 MOST_NOISE = float(np.log(4.0))
 """The largest wrong statement considered: a factor of four, either way."""
 
-LEVEL_FORCE = 0.3
-"""Relative 1σ of the force of a level that is left free: far more than a calibration is off."""
-
 # --- sizes that are integrated over
 
 DISCREPANCY_SIZES = (0.3, 100.0)

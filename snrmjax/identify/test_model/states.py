@@ -7,9 +7,6 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
 
-STATE_ERRORS = ("force", "velocity", "phase")
-"""What every state errs in by itself: logarithms of force and velocity, and the phase in rad."""
-
 LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
 """What all states of a level may have in common, relative or in rad."""
 
@@ -25,7 +22,8 @@ class TestStates(NamedTuple):
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N, or V where only the drive is known
     velocity: Complex[np.ndarray, " state"]  # m/s
-    errors: Float[np.ndarray, "state input"]  # 1σ of `STATE_ERRORS`; in parts where not stated
+    # 1σ of the logarithms of force and velocity and of the phase (rad); in parts where not stated.
+    errors: Float[np.ndarray, "state input"]
     stated: bool  # whether these were
     constant: float  # A, 1/kg
     level_std: tuple[float, float, float, float]  # stated 1σ of `LEVEL_ERRORS`; zero: not stated
