@@ -53,7 +53,9 @@ SUB_ROOMS = {
     "identify.curves": set(),
     "identify.pointwise": {"identify.checks", "identify.curves"},
     "identify.checks": set(),
-    "identify.joint": {"identify.checks", "identify.curves", "identify.pointwise"},
+    "identify.joint": {
+        *("identify.checks", "identify.curves", "identify.pointwise", "identify.test_model"),
+    },
     "identify.prediction": {"identify.curves", "identify.pointwise", "identify.joint"},
     "identify.inference": {
         *("identify.curves", "identify.pointwise", "identify.joint", "identify.prediction"),
@@ -64,7 +66,7 @@ SUB_ROOMS = {
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "methods.bench": {"methods.result", "methods.one_sensor"},
-    "identify.test_model": set(),
+    "identify.test_model": {"identify.curves"},
     "diagnose.misfit": set(),
     "diagnose.search": {"diagnose.misfit"},
     "diagnose.checks": {

@@ -24,7 +24,7 @@ from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
-from snrmjax.identify.test_model.linear_gaussian import LinearRows, most_likely
+from snrmjax.identify.test_model.linear_gaussian import LinearRows, maximised, precision_at
 from snrmjax.identify.test_model.priors import (
     LEVELS,
     UNSTATED_NOISE,
@@ -205,12 +205,12 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
         return value, slopes
 
     bounds = [sizes.noise_bounds, *(sizes.bounds[place] for place in used)]
-    found = most_likely(with_priors, np.zeros(len(bounds)), bounds)
-    others = np.linalg.inv(found.covariance)[1:, 1:]
+    found = maximised(with_priors, np.zeros(len(bounds)), bounds)
+    others = precision_at(with_priors, found)[1:, 1:]
     volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
-    top = with_priors(found.point)[0] - likelihood(found.point)[0]
+    top = with_priors(found)[0] - likelihood(found)[0]
     grid = np.linspace(*sizes.noise_bounds, _NOISES)
-    logs = np.array([likelihood(np.append(one, found.point[1:]))[0] for one in grid])
+    logs = np.array([likelihood(np.append(one, found[1:]))[0] for one in grid])
     logs += volume + top - model.penalty
     return Evidence(*(float(logsumexp(logs + prior(grid))) for prior in sizes.noise))
 

@@ -34,16 +34,7 @@ from .inference.sensitivity import (
     sensitivity,
 )
 from .joint.fitting import FitStatus
-from .joint.joint_fit import (
-    FailedRival,
-    FamilyChoice,
-    JointFit,
-    NoiseEstimate,
-    Rival,
-    fit_jointly,
-)
-from .joint.ranking import FamilyCandidate
-from .joint.selection import SelectionStatus
+from .joint.joint_fit import JointFit, NoiseEstimate, fit_jointly
 from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay
 from .modal.linear_fit import fit_linear_modes
@@ -101,9 +92,6 @@ __all__ = [
     "DayToDay",
     "DecayModes",
     "DrivePoint",
-    "FailedRival",
-    "FamilyCandidate",
-    "FamilyChoice",
     "FitStatus",
     "FittedPoint",
     "FittedResponse",
@@ -127,9 +115,7 @@ __all__ = [
     "Profile",
     "Resonance",
     "ResonanceDistribution",
-    "Rival",
     "ScaledModes",
-    "SelectionStatus",
     "Sensitivity",
     "SensorMasses",
     "SnrmPoints",

@@ -24,15 +24,7 @@ from snrmjax.identify.joint.force_balance import (
     PriorStd,
     Unknowns,
 )
-from snrmjax.identify.joint.joint_fit import (
-    FailedRival,
-    FamilyChoice,
-    JointFit,
-    NoiseEstimate,
-    Rival,
-)
-from snrmjax.identify.joint.ranking import FamilyCandidate
-from snrmjax.identify.joint.selection import SelectionStatus
+from snrmjax.identify.joint.joint_fit import JointFit, NoiseEstimate
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table
@@ -40,7 +32,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 
 BAND_POINTS = 200
-_FORMAT = 3
+_FORMAT = 4
 
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:
@@ -102,19 +94,6 @@ def summarise_fit(
             "damping_std_relative": level["damping"],
         },
         "modal_mass": _modal_mass(fit),
-        "tried": [candidate._asdict() for candidate in fit.families.candidates],
-        "rivals": [
-            {
-                "curve": one.curve,
-                "family": described(_curve(one.fit, one.curve)),
-                "weight": one.weight,
-            }
-            for one in fit.families.rivals
-        ],
-        "failed_rivals": [
-            {**one._asdict(), "status": one.status.name.lower()} for one in fit.families.failed
-        ],
-        "selection": fit.families.status.name.lower(),
         "contributions": [one._asdict() for one in shares],
         "resonances": [_point(p) for r in responses for p in r.resonances],
         "folds": [_point(p) for r in responses for p in r.folds],
@@ -163,11 +142,6 @@ def _modal_mass(fit: JointFit) -> dict:
     }
 
 
-def _curve(fit: JointFit, name: str) -> AbstractFamily:
-    pair = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
-    return pair[0] if name == "backbone" else pair[1]
-
-
 def described(family: AbstractFamily) -> str:
     """A family as the command takes it."""
     return family.label
@@ -190,7 +164,7 @@ def write_joint_fit(path: FilePath, fit: JointFit) -> None:
 
 
 def _content(fit: JointFit) -> dict:
-    unknowns, failed = fit.unknowns, fit.families.failed
+    unknowns = fit.unknowns
     return {
         "format": _FORMAT,
         "names": list(fit.names()),
@@ -208,10 +182,6 @@ def _content(fit: JointFit) -> dict:
         "residuals": fit.residuals,
         "level_std": fit.noise.level_std,
         "neighbour_correlation": fit.noise.autocorrelation,
-        "candidates": [candidate._asdict() for candidate in fit.families.candidates],
-        "rivals": [[one.curve, one.weight, _of_a_rival(one.fit)] for one in fit.families.rivals],
-        "failed_rivals": [[one.curve, one.family, one.weight, one.status] for one in failed],
-        "selection_status": fit.families.status,
         "noise_scale": fit.noise.scale,
         "noise_scale_std": fit.noise.scale_std,
         "noise_stated": fit.noise.stated,
@@ -222,13 +192,6 @@ def _content(fit: JointFit) -> dict:
         "status": fit.status,
         "level_numbers": fit.level_numbers,
     }
-
-
-_SHARED = ("modes", "candidates")  # by a fit and its rivals
-
-
-def _of_a_rival(fit: JointFit) -> dict:
-    return {key: value for key, value in _content(fit).items() if key not in _SHARED}
 
 
 def read_joint_fit(path: FilePath) -> JointFit:
@@ -260,7 +223,6 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
         _family(content["modal_damping"]),
     )
     arrays = {k: jnp.asarray(v) for k, v in content["unknowns"].items()}
-    shared = {key: content[key] for key in _SHARED}
     prior = PriorStd(**{name: jnp.asarray(std) for name, std in content["spread"].items()})
     # Files written before a fit had a status know only whether it converged.
     known = FitStatus.CONVERGED if content["converged"] else FitStatus.NOT_SETTLED
@@ -274,18 +236,6 @@ def _rebuilt(content: dict[str, Any]) -> JointFit:
             level_std=np.asarray(content["level_std"]),
             autocorrelation=np.asarray(content.get("neighbour_correlation", [0.0, 0.0])),
             stated=content["noise_stated"],
-        ),
-        families=FamilyChoice(
-            candidates=tuple(FamilyCandidate(**row) for row in content["candidates"]),
-            rivals=tuple(
-                Rival(curve, weight, _rebuilt(rival | shared))
-                for curve, weight, rival in content.get("rivals", [])
-            ),
-            failed=tuple(
-                FailedRival(curve, family, weight, FitStatus(status))
-                for curve, family, weight, status in content.get("failed_rivals", [])
-            ),
-            status=SelectionStatus(content.get("selection_status", SelectionStatus.SETTLED)),
         ),
         residuals=np.asarray(content["residuals"]),
         drive_known_only=content["drive_known_only"],

@@ -137,8 +137,6 @@ def joint_sections(
         pictured = [ReportFigure(figures["next"], ADVICE_CAPTION)]
         table = advice_table(told.advice)
         sections.append(Section("What to measure next", (), pictured, [table]))
-    if fit.families.candidates:
-        sections.append(Section("Families tried", (), (), [family_table(summary)]))
     return sections
 
 
@@ -325,37 +323,3 @@ def advice_table(advice: Sequence[NextMeasurement]) -> ReportTable:
         "left: the mean width of the bands after this measurement, of today's."
     )
     return ReportTable(header, rows, caption)
-
-
-def family_table(summary: dict) -> ReportTable:
-    """Families tried, the best of each curve first."""
-    tried = sorted(summary["tried"], key=lambda one: (one["curve"], -one["score"]))
-    rows = [
-        (
-            one["curve"],
-            f"{one['family']}:{one['size']}@{one['argument']}",
-            str(one["parameters"]),
-            minus(f"{one['score']:.1f}") + (f" ± {one['score_std']:.1f}" if one["score"] else ""),
-            f"{one['prediction_error']:.3f}",
-            f"{100 * one['weight']:.0f}",
-            "taken" if one["chosen"] else "",
-        )
-        for one in tried
-    ]
-    header = (
-        "curve",
-        "family",
-        "parameters",
-        "score",
-        "error of prediction",
-        "weight (%)",
-        "choice",
-    )
-    caption = (
-        "Score: how well left-out levels were predicted (0 is best), ± 1σ; within 2 of the best is "
-        "as good. Error of prediction: how far the curve missed the left-out levels, over what "
-        "its band said, 1 if the band is right. Weight: share of this curve in the band. The "
-        "curve taken may have one term more than the best score asks for, so that its band does "
-        "not rest on the shape of too small a family."
-    )
-    return ReportTable(header, rows, caption, f"{len(rows)} families of curves compared")

@@ -183,7 +183,7 @@ def test_the_report_begins_with_the_verdict_in_a_sentence(drag, pictures):
     assert body.index('class="result"') < body.index('class="pairs"') < body.index("<h2>")
     sentence = re.search(r'<p class="result">(.*?)</p>', body)[1]
     assert "quadratic damping" in sentence
-    assert "the misfit falls from 4.2 to 1.0 times the noise" in sentence
+    assert re.search(r"the misfit falls from 4\.\d to 1\.0 times the noise", sentence)
     assert "quadratic_damping" not in body
     assert "may be" not in body
 

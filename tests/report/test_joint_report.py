@@ -233,20 +233,6 @@ def test_states_that_lie_together_share_a_label(told):
     assert [text.get_text() for text in figure.axes[0].texts] == ["1, 2"]
 
 
-def test_families_are_listed_best_first():
-    tried = sj.fit_jointly(noisy(1), modes(), backbone="polynomial", damping="constant")
-    table = joint_report.joint_sections(
-        joint_report.reported_fit(tried),
-        dict.fromkeys(("joint_fit", "residuals", "contributions"), drawing.panels(1, 1, 1, 1)[0]),
-    )[-1].tables[0]
-    scores = [c.score for c in tried.families.candidates if c.curve == "backbone"]
-    listed = [row for row in table.rows if row[0] == "backbone"]
-    assert len(listed) == len(scores) > 1
-    assert listed[0][3] == "0.0"
-    close_to(listed[-1][3].split(" ± ")[0], min(scores))
-    assert sum(row[-1] == "taken" for row in listed) == 1
-
-
 def test_nothing_to_show_is_an_error():
     for draw, named in (
         (joint_plot.contributions_figure, "nothing to show"),

@@ -76,7 +76,7 @@ class Spline(AbstractFamily):
         argument: Argument,
     ) -> "Spline":
         """The spline through values at knots, which are squares of amplitude/scale."""
-        mix = jnp.asarray(np.linalg.inv(_terms(knots, knots)))
+        mix = jnp.asarray(np.linalg.inv(spline_terms(knots, knots)))
         return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
 
 
@@ -163,8 +163,8 @@ class SmoothingSpline(Spline):
         argument: Argument,
     ) -> "SmoothingSpline":
         """See `Spline`; bends of all sizes are alike likely until `bend_std` says otherwise."""
-        mix = jnp.asarray(np.linalg.inv(_terms(knots, knots)))
-        bends = jnp.asarray(_bends(knots))
+        mix = jnp.asarray(np.linalg.inv(spline_terms(knots, knots)))
+        bends = jnp.asarray(bends_of(knots))
         fixed = (scale, argument, jnp.asarray(knots), mix, bends, jnp.asarray(np.inf))
         return cls(jnp.asarray(values), *fixed)
 
@@ -192,10 +192,10 @@ def spline_columns(
 ) -> Float[np.ndarray, "point knot"]:
     """Derivatives of a spline by its values at the knots, on the host."""
     u = (amplitude / float(curve.scale)) ** 2
-    return _terms(u, np.asarray(curve.knots)) @ np.asarray(curve.mix)
+    return spline_terms(u, np.asarray(curve.knots)) @ np.asarray(curve.mix)
 
 
-def _bends(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
+def bends_of(knots: Float[np.ndarray, " knot"]) -> Float[np.ndarray, "bend knot"]:
     """Change of slope at every inner knot, times the mean distance to its neighbours.
 
     A bend's variance is expected to grow with that distance, counted in logarithms of amplitude:
@@ -228,7 +228,8 @@ def hats(u: Array | np.ndarray, knots: Float[Array | np.ndarray, " knot"]) -> tu
     return value, 0.5 * up**2 / rise + down - 0.5 * down**2 / fall
 
 
-def _terms(
+def spline_terms(
     u: Float[np.ndarray, " point"], knots: Float[np.ndarray, " knot"]
 ) -> Float[np.ndarray, "point term"]:
+    """1, u and the `hats` at some points u, on the host."""
     return np.column_stack([np.ones_like(u), u, hats(u, knots)[0]])

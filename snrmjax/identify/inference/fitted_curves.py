@@ -19,7 +19,6 @@ from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled
 
 _BLOCK = 256  # amplitudes that one program works on
-_LEAST = 0.01  # of the largest amplitude, below which rivals are not asked
 _ITERATIONS = 12
 _KNOTS = 120  # of the curves for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
@@ -34,8 +33,6 @@ def fitted_values(
 ) -> BackboneValues:
     """ω̃ and ζ̃ at amplitudes on the backbone, with 1σ at that amplitude.
 
-    The bands include what the choice among families leaves open (`open_choice`).
-
     Arguments: either `velocity` in m/s or `displacement` in m, zero allowed. With `of_a_new_level`
     the bands are those of the next test: they include by how much one level differs from another.
     Raises `ValueError` for a velocity that the backbone has at several displacements, as it can
@@ -46,13 +43,10 @@ def fitted_values(
     if velocity is not None:
         at = np.asarray(velocity, dtype=np.float64)
         values, slopes = values_with_slopes(fit, at)
-        shifts = open_choice(fit, velocity=at)
     else:
         given = np.asarray(displacement, np.float64)
         values, slopes, at = values_at_displacement(fit, given)
-        shifts = open_choice(fit, displacement=given)
     covariance = np.einsum("ocp,pq,odq->ocd", slopes, fit.covariance, slopes)
-    covariance += np.einsum("koc,kod->ocd", shifts, shifts)
     squared, damping = values.T
     if of_a_new_level:
         stiffness, dissipation = np.asarray(fit.prior.level)[2:]
@@ -71,64 +65,6 @@ def fitted_values(
         modal_damping=jnp.asarray(damping),
         modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
     )
-
-
-def open_choice(
-    fit: JointFit,
-    *,
-    velocity: Float[np.ndarray, " point"] | None = None,
-    displacement: Float[np.ndarray, " point"] | None = None,
-) -> Float[np.ndarray, "rival point curve"]:
-    """How far ω̃² and 2ζ̃ω̃ may be off because another family could be the right one.
-
-    One shift for each of the fit's rivals, to be taken as an error of 1σ (`beyond_estimation`).
-    Zero where a rival does not have a velocity, or has it twice. Below a hundredth of the largest
-    amplitude the shifts are those there: dry friction has no finite damping at rest.
-    """
-    largest = fit.largest[0 if velocity is None else 1]
-    at = np.asarray(displacement if velocity is None else velocity, dtype=np.float64)
-    at = np.maximum(at, _LEAST * largest)
-
-    def described(one: JointFit, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if velocity is None:
-            values, slopes, _ = values_at_displacement(one, at)
-        else:
-            values, slopes = values_with_slopes(one, at)
-        return values, np.einsum("ocp,pq,ocq->oc", slopes, one.covariance, slopes)
-
-    shifts = np.zeros((len(fit.families.rivals), len(at), 2))
-    own = described(fit, at) if fit.families.rivals else (at, at)
-    for shift, rival in zip(shifts, fit.families.rivals, strict=True):
-        has = np.ones(len(at), dtype=bool)
-        if velocity is not None:
-            has = at < _near(rival.fit, float(np.max(at))).once
-        if has.any():
-            theirs = described(rival.fit, at[has])
-            shift[has] = beyond_estimation(rival.weight, own[0][has], own[1][has], *theirs)
-    return shifts
-
-
-def beyond_estimation(
-    weight: float,
-    value: Float[np.ndarray, "*batch"],
-    variance: Float[np.ndarray, "*batch"],
-    other: Float[np.ndarray, "*batch"],
-    other_variance: Float[np.ndarray, "*batch"],
-) -> Float[np.ndarray, "*batch"]:
-    """What of the difference of two families' answers is no error of estimation, as 1σ.
-
-    If both were right, the variance of their difference would be that of their variances: only
-    what the squared difference has beyond this speaks of the choice, and counts with the rival's
-    weight. Zero where either has no finite answer.
-    References: for the variance of the difference, Hausman, Econometrica 46 (1978) 1251,
-    doi:10.2307/1913827; for the choice as a part of the variance, Buckland, Burnham & Augustin,
-    Biometrics 53 (1997) 603, doi:10.2307/2533961.
-    """
-    with np.errstate(invalid="ignore"):
-        apart, expected = other - value, np.abs(other_variance - variance)
-        excess = np.sqrt(weight * np.maximum(apart**2 - expected, 0.0))
-    known = np.isfinite(apart) & np.isfinite(excess)
-    return np.where(known, np.sign(apart) * excess, 0.0)
 
 
 def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
@@ -159,11 +95,7 @@ def as_backbone(
         displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
         sampled = values_at_displacement(fit, displacement)
     values, slopes = (np.asarray(part) for part in sampled[:2])
-    shifts = np.asarray(open_choice(fit, displacement=displacement))
-    covariance = [
-        slopes[:, k] @ fit.covariance @ slopes[:, k].T + shifts[:, :, k].T @ shifts[:, :, k]
-        for k in range(2)
-    ]
+    covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
     measured = np.asarray(fit.motion().displacement)
     # Dry friction has no finite damping at rest: there the next knot's value stands.
     damping = values[:, 1].copy()

@@ -109,9 +109,8 @@ def fitted_response(
 
     Bands come from the implicit function theorem on the curve's own equation
     |(ω̃² − Ω²) + iΩδ| X = |A|F: at fixed amplitude for the frequency, at fixed frequency for the
-    velocity, along both equations of a resonance and of a fold. They include what the choice among
-    families leaves open: what rivals say of the same points. They are those of a further level:
-    they also hold by how much one level differs from another.
+    velocity, along both equations of a resonance and of a fold. They are those of a further
+    level: they also hold by how much one level differs from another.
 
     Arguments: `force` in N, frequencies in rad/s; curves end at `largest_amplitude_ratio` times
     the largest measured amplitude, beyond which the fitted curves are extrapolated; `of` the level
@@ -133,7 +132,7 @@ def fitted_response(
     for number, curve in enumerate(curves):
         band = banded_curve(fit, force, curve.amplitude, curve.frequency, level)
         places = [*(tips if number == 0 else ()), *turns(curve.frequency, curve.amplitude)]
-        points = [located(fit, force, place, largest_amplitude_ratio, level) for place in places]
+        points = [located(fit, force, place, level) for place in places]
         good = [one for one in points if one.status == LocatedStatus.LOCATED]
         missing = tuple(one for one in points if one.status != LocatedStatus.LOCATED)
         answer.append(
@@ -176,8 +175,8 @@ def predicted_resonance(
 ) -> ResonanceDistribution:
     """Whether a further level has its resonance within a range of amplitudes, and where.
 
-    Curves are drawn from the fit and from its rivals, each as often as it weighs, with a further
-    level's errors (`new_level`). Beyond the data the bands widen with what they leave open.
+    Curves are drawn from the fit with a further level's errors (`new_level`). Beyond the data the
+    bands widen with what they leave open.
 
     Arguments: `force` in N, looked for up to `largest_amplitude_ratio` times the largest measured
     amplitude; `of` the level where it is not `new_level`'s; `self_excited` allows negative damping.
@@ -185,27 +184,21 @@ def predicted_resonance(
     new = new_level(fit, force) if of is None else of
     amplitude = amplitudes_to(fit.largest[0], largest_amplitude_ratio)
 
-    def known(one: JointFit, weight: float) -> KnownCurves:
-        values, slopes, _ = values_at_displacement(one, amplitude)
-        root = covariance_root(one.covariance)
-        load, names = force, one.names()
-        by_load = -float(one.prior.linear[-1]) * root[-1]
-        if new.drive is not None:
-            load = float(one.force_of_drive(np.array(new.drive)))
-            offset = float(one.unknowns.force_offset * np.min(np.asarray(one.data.force)))
-            by = {"force_gain": 1 - offset / load}
-            by["force_offset"] = float(np.min(np.asarray(one.data.force))) / load
-            by_load = by_load + sum(by[n] * root[names.index(n)] for n in by if n in names)
-        constant = abs(float(one.problem.constant_of(one.unknowns)))
-        return KnownCurves(weight, values, slopes @ root, constant * load, by_load)
-
-    rivals = fit.families.rivals
-    left = {kind: 1 - sum(r.weight for r in rivals if r.curve == kind) for kind in _CURVES}
-    odds = [one.weight / max(left[one.curve], one.weight * _LEAST) for one in rivals]
+    values, slopes, _ = values_at_displacement(fit, amplitude)
+    root = covariance_root(fit.covariance)
+    load, names = force, fit.names()
+    by_load = -float(fit.prior.linear[-1]) * root[-1]
+    if new.drive is not None:
+        load = float(fit.force_of_drive(np.array(new.drive)))
+        smallest = float(np.min(np.asarray(fit.data.force)))
+        by = {"force_gain": 1 - float(fit.unknowns.force_offset) * smallest / load}
+        by["force_offset"] = smallest / load
+        by_load = by_load + sum(by[n] * root[names.index(n)] for n in by if n in names)
+    constant = abs(float(fit.problem.constant_of(fit.unknowns)))
     modes = with_deviations(fit.modes, fit.unknowns.linear, fit.prior.linear)
     return resonance_distribution(
         *(force, amplitude),
-        [known(fit, 1.0), *(known(r.fit, weight) for r, weight in zip(rivals, odds, strict=True))],
+        KnownCurves(values, slopes @ root, constant * load, by_load),
         *(new, other_modes(modes, fit.data.sensor, force)),
         ratio=largest_amplitude_ratio,
         gain_of_force=bool(fit.prior.gain_of_force > 0),

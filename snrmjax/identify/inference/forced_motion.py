@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.linalg import block_diag
 
-from snrmjax.identify.inference.fitted_curves import beyond_estimation
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
     Unknowns,
@@ -120,57 +119,28 @@ class BandedCurve(NamedTuple):
     velocity_std: Float[np.ndarray, " point"]  # of the magnitude at fixed frequency
 
 
-class _Banded(NamedTuple):
-    amplitude: np.ndarray
-    frequency: np.ndarray
-    frequency_std: np.ndarray
-    velocity: np.ndarray
-    velocity_std: np.ndarray
-    excess: np.ndarray  # of the curve's equation
-    by_amplitude: np.ndarray  # its slopes
-    by_frequency: np.ndarray
-    through: np.ndarray  # slope of the speed by the amplitude
-
-
 def banded_curve(
     fit: JointFit, force: float, amplitude: np.ndarray, frequency: np.ndarray, new: NewLevel
 ) -> BandedCurve:
     """The points of a response curve that are nearest to some, with bands."""
 
-    def banded(one: JointFit, x: np.ndarray, omega: np.ndarray, steps: int) -> _Banded:
-        program, motion = one.packed(), ForcedMotion.of(one, force, new)
-        own, level = program.padded_covariance(one.covariance), np.diag(new.std**2)
-        covariance = jnp.asarray(block_diag(own, level))
-        count, vector = np.array(steps), motion.with_level(program.vector)
-        found = by_blocks(
-            lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
-            *(_BLOCK, np.asarray(x), np.asarray(omega)),
-        )
-        return _Banded(*found)
-
+    program, motion = fit.packed(), ForcedMotion.of(fit, force, new)
+    own, level = program.padded_covariance(fit.covariance), np.diag(new.std**2)
+    covariance = jnp.asarray(block_diag(own, level))
+    count, vector = np.array(_ONTO_THE_CURVE), motion.with_level(program.vector)
     # The points come from curves drawn anew through knots: steps put them on the fit's own.
-    own = banded(fit, amplitude, frequency, _ONTO_THE_CURVE)
-    values = own.frequency, np.abs(own.velocity)
-    variances = own.frequency_std**2, own.velocity_std**2
-    added = [np.zeros_like(one) for one in variances]
-    for rival in fit.families.rivals:
-        other = banded(rival.fit, own.amplitude, own.frequency, 0)
-        # Where the rival's curve would be, to first order, by the slopes of the fit's own.
-        there = own.frequency - other.excess / own.by_frequency
-        speed = np.abs(other.velocity) - own.through / own.by_amplitude * other.excess
-        answers = ((there, other.frequency_std), (speed, other.velocity_std))
-        for k, (answer, std) in enumerate(answers):
-            given = (values[k], variances[k], answer, std**2)
-            added[k] += beyond_estimation(rival.weight, *given) ** 2
-    wide = [np.sqrt(one + more) for one, more in zip(variances, added, strict=True)]
-    return BandedCurve(own.frequency, wide[0], own.velocity, wide[1])
+    found = by_blocks(
+        lambda x, omega: _bands(motion, vector, covariance, x, omega, count),
+        *(_BLOCK, np.asarray(amplitude), np.asarray(frequency)),
+    )
+    return BandedCurve(*found)
 
 
 @compiled
 def _bands(
     motion: ForcedMotion, vector: Array, covariance: Array, x: Array, omega: Array, steps: Array
 ) -> tuple[Array, ...]:
-    """The fields of `_Banded`, after so many steps onto the curve."""
+    """The fields of `BandedCurve`, after so many steps onto the curve."""
     ones, excess = jnp.ones_like(x), motion.excess
 
     def by(position: int, x: Array, omega: Array) -> Array:
@@ -197,5 +167,4 @@ def _bands(
     frequency_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", by_vector, covariance, by_vector))
     velocity_std = jnp.sqrt(jnp.einsum("op,pq,oq->o", moved, covariance, moved))
     velocity = motion.velocity(vector, x, omega)
-    known = (x, omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std)
-    return *known, excess(vector, x, omega), by_x, by_omega, through
+    return omega, frequency_std / jnp.abs(by_omega), velocity, velocity_std

@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from snrmjax.identify.inference.fitted_curves import as_backbone, beyond_estimation
 from snrmjax.identify.inference.forced_motion import ForcedMotion
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.prediction import predict_response, resonances
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import AbstractResult, Variable
@@ -43,7 +41,6 @@ class FittedPoint(AbstractResult):
     continued: bool  # beyond the measured amplitudes
     kind: str = "resonance"  # or "fold"
     status: LocatedStatus = LocatedStatus.LOCATED
-    rivals_without: int = 0  # competing families without such a point: the band leaves them out
 
     def summary(self) -> tuple[str, ...]:
         """See `AbstractResult`."""
@@ -51,8 +48,6 @@ class FittedPoint(AbstractResult):
         status = "located" if self.status == LocatedStatus.LOCATED else "not located"
         if self.continued:
             status += ", beyond the measured amplitudes"
-        if self.rivals_without:
-            status += f"; {self.rivals_without} competing families have no such point"
         return (
             f"FittedPoint: {self.kind} under {self.force:.4g} N",
             f"{size:.6g} ± {std:.2g} Hz, {self.velocity:.4g} ± {self.velocity_std:.2g} m/s",
@@ -97,9 +92,9 @@ class _Solved(NamedTuple):
 
 
 def located(
-    fit: JointFit, force: float, place: Place, ratio: float, new: NewLevel = ON_THE_CURVES
+    fit: JointFit, force: float, place: Place, new: NewLevel = ON_THE_CURVES
 ) -> FittedPoint:
-    """The resonance or fold near a place; rivals' are looked for up to `ratio` of the data."""
+    """The resonance or fold near a place."""
     largest = fit.largest[0] * (1 + 1e-9)
     found = _solved(fit, force, place, new)
     if found is None:
@@ -114,16 +109,7 @@ def located(
             status=LocatedStatus.NOT_LOCATED,
         )
     values, variance = found.values, found.variance(fit)
-    widened, without = variance + found.by_level**2 @ new.std**2, 0
-    near = Place(place.kind, float(values[2]), float(values[0]))
-    for rival in fit.families.rivals:
-        answer = _of_a_rival(rival.fit, force, near, ratio, new)
-        if answer is None:
-            without += 1
-            continue
-        given = (rival.weight, values, variance, answer.values, answer.variance(rival.fit))
-        shift = beyond_estimation(*given)
-        widened = widened + shift**2
+    widened = variance + found.by_level**2 @ new.std**2
     (omega, speed, x), std = values, np.sqrt(widened)
     return FittedPoint(
         force=force,
@@ -133,7 +119,6 @@ def located(
         velocity_std=float(std[1]),
         continued=bool(x > largest),
         kind=place.kind,
-        rivals_without=without,
     )
 
 
@@ -142,29 +127,6 @@ def turns(frequency: np.ndarray, amplitude: np.ndarray) -> list[Place]:
     steps = np.sign(np.diff(frequency))
     at = np.flatnonzero(steps[:-1] * steps[1:] < 0) + 1
     return [Place("fold", float(amplitude[k]), float(frequency[k])) for k in at]
-
-
-def _of_a_rival(
-    rival: JointFit, force: float, place: Place, ratio: float, new: NewLevel
-) -> _Solved | None:
-    """A rival's resonance or fold that corresponds to one of the fit, and its slopes."""
-    near = _solved(rival, force, place, new)
-    if near is not None:
-        return near
-    if new.drive is not None:
-        force = float(rival.force_of_drive(np.array(new.drive)))
-    rough = as_backbone(rival, largest_amplitude_ratio=ratio)
-    if place.kind == "resonance":
-        tips = resonances(rough, rival.modes, force, largest_amplitude_ratio=ratio)
-        starts = [Place("resonance", tip.amplitude, tip.frequency) for tip in tips]
-    else:
-        curves = predict_response(rough, rival.modes, force, largest_amplitude_ratio=ratio)
-        starts = [turn for c in curves for turn in turns(c.frequency, c.amplitude)]
-    for start in sorted(starts, key=lambda one: abs(np.log(one.amplitude / place.amplitude))):
-        found = _solved(rival, force, start, new)
-        if found is not None:
-            return found
-    return None
 
 
 def point_slopes(

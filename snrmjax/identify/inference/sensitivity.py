@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.curves.packed_curve import packed
 from snrmjax.identify.inference.fitted_curves import (
-    open_choice,
     values_at_displacement,
 )
 from snrmjax.identify.inference.table_result import AbstractTable
@@ -212,7 +211,7 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
     dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. The correlation of
-    neighbouring states' residuals adds to it, and so does the choice among families.
+    neighbouring states' residuals adds to it.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
@@ -257,10 +256,6 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
         values, directions = np.linalg.eigh(added)
         rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
-    if fit.families.rivals:
-        name = "choice of the families"
-        rows.append((name, name, np.ones((p, 1))))
-        summed.append(np.sum(open_choice(fit, displacement=at) ** 2, axis=0))
     parts = np.stack(summed)
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()
     listed = [

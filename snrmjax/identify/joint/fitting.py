@@ -1,10 +1,8 @@
 """Rounds of fitting the curves and estimating the noise anew, until both belong together."""
 
-import dataclasses
 from enum import IntEnum
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -20,7 +18,6 @@ from snrmjax.identify.checks.residual_autocorrelation import (
 )
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
-    PriorStd,
     Unknowns,
     Weighting,
     nearest_errors,
@@ -32,8 +29,6 @@ from snrmjax.identify.joint.residuals import (
     corrected_residuals,
     on_levels,
 )
-from snrmjax.identify.joint.selection import Selection
-from snrmjax.identify.joint.variance_components import VarianceComponents, few_levels_factor
 from snrmjax.identify.pointwise.backbone_points import OFF_RESONANCE
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
@@ -71,6 +66,30 @@ FIT_MESSAGE: dict[FitStatus, str] = {
 }
 
 
+class NoiseAndLevels(NamedTuple):
+    """1σ of the noise and of the errors that the states of a level share."""
+
+    noise: float  # by which the residuals exceed the stated noise
+    noise_std: float
+    level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
+    independent: float = 1.0  # share of the states that count, where neighbours err alike
+
+    @property
+    def unit(self) -> float:
+        """What residuals are counted in: the noise, larger where few states are independent."""
+        return self.noise / float(np.sqrt(self.independent))
+
+    @property
+    def contradicts_upward(self) -> bool:
+        """Whether the residuals are too large for the stated noise."""
+        return self.noise - 3 * self.noise_std > 1
+
+    @property
+    def contradicts_downward(self) -> bool:
+        """Whether they are too small for it."""
+        return self.noise + 3 * self.noise_std < 1
+
+
 class FitSettings(NamedTuple):
     """What a fit frees and believes."""
 
@@ -78,6 +97,7 @@ class FitSettings(NamedTuple):
     stated: bool  # whether the noise of the states is stated
     robust: bool  # whether outlying states lose weight
     rounds: tuple[int, int]  # of fitting and estimating the noise anew: at least, at most
+    beside: np.ndarray  # (state, error): complex 1σ of what `BalanceData.beside` may err in
 
 
 class Fitted(NamedTuple):
@@ -86,7 +106,7 @@ class Fitted(NamedTuple):
     unknowns: Unknowns
     covariance: np.ndarray
     problem: BalanceProblem  # with the corrections and the noise of the last round
-    components: VarianceComponents
+    components: NoiseAndLevels
     residuals: np.ndarray
     autocorrelation: np.ndarray
     status: FitStatus
@@ -95,11 +115,11 @@ class Fitted(NamedTuple):
 def fitted(
     start: Unknowns,
     problem: BalanceProblem,
-    components: VarianceComponents,
+    components: NoiseAndLevels,
     settings: FitSettings,
 ) -> Fitted:
     """Fit, estimate anew how large the noise is, and fit again."""
-    free, stated, robust, (fewest, most) = settings
+    free, stated, robust, (fewest, most), beside = settings
     stated_std, n, padded = problem.data.std, len(problem.data.level), padded_problem(problem)
     program = packed_unknowns(start, free, padded.data.n_levels)
     n_padded = len(padded.data.level)
@@ -154,10 +174,18 @@ def fitted(
     if not stated:
         phase = np.angle(np.asarray(problem.data.velocity))
         unequal = sizes_off_resonance(residuals, rows @ root, phase, OFF_RESONANCE)
+    # What one mode leaves off resonance is known no better than the posterior has it.
+    data, constant = problem.data, complex(problem.modal_constant)
+    velocity = np.asarray(data.velocity) / (1j * np.asarray(data.frequency) * constant)
+    moved = (velocity / np.asarray(data.force))[:, None] * beside
+    whiten = np.asarray(answer.weighting.whiten)[:n]
+    moved = np.einsum("sij,sje->sie", whiten, np.stack([moved.real, moved.imag], axis=1))
+    arms = root @ root.T @ np.einsum("sip,sie->pe", rows, moved)
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
         covariance=root @ root.T
+        + arms @ arms.T
         + size * added_covariance(root, rows, alike, levels, counted, unequal),
         problem=problem,
         components=components,
@@ -239,26 +267,3 @@ def finite_fit(found: Fitted) -> Fitted:
             "the residuals of the fit became infinite or undefined: try other families."
         )
     return found
-
-
-def as_guess(found: Fitted, problem: BalanceProblem) -> tuple[Unknowns, BalanceProblem]:
-    """A fit as another one starts from it: levels in their own units, its states' errors."""
-    raw = found.unknowns.level * found.problem.prior.level
-    guess = eqx.tree_at(lambda u: u.level, found.unknowns, raw)
-    return guess, problem.with_data(correction=found.problem.data.correction)
-
-
-def started(guess: Unknowns, chosen: Selection, prior: PriorStd) -> Unknowns:
-    """The chosen curves, and the guess's deviations of levels in units of their new 1σ."""
-    unit = jnp.where(prior.level > 0, prior.level, 1.0)
-    level = jnp.where(prior.level > 0, guess.level / unit, 0.0)
-    pair = (chosen.squared_frequency, chosen.modal_damping)
-    return eqx.tree_at(
-        lambda u: (u.squared_frequency, u.modal_damping, u.level), guess, (*pair, level)
-    )
-
-
-def with_components(prior: PriorStd, components: VarianceComponents, n_levels: int) -> PriorStd:
-    """Levels' errors as stated, or as estimated and as much wider as few levels leave open."""
-    found = few_levels_factor(n_levels) * jnp.array(components.level)
-    return dataclasses.replace(prior, level=jnp.where(prior.level > 0, prior.level, found))

@@ -1,7 +1,6 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,19 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from snrmjax.identify.checks.instruments import saying_what_is_undetermined
-from snrmjax.identify.checks.next_family import trying_the_next_family
 from snrmjax.identify.curves.families import parse_family
-from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.splines import SmoothingSpline
 from snrmjax.identify.joint.fitting import (
     FIT_MESSAGE,
     FitSettings,
     FitStatus,
-    Fitted,
-    as_guess,
     finite_fit,
     fitted,
-    started,
-    with_components,
 )
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
@@ -45,23 +39,22 @@ from snrmjax.identify.joint.free_unknowns import (
     padded_levels,
     recorded_motion_of,
 )
-from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.notes import (
     notes_on_autocorrelation,
-    notes_on_failed_rivals,
-    notes_on_families,
+    notes_on_discrepancy,
     notes_on_level_errors,
     notes_on_modal_mass,
     notes_on_noise,
     notes_on_reach,
     notes_on_stated_errors,
 )
-from snrmjax.identify.joint.ranking import FamilyCandidate
-from snrmjax.identify.joint.selection import (
-    FamilyRequest,
-    Selection,
-    SelectionStatus,
-    select_families,
+from snrmjax.identify.joint.posterior_start import (
+    errors_of_discrepancy,
+    noise_and_levels,
+    posterior_of,
+    unknowns_at,
+    wandering_stiffness,
+    with_levels,
 )
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -72,39 +65,7 @@ from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
 _ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
-_ROUGHLY = 2, 6  # the same, of a fit that another one starts from, and of rivals
 _ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
-_CLEARLY_LESS = 0.9  # of the noise, that a fit from another start must find
-
-
-class Rival(NamedTuple):
-    """The same data fitted with another family of one of the curves, that they could mean too."""
-
-    curve: str  # "backbone" or "damping": the one of another family
-    weight: float  # among all families tried, by how well they predict left-out levels
-    fit: "JointFit"
-
-
-class FailedRival(NamedTuple):
-    """A family that the data could mean too, whose fit failed: the bands do not include it."""
-
-    curve: str  # "backbone" or "damping"
-    family: str  # with its size and amplitude
-    weight: float
-    status: FitStatus
-
-
-class FamilyChoice(eqx.Module):
-    """Which families were tried, how the choice among them ended, and what it leaves open.
-
-    `rivals` are fits with other families that predict left-out levels about as well: bands of
-    curves and responses include what is left open by the choice.
-    """
-
-    candidates: tuple[FamilyCandidate, ...] = eqx.field(static=True, default=())
-    rivals: tuple[Rival, ...] = ()
-    failed: tuple[FailedRival, ...] = eqx.field(static=True, default=())
-    status: SelectionStatus = eqx.field(static=True, default=SelectionStatus.SETTLED)
 
 
 class NoiseEstimate(eqx.Module):
@@ -121,7 +82,7 @@ class JointFit(AbstractResult):
     """Two curves, what else was unknown, and how well all of it is known.
 
     `covariance` belongs to the free unknowns in the order of `names`, and includes the correlation
-    of neighbouring states' residuals, but not the choice among families. `noise.level_std` belongs
+    of neighbouring states' residuals. `noise.level_std` belongs
     to `LEVEL_ERRORS`, stated or estimated: what was estimated from few levels counts for more in
     `prior`, as Student's t does.
     """
@@ -132,7 +93,6 @@ class JointFit(AbstractResult):
     covariance: Float[np.ndarray, "unknown unknown"]
     problem: BalanceProblem
     noise: NoiseEstimate
-    families: FamilyChoice
     residuals: Float[np.ndarray, "state part"]  # whitened, of unit variance if all is right
     drive_known_only: bool = eqx.field(static=True)
     free: tuple[str, ...] = eqx.field(static=True)
@@ -243,14 +203,13 @@ class JointFit(AbstractResult):
         noise = f"{scale} times the stated noise"
         if not self.noise.stated:
             noise = f"noise {100 * self.noise.scale:.2g} % of the velocity (estimated)"
-        rivals = len(self.families.rivals)
         return (
             f"JointFit: natural frequency: {squared.words}; damping: {damping.words}",
             f"{len(self.data.level)} steady states of {self.data.n_levels} levels at "
             f"{self.modes.sensors[self.data.sensor]!r}, {size.min():.3g} to {size.max():.3g} m/s",
             f"natural frequency {omega.min() / _HERTZ:.6g} to {omega.max() / _HERTZ:.6g} Hz, "
             f"damping ratio {100 * ratio.min():.3g} to {100 * ratio.max():.3g} %",
-            f"residuals: {noise}; {rivals} competing families in the bands",
+            f"residuals: {noise}",
             f"status: {FIT_MESSAGE[self.status]}",
             *(f"note: {note}" for note in self.notes),
         )
@@ -289,7 +248,6 @@ class JointFit(AbstractResult):
 @on_one_core
 @naming_wrong_phases
 @saying_what_is_undetermined(LEVEL_ERRORS)
-@trying_the_next_family
 def fit_jointly(
     data: SteadyStates,
     modes: LinearModes | Structure,
@@ -303,26 +261,24 @@ def fit_jointly(
 ) -> JointFit:
     """Fit both curves to the complex force balance of all states at once.
 
-    Levenberg–Marquardt on residuals whitened with the stated noise. Gain and phase errors that a
-    level shares are unknowns with the stated 1σ. Where levels differ by more than that allows, the
-    level-to-level variance of gain, phase, stiffness and damping is estimated (restricted maximum
-    likelihood) and enters the bands. Families and level-to-level variance are chosen at a first fit
-    without any, or at the initial guess where that leads to clearly less noise. Where the stated
-    noise is believed, every step corrects the states for their most likely errors (orthogonal
-    distance regression). The other modes' frequencies and dampings stay inside their stated errors.
-    The modal mass is an unknown with its stated 1σ (`LinearModesStd.modal_mass`); where none is
-    stated it is the model's, unless states away from resonance ask for another. A free force gain
-    is one with it.
+    The model of a test (`identify.test_model`) says how smooth the curves are, how large the noise
+    is and by how much levels differ in gain, phase, stiffness and damping, each with a stated prior
+    and by the largest probability of the data. From its answer Levenberg–Marquardt goes on with the
+    balance as it is. Where the stated noise is believed, every step corrects the states for their
+    most likely errors (orthogonal distance regression). The other modes' frequencies and dampings
+    stay inside their stated errors. The modal mass is an unknown with its stated 1σ
+    (`LinearModesStd.modal_mass`); where none is stated it is the model's, unless states away from
+    resonance ask for another. A free force gain is one with it.
 
     Arguments: `backbone` and `damping` name a family of `FAMILIES`, with a size if wanted
     ("polynomial:2", "spline:5") and the amplitude ("polynomial:2@velocity"); what is left out is
-    chosen by cross-validation over left-out levels, and so is the family itself for "auto". `free`
-    may name "force_gain", "force_offset" and "instrument_phase"; the gain is always free where only
-    the drive is known. `modes` may be a structure, which also states the 1σ of what the states of a
-    level share: gain, phase, natural frequency and damping ratio. `level_gain_std` (relative) and
-    `level_phase_std` (rad), where given, stand in place of the first two.
-    Returns a `JointFit`, whose `status` says whether it converged; where families are chosen here,
-    those of the next best fit that did.
+    the simplest that lies in the band of the smooth curve. "auto" is that curve itself, a
+    smoothing spline. `free` may name "force_gain", "force_offset" and "instrument_phase"; the gain
+    is always free where only the drive is known. `modes` may be a structure, which also states the
+    1σ of what the states of a level share: gain, phase, natural frequency and damping ratio.
+    `level_gain_std` (relative) and `level_phase_std` (rad), where given, stand in place of the
+    first two.
+    Returns a `JointFit`, whose `status` says whether it converged.
     Raises `ValueError` for too few states, an unknown family or name, a family with more parameters
     than there are data, a gain, an offset or a phase that the data do not determine, and a fit
     whose residuals become infinite or undefined.
@@ -339,112 +295,72 @@ def fit_jointly(
         raise ValueError(
             f"`data` has the sensors {list(data.sensors)}, but `modes` has {list(modes.sensors)}."
         )
+    choices = parse_family(backbone), parse_family(damping)
     measured, stated = balance_data(data, modes)
-    numbers = level_numbers(data, modes)
     n = len(measured.level)
     if n < 3:
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
-    request = FamilyRequest(parse_family(backbone), parse_family(damping), released, stated)
 
-    def select(guess: Unknowns, problem: BalanceProblem, *, components_too: bool) -> Selection:
-        # Where no noise is stated a smooth curve would bend for levels whose gains differ.
-        smooth = stated or components_too
-        given = (problem, guess, request)
-        return select_families(*given, components_too=components_too, smooth=smooth)
-
-    def fit_from(
-        chosen: Selection, guess: Unknowns, problem: BalanceProblem, rounds: tuple[int, int]
-    ) -> Fitted:
-        level = with_components(problem.prior, chosen.components, measured.n_levels)
-        std = problem.data.std.at[:, 3].set(chosen.jitter)
-        noisy = BalanceProblem(problem.with_data(std=std).data, modes, level)
-        start = started(guess, chosen, level)
-        return fitted(
-            start, noisy, chosen.components, FitSettings(released, stated, robust, rounds)
-        )
-
-    # What the initial guess misses would pass for levels that differ: a fit without level-to-level
-    # variance comes first.
-    first_guess = initial_guess(problem, released)
-    chosen = select(first_guess, problem, components_too=False)
-    first = finite_fit(fit_from(chosen, first_guess, problem, _ROUGHLY))
-    if (
-        modes.modal_mass_std is None
-        and abs(first.unknowns.linear[-1]) < _ASKED * first.covariance[-1, -1] ** 0.5
-    ):
+    knots = [one.size for one in choices if one.kind == SmoothingSpline.kind and one.size]
+    first = posterior_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
+    found = first.posterior
+    mass, std = found.modal_mass
+    if modes.modal_mass_std is None and abs(mass - 1) < _ASKED * std:
         problem = with_known_mass(problem)
-        chosen = select(first_guess, problem, components_too=False)
-        first = finite_fit(fit_from(chosen, first_guess, problem, _ROUGHLY))
-    prior = problem.prior
-    guess, corrected = first_guess, problem
-    if first.status != FitStatus.STEP_LIMIT:  # which may have ended anywhere
-        guess, corrected = as_guess(first, problem)
-    chosen = select(guess, corrected, components_too=True)
-    best = fit_from(chosen, guess, corrected, _ROUNDS)
-    if best.status != FitStatus.CONVERGED or (stated and best.components.contradicts_upward):
-        # Where levels differ so much that no fit without that comes near, the guess is better.
-        other = select(first_guess, problem, components_too=True)
-        again = fit_from(other, first_guess, problem, _ROUNDS)
-        better = again.components.noise < _CLEARLY_LESS * best.components.noise
-        if best.status == FitStatus.NOT_FINITE or (better and again.status != FitStatus.NOT_FINITE):
-            chosen, best = other, again
-    finite_fit(best)
-
-    def told(found: Fitted, families: FamilyChoice) -> JointFit:
-        components, last = found.components, found.problem
-        notes: tuple[str, ...] = ()
-        if found.status != FitStatus.CONVERGED:
-            notes = (f"the fit has {FIT_MESSAGE[found.status]}; try a simpler family.",)
-        notes += notes_on_families(families.status, families.candidates)
-        lost = [(one.family, one.curve, one.weight) for one in families.failed]
-        notes += notes_on_failed_rivals(lost, len(families.rivals))
-        wandering = 0.5 * float(last.data.std[0, 3])
-        noise = (components, wandering, np.asarray(prior.level), measured.n_levels)
-        notes += notes_on_noise(*noise, stated=stated, alike=bool(found.autocorrelation.any()))
-        level = np.asarray(last.data.level)
-        if np.any((np.asarray(prior.level) == 0) & (np.asarray(last.prior.level) > 0)):
-            errors = np.asarray(found.unknowns.level * last.prior.level)
-            force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
-            of_force = bool(prior.gain_of_force > 0)
-            notes += notes_on_level_errors(errors, numbers, np.array(force), of_force=of_force)
-        notes += notes_on_stated_errors(np.asarray(found.unknowns.level), level_std)
-        notes += notes_on_modal_mass(found.unknowns, last, found.covariance)
-        notes += notes_on_autocorrelation(found.autocorrelation)
-        motion = recorded_motion_of(found.unknowns, last)
-        notes += notes_on_reach(motion, level)
-        return JointFit(
-            unknowns=found.unknowns,
-            covariance=found.covariance,
-            problem=last,
-            noise=NoiseEstimate(
-                scale=components.noise,
-                scale_std=components.noise_std,
-                level_std=np.asarray(components.level),
-                autocorrelation=found.autocorrelation,
-                stated=stated,
-            ),
-            families=families,
-            residuals=found.residuals,
-            drive_known_only=driven,
-            free=released,
-            notes=notes,
-            status=found.status,
-            level_numbers=numbers,
+        first = posterior_of(
+            problem, released, stated, robust=robust, knots=max(knots, default=None)
         )
+        found = first.posterior
+    components = noise_and_levels(found)
+    prior = with_levels(problem.prior, components, measured.n_levels)
+    wandering = wandering_stiffness(found)
+    errors = measured.std.at[:, 3].set(wandering)
+    data_too = problem.with_data(std=errors, beside=jnp.asarray(found.discrepancy)).data
+    noisy = BalanceProblem(data_too, modes, prior)
+    start = unknowns_at(first, noisy, released, choices)
+    settings = FitSettings(released, stated, robust, _ROUNDS, errors_of_discrepancy(found))
+    best = finite_fit(fitted(start, noisy, components, settings))
 
-    rivals, failed = [], []
-    guess, corrected = as_guess(best, problem)
-    for one in chosen.rivals:
-        pair: list[AbstractFamily] = [best.unknowns.squared_frequency, best.unknowns.modal_damping]
-        pair[one.curve == "damping"] = one.family
-        other = chosen._replace(squared_frequency=pair[0], modal_damping=pair[1])
-        found = fit_from(other, guess, corrected, _ROUGHLY)
-        if found.status == FitStatus.CONVERGED:
-            alone = FamilyChoice(chosen.table, status=chosen.status)
-            rivals.append(Rival(one.curve, one.weight, told(found, alone)))
-        else:
-            failed.append(FailedRival(one.curve, one.family.label, one.weight, found.status))
-    return told(best, FamilyChoice(chosen.table, tuple(rivals), tuple(failed), chosen.status))
+    # What levels differ by is said where the data ask for it, and stays possible elsewhere.
+    told = np.where(level_std > 0, level_std, np.where(found.differing, components.level, 0.0))
+    last = best.problem
+    notes: tuple[str, ...] = ()
+    if best.status != FitStatus.CONVERGED:
+        notes = (f"the fit has {FIT_MESSAGE[best.status]}; try a simpler family.",)
+    said = best.components._replace(level=tuple(told.tolist()))
+    alike = bool(best.autocorrelation.any())
+    notes += notes_on_noise(
+        *(said, 0.5 * wandering, level_std, measured.n_levels), stated=stated, alike=alike
+    )
+    level, numbers = np.asarray(last.data.level), level_numbers(data, modes)
+    if np.any((level_std == 0) & (told > 0)):
+        shifts = np.asarray(best.unknowns.level * last.prior.level)
+        force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
+        of_force = bool(prior.gain_of_force > 0)
+        notes += notes_on_level_errors(shifts, numbers, np.array(force), of_force=of_force)
+    notes += notes_on_stated_errors(np.asarray(best.unknowns.level), level_std)
+    notes += notes_on_discrepancy(found.hyper.discrepancy)
+    notes += notes_on_modal_mass(best.unknowns, last, best.covariance)
+    notes += notes_on_autocorrelation(best.autocorrelation)
+    notes += notes_on_reach(recorded_motion_of(best.unknowns, last), level)
+    return JointFit(
+        unknowns=best.unknowns,
+        covariance=best.covariance,
+        problem=last,
+        noise=NoiseEstimate(
+            scale=best.components.noise,
+            scale_std=best.components.noise_std,
+            level_std=told,
+            autocorrelation=best.autocorrelation,
+            stated=stated,
+        ),
+        residuals=best.residuals,
+        drive_known_only=driven,
+        free=released,
+        notes=notes,
+        status=best.status,
+        level_numbers=numbers,
+    )

@@ -6,16 +6,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2, norm
 
-from snrmjax.identify.curves.family_base import family_in_words
+from snrmjax.identify.joint.fitting import NoiseAndLevels
 from snrmjax.identify.joint.force_balance import (
     LEVEL_ERRORS,
     BalanceProblem,
     Motion,
     Unknowns,
 )
-from snrmjax.identify.joint.ranking import FamilyCandidate
-from snrmjax.identify.joint.selection import SelectionStatus
-from snrmjax.identify.joint.variance_components import VarianceComponents
 
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
@@ -34,75 +31,8 @@ _COMMON = {
 """What an error that all levels share may be."""
 
 
-def notes_on_families(
-    status: SelectionStatus, candidates: Sequence[FamilyCandidate]
-) -> tuple[str, ...]:
-    """Where the choice of families did not settle, or rests on fits that had not converged."""
-    notes = []
-    if status == SelectionStatus.NOT_SETTLED:
-        notes.append(
-            "the choice of families and the level-to-level variance still changed one another in "
-            f"the last round: {_what_was_open(candidates)}."
-        )
-    unfinished = [one for one in candidates if not one.converged]
-    told = [one for one in unfinished if one.chosen or one.weight > _COUNTS]
-    if told:
-        arguments: dict[tuple[str, str, int], list[str]] = {}
-        for one in told:
-            arguments.setdefault((one.curve, one.family, one.size), []).append(one.argument)
-        listed = ", ".join(
-            f"{family_in_words(family, size, of)} for the {curve}"
-            for (curve, family, size), of in arguments.items()
-        )
-        better = ("was", "it", "its score says")
-        if len(told) > 1:
-            better = ("were", "they", "their scores say")
-        notes.append(
-            f"{len(told)} of the {len(candidates)} trial curves ({listed}) {better[0]} not fitted "
-            f"to the end; {better[1]} may be better than {better[2]}."
-        )
-    return tuple(notes)
-
-
-def notes_on_failed_rivals(
-    failed: Sequence[tuple[str, str, float]], fitted: int
-) -> tuple[str, ...]:
-    """Competing families that the bands do not include.
-
-    Arguments: family, curve and weight of each; `fitted` is how many others the bands include.
-    """
-    if not failed:
-        return ()
-    listed = ", ".join(
-        f"{family} of the {curve}, weight {100 * weight:.0f} %" for family, curve, weight in failed
-    )
-    return (
-        f"{len(failed)} of {len(failed) + fitted} competing families could not be fitted "
-        f"({listed}): the bands do not include them.",
-    )
-
-
-def _what_was_open(candidates: Sequence[FamilyCandidate]) -> str:
-    """What else may fit as well, and what to name to be sure of the choice."""
-    curves = dict.fromkeys(one.curve for one in candidates)
-    own = [[one for one in candidates if one.curve == curve] for curve in curves]
-    if any(len({one.family for one in rows}) > 1 for rows in own):
-        return "other families may fit as well; name one to be sure of the choice"
-    wanted = []
-    if any(len({one.size for one in rows}) > 1 for rows in own):
-        wanted.append("a size (`spline:5`, for example)")
-    if any(len({one.argument for one in rows}) > 1 for rows in own):
-        wanted.append("@displacement or @velocity")
-    if not wanted:
-        return "the level-to-level variance, and with it the bands, are less certain than they say"
-    return (
-        "another size or amplitude of the same families may fit as well; add "
-        f"{' and '.join(wanted)} to their names to be sure of the choice"
-    )
-
-
 def notes_on_noise(
-    components: VarianceComponents,
+    components: NoiseAndLevels,
     wandering: float,
     given: Float[np.ndarray, " error"],
     n_levels: int,
@@ -144,13 +74,6 @@ def notes_on_noise(
             f"levels differ from one another by {shared} (1σ, estimated)"
             + (", which no stated error explains" if stated or np.any(given > 0) else "")
             + "; the bands include this level-to-level variance."
-        )
-    if components.unbounded:
-        names = " and ".join(LEVEL_ERRORS[kind] for kind in components.unbounded)
-        notes.append(
-            f"by how much levels differ in {names} cannot be told from these data: it would "
-            "have to be larger than levels of one test can differ. The bands do not include it; "
-            "state it in the model's [measurement] if you know it."
         )
     if n_levels == 1:
         notes.append(
@@ -203,6 +126,21 @@ def notes_on_stated_errors(
             f"and the bands are too narrow if that is what levels vary by{alike}."
         )
     return tuple(notes)
+
+
+def notes_on_discrepancy(size: tuple[float, float]) -> tuple[str, ...]:
+    """What states beside resonance have that no single mode does.
+
+    Arguments: `size` 1σ in phase with the motion and in quadrature, over the damping's force.
+    """
+    if not max(size) > 0:
+        return ()
+    return (
+        f"beside resonance the states differ from any single mode by {100 * size[0]:.2g} % of its "
+        f"damping force in phase with the motion and {100 * size[1]:.2g} % in quadrature (1σ): a "
+        "gain of force or sensor, a mode close by, steps too short to settle or a joint's history "
+        "do that. The curves are those at resonance, and the bands include it.",
+    )
 
 
 def notes_on_modal_mass(
@@ -330,8 +268,9 @@ def notes_on_reach(motion: Motion, level: np.ndarray) -> tuple[str, ...]:
     size = np.asarray(motion.displacement)
     peaks = np.array([size[level == k].max() for k in np.unique(level)])
     if len(peaks) > 1 and peaks.max() < _ALIKE * peaks.min():
+        apart = 100 * (peaks.max() / peaks.min() - 1)
         notes.append(
-            f"the levels' largest amplitudes lie within {100 * (peaks.max() / peaks.min() - 1):.2g}"
+            f"the levels' largest amplitudes lie within {max(apart, 0.1):.2g}"
             " % of each other: how the mode changes with amplitude rests on the smaller states of "
             "the same levels alone."
         )

@@ -1,6 +1,6 @@
 """A resonance under a force that was not measured, as a distribution: whether, and where."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -75,9 +75,8 @@ class ResonanceDistribution(AbstractResult):
 
 
 class KnownCurves(NamedTuple):
-    """Both curves along amplitudes, as one family has them, with independent errors of 1σ each."""
+    """Both curves along amplitudes, with independent errors of 1σ each."""
 
-    weight: float
     values: Float[np.ndarray, "point curve"]  # ω̃² and 2ζ̃ω̃
     errors: Float[np.ndarray, "point curve error"]
     load: float  # |A|F, m/s²
@@ -92,7 +91,7 @@ def amplitudes_to(largest: float, ratio: float) -> Float[np.ndarray, " point"]:
 def resonance_distribution(
     force: float,
     amplitude: Float[np.ndarray, " point"],
-    curves: Sequence[KnownCurves],
+    curves: KnownCurves,
     new: NewLevel,
     other: Callable[[Float[np.ndarray, " draw"]], Complex[np.ndarray, " draw"]],
     *,
@@ -113,26 +112,21 @@ def resonance_distribution(
     with `gain_of_force` a level's gain is that of its recorded force, else of its velocity.
     """
     rng, edge = np.random.default_rng(0), int(np.searchsorted(amplitude, amplitude[-1] / ratio))
-    weights = np.cumsum([one.weight for one in curves])
-    counts = np.diff(np.round(_DRAWS * np.append(0.0, weights / weights[-1]))).astype(int)
-    drawn = []
-    for one, count in zip(curves, counts, strict=True):
-        gain, phase, stiffness, loss = (new.std * rng.normal(size=(count, len(new.std)))).T
-        error = rng.normal(size=(count, one.errors.shape[-1]))
-        squared, damping = (one.values.T[k] + error @ one.errors[:, k].T for k in range(2))
-        damping[::_HELD, edge:] = damping[::_HELD, edge, None]
-        of_force = gain if gain_of_force and new.drive is not None else 0 * gain
-        load = one.load * np.exp(error @ one.load_errors + of_force) * np.cos(phase)
-        squared, damping = squared * np.exp(stiffness)[:, None], damping * np.exp(loss)[:, None]
-        with np.errstate(invalid="ignore"):
-            natural = np.sqrt(squared)
-        omega = natural + 0.5 * damping * np.tan(phase)[:, None]
-        speed = (amplitude / natural if of_velocity else amplitude) * omega
-        root = _Root.of(speed * damping / load[:, None])
-        passive = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
-        recorded = np.exp(0 * gain if gain_of_force else gain)
-        drawn.append((root.at(omega), root.at(speed, at_rest=0.0), recorded, passive))
-    at, own, recorded, kept = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    gain, phase, stiffness, loss = (new.std * rng.normal(size=(_DRAWS, len(new.std)))).T
+    error = rng.normal(size=(_DRAWS, curves.errors.shape[-1]))
+    squared, damping = (curves.values.T[k] + error @ curves.errors[:, k].T for k in range(2))
+    damping[::_HELD, edge:] = damping[::_HELD, edge, None]
+    of_force = gain if gain_of_force and new.drive is not None else 0 * gain
+    load = curves.load * np.exp(error @ curves.load_errors + of_force) * np.cos(phase)
+    squared, damping = squared * np.exp(stiffness)[:, None], damping * np.exp(loss)[:, None]
+    with np.errstate(invalid="ignore"):
+        natural = np.sqrt(squared)
+    omega = natural + 0.5 * damping * np.tan(phase)[:, None]
+    speed = (amplitude / natural if of_velocity else amplitude) * omega
+    root = _Root.of(speed * damping / load[:, None])
+    kept = root.found | ~np.any(damping[:, edge:] <= 0, axis=1) | self_excited
+    at, own = root.at(omega), root.at(speed, at_rest=0.0)
+    recorded = np.exp(0 * gain if gain_of_force else gain)
     known = np.isfinite(at)
     quantiles = np.full((2, len(QUANTILES)), np.nan)
     if known.sum() >= _FEWEST:
@@ -209,9 +203,9 @@ def resonance_of_points(
     damping = np.hypot(fit.level_damping_std, level_stds[3]) / abs(end.damping_ratio[0])
     std = further_std([*level_stds[:2], 2 * frequency, damping], day)
     load = abs(float(backbone.modal_constant)) * force
-    curves = KnownCurves(1.0, np.stack(values, 1), errors, load, np.zeros(first + second))
+    curves = KnownCurves(np.stack(values, 1), errors, load, np.zeros(first + second))
     return resonance_distribution(
-        *(force, amplitude, [curves], NewLevel(std, another_day=day is not None)),
+        *(force, amplitude, curves, NewLevel(std, another_day=day is not None)),
         other_modes(modes, modes.sensors.index(backbone.sensor), force),
         of_velocity=backbone.argument == "velocity",
         ratio=ratio,

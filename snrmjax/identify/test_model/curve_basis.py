@@ -1,9 +1,12 @@
 """Smooth curves of amplitude as sums of fixed functions with prior variances.
 
-A constant, a and a², and a Gaussian process (Matérn 5/2 in the logarithm of amplitude) as a sum of
-sines whose variances are its spectral density: length and size of the process are in the variances
-alone, so that the functions are evaluated once. Beyond the range it fades: there the powers speak.
-Reference: Solin & Särkkä, Stat. Comput. 30 (2020) 419, doi:10.1007/s11222-019-09886-w.
+A straight line over a², and the bends of a natural cubic spline in a²: differences of a value from
+the straight line between those at the next knots, alike likely per step of log amplitude. Their
+size may change along the curve, as levels of a softening arch pass its fold; the functions are the
+same for all sizes, so that they are evaluated once. Beyond the knots a curve is straight in a².
+References: for the prior, Green & Silverman, Nonparametric Regression and Generalized Linear Models
+(1994), ch. 2; for sizes that vary, Ruppert & Carroll, Aust. N. Z. J. Stat. 42 (2000) 205,
+doi:10.1111/1467-842X.00119.
 """
 
 from typing import NamedTuple
@@ -11,71 +14,67 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES
+from snrmjax.identify.curves.splines import bends_of, hats, spline_terms
+from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
-_SINES = 24
-_ROOM = 1.5  # half length of the sines' domain, over half the range
-_FLOOR = 0.03  # of the largest amplitude, at most: below it the logarithm is bent straight
-N_POWERS = 3
-N_FUNCTIONS = N_POWERS + _SINES
-LENGTHS = (0.2, 3.0)
-"""Of the range: shorter ones the sines do not follow, longer ones are parabolas."""
+MOST_KNOTS = 40
+_BEYOND = (1.15, 1.3)  # knots over the largest amplitude, for levels whose record is too small
+_NEAREST = 1.05  # ratio of two knots' amplitudes
+N_POWERS = 2
+_NOTHING = 1e-6  # of the largest variance: a direction of the sizes that counts for nothing
 
 
 class CurveBasis(NamedTuple):
     """The functions for one range of amplitudes."""
 
     largest: float  # m
-    low: float  # ends of the range in the bent logarithm
-    high: float
-    floor: float  # of the largest amplitude
+    knots: Float[np.ndarray, " knot"]  # of (a/largest)²
+    mix: Float[np.ndarray, "term function"]  # of the spline's terms
+    directions: Float[np.ndarray, "bend direction"]  # of the logarithms of the bends' sizes
 
     @classmethod
-    def of(cls, amplitude: Float[np.ndarray, " state"]) -> "CurveBasis":
-        """For measured amplitudes."""
-        largest, smallest = float(np.max(amplitude)), float(np.min(amplitude))
-        floor = min(_FLOOR, smallest / largest)
-        low, high = (float(np.log(u + floor)) for u in (smallest / largest, 1.0))
-        return cls(largest, min(low, high - 0.3), high, floor)
+    def of(
+        cls, amplitude: Float[np.ndarray, " state"], most_knots: int = MOST_KNOTS
+    ) -> "CurveBasis":
+        """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond."""
+        largest = float(np.max(amplitude))
+        apart = [1.0]
+        for one in np.sort(amplitude / largest)[::-1]:
+            if 0 < one * _NEAREST <= apart[-1]:
+                apart.append(float(one))
+        pick = np.linspace(0, len(apart) - 1, min(most_knots - 1, len(apart)))
+        inside = np.array(apart)[np.round(pick).astype(int)][::-1]
+        knots = np.array([0.0, *inside, *_BEYOND]) ** 2
+        bends = bends_of(knots)
+        functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])
+        apart_by = np.subtract.outer(np.arange(len(bends)), np.arange(len(bends))) / SIZES_ALIKE
+        values, vectors = np.linalg.eigh(np.exp(-0.5 * apart_by**2))
+        keep = values > _NOTHING * np.max(values, initial=0.0)
+        directions = vectors[:, keep] * np.sqrt(values[keep])
+        mix = np.linalg.solve(spline_terms(knots, knots), functions)
+        return cls(largest, knots, mix, directions)
+
+    @property
+    def n_functions(self) -> int:
+        """How many functions there are."""
+        return self.mix.shape[1]
 
     def values(
         self, amplitude: Float[np.ndarray, " point"]
     ) -> tuple[Float[np.ndarray, "point function"], Float[np.ndarray, "point function"]]:
         """The functions, and their derivatives by the logarithm of amplitude."""
-        u = np.asarray(amplitude, dtype=float) / self.largest
-        x, slope = np.log(u + self.floor), u / (u + self.floor)
-        half = 0.5 * _ROOM * (self.high - self.low)
-        rate = np.pi * np.arange(1, _SINES + 1) / (2 * half)
-        # Beyond the domain the process is what it is at its end.
-        inside = np.abs(x - self._middle) < half
-        at = np.clip(x - self._middle, -half, half)[:, None] + half
-        sines = np.sin(rate * at) / np.sqrt(half)
-        cosines = np.where(inside, slope, 0.0)[:, None] * rate * np.cos(rate * at) / np.sqrt(half)
-        one = np.ones_like(u)
-        return (
-            np.column_stack([one, u, u**2, sines]),
-            np.column_stack([0 * one, u, 2 * u**2, cosines]),
-        )
+        u = (np.asarray(amplitude, dtype=float) / self.largest) ** 2
+        bent, slopes = hats(u, self.knots)
+        by_u = np.column_stack([np.zeros_like(u), np.ones_like(u), slopes])
+        terms = np.column_stack([np.ones_like(u), u, bent])
+        return terms @ self.mix, 2 * u[:, None] * by_u @ self.mix
 
     def log_variances(
-        self, log_size: float, log_length: float
-    ) -> tuple[Float[np.ndarray, " function"], Float[np.ndarray, "function two"]]:
-        """ln of the prior variances by the process's size and length, and their slopes.
-
-        The length is over the range. The powers have variances of their own.
-        """
-        span = self.high - self.low
-        length = np.exp(log_length) * span
-        rate = np.pi * np.arange(1, _SINES + 1) / (_ROOM * span)
-        of_rate = 5 / length**2 + rate**2
-        density = np.log(16 / 3) + 2 * log_size + 2.5 * np.log(5) - 5 * np.log(length)
-        density = density - 3 * np.log(of_rate)
-        powers = 2 * np.log([CURVE_CONSTANT, CURVE_SLOPES, CURVE_SLOPES])
-        slopes = np.zeros((N_FUNCTIONS, 2))
+        self, log_size: float, along: Float[np.ndarray, " direction"]
+    ) -> tuple[Float[np.ndarray, " function"], Float[np.ndarray, "function hyper"]]:
+        """ln of the prior variances by the bends' size and how it changes; their slopes by both."""
+        powers = 2 * np.log([CURVE_CONSTANT, CURVE_SLOPES])
+        slopes = np.zeros((self.n_functions, 1 + len(along)))
         slopes[N_POWERS:, 0] = 2.0
-        slopes[N_POWERS:, 1] = -5 + 30 / length**2 / of_rate
-        return np.concatenate([powers, density]), slopes
-
-    @property
-    def _middle(self) -> float:
-        return 0.5 * (self.low + self.high)
+        slopes[N_POWERS:, 1:] = 2 * self.directions
+        return np.concatenate([powers, 2 * (log_size + self.directions @ along)]), slopes

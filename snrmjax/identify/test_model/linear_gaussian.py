@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import minimize
 
 _STEP = 1e-4  # of a logarithm, for second derivatives
@@ -72,32 +73,30 @@ class LinearRows(NamedTuple):
         return value + self.offset, by_scale, by_variance
 
 
-class MostLikely(NamedTuple):
-    """The most likely hyperparameters and the evidence, by Laplace's approximation about them."""
-
-    point: Float[np.ndarray, " hyper"]  # logarithms
-    log_evidence: float
-    covariance: Float[np.ndarray, "hyper hyper"]
-
-
 Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarray, " hyper"]]]
 
 
-def most_likely(
+def laplace_evidence(
     objective: Objective,
-    start: Float[np.ndarray, " hyper"],
+    point: Float[np.ndarray, " hyper"],
     bounds: list[tuple[float, float]],
-) -> MostLikely:
-    """Maximise ln p (likelihood times prior, with slopes) and integrate about the maximum."""
-    point, n = maximised(objective, start, bounds), len(start)
-    hessian = np.zeros((n, n))
-    for k, unit in enumerate(_STEP * np.eye(n)):
+) -> float:
+    """ln p integrated about its maximum, by Laplace's approximation, over what is not held."""
+    free = np.array([high > low for low, high in bounds])
+    precision = precision_at(objective, point)[np.ix_(free, free)]
+    volume = 0.5 * (len(precision) * np.log(2 * np.pi) - np.linalg.slogdet(precision)[1])
+    return objective(point)[0] + float(volume)
+
+
+def precision_at(
+    objective: Objective, point: Float[np.ndarray, " hyper"]
+) -> Float[np.ndarray, "hyper hyper"]:
+    """Negative second derivatives of ln p, where it is flat or at a bound those of a wide prior."""
+    hessian = np.zeros((len(point), len(point)))
+    for k, unit in enumerate(_STEP * np.eye(len(point))):
         hessian[k] = (objective(point - unit)[1] - objective(point + unit)[1]) / (2 * _STEP)
     values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-    values = np.maximum(values, 1e-2)  # flat or at a bound: as wide as a prior may be
-    covariance = (vectors / values) @ vectors.T
-    volume = 0.5 * (n * np.log(2 * np.pi) - float(np.sum(np.log(values))))
-    return MostLikely(point, objective(point)[0] + volume, covariance)
+    return (vectors * np.maximum(values, 1e-2)) @ vectors.T
 
 
 def maximised(
@@ -123,7 +122,11 @@ def maximised(
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     """Inverse and ln determinant of a positive definite matrix, in units that make it even."""
     size = np.sqrt(np.diagonal(matrix))
-    factor = np.linalg.cholesky(matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix)))
-    root = np.linalg.inv(factor) / size
+    even = matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix))
+    factor, failed = dpotrf(even, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the matrix is not positive definite.")
+    half = np.tril(dpotri(factor, lower=True)[0])
+    inverse = half + np.tril(half, -1).T
     log_det = 2 * float(np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(size)))
-    return root.T @ root, log_det
+    return inverse / np.outer(size, size), log_det

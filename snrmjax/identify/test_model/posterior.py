@@ -21,14 +21,19 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.special import ndtri, stdtrit
 
 from snrmjax.identify.test_model import priors
-from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.balance import Balance
+from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.hyper import (
     ALONG,
-    DAMPING,
+    BENDS,
+    FIRST_ALONG,
     LEVELS,
-    STIFFNESS,
+    MASS,
+    OFFSET,
+    PHASE,
     Hyper,
     Places,
     bounds_of,
@@ -40,20 +45,21 @@ from snrmjax.identify.test_model.hyper import (
 )
 from snrmjax.identify.test_model.linear_gaussian import (
     LinearRows,
-    MostLikely,
     Objective,
+    laplace_evidence,
     maximised,
-    most_likely,
 )
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.numerics.blocks import on_one_core
 
-_ROUNDS = 6
-_WITHOUT_PROCESS, _AS_RECORDED = 2, 2  # rounds until curves are free, until states are corrected
+_ROUNDS = 12  # at most
+_SETTLED = 2  # rounds, until steps are checked and the modal mass is free
+_GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
+_TRIED = 4  # rounds of each start
+_STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
+_SHORTEST = 0.05  # share of a step that is still tried
+_FARTHEST = np.array([1.0, 1.0, 0.5, 0.5])  # of a level's errors, relative or rad
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
-_FARTHEST = 0.3  # relative or rad, of a state's correction
-_LINEAR = 0.5  # relative or rad, of a level's error, that a straight line reaches
-_SIGMAS = 4.0  # of a level's error, at which the problem is made straight at most
 
 
 class CurveValues(NamedTuple):
@@ -77,13 +83,31 @@ class TestPosterior(NamedTuple):
     log_evidence: float
     corrections: Float[np.ndarray, "state input"]  # most likely errors, subtracted from the record
     residuals: Float[np.ndarray, "state part"]  # whitened: of unit variance where all is right
+    arms_of_stiffness: Float[np.ndarray, "state part"]  # how a relative change of ω̃² moves them
+    beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
+    effective_unknowns: float  # that the states, and not their priors, tell
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
 
     @property
     def modal_mass(self) -> tuple[float, float]:
         """κ, the modal mass over the model's, and its 1σ."""
-        return 1 + float(self.mean[0]), float(np.sqrt(self.covariance[0, 0]))
+        return 1 + float(self.mean[MASS]), float(np.sqrt(self.covariance[MASS, MASS]))
+
+    @property
+    def instrument_phase(self) -> float:
+        """Phase that all records share, rad."""
+        return float(self.mean[PHASE])
+
+    @property
+    def force_offset(self) -> float:
+        """Offset of the force, over the smallest."""
+        return float(self.mean[OFFSET])
+
+    @property
+    def discrepancy(self) -> Complex[np.ndarray, " state"]:
+        """What one mode leaves off resonance of FA/X, rad²/s²."""
+        return self.beside @ self.mean[self.places.beside]
 
     @property
     def level_errors(self) -> Float[np.ndarray, "level error"]:
@@ -95,7 +119,7 @@ class TestPosterior(NamedTuple):
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
         values, slopes = self.basis.values(amplitude)
-        mass = 1 + self.mean[0]
+        mass = 1 + self.mean[MASS]
         reference = self.places.reference
         n = len(values)
         rows = np.zeros((n, 2, len(self.mean)))
@@ -107,107 +131,221 @@ class TestPosterior(NamedTuple):
             found[:, k] = unit * (values @ self.mean[own]) / mass
             steep[:, k] = unit * (slopes @ self.mean[own]) / mass
             rows[:, k, own] = unit * values / mass
-            rows[:, k, 0] = -found[:, k] / mass
+            rows[:, k, MASS] = -found[:, k] / mass
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
         return CurveValues(found[:, 0] + reference, found[:, 1], covariance, steep)
 
 
-class _Round(NamedTuple):
-    """The problem made straight at some corrections."""
-
-    equations: LinearRows
-    design: Float[np.ndarray, "row unknown"]
-    rows: Float[np.ndarray, " row"]
-    slopes: Complex[np.ndarray, "state input"]  # of the residual by the states' errors
-    root: Float[np.ndarray, "state 2 2"]
-
-
 @on_one_core
 def fit_test(
-    states: TestStates, *, discrepancy: bool = False, robust: bool = False, rounds: int = _ROUNDS
+    states: TestStates,
+    *,
+    discrepancy: bool = False,
+    robust: bool = False,
+    rounds: int = _ROUNDS,
+    most_knots: int | None = None,
 ) -> TestPosterior:
     """The posterior of a test.
 
-    Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth along a
-    level, zero at phase resonance; with `robust` noise has outliers (Student's t).
+    Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
+    and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t);
+    curves have `most_knots` at most.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
         raise ValueError(f"a test needs at least two states, not {len(states.level)}.")
     n, omega = len(states.level), states.frequency
     reference = float(np.mean(omega**2))
-    z = _dynamic_stiffness(states, np.zeros_like(states.errors))
+    z = 1j * omega * states.constant * states.force / (states.velocity)
     # Of curves: all that the test passed through, and the damping as single states have it.
     units = (
         float(np.ptp(omega**2) + _REACH * np.median(np.abs(z))),
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
-    basis = CurveBasis.of(states.amplitude)
-    places = places_of(states.n_levels, discrepancy, reference)
-    corrections, weight = np.zeros_like(states.errors), np.ones(n)
-    at_levels = np.zeros((states.n_levels, 2))
-    mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * states.n_levels * discrepancy)
-    mean[places.damping.start] = 1.0
-    smooth = mean
-    stated = np.array(states.level_std[:2])
-    farthest = _SIGMAS * np.where(stated > 0, stated, [one.scale for one in priors.LEVELS[:2]])
-    start = starting_point(states, discrepancy)
-    point, found = start, None
-    for k in range(rounds):
-        problem = _Problem(
-            states, basis, places, units, mean, smooth, corrections, at_levels, weight
-        )
-        this = _straight(problem, first=k == 0)
-        bounds = bounds_of(states, point)
-        if k < _WITHOUT_PROCESS:  # parabolas first, whose slopes are sound
-            for own in (STIFFNESS.start, DAMPING.start):
-                bounds[own] = (bounds[own][0], bounds[own][0])
-        if k == 0:  # and no level differs from another yet
-            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
-        objective = objective_of(this.equations, states, basis, places)
-        begin = point if k > _WITHOUT_PROCESS else start
-        for _ in range(2):
-            best = most_likely(objective, begin, bounds)
-            point, hyper = best.point, hyper_at(best.point)
-            variance = prior_variances(hyper, basis, places, states)[0]
-            mean, covariance = this.equations.posterior(hyper.noise, variance)
-            if np.max(np.abs(mean[places.levels[:, :2]])) < _LINEAR:
-                break
-            # A gain of two would be a turned sign: no straight line goes that far.
-            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
-        # Slopes of curves that bend as they like would let errors of amplitude explain all.
-        variance[places.processes] = 0.0
-        smooth = this.equations.posterior(hyper.noise, variance)[0]
-        left = (this.rows - this.design @ mean).reshape(n, 2)
-        # A step may lead away from where the problem is straight: the best round counts.
-        if found is None or k <= _WITHOUT_PROCESS or best.log_evidence > found.best.log_evidence:
-            found = _Found(best, this, mean, covariance, left / hyper.noise, corrections)
-        if k >= _AS_RECORDED:
-            # The errors with which every state lies on the curves, to first order.
-            parts = np.stack([this.slopes.real, this.slopes.imag], axis=1)
-            pull = np.einsum("nij,nj->ni", this.root.transpose(0, 2, 1), left)
-            errors = -np.einsum("nie,ni->ne", parts, pull) * states.errors**2
-            corrections = np.clip(errors, -_FARTHEST, _FARTHEST)
-            at_levels = np.clip(mean[places.levels][:, :2], -farthest, farthest)
-        if robust:
-            square = np.sum(left**2, axis=1) / hyper.noise**2
-            weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
+    basis = CurveBasis.of(states.amplitude, most_knots or MOST_KNOTS)
+    places = places_of(basis, states.n_levels, discrepancy, reference)
+    beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
+    balance = Balance(states, basis, places, units, np.ones(n), beside)
+    # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
+    # that bend as they like from the first, which arches are: the more probable goes on.
+    walks = [_Walk.of(balance, robust=robust, straight=straight) for straight in (True, False)]
+    for walk in walks:
+        walk.advance(min(_TRIED, rounds))
+    walk = max(walks, key=lambda one: one.likelihood)
+    walk.advance(rounds - min(_TRIED, rounds))
+    found = walk.found
     if found is None:
         raise ValueError(f"`rounds` must be at least one, not {rounds}.")
-    flat = objective_of(found.round.equations, states, basis, places, flat=True)
+    # The size of what few levels differ by is not well known: as Student's t has it. What they have
+    # in common may be anything of that size.
+    hyper = hyper_at(found.point, basis)
+    variance, _ = prior_variances(hyper, basis, places, states)
+    for own, std in zip(places.levels.T, states.level_std, strict=True):
+        variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
+    last = walk.balance.straight(found.mean, found.errors, apart=False)
+    mean, covariance = last.equations.posterior(hyper.noise, variance)
+    told = variance > 0
+    objective = objective_of(found.equations, states, basis, places)
+    bounds = bounds_of(states, basis, found.point)
+    flat = objective_of(found.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
         basis,
         units,
-        found.mean,
-        found.covariance,
-        hyper_at(found.best.point),
-        found.best.log_evidence,
-        found.corrections,
+        mean,
+        covariance,
+        hyper,
+        laplace_evidence(objective, found.point, bounds),
+        found.errors,
         found.residuals,
+        last.arms_of_stiffness,
+        walk.balance.beside,
+        float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
         places,
-        _differing(flat, found.best.point, bounds_of(states, start), states),
+        _differing(flat, found.point, bounds, states),
     )
+
+
+def few_levels_factor(n_levels: int) -> float:
+    """By how much a 95 % band is wider whose 1σ had to be found from so few levels.
+
+    Student's t over the normal. Two levels count as three: with t of one degree no band would be of
+    use.
+    """
+    return float(stdtrit(max(n_levels - 1, 2), 0.975) / ndtri(0.975))
+
+
+class _Found(NamedTuple):
+    """What a round found."""
+
+    point: Float[np.ndarray, " hyper"]
+    likelihood: float
+    equations: LinearRows
+    mean: Float[np.ndarray, " unknown"]
+    residuals: Float[np.ndarray, "state part"]
+    errors: Float[np.ndarray, "state input"]
+
+
+class _Walk:
+    """Rounds of making the problem straight and solving it, from one start on."""
+
+    def __init__(self, balance: Balance, point: np.ndarray, mean: np.ndarray, *, robust: bool):
+        self.balance, self.start, self.point, self.mean = balance, point, point, mean
+        self.errors = np.zeros_like(balance.states.errors)
+        self.found: _Found | None = None
+        self.turn, self.robust, self.straight, self.still = 0, robust, False, False
+
+    @classmethod
+    def of(cls, balance: Balance, *, robust: bool, straight: bool) -> "_Walk":
+        """A walk from the records; the first rounds with `straight` lines over a² if asked."""
+        places, discrepancy = balance.places, balance.beside.shape[1] > 0
+        mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * discrepancy)
+        mean[places.damping.start] = 1.0
+        start = starting_point(balance.states, balance.basis, discrepancy)
+        walk = cls(balance, start, mean, robust=robust)
+        walk.straight = straight
+        return walk
+
+    @property
+    def likelihood(self) -> float:
+        """ln of likelihood times prior of what was found."""
+        return -np.inf if self.found is None else self.found.likelihood
+
+    def advance(self, rounds: int) -> None:
+        """Some rounds more, or until nothing moves."""
+        for _ in range(rounds):
+            if self.still:
+                return
+            self._round()
+
+    def _round(self) -> None:
+        k, states, basis = self.turn, self.balance.states, self.balance.basis
+        places, start = self.balance.places, self.start
+        if k == _SETTLED:
+            self.balance = self.balance.with_discrepancy(self.mean, self.errors)
+        this = self.balance.straight(self.mean, self.errors, first=k == 0)
+        bounds = bounds_of(states, basis, self.point)
+        along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
+        if k == 0:  # no level differs from another yet, and bends are of one size
+            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
+            bounds[along] = [(0.0, 0.0)] * (along.stop - along.start)
+        if k < _SETTLED and self.straight:
+            bounds[BENDS] = [(low, low) for low, _ in bounds[BENDS]]
+        # What curves do not follow yet would pass for another modal mass.
+        free = k >= _SETTLED or states.mass_std > _GUESS
+        held = states if free else states._replace(mass_std=0.0)
+        objective = objective_of(this.equations, held, basis, places)
+        begin = self.point if k > (_SETTLED if self.straight else 1) else start
+        for _ in range(2):
+            point = maximised(objective, begin, bounds)
+            hyper = hyper_at(point, basis)
+            variance = prior_variances(hyper, basis, places, held)[0]
+            goal, covariance = this.equations.posterior(hyper.noise, variance)
+            if np.all(np.abs(goal[places.levels]) < _FARTHEST):
+                break
+            # Levels that differ by more are no levels of one structure: not this way.
+            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
+        moved = _step(
+            self.balance, self.mean, goal, self.errors, hyper.noise, variance, free=k < _SETTLED
+        )
+        left = (this.rows - this.design @ goal).reshape(-1, 2)
+        value = objective(point)[0]
+        if k <= _SETTLED or value > self.likelihood:
+            self.found = _Found(
+                point, value, this.equations, goal, left / hyper.noise, moved.errors
+            )
+        size = np.sqrt(np.diag(covariance) + 1e-300)
+        self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
+        self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
+        self.turn += 1
+        if self.robust:
+            square = np.sum(left**2, axis=1) / hyper.noise**2
+            weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
+            self.balance = self.balance._replace(weight=weight)
+
+
+class _Moved(NamedTuple):
+    """Unknowns after a step, and the states' errors with them."""
+
+    unknowns: Float[np.ndarray, " unknown"]
+    errors: Float[np.ndarray, "state input"]
+
+
+def _step(
+    balance: Balance,
+    mean: np.ndarray,
+    goal: np.ndarray,
+    errors: np.ndarray,
+    noise: float,
+    variance: np.ndarray,
+    *,
+    free: bool,
+) -> _Moved:
+    """Towards the goal of the straight problem as far as the true one agrees; all of it if free."""
+
+    def cost(unknowns: np.ndarray, own: np.ndarray) -> float:
+        if not np.all(np.isfinite(own)):
+            return np.inf
+        bound = variance > 0
+        prior = float(np.sum(unknowns[bound] ** 2 / variance[bound]))
+        return balance.misfit(unknowns, own) / noise**2 + prior
+
+    if free:
+        own = balance.nearest_errors(goal, errors)
+        # Where phasors are no mode's the way may be lost.
+        return _Moved(goal, own) if np.all(np.isfinite(own)) else _Moved(mean, errors)
+    before = cost(mean, balance.nearest_errors(mean, errors))
+    share, best = 1.0, (np.inf, mean, errors)
+    while share > _SHORTEST:
+        unknowns = mean + share * (goal - mean)
+        own = balance.nearest_errors(unknowns, errors)
+        value = cost(unknowns, own)
+        if np.isfinite(value) and value < best[0]:
+            best = (value, unknowns, own)
+        if value <= before:
+            break
+        share *= 0.5
+    return _Moved(*best[1:])
 
 
 def _differing(
@@ -235,108 +373,3 @@ def _differing(
         kept.remove(kind)
         point, value = without, least
     return 0 in kept, 1 in kept, 2 in kept, 3 in kept
-
-
-class _Found(NamedTuple):
-    """What a round found."""
-
-    best: MostLikely
-    round: _Round
-    mean: Float[np.ndarray, " unknown"]
-    covariance: Float[np.ndarray, "unknown unknown"]
-    residuals: Float[np.ndarray, "state part"]
-    corrections: Float[np.ndarray, "state input"]
-
-
-class _Problem(NamedTuple):
-    """Where the problem is made straight."""
-
-    states: TestStates
-    basis: CurveBasis
-    places: Places
-    units: tuple[float, float]
-    mean: Float[np.ndarray, " unknown"]
-    smooth: Float[np.ndarray, " unknown"]  # with parabolas in place of the curves
-    corrections: Float[np.ndarray, "state input"]
-    at_levels: Float[np.ndarray, "level two"]  # gain and phase of the levels' records
-    weight: Float[np.ndarray, " state"]
-
-
-def _dynamic_stiffness(states: TestStates, errors: np.ndarray) -> Complex[np.ndarray, " state"]:
-    """Z = FA/X of states with these errors added to their records."""
-    velocity = states.velocity * np.exp(errors[:, 1] + 1j * errors[:, 2])
-    return 1j * states.frequency * states.constant * states.force * np.exp(errors[:, 0]) / velocity
-
-
-def _straight(problem: _Problem, *, first: bool) -> _Round:
-    states, basis, places, units, mean, smooth, corrections, at_levels, weight = problem
-    omega, level = states.frequency, states.level
-    gain, phase = at_levels[level].T
-    nothing = np.zeros_like(gain)
-    parts = (gain, nothing, phase) if states.force_is_free else (nothing, gain, phase)
-    added = corrections - np.stack(parts, axis=1)
-    z = _dynamic_stiffness(states, added)
-    amplitude = states.amplitude * np.exp(added[:, 1])
-    values, by_log = basis.values(amplitude)
-    mass = 1 + mean[0]
-    curve = [
-        units[0] * (values @ mean[places.stiffness]),
-        units[1] * (values @ mean[places.damping]),
-    ]
-    slope = units[0] * (by_log @ smooth[places.stiffness]) + 1j * omega * units[1] * (
-        by_log @ smooth[places.damping]
-    )
-    if first:
-        slope = 0.0 * slope
-    # Errors of levels multiply what the model has, as soon as there is one: with the record itself
-    # they could explain all of it away.
-    own = z if first else mass * (places.reference - omega**2) + curve[0] + 1j * omega * curve[1]
-    slopes = np.stack([z, -z - slope, -1j * z], axis=1)
-    design = np.zeros((len(z), len(mean)), dtype=complex)
-    design[:, 0] = places.reference - omega**2
-    design[:, places.stiffness] = units[0] * values
-    design[:, places.damping] = 1j * omega[:, None] * units[1] * values
-    of_gain = own if states.force_is_free else -own - slope
-    of_level = (of_gain, -1j * own, curve[0] + mass * places.reference, 1j * omega * curve[1])
-    for k, column in enumerate(of_level):
-        design[np.arange(len(z)), places.levels[level, k]] = column
-    if places.discrepancy[0].stop > places.discrepancy[0].start:
-        theta = np.angle(z / 1j)
-        along = np.sin(theta)[:, None] * np.cos(np.arange(ALONG) * theta[:, None])
-        along = along * np.exp(-0.25 * (np.arange(ALONG) * priors.DISCREPANCY_LENGTH) ** 2)
-        size = np.abs(omega * curve[1])[:, None] * along
-        columns = ALONG * level[:, None] + np.arange(ALONG)
-        for part, unit in zip(places.discrepancy, (1.0, 1j), strict=True):
-            design[np.arange(len(z))[:, None], part.start + columns] = unit * size
-    # Residual at the record: rows − design @ unknowns, by its straight line from the corrected one.
-    rows = z - (places.reference - omega**2) - np.sum(slopes * corrections, axis=1)
-    rows = rows + of_level[0] * gain + of_level[1] * phase
-    root, log_det = _whitening(slopes, states.errors, weight)
-    white = np.einsum("nij,njk->nik", root, np.stack([design.real, design.imag], axis=1))
-    goal = np.einsum("nij,nj->ni", root, np.stack([rows.real, rows.imag], axis=1))
-    # Of the rows to what was recorded: |∂Z/∂X| a state.
-    jacobian = float(np.sum(np.log(np.abs(z) * np.abs(z + slope))))
-    matrix, vector = white.reshape(-1, len(mean)), goal.reshape(-1)
-    equations = LinearRows.of(matrix, vector, jacobian - 0.5 * log_det)
-    return _Round(equations, matrix, vector, slopes, root)
-
-
-def _whitening(
-    slopes: Complex[np.ndarray, "state input"],
-    std: Float[np.ndarray, "state input"],
-    weight: Float[np.ndarray, " state"],
-) -> tuple[Float[np.ndarray, "state 2 2"], float]:
-    """Inverse Cholesky factors of every state's covariance, and the sum of log determinants."""
-    scaled = slopes * std / np.sqrt(weight)[:, None]
-    a = np.sum(scaled.real**2, axis=1)
-    b = np.sum(scaled.real * scaled.imag, axis=1)
-    c = np.sum(scaled.imag**2, axis=1)
-    floor = 1e-12 * (a + c)  # rounding must not make it singular
-    a = a + floor
-    det = np.maximum(a * c - b**2, floor * a)
-    root = np.zeros((len(a), 2, 2))
-    root[:, 0, 0] = 1 / np.sqrt(a)
-    low = np.sqrt(det / a)
-    root[:, 1, 0] = -b / (a * low)
-    root[:, 1, 1] = 1 / low
-    return root, float(np.sum(np.log(det)))

@@ -1,6 +1,6 @@
 """What is taken for likely before a test is seen: every prior with its unit and its reason.
 
-Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-normal distribution
+Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-Cauchy distribution
 of the size itself; those of curves and noise are medians of lognormal ones.
 """
 
@@ -34,6 +34,29 @@ class HalfNormalSize(NamedTuple):
         return log_value - np.log(self.scale) - 0.5 * square + np.log(2) - _LOG_ROOT, 1.0 - square
 
 
+class HalfCauchySize(NamedTuple):
+    """A positive number that is mostly below a scale, and may be far above it."""
+
+    scale: float
+
+    def log_density(self, log_value: float) -> tuple[float, float]:
+        """ln p of the logarithm, and its slope."""
+        square = np.exp(2 * (log_value - np.log(self.scale)))
+        value = log_value - np.log(self.scale) - np.log1p(square) + np.log(2 / np.pi)
+        return value, 1.0 - 2 * square / (1 + square)
+
+
+class NormalNumber(NamedTuple):
+    """Any number about zero."""
+
+    std: float
+
+    def log_density(self, value: float) -> tuple[float, float]:
+        """ln p, and its slope."""
+        step = value / self.std
+        return -0.5 * step**2 - np.log(self.std) - _LOG_ROOT, -step / self.std
+
+
 class FlatSize(NamedTuple):
     """A positive number whose logarithm is anywhere between two ends."""
 
@@ -44,6 +67,8 @@ class FlatSize(NamedTuple):
         """ln p of the logarithm, and its slope."""
         return -float(np.log(self.high - self.low)), 0.0
 
+
+Density = LogNormalSize | HalfNormalSize | HalfCauchySize | NormalNumber
 
 STATED_NOISE = LogNormalSize(1.0, 0.1)
 """Noise over the stated one: standard deviations from ten readings are good to some 20 %, and a
@@ -56,19 +81,24 @@ evaluation some 3 %."""
 FORCE_TO_VELOCITY = 0.1
 """Error of a force of which none is stated, over that of the velocity: calibrated load cells."""
 
-LEVEL_GAIN = HalfNormalSize(0.02)
+LEVEL_GAIN = HalfCauchySize(0.02)
 """Relative: drift of conditioners and of a shaker's coupling between levels."""
 
-LEVEL_PHASE = HalfNormalSize(0.01)
+LEVEL_PHASE = HalfCauchySize(0.01)
 """rad: 0.6°, a filter's or a controller's between levels."""
 
-LEVEL_STIFFNESS = HalfNormalSize(0.004)
+LEVEL_STIFFNESS = HalfCauchySize(0.004)
 """Relative, of ω̃²: 0.2 % of frequency, some 10 K of temperature in metals, or a joint's seat."""
 
 LEVEL_DAMPING = HalfNormalSize(0.05)
 """Relative: joints and clamps that are opened between levels repeat to some 10 %."""
 
-LEVELS = (LEVEL_GAIN, LEVEL_PHASE, LEVEL_STIFFNESS, LEVEL_DAMPING)
+LEVELS: tuple[HalfCauchySize | HalfNormalSize, ...] = (
+    LEVEL_GAIN,
+    LEVEL_PHASE,
+    LEVEL_STIFFNESS,
+    LEVEL_DAMPING,
+)
 """In the order of `LEVEL_ERRORS`."""
 
 LEVELS_DIFFER = 5.41
@@ -78,16 +108,23 @@ CURVE_CONSTANT = 1.0
 """Of the mean of both curves, over ω² and over the typical damping: nothing is assumed."""
 
 CURVE_SLOPES = 1.0
-"""Of their terms in a and a²: changes as large as the curves themselves."""
+"""Of their terms in a²: changes as large as the curves themselves."""
 
-CURVE_PROCESS = LogNormalSize(0.01, 1.5)
-"""Size of what is smooth but no parabola, over the same."""
+CURVE_BENDS = LogNormalSize(1e-3, 2.0)
+"""Size of the bends at some twenty knots, over the same: nothing to as much as the curve."""
 
-CURVE_LENGTH = LogNormalSize(0.7, 0.4)
-"""Length over which that changes, over the measured range of log amplitude."""
+BENDS_VARY = NormalNumber(1.0)
+"""Of the logarithm of that size along a curve: where joints open a curve bends thrice as much."""
 
-DISCREPANCY = HalfNormalSize(0.02)
-"""Of Ωδ: what a single mode leaves off resonance. Measured beams show 1 to 5 %."""
+SIZES_ALIKE = 2.0
+"""Bends, over which they are of one size."""
+
+DISCREPANCY = HalfNormalSize(0.1)
+"""Of Ωδ: what a single mode leaves off resonance. Measured beams show 1 to 5 %, joints that slip
+some 20 %."""
+
+DISCREPANCY_LOG_ODDS = 3.0
+"""ln of the odds against one that counts: one test of twenty, mostly of joints that slip."""
 
 DISCREPANCY_LENGTH = np.radians(30.0)
 """Phase over which a discrepancy changes."""

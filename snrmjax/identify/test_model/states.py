@@ -29,6 +29,9 @@ class TestStates(NamedTuple):
     level_std: tuple[float, float, float, float]  # stated 1σ of `LEVEL_ERRORS`; zero: not stated
     mass_std: float  # relative 1σ of κ; zero where it is known
     force_is_free: bool = False  # whether a gain of the force is: a level's gain is then its own
+    # 1σ of a phase (rad) that all records share, and of an offset of the force over the smallest.
+    phase_std: float = 0.0
+    offset_std: float = 0.0
 
     @property
     def n_levels(self) -> int:

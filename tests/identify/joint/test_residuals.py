@@ -9,15 +9,16 @@ from scipy.optimize import least_squares
 from truths.exact_states import LEVELS, OMEGA, PARTICIPATION, SHAPE, noisy
 
 import snrmjax as sj
+from snrmjax.identify.curves.families import Polynomial, ViscousQuadratic
 from snrmjax.identify.joint.fitting import SOLVER
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
     PriorStd,
+    Unknowns,
     balance_data,
     weighting_at,
 )
 from snrmjax.identify.joint.free_unknowns import FREE, Unravel, packed_unknowns, padded_problem
-from snrmjax.identify.joint.initial_guess import initial_guess
 from snrmjax.identify.joint.residuals import (
     LevelPattern,
     NormalSteps,
@@ -36,7 +37,13 @@ def drawn(free, *, room=False):
     prior = PriorStd(jnp.array([0.01, 0.02, 0.002, 0.03]), jnp.array([5.0, 2e-3, 0.02]))
     data = balance_data(noisy(1, gain=0.01), modes)[0]
     problem = BalanceProblem(data, modes, prior)
-    unknowns = initial_guess(problem, ())
+    near = np.array([2.5e-3, 0.04]), np.array([OMEGA**2, 1.3 * OMEGA**2]), np.ones(2)
+    (stiff,) = Polynomial.starts(1, "displacement", *near)
+    (lossy,) = ViscousQuadratic.starts(
+        1, "velocity", np.array([0.1, 1.0]), np.array([12.0, 18.0]), np.ones(2)
+    )
+    none = jnp.zeros(())
+    unknowns = Unknowns(stiff, lossy, none, none, none, jnp.zeros((data.n_levels, 4)), jnp.zeros(3))
     unravel = Unravel(unknowns, free)
     if room:
         problem = padded_problem(problem)

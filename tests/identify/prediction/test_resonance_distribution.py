@@ -35,15 +35,15 @@ def no_other(frequency):
     return np.zeros(len(frequency), dtype=complex)
 
 
-def curves(damping, errors=None, load=OMEGA * DELTA * 0.5, weight=1.0):
+def curves(damping, errors=None, load=OMEGA * DELTA * 0.5):
     """A constant natural frequency and some damping along `AMPLITUDE`, under |A|F."""
     values = np.column_stack([np.full(len(AMPLITUDE), OMEGA**2), damping])
     shape = np.zeros((len(AMPLITUDE), 2, 1))
     shape[:, 1, 0] = 0.0 if errors is None else errors
-    return KnownCurves(weight, values, shape, load, np.zeros(1))
+    return KnownCurves(values, shape, load, np.zeros(1))
 
 
-def found(*given, new=ON_THE_CURVES, **settings):
+def found(given, *, new=ON_THE_CURVES, **settings):
     """The distribution of some curves up to twice the largest amplitude."""
     return resonance_distribution(
         2.0, AMPLITUDE, given, new, no_other, **{"ratio": 2.0, **settings}
@@ -143,15 +143,6 @@ def test_a_self_excited_structure_may_have_negative_damping():
     assert "probability 0, else beyond" in where_in_words(one)
 
 
-def test_families_count_with_their_weights():
-    both = found(
-        curves(np.full(len(AMPLITUDE), DELTA), weight=3.0),
-        curves(np.full(len(AMPLITUDE), DELTA / 8), weight=1.0),
-    )
-    assert both.probability == pytest.approx(0.75, abs=0.01)  # 8·0.5 is beyond the range
-    np.testing.assert_allclose(both.velocity, 0.5 * OMEGA, rtol=1e-12)
-
-
 def test_a_singular_covariance_has_a_root():
     some = np.array([[1.0, 2.0], [2.0, 4.0]])
     root = covariance_root(some)
@@ -198,7 +189,7 @@ def test_ninety_five_per_cent_hold_a_left_out_level():
             values[:, k], shape[:, k, 2 * k : 2 * k + 2] = along @ best, along @ root
         squared, damping = measured[4]
         speed = at[4] * np.sqrt(squared)
-        known = KnownCurves(1.0, values, shape, speed * damping, np.zeros(4))
+        known = KnownCurves(values, shape, speed * damping, np.zeros(4))
         one = found(known, new=NewLevel(std))
         pair = ((one.frequency, np.sqrt(squared)), (one.velocity, speed))
         inside += [each[0] < value < each[-1] for each, value in pair]

@@ -1,83 +1,80 @@
-"""Curves as sums of functions: their covariance is that of a Matérn process between its mirrors."""
+"""Curves as sums of functions: natural cubic splines in a², whose bends have a size."""
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
-from snrmjax.identify.test_model.curve_basis import _ROOM, LENGTHS, N_POWERS, CurveBasis
-from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES
+from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, N_POWERS, CurveBasis
+from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
-SIZE = 0.01
-
-
-def matern(distance, length):
-    """Matérn 5/2 of unit variance."""
-    d = np.sqrt(5) * np.abs(distance) / length
-    return (1 + d + d**2 / 3) * np.exp(-d)
+AMPLITUDE = 2e-3 * np.geomspace(0.02, 1, 60)
 
 
-def covariances(smallest, length):
-    """Of the process as the functions have it, between images, and without any boundary."""
-    amplitude = 2e-3 * np.geomspace(smallest, 1, 80)
-    basis = CurveBasis.of(amplitude)
-    values, span = basis.values(amplitude)[0], basis.high - basis.low
-    log_variance, _ = basis.log_variances(np.log(SIZE), np.log(length))
-    x = np.log(amplitude / amplitude.max() + basis.floor)
-    own = SIZE**2 * matern(x[:, None] - x, length * span)
-    images, wide = np.zeros_like(own), _ROOM * span
-    mirror = 0.5 * (basis.low + basis.high) - 0.5 * wide
-    for n in range(-9, 10):  # a process that is zero at both ends: odd about each of them
-        images += matern(x[:, None] - x + 2 * n * wide, length * span)
-        images -= matern(x[:, None] + x - 2 * mirror + 2 * n * wide, length * span)
-    processes = values[:, N_POWERS:]
-    found = (processes * np.exp(log_variance[N_POWERS:])) @ processes.T
-    return found, SIZE**2 * images, own, values[:, :N_POWERS]
+@pytest.fixture(scope="module")
+def basis():
+    return CurveBasis.of(AMPLITUDE)
 
 
-@pytest.mark.parametrize("smallest", [0.001, 0.05, 0.5])
-@pytest.mark.parametrize("length", [LENGTHS[0], 0.7, 1.5])
-def test_the_process_is_a_matern_process_between_its_mirrors(smallest, length):
-    found, images, _, _ = covariances(smallest, length)
-    # The sines that are left out have at most 0.06 of the variance, at the shortest length.
-    share = 0.07 if length == LENGTHS[0] else 2e-3
-    np.testing.assert_allclose(found, images, rtol=0, atol=share * SIZE**2)
+def test_any_values_at_the_knots_are_followed_by_the_natural_spline(basis):
+    rng = np.random.default_rng(0)
+    unknowns = rng.normal(size=basis.n_functions)
+    at_knots = basis.values(2e-3 * np.sqrt(basis.knots))[0] @ unknowns
+    spline = CubicSpline(basis.knots, at_knots, bc_type="natural")
+    inside = np.sqrt(np.linspace(0.0, basis.knots[-1], 301))
+    found = basis.values(2e-3 * inside)[0] @ unknowns
+    np.testing.assert_allclose(found, spline(inside**2), atol=1e-6 * np.abs(at_knots).max())
+    assert np.sum(basis.knots <= 1.0) == MOST_KNOTS
+    assert basis.n_functions == len(basis.knots)
 
 
-@pytest.mark.parametrize("smallest", [0.05, 0.5])
-@pytest.mark.parametrize("length", [LENGTHS[0], 0.7])
-def test_beside_the_parabola_the_boundary_is_not_seen(smallest, length):
-    """Root-mean-square size of what constant, a and a² do not follow, inside the range."""
-    found, _, own, powers = covariances(smallest, length)
-    basis = np.linalg.qr(powers)[0]
-    beside = np.eye(len(own)) - basis @ basis.T
-    sizes = [np.sqrt(np.trace(beside @ one @ beside)) for one in (found, own)]
-    assert sizes[0] == pytest.approx(sizes[1], rel=0.07)
+def test_beyond_the_knots_a_curve_is_straight_over_the_squared_amplitude(basis):
+    u = np.array([1.7, 2.0, 5.0])
+    unknowns = np.random.default_rng(1).normal(size=basis.n_functions)
+    values = basis.values(2e-3 * np.sqrt(u))[0] @ unknowns
+    slope = np.diff(values) / np.diff(u)
+    assert slope[0] == pytest.approx(slope[1], rel=1e-9)
 
 
-def test_slopes_are_finite_differences():
-    amplitude = 2e-3 * np.array([0.004, 0.02, 0.1, 0.4, 0.9, 1.0])
-    basis, step = CurveBasis.of(amplitude), 1e-5
+def test_slopes_are_finite_differences(basis):
+    amplitude, step = 2e-3 * np.array([0.004, 0.03, 0.1, 0.4, 0.9, 1.3]), 1e-5
     _, slopes = basis.values(amplitude)
     ends = [basis.values(amplitude * np.exp(sign * step))[0] for sign in (1, -1)]
-    # The fastest sine turns by 50 rad over the range: 50³ step²/6.
-    np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=2e-5)
-    at = np.log([0.02, 0.6])
-    _, by = basis.log_variances(*at)
-    for k, unit in enumerate(step * np.eye(2)):
-        ends = [basis.log_variances(*(at + sign * unit))[0] for sign in (1, -1)]
-        np.testing.assert_allclose(by[:, k], (ends[0] - ends[1]) / (2 * step), atol=1e-7)
+    np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-6)
 
 
-def test_powers_keep_priors_of_their_own():
-    basis = CurveBasis.of(np.geomspace(1e-4, 2e-3, 9))
-    log_variance, _ = basis.log_variances(np.log(SIZE), np.log(0.7))
-    std = np.exp(0.5 * log_variance[:N_POWERS])
-    assert std == pytest.approx([CURVE_CONSTANT, CURVE_SLOPES, CURVE_SLOPES])
-    values, _ = basis.values(np.array([1e-3, 2e-3]))
-    assert values[:, :N_POWERS] == pytest.approx(np.array([[1, 0.5, 0.25], [1, 1, 1]]))
+def test_a_bend_is_the_distance_from_the_chord_between_its_neighbours(basis):
+    """Of knots far apart, whose mean distance in log amplitude is one unit each."""
+    own = CurveBasis.of(np.array([0.2, 0.4, 0.8]))
+    values = own.values(0.8 * np.sqrt(own.knots))[0]
+    for k in range(1, len(own.knots) - 1):
+        left, here, right = own.knots[k - 1 : k + 2]
+        share = (here - left) / (right - left)
+        off = values[k] - (1 - share) * values[k - 1] - share * values[k + 1]
+        # One bend moves its own knot off the chord, and no other one does.
+        assert np.count_nonzero(np.abs(off[N_POWERS:]) > 1e-9) == 1
+        assert np.allclose(off[:N_POWERS], 0.0, atol=1e-12)
 
 
-def test_one_amplitude_has_a_range_too():
-    basis = CurveBasis.of(np.full(5, 1e-3))
-    assert basis.high > basis.low
-    for part in basis.values(np.array([1e-3, 1e-5, 1e-1])):
-        assert np.all(np.isfinite(part))
+def test_sizes_of_bends_are_alike_over_two_of_them(basis):
+    covariance = basis.directions @ basis.directions.T
+    apart = np.subtract.outer(np.arange(len(covariance)), np.arange(len(covariance)))
+    np.testing.assert_allclose(covariance, np.exp(-0.5 * (apart / SIZES_ALIKE) ** 2), atol=1e-4)
+
+
+def test_variances_and_their_slopes(basis):
+    rng = np.random.default_rng(2)
+    along = rng.normal(size=basis.directions.shape[1])
+    log_variance, slopes = basis.log_variances(np.log(0.02), along)
+    assert np.exp(0.5 * log_variance[:N_POWERS]) == pytest.approx([CURVE_CONSTANT, CURVE_SLOPES])
+    expected = 2 * (np.log(0.02) + basis.directions @ along)
+    assert log_variance[N_POWERS:] == pytest.approx(expected)
+    step = 1e-6 * rng.normal(size=1 + len(along))
+    moved, _ = basis.log_variances(np.log(0.02) + step[0], along + step[1:])
+    assert moved - log_variance == pytest.approx(slopes @ step, abs=1e-12)
+
+
+@pytest.mark.parametrize("amplitude", [[1.0, 1.0], [0.5, 0.51, 1.0], [1e-6, 1.0]])
+def test_few_amplitudes_are_enough(amplitude):
+    own = CurveBasis.of(np.array(amplitude))
+    assert own.n_functions == len(own.knots) >= 2
+    assert np.all(np.isfinite(own.values(np.array(amplitude))[0]))

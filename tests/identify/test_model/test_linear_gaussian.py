@@ -5,7 +5,12 @@ import pytest
 from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
-from snrmjax.identify.test_model.linear_gaussian import LinearRows, most_likely
+from snrmjax.identify.test_model.linear_gaussian import (
+    LinearRows,
+    laplace_evidence,
+    maximised,
+    precision_at,
+)
 
 N = 30
 RNG = np.random.default_rng(1)
@@ -82,12 +87,17 @@ def bent(point):
 
 
 def test_what_is_normal_is_integrated_exactly():
-    found = most_likely(bent, np.zeros(3), [(-9.0, 9.0)] * 3)
-    assert found.point[:2] == pytest.approx([0.3, -0.4], abs=1e-3)  # of a slope of 1e-3
+    bounds = [(-9.0, 9.0)] * 3
+    found = maximised(bent, np.zeros(3), bounds)
+    assert found[:2] == pytest.approx([0.3, -0.4], abs=1e-3)  # of a slope of 1e-3
     grid = np.linspace(-8, 8, 401)
     values = [[bent(np.array([a, b, 0.0]))[0] for b in grid] for a in grid]
     volume = np.log(trapezoid(trapezoid(np.exp(values), grid), grid))
     # What is flat counts for the widest prior there is: 1σ of 10.
-    assert found.log_evidence == pytest.approx(volume + np.log(10 * np.sqrt(2 * np.pi)), abs=1e-3)
+    wide = volume + np.log(10 * np.sqrt(2 * np.pi))
+    assert laplace_evidence(bent, found, bounds) == pytest.approx(wide, abs=1e-3)
+    assert laplace_evidence(bent, found, [*bounds[:2], (0.0, 0.0)]) == pytest.approx(
+        volume, abs=1e-3
+    )
     matrix = np.array([[2.0, 0.6], [0.6, 1.0]])
-    assert found.covariance[:2, :2] == pytest.approx(np.linalg.inv(matrix), rel=1e-4)
+    assert precision_at(bent, found)[:2, :2] == pytest.approx(matrix, rel=1e-4)

@@ -1,0 +1,198 @@
+"""The balance of every state with all that is unknown, and its straight line about any point.
+
+A record that is corrected for its errors lies on the curves exactly (`nearest_errors`): the
+problem is made straight there (orthogonal distance regression), so that large errors of levels and
+steep curves cost rounds and not accuracy.
+Reference: Boggs, Byrd & Schnabel, SIAM J. Sci. Stat. Comput. 8 (1987) 1052, doi:10.1137/0908085.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from snrmjax.identify.test_model import priors
+from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.hyper import ALONG, MASS, OFFSET, PHASE, Places
+from snrmjax.identify.test_model.linear_gaussian import LinearRows
+from snrmjax.identify.test_model.states import TestStates
+
+_STEPS = 4  # towards every state's most likely errors
+_FARTHEST = 0.3  # relative or rad, of a state's error
+_LOST = 1e100  # slopes that no mode has
+
+
+class Balance(NamedTuple):
+    """Z − (κ(K − Ω²) + iΩκδ) of every state, by its errors and by the unknowns."""
+
+    states: TestStates
+    basis: CurveBasis
+    places: Places
+    units: tuple[float, float]  # of both curves' coefficients
+    weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
+    beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
+
+    def at(self, unknowns: np.ndarray, errors: np.ndarray) -> "BalancedStates":
+        """The balance of states whose records are corrected by these errors."""
+        states, places = self.states, self.places
+        omega, level = states.frequency, states.level
+        gain, phase, stiffer, lossier = unknowns[places.levels][level].T
+        velocity = np.exp(errors[:, 1] + 1j * (errors[:, 2] - phase - unknowns[PHASE]))
+        velocity = states.velocity * velocity * np.exp(0.0 if states.force_is_free else -gain)
+        force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
+        force = force + unknowns[OFFSET] * np.min(states.force)
+        z = 1j * omega * states.constant * force / velocity
+        values, by_log = self.basis.values(np.abs(velocity) / omega)
+        mass, (k, d) = 1 + unknowns[MASS], self.units
+        stiffness = k * (values @ unknowns[places.stiffness]) + mass * places.reference
+        damping = 1j * omega * d * (values @ unknowns[places.damping])
+        slope = (1 + stiffer) * k * (by_log @ unknowns[places.stiffness]) + 1j * omega * (
+            1 + lossier
+        ) * d * (by_log @ unknowns[places.damping])
+        model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
+        model = model + self.beside @ unknowns[places.beside]
+        return BalancedStates(z, model, slope, values, stiffness, damping)
+
+    def with_discrepancy(self, unknowns: np.ndarray, errors: np.ndarray) -> "Balance":
+        """With functions of what one mode leaves off resonance: of phase and log amplitude.
+
+        They are in units of the damping's force by these unknowns. In phase with the motion they
+        leave out what another modal mass would do: that is not theirs.
+        """
+        if self.places.discrepancy[0].start == self.places.discrepancy[0].stop:
+            return self
+        states, now = self.states, self.at(unknowns, errors)
+        damping, weight = np.abs(now.damping), 1 / np.abs(now.z) ** 2
+        mass = now.stiffness - (1 + unknowns[MASS]) * states.frequency**2
+        theta, n = np.angle(states.velocity)[:, None], ALONG // 2
+        order = (np.arange(n) + 1) // 2
+        turn = np.where((np.arange(n) % 2 == 0) & (order > 0), 0.5 * np.pi, 0.0)
+        waves = np.cos(order * theta - turn)
+        waves = waves * np.exp(-0.25 * (order * priors.DISCREPANCY_LENGTH) ** 2)
+        along = np.log(states.amplitude / self.basis.largest)[:, None]
+        beside = damping[:, None] * np.sin(theta) * np.hstack([waves, waves * along])
+        share = (weight * mass) @ beside / max((weight * mass) @ mass, 1e-300)
+        return self._replace(beside=np.hstack([beside - np.outer(mass, share), 1j * beside]))
+
+    def nearest_errors(self, unknowns: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """The most likely errors with which every state lies on the curves, from some on.
+
+        NaN where curves are so steep that no number holds their squares.
+        """
+        for _ in range(_STEPS):
+            now = self.at(unknowns, errors)
+            slopes = now.by_error
+            if not np.all(np.abs(slopes) < _LOST):
+                return np.full_like(errors, np.nan)
+            root, _ = whitening(slopes, self.states.errors, np.ones(len(errors)))
+            gap = now.z - now.model - np.sum(slopes * errors, axis=1)
+            white = np.einsum("nij,nj->ni", root, np.stack([gap.real, gap.imag], axis=1))
+            pull = np.einsum("nji,nj->ni", root, white)
+            parts = np.stack([slopes.real, slopes.imag], axis=1)
+            errors = -np.einsum("nie,ni->ne", parts, pull) * self.states.errors**2
+            errors = np.clip(errors, -_FARTHEST, _FARTHEST)
+        return errors
+
+    def misfit(self, unknowns: np.ndarray, errors: np.ndarray) -> float:
+        """Sum of the squares of the states' errors, and of what they leave, in their own 1σ."""
+        now = self.at(unknowns, errors)
+        root, _ = whitening(now.by_error, self.states.errors, self.weight)
+        gap = now.z - now.model - np.sum(now.by_error * errors, axis=1)
+        white = np.einsum("nij,nj->ni", root, np.stack([gap.real, gap.imag], axis=1))
+        return float(np.sum(white**2))
+
+    def straight(
+        self, unknowns: np.ndarray, errors: np.ndarray, *, first: bool = False, apart: bool = True
+    ) -> "Straight":
+        """The problem made straight about some unknowns and errors.
+
+        With `apart` errors of levels that nobody stated are what levels differ by: an error that
+        all have in common is one of the instruments, or of the modal mass.
+        At `first` curves are not known yet: what they would pass on of an error is left out, and
+        errors of levels move what was recorded.
+        """
+        states, places = self.states, self.places
+        now, omega = self.at(unknowns, errors), states.frequency
+        own = now.z if first else now.model
+        slope = 0.0 * now.slope if first else now.slope
+        slopes = now._replace(slope=slope).by_error
+        stiffer, lossier = unknowns[places.levels][states.level].T[2:]
+        design = np.zeros((len(omega), len(unknowns)), dtype=complex)
+        design[:, MASS] = (1 + stiffer) * places.reference - omega**2
+        design[:, PHASE] = -1j * own
+        design[:, OFFSET] = -own * np.min(states.force) / states.force
+        design[:, places.stiffness] = ((1 + stiffer) * self.units[0])[:, None] * now.values
+        design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
+            :, None
+        ] * now.values
+        of_gain = own if states.force_is_free else -own - slope
+        columns = (of_gain, -1j * own, now.stiffness, now.damping)
+        for k, column in enumerate(columns):
+            own = places.levels[:, k]
+            design[np.arange(len(omega)), own[states.level]] = column
+            if apart and not states.level_std[k] > 0:
+                design[:, own] -= np.mean(design[:, own], axis=1, keepdims=True)
+        design[:, places.beside] = self.beside
+        # Residual at the record: rows − design @ unknowns, by its straight line.
+        rows = now.z - now.model - np.sum(slopes * errors, axis=1) + design @ unknowns
+        if first:  # the curves of the start count for nothing
+            rows = now.z - (places.reference - omega**2)
+        root, log_det = whitening(slopes, states.errors, self.weight)
+        white = np.einsum("nij,njk->nik", root, np.stack([design.real, design.imag], axis=1))
+        goal = np.einsum("nij,nj->ni", root, np.stack([rows.real, rows.imag], axis=1))
+        # Of the rows to what was recorded: |∂Z/∂X| a state.
+        jacobian = float(np.sum(np.log(np.abs(now.z) * np.abs(now.z + slope))))
+        matrix, vector = white.reshape(-1, len(unknowns)), goal.reshape(-1)
+        stiff = np.stack([now.stiffness, np.zeros_like(now.stiffness)], axis=1)
+        return Straight(
+            LinearRows.of(matrix, vector, jacobian - 0.5 * log_det),
+            matrix,
+            vector,
+            np.einsum("nij,nj->ni", root, stiff),
+        )
+
+
+class BalancedStates(NamedTuple):
+    """Both sides of the balance, and what its slopes are made of."""
+
+    z: Complex[np.ndarray, " state"]  # FA/X
+    model: Complex[np.ndarray, " state"]
+    slope: Complex[np.ndarray, " state"]  # of the model by the logarithm of amplitude
+    values: Float[np.ndarray, "state function"]
+    stiffness: Float[np.ndarray, " state"]  # κK
+    damping: Complex[np.ndarray, " state"]  # iΩκδ
+
+    @property
+    def by_error(self) -> Complex[np.ndarray, "state input"]:
+        """Derivatives of what is left by relative errors of force and velocity, and of phase."""
+        return np.stack([self.z, -self.z - self.slope, -1j * self.z], axis=1)
+
+
+class Straight(NamedTuple):
+    """The problem made straight, in rows of unit variance where errors are as stated."""
+
+    equations: LinearRows
+    design: Float[np.ndarray, "row unknown"]
+    rows: Float[np.ndarray, " row"]
+    arms_of_stiffness: Float[np.ndarray, "state part"]
+
+
+def whitening(
+    slopes: Complex[np.ndarray, "state input"],
+    std: Float[np.ndarray, "state input"],
+    weight: Float[np.ndarray, " state"],
+) -> tuple[Float[np.ndarray, "state 2 2"], float]:
+    """Inverse Cholesky factors of every state's covariance, and the sum of log determinants."""
+    scaled = slopes * std / np.sqrt(weight)[:, None]
+    a = np.sum(scaled.real**2, axis=1)
+    b = np.sum(scaled.real * scaled.imag, axis=1)
+    c = np.sum(scaled.imag**2, axis=1)
+    floor = 1e-12 * (a + c)  # rounding must not make it singular
+    a = a + floor
+    det = np.maximum(a * c - b**2, floor * a)
+    root = np.zeros((len(a), 2, 2))
+    root[:, 0, 0] = 1 / np.sqrt(a)
+    low = np.sqrt(det / a)
+    root[:, 1, 0] = -b / (a * low)
+    root[:, 1, 1] = 1 / low
+    return root, float(np.sum(np.log(det)))
