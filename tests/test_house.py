@@ -66,7 +66,7 @@ SUB_ROOMS = {
     "methods.steady": {"methods.result", "methods.one_sensor"},
     "methods.records": {"methods.result", "methods.one_sensor"},
     "methods.bench": {"methods.result", "methods.one_sensor"},
-    "identify.test_model": {"identify.curves"},
+    "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": set(),
     "diagnose.search": {"diagnose.misfit"},
     "diagnose.checks": {

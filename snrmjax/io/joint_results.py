@@ -32,7 +32,7 @@ from snrmjax.io.units import HERTZ
 from snrmjax.model.modes import LinearModes, LinearModesStd, RigidBodyModes, linear_modes
 
 BAND_POINTS = 200
-_FORMAT = 4
+_FORMAT = 3
 
 
 def write_fitted_backbone(path: Path, fit: JointFit) -> None:

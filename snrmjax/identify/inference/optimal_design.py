@@ -308,7 +308,6 @@ def _information(fit: JointFit, states: _States) -> Float[np.ndarray, "state par
         std=jnp.broadcast_to(jnp.asarray(std), (n, len(std))),
         weight=jnp.ones(n),
         correction=no_errors(n),
-        beside=jnp.zeros(n, dtype=complex),
         n_levels=n_levels,
         sensor=fit.data.sensor,
     )

@@ -97,7 +97,6 @@ class FitSettings(NamedTuple):
     stated: bool  # whether the noise of the states is stated
     robust: bool  # whether outlying states lose weight
     rounds: tuple[int, int]  # of fitting and estimating the noise anew: at least, at most
-    beside: np.ndarray  # (state, error): complex 1σ of what `BalanceData.beside` may err in
 
 
 class Fitted(NamedTuple):
@@ -119,7 +118,7 @@ def fitted(
     settings: FitSettings,
 ) -> Fitted:
     """Fit, estimate anew how large the noise is, and fit again."""
-    free, stated, robust, (fewest, most), beside = settings
+    free, stated, robust, (fewest, most) = settings
     stated_std, n, padded = problem.data.std, len(problem.data.level), padded_problem(problem)
     program = packed_unknowns(start, free, padded.data.n_levels)
     n_padded = len(padded.data.level)
@@ -174,18 +173,10 @@ def fitted(
     if not stated:
         phase = np.angle(np.asarray(problem.data.velocity))
         unequal = sizes_off_resonance(residuals, rows @ root, phase, OFF_RESONANCE)
-    # What one mode leaves off resonance is known no better than the posterior has it.
-    data, constant = problem.data, complex(problem.modal_constant)
-    velocity = np.asarray(data.velocity) / (1j * np.asarray(data.frequency) * constant)
-    moved = (velocity / np.asarray(data.force))[:, None] * beside
-    whiten = np.asarray(answer.weighting.whiten)[:n]
-    moved = np.einsum("sij,sje->sie", whiten, np.stack([moved.real, moved.imag], axis=1))
-    arms = root @ root.T @ np.einsum("sip,sie->pe", rows, moved)
     status = FitStatus.CONVERGED if settled else FitStatus.NOT_SETTLED
     return Fitted(
         unknowns=Unravel(start, free)(np.asarray(program.vector)[program.own]),
         covariance=root @ root.T
-        + arms @ arms.T
         + size * added_covariance(root, rows, alike, levels, counted, unequal),
         problem=problem,
         components=components,

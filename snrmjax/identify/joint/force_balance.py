@@ -46,7 +46,6 @@ class BalanceData(eqx.Module):
     std: Float[Array, "state input"]  # of `STATE_ERRORS`
     weight: Float[Array, " state"]  # 1, or less for an outlier under the robust loss
     correction: Float[Array, "state input"]  # of `STATE_ERRORS`, what a fit adds to every record
-    beside: Complex[Array, " state"]  # what one mode leaves off resonance of FA/X, rad²/s²
     n_levels: int = eqx.field(static=True)
     sensor: int = eqx.field(static=True)  # the one whose motion is meant
 
@@ -186,7 +185,6 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
             std=jnp.asarray(errors[keep]),
             weight=jnp.asarray(np.ones(int(keep.sum()))),
             correction=no_errors(int(keep.sum())),
-            beside=jnp.asarray(np.zeros(int(keep.sum()), dtype=complex)),
             n_levels=len(levels),
             sensor=r,
         ),
@@ -293,7 +291,6 @@ def force_balance(
     omega = data.frequency
     stiffness = squared - omega**2 + 1j * omega * damping
     needed = stiffness * motion.velocity / (1j * omega * problem.constant_of(unknowns))
-    needed = needed + data.beside * motion.velocity / (1j * omega * problem.modal_constant)
     # Relative to the recorded force, but with no advantage from a larger gain.
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit

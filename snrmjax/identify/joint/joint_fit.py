@@ -41,7 +41,6 @@ from snrmjax.identify.joint.free_unknowns import (
 )
 from snrmjax.identify.joint.notes import (
     notes_on_autocorrelation,
-    notes_on_discrepancy,
     notes_on_level_errors,
     notes_on_modal_mass,
     notes_on_noise,
@@ -49,7 +48,6 @@ from snrmjax.identify.joint.notes import (
     notes_on_stated_errors,
 )
 from snrmjax.identify.joint.posterior_start import (
-    errors_of_discrepancy,
     noise_and_levels,
     posterior_of,
     unknowns_at,
@@ -318,10 +316,9 @@ def fit_jointly(
     prior = with_levels(problem.prior, components, measured.n_levels)
     wandering = wandering_stiffness(found)
     errors = measured.std.at[:, 3].set(wandering)
-    data_too = problem.with_data(std=errors, beside=jnp.asarray(found.discrepancy)).data
-    noisy = BalanceProblem(data_too, modes, prior)
+    noisy = BalanceProblem(problem.with_data(std=errors).data, modes, prior)
     start = unknowns_at(first, noisy, released, choices)
-    settings = FitSettings(released, stated, robust, _ROUNDS, errors_of_discrepancy(found))
+    settings = FitSettings(released, stated, robust, _ROUNDS)
     best = finite_fit(fitted(start, noisy, components, settings))
 
     # What levels differ by is said where the data ask for it, and stays possible elsewhere.
@@ -342,7 +339,6 @@ def fit_jointly(
         of_force = bool(prior.gain_of_force > 0)
         notes += notes_on_level_errors(shifts, numbers, np.array(force), of_force=of_force)
     notes += notes_on_stated_errors(np.asarray(best.unknowns.level), level_std)
-    notes += notes_on_discrepancy(found.hyper.discrepancy)
     notes += notes_on_modal_mass(best.unknowns, last, best.covariance)
     notes += notes_on_autocorrelation(best.autocorrelation)
     notes += notes_on_reach(recorded_motion_of(best.unknowns, last), level)

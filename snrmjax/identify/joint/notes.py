@@ -128,21 +128,6 @@ def notes_on_stated_errors(
     return tuple(notes)
 
 
-def notes_on_discrepancy(size: tuple[float, float]) -> tuple[str, ...]:
-    """What states beside resonance have that no single mode does.
-
-    Arguments: `size` 1σ in phase with the motion and in quadrature, over the damping's force.
-    """
-    if not max(size) > 0:
-        return ()
-    return (
-        f"beside resonance the states differ from any single mode by {100 * size[0]:.2g} % of its "
-        f"damping force in phase with the motion and {100 * size[1]:.2g} % in quadrature (1σ): a "
-        "gain of force or sensor, a mode close by, steps too short to settle or a joint's history "
-        "do that. The curves are those at resonance, and the bands include it.",
-    )
-
-
 def notes_on_modal_mass(
     unknowns: Unknowns,
     problem: BalanceProblem,

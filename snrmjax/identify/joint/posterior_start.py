@@ -6,7 +6,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex
 from scipy.optimize import minimize
 
 from snrmjax.identify.checks.residual_autocorrelation import (
@@ -20,7 +19,6 @@ from snrmjax.identify.curves.splines import SmoothingSpline, bends_of
 from snrmjax.identify.joint.fitting import NoiseAndLevels
 from snrmjax.identify.joint.force_balance import BalanceProblem, PriorStd, Unknowns
 from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
-from snrmjax.identify.test_model.priors import DISCREPANCY_LOG_ODDS
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.modes import residual_velocity
 
@@ -72,11 +70,7 @@ def posterior_of(
         phase_std=_FREE if "instrument_phase" in free else 0.0,
         offset_std=_FREE if "force_offset" in free else 0.0,
     )
-    found = fit_test(states, robust=robust, most_knots=knots)
-    if not stated or found.hyper.noise > 1:  # or else nothing is left to explain
-        more = fit_test(states, discrepancy=True, robust=robust, most_knots=knots)
-        if more.log_evidence - found.log_evidence > DISCREPANCY_LOG_ODDS:
-            found = more
+    found = fit_test(states, robust=robust, most_knots=knots, tempered=True)
     return Beginning(found, complex(gain * np.exp(1j * phase)))
 
 
@@ -113,13 +107,6 @@ def noise_and_levels(found: TestPosterior) -> NoiseAndLevels:
         size = np.sqrt(np.mean(found.residuals**2, axis=0))
         share = independent_share(residual_autocorrelation(found.residuals / size, alike))
     return NoiseAndLevels(noise, float(noise_std), found.hyper.level_std, share)
-
-
-def errors_of_discrepancy(found: TestPosterior) -> Complex[np.ndarray, "state error"]:
-    """Independent errors of 1σ of what one mode leaves off resonance."""
-    own = found.places.beside
-    size, vectors = np.linalg.eigh(found.covariance[own, own])
-    return found.beside @ (vectors * np.sqrt(np.maximum(size, 0.0)))
 
 
 def with_levels(prior: PriorStd, components: NoiseAndLevels, n_levels: int) -> PriorStd:

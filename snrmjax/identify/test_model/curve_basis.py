@@ -19,7 +19,7 @@ from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZ
 
 MOST_KNOTS = 40
 _BEYOND = (1.15, 1.3)  # knots over the largest amplitude, for levels whose record is too small
-_NEAREST = 1.05  # ratio of two knots' amplitudes
+_NEAREST = 1.1  # ratio of two knots' amplitudes
 N_POWERS = 2
 _NOTHING = 1e-6  # of the largest variance: a direction of the sizes that counts for nothing
 

@@ -29,6 +29,7 @@ class LinearRows(NamedTuple):
     across: float  # |r − Qc|²
     n_rows: int
     offset: float = 0.0  # ln of the Jacobian from the rows to what was recorded
+    share: float = 1.0  # of the rows that tell something of their own: a power of their likelihood
 
     @classmethod
     def of(
@@ -47,6 +48,7 @@ class LinearRows(NamedTuple):
         self, scale: float, variance: Float[np.ndarray, " unknown"]
     ) -> tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, "unknown unknown"]]:
         """Mean and covariance of the unknowns."""
+        scale = scale / np.sqrt(self.share)
         by_root = self.triangle * np.sqrt(variance)
         inverse = _inverse(np.eye(len(variance)) + by_root.T @ by_root / scale**2)[0]
         covariance = np.sqrt(variance)[:, None] * inverse * np.sqrt(variance)
@@ -58,11 +60,13 @@ class LinearRows(NamedTuple):
     ) -> tuple[float, float, Float[np.ndarray, " unknown"]]:
         """ln p of the rows, and its slopes by ln s and by the logarithms of the variances."""
         by_root = self.triangle * np.sqrt(variance)
-        n, m = self.n_rows, len(by_root)
+        n, m = self.share * self.n_rows, len(by_root)
+        constant = n * np.log(2 * np.pi * scale**2)
+        scale = scale / np.sqrt(self.share)
         inverse, log_det = _inverse(by_root @ by_root.T + scale**2 * np.eye(m))
         weighed = inverse @ self.along
         square = float(self.along @ weighed) + self.across / scale**2
-        value = -0.5 * (n * np.log(2 * np.pi) + (n - m) * np.log(scale**2) + log_det + square)
+        value = -0.5 * (constant - m * np.log(scale**2) + log_det + square)
         pull = by_root.T @ weighed
         by_variance = 0.5 * (pull**2 - np.sum(by_root * (inverse @ by_root), axis=0))
         by_scale = (

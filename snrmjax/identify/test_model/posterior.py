@@ -20,9 +20,14 @@ taken where likelihood times prior is largest, and integrated over by Laplace's 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from scipy.special import ndtri, stdtrit
 
+from snrmjax.identify.checks.residual_autocorrelation import (
+    along_resonance,
+    independent_share,
+    residual_autocorrelation,
+)
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
@@ -56,6 +61,7 @@ _ROUNDS = 12  # at most
 _SETTLED = 2  # rounds, until steps are checked and the modal mass is free
 _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
 _TRIED = 4  # rounds of each start
+_LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks like fewer
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
 _FARTHEST = np.array([1.0, 1.0, 0.5, 0.5])  # of a level's errors, relative or rad
@@ -84,7 +90,6 @@ class TestPosterior(NamedTuple):
     corrections: Float[np.ndarray, "state input"]  # most likely errors, subtracted from the record
     residuals: Float[np.ndarray, "state part"]  # whitened: of unit variance where all is right
     arms_of_stiffness: Float[np.ndarray, "state part"]  # how a relative change of ω̃² moves them
-    beside: Complex[np.ndarray, "state function"]  # what a discrepancy is made of
     effective_unknowns: float  # that the states, and not their priors, tell
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
@@ -103,11 +108,6 @@ class TestPosterior(NamedTuple):
     def force_offset(self) -> float:
         """Offset of the force, over the smallest."""
         return float(self.mean[OFFSET])
-
-    @property
-    def discrepancy(self) -> Complex[np.ndarray, " state"]:
-        """What one mode leaves off resonance of FA/X, rad²/s²."""
-        return self.beside @ self.mean[self.places.beside]
 
     @property
     def level_errors(self) -> Float[np.ndarray, "level error"]:
@@ -144,12 +144,14 @@ def fit_test(
     robust: bool = False,
     rounds: int = _ROUNDS,
     most_knots: int | None = None,
+    tempered: bool = False,
 ) -> TestPosterior:
     """The posterior of a test.
 
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t);
-    curves have `most_knots` at most.
+    curves have `most_knots` at most; with `tempered` states whose neighbours miss the curves alike
+    count as fewer.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -170,8 +172,10 @@ def fit_test(
     # that bend as they like from the first, which arches are: the more probable goes on.
     walks = [_Walk.of(balance, robust=robust, straight=straight) for straight in (True, False)]
     for walk in walks:
+        walk.tempered = tempered
         walk.advance(min(_TRIED, rounds))
-    walk = max(walks, key=lambda one: one.likelihood)
+    share = min(walk.share for walk in walks)
+    walk = max(walks, key=lambda one: one.likelihood_of(share))
     walk.advance(rounds - min(_TRIED, rounds))
     found = walk.found
     if found is None:
@@ -183,7 +187,8 @@ def fit_test(
     for own, std in zip(places.levels.T, states.level_std, strict=True):
         variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
     last = walk.balance.straight(found.mean, found.errors, apart=False)
-    mean, covariance = last.equations.posterior(hyper.noise, variance)
+    equations = last.equations._replace(share=found.equations.share)
+    mean, covariance = equations.posterior(hyper.noise, variance)
     told = variance > 0
     objective = objective_of(found.equations, states, basis, places)
     bounds = bounds_of(states, basis, found.point)
@@ -199,7 +204,6 @@ def fit_test(
         found.errors,
         found.residuals,
         last.arms_of_stiffness,
-        walk.balance.beside,
         float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
         places,
         _differing(flat, found.point, bounds, states),
@@ -234,6 +238,7 @@ class _Walk:
         self.errors = np.zeros_like(balance.states.errors)
         self.found: _Found | None = None
         self.turn, self.robust, self.straight, self.still = 0, robust, False, False
+        self.share, self.tempered = 1.0, False
 
     @classmethod
     def of(cls, balance: Balance, *, robust: bool, straight: bool) -> "_Walk":
@@ -258,12 +263,21 @@ class _Walk:
                 return
             self._round()
 
+    def likelihood_of(self, share: float) -> float:
+        """The same, were so many of the states independent."""
+        if self.found is None:
+            return -np.inf
+        states, basis, places = self.balance.states, self.balance.basis, self.balance.places
+        equations = self.found.equations._replace(share=share)
+        return objective_of(equations, states, basis, places)(self.found.point)[0]
+
     def _round(self) -> None:
         k, states, basis = self.turn, self.balance.states, self.balance.basis
         places, start = self.balance.places, self.start
         if k == _SETTLED:
             self.balance = self.balance.with_discrepancy(self.mean, self.errors)
         this = self.balance.straight(self.mean, self.errors, first=k == 0)
+        this = this._replace(equations=this.equations._replace(share=self.share))
         bounds = bounds_of(states, basis, self.point)
         along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
         if k == 0:  # no level differs from another yet, and bends are of one size
@@ -290,7 +304,7 @@ class _Walk:
         )
         left = (this.rows - this.design @ goal).reshape(-1, 2)
         value = objective(point)[0]
-        if k <= _SETTLED or value > self.likelihood:
+        if k <= _SETTLED or self.tempered or value > self.likelihood:
             self.found = _Found(
                 point, value, this.equations, goal, left / hyper.noise, moved.errors
             )
@@ -298,10 +312,19 @@ class _Walk:
         self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
+        if self.tempered:
+            self.share = _independent_share(states, left)
         if self.robust:
             square = np.sum(left**2, axis=1) / hyper.noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
             self.balance = self.balance._replace(weight=weight)
+
+
+def _independent_share(states: TestStates, left: Float[np.ndarray, "state part"]) -> float:
+    """Share of the states that tell something of their own, by what is left of them."""
+    size = np.sqrt(np.mean(left**2, axis=0))
+    levels = along_resonance(states.level, states.frequency)
+    return max(independent_share(residual_autocorrelation(left / size, levels)), _LEAST_SHARE)
 
 
 class _Moved(NamedTuple):

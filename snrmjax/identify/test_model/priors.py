@@ -87,7 +87,7 @@ LEVEL_GAIN = HalfCauchySize(0.02)
 LEVEL_PHASE = HalfCauchySize(0.01)
 """rad: 0.6°, a filter's or a controller's between levels."""
 
-LEVEL_STIFFNESS = HalfCauchySize(0.004)
+LEVEL_STIFFNESS = HalfNormalSize(0.004)
 """Relative, of ω̃²: 0.2 % of frequency, some 10 K of temperature in metals, or a joint's seat."""
 
 LEVEL_DAMPING = HalfNormalSize(0.05)
@@ -122,9 +122,6 @@ SIZES_ALIKE = 2.0
 DISCREPANCY = HalfNormalSize(0.1)
 """Of Ωδ: what a single mode leaves off resonance. Measured beams show 1 to 5 %, joints that slip
 some 20 %."""
-
-DISCREPANCY_LOG_ODDS = 3.0
-"""ln of the odds against one that counts: one test of twenty, mostly of joints that slip."""
 
 DISCREPANCY_LENGTH = np.radians(30.0)
 """Phase over which a discrepancy changes."""
