@@ -68,7 +68,7 @@ def test_bands_hold_what_was_measured_at_resonance(beside):
     # As a turned phase the asymmetry would shift all levels by 30 mHz.
     off = np.asarray(found.natural_frequency) - own
     assert abs(np.mean(off)) < 0.01 * HERTZ
-    # Where neighbouring states miss alike they count as few, and the curve is as smooth as they ask.
+    # Where neighbouring states miss alike they count as few: curves are smoother than the truth.
     assert np.max(np.abs(off)) < 0.025 * HERTZ
     ratio = damping(speed / own, np.zeros(len(own)), beside) / (2 * own)
     assert np.max(np.abs(found.damping_ratio - ratio) / found.damping_ratio_std) < 2.5
