@@ -247,7 +247,7 @@ def test_a_mode_close_by_is_found_and_doubted():
     # The table has what it was better than.
     assert found.table[-1][0].kind == "close_mode"
     assert "residual_mode" in [row.kind for row in found.table[0]]
-    assert found.table[-1][0].gain > 2 * found.table[0][0].gain
+    assert found.table[-1][0].chi_square < 0.6 * found.table[0][0].chi_square
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ from jaxtyping import Array, Complex, Float
 
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
-from snrmjax.identify.test_model.priors import LEVELS
+from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE, LEVELS
 from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.model.modes import residual_velocity
 
@@ -78,6 +78,8 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         level_std=(gain, phase, 2 * frequency / own, damping / ratio if ratio > 0 else 0.0),
         mass_std=float(np.hypot(mass_std or 0.05, predictions.force_gain_std)),
         force_is_free=predictions.force_gain_std > 0,
+        # What all levels share is a hypothesis of its own: it must not pass for levels that differ.
+        phase_std=INSTRUMENT_PHASE,
     )
 
 

@@ -1,6 +1,6 @@
 """What is taken for likely before a test is seen: every prior with its unit and its reason.
 
-Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-Cauchy distribution
+Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-normal distribution
 of the size itself; those of curves and noise are medians of lognormal ones.
 """
 
@@ -34,18 +34,6 @@ class HalfNormalSize(NamedTuple):
         return log_value - np.log(self.scale) - 0.5 * square + np.log(2) - _LOG_ROOT, 1.0 - square
 
 
-class HalfCauchySize(NamedTuple):
-    """A positive number that is mostly below a scale, and may be far above it."""
-
-    scale: float
-
-    def log_density(self, log_value: float) -> tuple[float, float]:
-        """ln p of the logarithm, and its slope."""
-        square = np.exp(2 * (log_value - np.log(self.scale)))
-        value = log_value - np.log(self.scale) - np.log1p(square) + np.log(2 / np.pi)
-        return value, 1.0 - 2 * square / (1 + square)
-
-
 class NormalNumber(NamedTuple):
     """Any number about zero."""
 
@@ -68,7 +56,7 @@ class FlatSize(NamedTuple):
         return -float(np.log(self.high - self.low)), 0.0
 
 
-Density = LogNormalSize | HalfNormalSize | HalfCauchySize | NormalNumber
+Density = LogNormalSize | HalfNormalSize | NormalNumber
 
 STATED_NOISE = LogNormalSize(1.0, 0.1)
 """Noise over the stated one: standard deviations from ten readings are good to some 20 %, and a
@@ -81,19 +69,23 @@ evaluation some 3 %."""
 FORCE_TO_VELOCITY = 0.1
 """Error of a force of which none is stated, over that of the velocity: calibrated load cells."""
 
-LEVEL_GAIN = HalfCauchySize(0.02)
-"""Relative: drift of conditioners and of a shaker's coupling between levels."""
+LEVEL_GAIN = HalfNormalSize(0.05)
+"""Relative: drift of conditioners and of a shaker's coupling between levels; published tests show
+15 %."""
 
-LEVEL_PHASE = HalfCauchySize(0.01)
-"""rad: 0.6°, a filter's or a controller's between levels."""
+LEVEL_PHASE = HalfNormalSize(0.02)
+"""rad: 1.1°, a filter's or a controller's between levels; hand-made tests show 3°."""
 
-LEVEL_STIFFNESS = HalfNormalSize(0.004)
-"""Relative, of ω̃²: 0.2 % of frequency, some 10 K of temperature in metals, or a joint's seat."""
+LEVEL_STIFFNESS = HalfNormalSize(0.008)
+"""Relative, of ω̃²: 0.4 % of frequency, some 20 K of temperature in metals, or a joint's seat."""
 
 LEVEL_DAMPING = HalfNormalSize(0.05)
 """Relative: joints and clamps that are opened between levels repeat to some 10 %."""
 
-LEVELS: tuple[HalfCauchySize | HalfNormalSize, ...] = (
+INSTRUMENT_PHASE = 0.1
+"""rad: 6°, of all records together, where a hypothesis may be that there is one."""
+
+LEVELS: tuple[HalfNormalSize, ...] = (
     LEVEL_GAIN,
     LEVEL_PHASE,
     LEVEL_STIFFNESS,
