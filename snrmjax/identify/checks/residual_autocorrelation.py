@@ -58,6 +58,17 @@ def independent_share(correlation: Float[np.ndarray, " part"]) -> float:
     return float(np.mean((1 - correlation) / (1 + correlation)))
 
 
+def share_told_by(
+    residuals: Float[np.ndarray, "state part"],
+    level: Int[np.ndarray, " state"],
+    frequency: Float[np.ndarray, " state"],
+) -> float:
+    """`independent_share` by what a fit leaves of states, whatever its size is."""
+    size = np.sqrt(np.mean(residuals**2, axis=0))
+    levels = along_resonance(level, frequency)
+    return independent_share(residual_autocorrelation(residuals / size, levels))
+
+
 def _correlation(
     residuals: Float[np.ndarray, " state"], levels: list[Int[np.ndarray, " place"]], lag: int
 ) -> tuple[float, int]:

@@ -238,14 +238,6 @@ FamilyTable.__doc__ = f"{FamilyTable.__doc__}\n\n{FAMILIES!r}"
 ARGUMENTS: tuple[Argument, ...] = ("displacement", "velocity")
 """Amplitudes that a curve may be a function of."""
 
-# What "auto" tries. Constant damping is the polynomial of size 0 there: one that may grow. Splines
-# with free knots are no law, and their bands hold nothing of what few knots cannot follow.
-BACKBONE_FAMILIES = ("polynomial", "power_law", "smoothing_spline")
-DAMPING_FAMILIES = (
-    *("polynomial", "viscous_quadratic", "viscous_coulomb", "viscous_microslip"),
-    *("power_law", "smoothing_spline"),
-)
-
 
 class Choice(NamedTuple):
     """What the user fixed of a family."""

@@ -5,7 +5,7 @@ of the values, in the amplitude itself.
 """
 
 import itertools
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -102,9 +102,8 @@ class SmoothingSpline(Spline):
     """A natural cubic spline with many knots that is as smooth as the data ask for.
 
     Its bends, the differences of a value from the straight line between those at the next knots,
-    have a prior 1σ that restricted maximum likelihood estimates: one for all while families are
-    compared, then 1.5 times one that changes along the curve (`sizes_along`), with adjacent bends
-    correlated (`likeness`). A band then covers what the curve may do between knots; with few free
+    have a prior 1σ, one for all or one that changes along the curve, which the model of a test
+    finds (`test_model`). A band then covers what the curve may do between knots; with few free
     knots it does not cover what they cannot follow. Knots are many, about evenly spaced in the
     logarithm of amplitude: steps of damping as joints begin to slip lie between levels too.
     Reference: Nychka, J. Am. Stat. Assoc. 83 (1988) 1134, doi:10.1080/01621459.1988.10478711.
@@ -140,12 +139,7 @@ class SmoothingSpline(Spline):
         states are far below it, and the few at resonance need knots too.
         """
         scale = float(np.max(amplitude))
-        apart = [1.0]
-        for one in np.sort(amplitude / scale)[::-1]:
-            if 0 < one * _NEAREST <= apart[-1]:
-                apart.append(float(one))
-        pick = np.linspace(0, len(apart) - 1, min(order - 1, len(apart)))
-        knots = np.array([0.0, *np.array(apart)[np.round(pick).astype(int)][::-1]]) ** 2
+        knots = np.append(0.0, amplitudes_apart(amplitude / scale, order - 1, _NEAREST) ** 2)
         unit = jnp.asarray(scale, dtype=jnp.float64)
         blank = cls.through(knots, np.zeros(len(knots)), unit, argument)
         start = linear_start(spline_columns(blank, amplitude), values, weight)
@@ -169,22 +163,19 @@ class SmoothingSpline(Spline):
         return cls(jnp.asarray(values), *fixed)
 
 
-class Bent(NamedTuple):
-    """A smoothing spline as a straight line and its bends: values at knots = both · unknowns."""
+def amplitudes_apart(
+    amplitude: Float[np.ndarray, " point"], most: int, ratio: float
+) -> Float[np.ndarray, " knot"]:
+    """Some of the amplitudes in rising order, each at least so many times the one below.
 
-    both: Float[np.ndarray, "knot unknown"]  # two of the line, then the bends
-    straight: Float[np.ndarray, " knot"]  # values at the knots without the bends
-    prior_std: Float[np.ndarray, " unknown"]
-
-
-def bent(curve: SmoothingSpline) -> Bent:
-    """The line and the bends of a curve."""
-    of_bends = np.asarray(curve.bends)
-    values, knots = np.asarray(curve.parameters), np.asarray(curve.knots)
-    back = np.linalg.pinv(of_bends)
-    both = np.column_stack([np.ones_like(knots), knots, back])
-    prior = np.concatenate([[np.inf, np.inf], np.full(len(of_bends), np.asarray(curve.bend_std))])
-    return Bent(both, values - back @ (of_bends @ values), prior)
+    Arguments: `amplitude` relative to the largest; of more than `most` even picks.
+    """
+    apart = [1.0]
+    for one in np.sort(amplitude)[::-1]:
+        if 0 < one * ratio <= apart[-1]:
+            apart.append(float(one))
+    pick = np.linspace(0, len(apart) - 1, min(most, len(apart)))
+    return np.array(apart)[np.round(pick).astype(int)][::-1]
 
 
 def spline_columns(

@@ -8,11 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
-    independent_share,
-    residual_autocorrelation,
-)
+from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice, values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractFamily, Argument
 from snrmjax.identify.curves.splines import SmoothingSpline, bends_of
@@ -100,12 +96,10 @@ def unknowns_at(
 def noise_and_levels(found: TestPosterior) -> NoiseAndLevels:
     """The noise, and 1σ of what levels share, as the posterior has them."""
     states, n = found.states, len(found.states.level)
-    share, alike = 1.0, along_resonance(states.level, states.frequency)
-    noise = found.hyper.noise
+    share, noise = 1.0, found.hyper.noise
     noise_std = noise / np.sqrt(2 * max(2 * n - found.effective_unknowns, 0.5 * n))
     if not states.stated or noise - 3 * noise_std > 1:
-        size = np.sqrt(np.mean(found.residuals**2, axis=0))
-        share = independent_share(residual_autocorrelation(found.residuals / size, alike))
+        share = share_told_by(found.residuals, states.level, states.frequency)
     return NoiseAndLevels(noise, float(noise_std), found.hyper.level_std, share)
 
 

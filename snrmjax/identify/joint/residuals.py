@@ -5,7 +5,6 @@ moves the states of that level alone: one push forward through the residuals ser
 all levels. Of eight levels with four errors each, 32 pushes become four.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,19 +16,15 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     Unknowns,
     Weighting,
     force_balance,
-    motion_of,
     nearest_errors,
-    weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
+from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.numerics.blocks import mapped
-from snrmjax.numerics.compiled import compiled
 
 _SINGULAR = 1e-13  # of JᵀJ's diagonal, what is added to it: rounding must not make it singular
 
@@ -188,85 +183,3 @@ def on_levels(
     """A solver for residuals in the order of `all_residuals`, with steps by `NormalSteps`."""
     steps = NormalSteps(LevelPattern.of(unravel, data))
     return eqx.tree_at(lambda damped: damped.descent, solver, steps)
-
-
-class BalanceSlopes(NamedTuple):
-    """The whitened balance at the initial guess and its slopes, on the host."""
-
-    balance: np.ndarray  # (state, part)
-    by_squared: np.ndarray  # (state, part)
-    by_damping: np.ndarray
-    by_level: np.ndarray  # (state, part, error), in the errors' own units
-    by_other: np.ndarray  # (state, part, unknown): gain, offset, phase, linear deviations
-    displacement: np.ndarray
-    speed: np.ndarray
-    squared: np.ndarray
-    damping: np.ndarray
-
-
-def balance_slopes(unknowns: Unknowns, problem: BalanceProblem) -> BalanceSlopes:
-    """The balance and its slopes at some unknowns and at the states as they are corrected.
-
-    Deviations of levels are in their own units here, not of some 1σ. What has a prior counts from
-    its prior's mean: the balance is that of levels and linear modes without deviations.
-    """
-    n, room = len(problem.data.level), padded_problem(problem)
-    unravel = packed_unknowns(unknowns, (), room.data.n_levels).unravel
-    parts = _slopes(unravel.unknowns, room)
-    return BalanceSlopes(*(np.asarray(part)[:n] for part in parts))
-
-
-@compiled
-def _slopes(unknowns: Unknowns, problem: BalanceProblem) -> tuple:
-    data = problem.data
-    unit = dataclasses.replace(problem.prior, level=jnp.ones(len(LEVEL_ERRORS)))
-    problem = dataclasses.replace(problem, prior=unit)
-    weighting = weighting_at(unknowns, problem)
-
-    def balance(level: Array, other: tuple[Array, Array, Array, Array]) -> Array:
-        each = eqx.tree_at(
-            lambda u: (*(u.log_force_gain, u.force_offset, u.instrument_phase, u.linear, u.level),),
-            unknowns,
-            (*other, unknowns.level + level),
-        )
-        own = force_balance(each, problem, data.correction) + weighting.offset
-        return jnp.einsum("sij,sj->si", weighting.whiten, own)
-
-    other = (
-        *(unknowns.log_force_gain, unknowns.force_offset),
-        *(unknowns.instrument_phase, unknowns.linear),
-    )
-    still = jnp.zeros_like(unknowns.level)
-    # Every level's error moves its own states only: one push forward for all levels.
-    kinds, n_linear = still.shape[1], unknowns.linear.shape[0]
-    units = jnp.eye(kinds + 3 + n_linear)
-    present, push = jax.linearize(balance, still, other)
-
-    def pushed(unit: Array) -> Array:
-        of_levels = jnp.broadcast_to(unit[:kinds], still.shape)
-        gain, offset, phase = unit[kinds : kinds + 3]
-        return push(of_levels, (gain, offset, phase, unit[kinds + 3 :]))
-
-    slopes = jnp.moveaxis(mapped(pushed, units), 0, 2)
-    by_level, by_other = slopes[..., :kinds], slopes[..., kinds:]
-    motion = motion_of(unknowns, problem, data.correction)
-    # The balance is linear in the values of both curves.
-    by_damping = motion.velocity / (problem.constant_of(unknowns) * motion.force)
-    by_squared = by_damping / (1j * data.frequency)
-    level = unknowns.level[data.level]
-
-    def parts(slope: Array, share: Array) -> Array:
-        both = jnp.stack([slope.real, slope.imag], axis=1) * share[:, None]
-        return jnp.einsum("sij,sj->si", weighting.whiten, both)
-
-    nominal = present - jnp.einsum("sie,se->si", by_level, level)
-    nominal = nominal - jnp.einsum("sio,o->si", by_other[..., 3:], unknowns.linear)
-    return (
-        *(nominal, parts(by_squared, 1 + level[:, 2])),
-        parts(by_damping, 1 + level[:, 3]),
-        by_level,
-        by_other,
-        *(motion.displacement, jnp.abs(motion.velocity)),
-        unknowns.squared_frequency(motion.amplitude(unknowns.squared_frequency)),
-        unknowns.modal_damping(motion.amplitude(unknowns.modal_damping)),
-    )

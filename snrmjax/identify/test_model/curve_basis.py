@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.identify.curves.splines import bends_of, hats, spline_terms
+from snrmjax.identify.curves.splines import amplitudes_apart, bends_of, hats, spline_terms
 from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
 MOST_KNOTS = 40
@@ -38,12 +38,7 @@ class CurveBasis(NamedTuple):
     ) -> "CurveBasis":
         """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond."""
         largest = float(np.max(amplitude))
-        apart = [1.0]
-        for one in np.sort(amplitude / largest)[::-1]:
-            if 0 < one * _NEAREST <= apart[-1]:
-                apart.append(float(one))
-        pick = np.linspace(0, len(apart) - 1, min(most_knots - 1, len(apart)))
-        inside = np.array(apart)[np.round(pick).astype(int)][::-1]
+        inside = amplitudes_apart(amplitude / largest, most_knots - 1, _NEAREST)
         knots = np.array([0.0, *inside, *_BEYOND]) ** 2
         bends = bends_of(knots)
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])

@@ -13,7 +13,7 @@ Z = FA/X of every state (`TestStates`), what can be wrong moves it to first orde
 
 Slopes and weights are those at the states corrected for their most likely errors, found in a few
 rounds (orthogonal distance regression). Given the hyperparameters (noise, sizes of levels' errors,
-of the curves' processes and of the discrepancy) all is one Gaussian (`linear_gaussian`); those are
+of the curves' bends and of the discrepancy) all is one Gaussian (`linear_gaussian`); those are
 taken where likelihood times prior is largest, and integrated over by Laplace's approximation.
 """
 
@@ -23,11 +23,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri, stdtrit
 
-from snrmjax.identify.checks.residual_autocorrelation import (
-    along_resonance,
-    independent_share,
-    residual_autocorrelation,
-)
+from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
@@ -170,9 +166,11 @@ def fit_test(
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
     # that bend as they like from the first, which arches are: the more probable goes on.
-    walks = [_Walk.of(balance, robust=robust, straight=straight) for straight in (True, False)]
+    walks = [
+        _Walk(balance, straight=straight, robust=robust, tempered=tempered)
+        for straight in (True, False)
+    ]
     for walk in walks:
-        walk.tempered = tempered
         walk.advance(min(_TRIED, rounds))
     share = min(walk.share for walk in walks)
     walk = max(walks, key=lambda one: one.likelihood_of(share))
@@ -233,23 +231,17 @@ class _Found(NamedTuple):
 class _Walk:
     """Rounds of making the problem straight and solving it, from one start on."""
 
-    def __init__(self, balance: Balance, point: np.ndarray, mean: np.ndarray, *, robust: bool):
-        self.balance, self.start, self.point, self.mean = balance, point, point, mean
-        self.errors = np.zeros_like(balance.states.errors)
-        self.found: _Found | None = None
-        self.turn, self.robust, self.straight, self.still = 0, robust, False, False
-        self.share, self.tempered = 1.0, False
-
-    @classmethod
-    def of(cls, balance: Balance, *, robust: bool, straight: bool) -> "_Walk":
-        """A walk from the records; the first rounds with `straight` lines over a² if asked."""
+    def __init__(self, balance: Balance, *, straight: bool, robust: bool, tempered: bool):
+        """From the records; the first rounds with `straight` lines over a² if asked."""
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
-        mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * discrepancy)
-        mean[places.damping.start] = 1.0
-        start = starting_point(balance.states, balance.basis, discrepancy)
-        walk = cls(balance, start, mean, robust=robust)
-        walk.straight = straight
-        return walk
+        self.balance, self.straight = balance, straight
+        self.robust, self.tempered = robust, tempered
+        self.start = starting_point(balance.states, balance.basis, discrepancy)
+        self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
+        self.mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * discrepancy)
+        self.mean[places.damping.start] = 1.0
+        self.found: _Found | None = None
+        self.turn, self.still, self.share = 0, False, 1.0
 
     @property
     def likelihood(self) -> float:
@@ -313,18 +305,12 @@ class _Walk:
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
         self.turn += 1
         if self.tempered:
-            self.share = _independent_share(states, left)
+            told = share_told_by(left, states.level, states.frequency)
+            self.share = max(told, _LEAST_SHARE)
         if self.robust:
             square = np.sum(left**2, axis=1) / hyper.noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
             self.balance = self.balance._replace(weight=weight)
-
-
-def _independent_share(states: TestStates, left: Float[np.ndarray, "state part"]) -> float:
-    """Share of the states that tell something of their own, by what is left of them."""
-    size = np.sqrt(np.mean(left**2, axis=0))
-    levels = along_resonance(states.level, states.frequency)
-    return max(independent_share(residual_autocorrelation(left / size, levels)), _LEAST_SHARE)
 
 
 class _Moved(NamedTuple):

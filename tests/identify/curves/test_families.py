@@ -8,7 +8,6 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from snrmjax.identify.curves.families import (
-    DAMPING_FAMILIES,
     FAMILIES,
     PowerLaw,
     Spline,
@@ -126,7 +125,7 @@ def test_one_of_the_power_laws_starts_at_each_exponent_tried():
 
 
 def test_scaling_amplitude_and_value_scales_the_curve():
-    for kind in DAMPING_FAMILIES:
+    for kind in FAMILIES:
         family = FAMILIES[kind]
         values = 3.0 + 0.7 * AMPLITUDE
         size = family.orders[0]
