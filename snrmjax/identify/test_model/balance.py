@@ -51,7 +51,7 @@ class Balance(NamedTuple):
         ) * d * (by_log @ unknowns[places.damping])
         model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
-        return BalancedStates(z, model, slope, values, stiffness, damping)
+        return BalancedStates(force, z, model, slope, values, stiffness, damping)
 
     def with_discrepancy(self, unknowns: np.ndarray, errors: np.ndarray) -> "Balance":
         """With functions of what one mode leaves off resonance: of phase and log amplitude.
@@ -120,7 +120,7 @@ class Balance(NamedTuple):
         design = np.zeros((len(omega), len(unknowns)), dtype=complex)
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
         design[:, PHASE] = -1j * own
-        design[:, OFFSET] = -own * np.min(states.force) / states.force
+        design[:, OFFSET] = -own * np.min(states.force) / now.force
         design[:, places.stiffness] = ((1 + stiffer) * self.units[0])[:, None] * now.values
         design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
             :, None
@@ -155,6 +155,7 @@ class Balance(NamedTuple):
 class BalancedStates(NamedTuple):
     """Both sides of the balance, and what its slopes are made of."""
 
+    force: Float[np.ndarray, " state"]  # corrected, N
     z: Complex[np.ndarray, " state"]  # FA/X
     model: Complex[np.ndarray, " state"]
     slope: Complex[np.ndarray, " state"]  # of the model by the logarithm of amplitude

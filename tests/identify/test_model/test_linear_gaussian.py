@@ -101,3 +101,21 @@ def test_what_is_normal_is_integrated_exactly():
     )
     matrix = np.array([[2.0, 0.6], [0.6, 1.0]])
     assert precision_at(bent, found)[:2, :2] == pytest.approx(matrix, rel=1e-4)
+
+
+def test_rows_that_are_repeated_count_once_with_their_share():
+    """A likelihood to the power of a half, of rows that all stand twice, is that of one copy."""
+    rng = np.random.default_rng(5)
+    design, rows = rng.normal(size=(30, 4)), rng.normal(size=30)
+    once = LinearRows.of(design, rows)
+    twice = LinearRows.of(np.vstack([design, design]), np.append(rows, rows))._replace(share=0.5)
+    variance = np.array([1.0, 0.3, 2.0, 0.1])
+    for scale in (0.7, 1.3):
+        one, other = (each.log_likelihood(scale, variance) for each in (once, twice))
+        assert other[0] == pytest.approx(one[0], rel=1e-10)
+        assert other[1] == pytest.approx(one[1], rel=1e-9)
+        assert other[2] == pytest.approx(one[2], rel=1e-9)
+        for first, second in zip(
+            once.posterior(scale, variance), twice.posterior(scale, variance), strict=True
+        ):
+            assert second == pytest.approx(first, rel=1e-9, abs=1e-12)

@@ -7,7 +7,7 @@ import pytest
 from truths.exact_states import CONSTANT, damping, squared
 
 from snrmjax.identify.test_model import states as measured
-from snrmjax.identify.test_model.posterior import fit_test
+from snrmjax.identify.test_model.posterior import few_levels_factor, fit_test
 from snrmjax.numerics.blocks import on_one_core
 
 LEVELS, PER_LEVEL, NOISE, SPREAD = 6, 15, 0.005, 0.005
@@ -187,3 +187,36 @@ def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
     errors, known = measured.state_errors(np.array([[0.0, np.nan, 0.02], [0.003, 0.01, 0.02]]))
     assert not known
     assert errors == pytest.approx(np.tile([0.1, 1.0, 1.0], (2, 1)))
+
+
+@pytest.mark.parametrize("n_levels", [2, 3, 4, 8])
+def test_few_levels_widen_a_band_as_students_t_does(n_levels):
+    """Means of draws whose spread is found from them: 95 % of 20 000 lie inside."""
+    draws = np.random.default_rng(n_levels).normal(size=(20000, n_levels))
+    spread = draws.std(axis=1, ddof=1)
+    band = 1.96 * few_levels_factor(n_levels) * spread / np.sqrt(n_levels)
+    # Two levels count as three: t = 4.303 of one degree of freedom holds 85.5 %.
+    wanted = 2 / np.pi * np.arctan(4.303) if n_levels == 2 else 0.95
+    assert np.mean(np.abs(draws.mean(axis=1)) < band) == pytest.approx(wanted, abs=0.006)
+
+
+def test_states_that_err_alike_count_as_fewer(known):
+    """A slow misfit of 3 % along every level: the curves' bands must not shrink with its states."""
+    slow = 0.03 * np.sin(np.tile(np.linspace(-4, 4, PER_LEVEL), LEVELS))
+    states = known.states._replace(velocity=known.states.velocity * np.exp(slow), stated=False)
+    states = states._replace(errors=np.tile([0.1, 1.0, 1.0], (len(slow), 1)))
+    plain, tempered = (fitted(states, tempered=one) for one in (False, True))
+    wide, narrow = (np.median(off(one)[2], axis=0) for one in (tempered, plain))
+    assert wide[1] > 1.15 * narrow[1]
+    assert wide[0] > narrow[0]
+    white = fitted(known.states, tempered=True)
+    same = np.median(off(white)[2], axis=0) / np.median(off(known.fit())[2], axis=0)
+    assert same == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_phase_of_all_records_is_found_and_is_no_levels():
+    clean = made(3, spread=0.0, noise=0.002)
+    turned = clean.states._replace(velocity=clean.states.velocity * np.exp(0.05j), phase_std=0.1)
+    found = fitted(turned)
+    assert found.instrument_phase == pytest.approx(0.05, abs=0.004)
+    assert not found.differing[1]

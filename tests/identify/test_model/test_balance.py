@@ -1,0 +1,120 @@
+"""The balance of states: its slopes against differences, and errors against what was put in."""
+
+import numpy as np
+import pytest
+
+from snrmjax.identify.test_model import states as measured
+from snrmjax.identify.test_model.balance import Balance
+from snrmjax.identify.test_model.curve_basis import CurveBasis
+from snrmjax.identify.test_model.hyper import ALONG, OFFSET, PHASE, places_of
+
+LEVELS, OMEGA, CONSTANT = 3, 500.0, 6.0
+
+
+def balance(*, force_is_free=False, discrepancy=True):
+    """States drawn near a mode, as no law has them, and unknowns of plausible sizes."""
+    rng = np.random.default_rng(0)
+    level = np.repeat(np.arange(LEVELS), 7)
+    n = len(level)
+    omega = OMEGA * (1 + 0.02 * rng.normal(size=n))
+    velocity = (0.2 + 0.3 * level) * np.exp(0.1 * rng.normal(size=n) + 1j * rng.uniform(-1, 1, n))
+    states = measured.TestStates(
+        *(level, omega, 1.0 + rng.uniform(size=n), velocity, np.tile([0.001, 0.01, 0.01], (n, 1))),
+        *(True, CONSTANT, (0.0, 0.01, 0.0, 0.0), 0.05, force_is_free, 0.1, 0.1),
+    )
+    basis = CurveBasis.of(states.amplitude, 8)
+    places = places_of(basis, LEVELS, discrepancy, OMEGA**2)
+    beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
+    own = Balance(states, basis, places, (1e4, 10.0), np.ones(n), beside)
+    unknowns = np.zeros(max(places.levels[-1, -1] + 1, places.beside.stop))
+    unknowns[places.stiffness] = 0.1 * rng.normal(size=basis.n_functions)
+    unknowns[places.damping] = 1 + 0.1 * rng.normal(size=basis.n_functions)
+    unknowns[[0, PHASE, OFFSET]] = 0.02, 0.03, 0.0
+    unknowns[places.levels] = 0.05 * rng.normal(size=(LEVELS, 4))
+    errors = 0.01 * rng.normal(size=(n, 3))
+    return own.with_discrepancy(unknowns, errors), unknowns, errors
+
+
+def balanced(own, unknowns, errors):
+    """Forces and phases with which the states, corrected for these errors, lie on the curves."""
+    now = own.at(unknowns, errors)
+    ratio, states = now.model / now.z, own.states
+    states = states._replace(
+        force=states.force * np.abs(ratio),
+        velocity=states.velocity * np.exp(-1j * np.angle(ratio)),
+    )
+    own = own._replace(states=states)
+    now = own.at(unknowns, errors)
+    np.testing.assert_allclose(now.z, now.model, rtol=1e-10)
+    return own
+
+
+def left(own, unknowns, errors):
+    now = own.at(unknowns, errors)
+    return now.z - now.model
+
+
+@pytest.mark.parametrize("force_is_free", [False, True])
+def test_slopes_by_unknowns_are_differences(force_is_free):
+    own, unknowns, errors = balance(force_is_free=force_is_free)
+    own = balanced(own, unknowns, errors)
+    straight = own.straight(unknowns, errors, apart=False)
+    rows = straight.design.reshape(-1, 2, len(unknowns))
+    # The same rows by differences, whitened as the problem is.
+    for k in np.flatnonzero(np.any(rows != 0, axis=(0, 1))):
+        step = np.zeros(len(unknowns))
+        step[k] = 1e-6
+        ends = [left(own, unknowns + sign * step, errors) for sign in (1, -1)]
+        slope = -(ends[0] - ends[1]) / 2e-6
+        size = np.linalg.norm(rows[:, :, k])
+        white = whitened(own, unknowns, errors, slope)
+        np.testing.assert_allclose(rows[:, :, k], white, atol=1e-5 * size)
+
+
+def whitened(own, unknowns, errors, values):
+    """Through the inverse root of J C Jᵀ, with J by differences of the balance."""
+    std, out = own.states.errors, np.zeros((len(values), 2))
+    jacobian = np.zeros((len(values), 2, 3))
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-7
+        slope = (left(own, unknowns, errors + step) - left(own, unknowns, errors - step)) / 2e-7
+        jacobian[:, :, k] = np.stack([slope.real, slope.imag], axis=1)
+    for n, (one, error) in enumerate(zip(jacobian, std, strict=True)):
+        root = np.linalg.cholesky(one @ np.diag(error**2) @ one.T)
+        out[n] = np.linalg.solve(root, [values[n].real, values[n].imag])
+    return out
+
+
+def test_nearest_errors_put_every_state_on_the_curves_and_are_the_smallest():
+    own, unknowns, errors = balance()
+    own = balanced(own, unknowns, 0 * errors)
+    velocity = own.states.velocity * np.exp(0.01 * np.sin(np.arange(21)))
+    erring = own._replace(states=own.states._replace(velocity=velocity))
+    found = erring.nearest_errors(unknowns, 0 * errors)
+    gap = left(erring, unknowns, found)
+    assert np.max(np.abs(gap) / np.abs(erring.at(unknowns, found).z)) < 1e-8
+    # Not farther, in 1σ, than taking back what was put in.
+    put = np.zeros_like(found)
+    put[:, 1] = -0.01 * np.sin(np.arange(21))
+    assert np.all(
+        np.sum((found / own.states.errors) ** 2, axis=1)
+        <= np.sum((put / own.states.errors) ** 2, axis=1) * (1 + 1e-3) + 1e-12
+    )
+
+
+def test_what_all_levels_share_is_no_difference_of_theirs():
+    own, unknowns, errors = balance(discrepancy=False)
+    straight = own.straight(unknowns, errors)
+    for kind, std in enumerate(own.states.level_std):
+        together = straight.design[:, own.places.levels[:, kind]].sum(axis=1)
+        size = np.abs(straight.design[:, own.places.levels[:, kind]]).max()
+        assert (np.abs(together).max() > 0.1 * size) == (std > 0)  # a stated one may be shared
+
+
+def test_a_discrepancy_vanishes_at_phase_resonance():
+    own, unknowns, errors = balance()
+    states = own.states._replace(velocity=np.abs(own.states.velocity).astype(complex))
+    found = own._replace(states=states).with_discrepancy(unknowns, errors)
+    in_quadrature = found.beside[:, ALONG:]
+    np.testing.assert_allclose(in_quadrature, 0.0, atol=1e-12)
