@@ -19,7 +19,7 @@ and of the force between shaker and beam. In turn the beams have
 Velocity and phase have 0.2 % noise, force 0.1 %; nothing is stated of it. Truth: the beam's own
 phase resonance, found by a phase-locked loop in the same integration (with the drift at which the
 level passed it), at every level's drive and between levels: frequency, velocity, and damping from
-the power that the beam dissipates. Both the joint fit (families chosen by its data) and the
+the power that the beam dissipates. Both the joint fit (smooth curves) and the
 pointwise curve are judged there: shares inside 95 % bands, bias over their half-width, and answers
 that neither holds, with and without a warning. One JSON line for every kind.
 """

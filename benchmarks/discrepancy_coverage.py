@@ -14,8 +14,8 @@ six effects that neither the joint fit nor the pointwise curve knows, each of a 
 - force: a force whose recorded phase turns with its distance from resonance;
 
 and `none`. Velocity and phase have 0.2 % noise; nothing is stated of it. Judged at the phase
-resonance of every level: natural frequency and damping, by the joint fit (families chosen by its
-data) and by the pointwise backbone, as shares inside 95 % bands and bias over their half-width.
+resonance of every level: natural frequency and damping, by the joint fit (smooth
+curves) and by the pointwise backbone, as shares inside 95 % bands and bias over their half-width.
 One JSON line for every effect.
 """
 

@@ -6,7 +6,7 @@ Run: python benchmarks/joint_fit_coverage.py [--tests 500] [--beam flat|curved] 
 Exact steady states of each beam (harmonic balance, 15 harmonics; flat beam: a stepped sine, stable
 states within 60° of resonance; curved beam: a phase-locked loop, within 1.2°) get the errors of a
 careful test: 1 % of amplitude, 0.7° of phase and 0.3 % of force at random, 1 % of gain for a whole
-level. Every test is fitted jointly with families chosen by its own data, and the bands are compared
+level. Every test is fitted jointly with smooth curves, and the bands are compared
 with the truth: natural frequency and damping at 25 amplitudes between the lowest and the highest
 level, resonance and fold at a force between two levels. The truth comes from the phase-locked
 backbone and the response curve by harmonic balance, which do not use the fit. Then the same with

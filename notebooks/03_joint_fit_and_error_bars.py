@@ -185,7 +185,7 @@ for name, fit in fits.items():
     with_gain = sj.fit_jointly(
         tests[name].steady_states,
         flat.modes,
-        backbone=fit.unknowns.squared_frequency.label,  # the families that were chosen
+        backbone=fit.unknowns.squared_frequency.label,  # the same curves
         damping=fit.unknowns.modal_damping.label,
         level_gain_std=0.01,
     )

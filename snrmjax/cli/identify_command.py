@@ -161,11 +161,12 @@ def identify(
     fit: Annotated[
         str | None,
         typer.Option(
-            help="Family of the backbone and, after a comma, of the damping: auto (the one that "
-            "predicts left-out levels best), polynomial:2, power_law, spline:5, smoothing_spline; "
-            "for damping also constant, viscous_quadratic, viscous_coulomb, viscous_microslip. "
-            ":2 is its size, @velocity its amplitude. Default: auto,auto where another option "
-            "asks for a joint fit.",
+            help="Family of the backbone and, after a comma, of the damping: auto (a smooth curve "
+            "that bends as much as the data ask for), polynomial:2, power_law, spline:5, "
+            "smoothing_spline; for damping also constant, viscous_quadratic, viscous_coulomb, "
+            "viscous_microslip. :2 is its size (left out: the simplest in the smooth curve's "
+            "band), @velocity its amplitude. Default: auto,auto where another option asks for a "
+            "joint fit.",
             metavar="BACKBONE[,DAMPING]",
             rich_help_panel=_JOINT,
         ),

@@ -31,8 +31,6 @@ from snrmjax.identify.prediction.resonance_distribution import (
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
-_CURVES = ("backbone", "damping")
-_LEAST = 0.1  # of a rival's weight, that the family taken has
 
 
 class FittedResponse(AbstractResult):

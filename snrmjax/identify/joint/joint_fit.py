@@ -1,5 +1,6 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -302,24 +303,27 @@ def fit_jointly(
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
     problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
 
-    knots = [one.size for one in choices if one.kind == SmoothingSpline.kind and one.size]
-    first = posterior_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
-    found = first.posterior
-    mass, std = found.modal_mass
+    knots = {one.size for one in choices if one.kind == SmoothingSpline.kind and one.size}
+    if len(knots) > 1:
+        raise ValueError(
+            f"smooth curves have their knots in common: give both one size, not {min(knots)} "
+            f"and {max(knots)}."
+        )
+    asked = functools.partial(posterior_of, robust=robust, knots=max(knots, default=None))
+    first = asked(problem, released, stated)
+    mass, std = first.posterior.modal_mass
     if modes.modal_mass_std is None and abs(mass - 1) < _ASKED * std:
         problem = with_known_mass(problem)
-        first = posterior_of(
-            problem, released, stated, robust=robust, knots=max(knots, default=None)
-        )
-        found = first.posterior
+        first = asked(problem, released, stated)
+    found = first.posterior
     components = noise_and_levels(found)
     prior = with_levels(problem.prior, components, measured.n_levels)
     wandering = wandering_stiffness(found)
     errors = measured.std.at[:, 3].set(wandering)
     noisy = BalanceProblem(problem.with_data(std=errors).data, modes, prior)
     start = unknowns_at(first, noisy, released, choices)
-    settings = FitSettings(released, stated, robust, _ROUNDS)
-    best = finite_fit(fitted(start, noisy, components, settings))
+    how = FitSettings(released, stated, robust, _ROUNDS)
+    best = finite_fit(fitted(start, noisy, components, how))
 
     # What levels differ by is said where the data ask for it, and stays possible elsewhere.
     told = np.where(level_std > 0, level_std, np.where(found.differing, components.level, 0.0))

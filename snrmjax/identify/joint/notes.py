@@ -20,7 +20,6 @@ _LISTED = 8  # levels by name
 _TREND = 4  # levels: fewer are in order by chance too often
 _BREACH = 2.0  # standard deviations that are worth a word
 _CHANCE = 1e-3  # of stated errors that are right to be called too small
-_COUNTS = 0.03  # weight of a family that could widen a band
 
 _COMMON = {
     "gain": "all velocities share an error, or the force or the modal mass has one",

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from snrmjax.identify.curves.splines import amplitudes_apart, bends_of, hats, spline_terms
 from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
-MOST_KNOTS = 40
+MOST_KNOTS = 42
 _BEYOND = (1.15, 1.3)  # knots over the largest amplitude, for levels whose record is too small
 _NEAREST = 1.1  # ratio of two knots' amplitudes
 N_POWERS = 2
@@ -38,7 +38,8 @@ class CurveBasis(NamedTuple):
     ) -> "CurveBasis":
         """For measured amplitudes: knots at rest, at amplitudes of states, and a little beyond."""
         largest = float(np.max(amplitude))
-        inside = amplitudes_apart(amplitude / largest, most_knots - 1, _NEAREST)
+        most = max(most_knots - 1 - len(_BEYOND), 1)
+        inside = amplitudes_apart(amplitude / largest, most, _NEAREST)
         knots = np.array([0.0, *inside, *_BEYOND]) ** 2
         bends = bends_of(knots)
         functions = np.column_stack([np.ones_like(knots), knots, np.linalg.pinv(bends)])

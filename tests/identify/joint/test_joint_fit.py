@@ -318,6 +318,15 @@ def test_the_simplest_size_in_the_band_is_taken():
     assert found.unknowns.squared_frequency.label == "polynomial:1@displacement"
 
 
+def test_a_smooth_curve_has_as_many_knots_as_were_asked_for():
+    found = fit_jointly(noisy(3), modes(), backbone="smoothing_spline:9", damping="auto")
+    assert found.unknowns.squared_frequency.label == "smoothing_spline:9@displacement"
+    again = fit_jointly(noisy(3), modes(), backbone=found.unknowns.squared_frequency.label)
+    assert again.unknowns.squared_frequency.label == found.unknowns.squared_frequency.label
+    with pytest.raises(ValueError, match="one size, not 5 and 9"):
+        fit_jointly(noisy(3), modes(), backbone="smoothing_spline:9", damping="smoothing_spline:5")
+
+
 def test_an_exponent_at_the_end_of_its_range_leaves_the_bands_alone():
     # The law is a power of one, the largest that microslip may have; this noise asks for more.
     data = noisy(3, gain=0.01)
