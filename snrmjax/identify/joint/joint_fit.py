@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.checks.instruments import saying_what_is_undetermined
 from snrmjax.identify.curves.families import parse_family
@@ -15,6 +15,7 @@ from snrmjax.identify.joint.fitting import (
     FIT_MESSAGE,
     FitSettings,
     FitStatus,
+    Fitted,
     finite_fit,
     fitted,
 )
@@ -64,6 +65,7 @@ from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
 _ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
+_MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
 _ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
 
 
@@ -325,8 +327,10 @@ def fit_jointly(
     how = FitSettings(released, stated, robust, _ROUNDS)
     best = finite_fit(fitted(start, noisy, components, how))
 
-    # What levels differ by is said where the data ask for it, and stays possible elsewhere.
-    told = np.where(level_std > 0, level_std, np.where(found.differing, components.level, 0.0))
+    # What levels differ by is said where the data ask for it or the fit made use of it, and stays
+    # possible elsewhere.
+    differ = np.array(found.differing) | _moved(best)
+    told = np.where(level_std > 0, level_std, np.where(differ, components.level, 0.0))
     last = best.problem
     notes: tuple[str, ...] = ()
     if best.status != FitStatus.CONVERGED:
@@ -364,3 +368,11 @@ def fit_jointly(
         status=best.status,
         level_numbers=numbers,
     )
+
+
+def _moved(fit: Fitted) -> Bool[np.ndarray, " error"]:
+    """In which kinds of error a fit moved a level by more than chance does."""
+    level, end = np.asarray(fit.unknowns.level), len(fit.covariance) - len(fit.unknowns.linear)
+    std = np.sqrt(np.diag(fit.covariance))[end - level.size : end].reshape(level.shape)
+    beyond = np.abs(level) > _MOVED * np.where(std > 0, std, np.inf)
+    return np.any(beyond, axis=0)
