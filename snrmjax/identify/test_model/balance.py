@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.curve_basis import CurveBasis
-from snrmjax.identify.test_model.hyper import ALONG, MASS, OFFSET, PHASE, Places
+from snrmjax.identify.test_model.hyper import ALONG, MASS, OFFSET, PHASE, TREND, Places
 from snrmjax.identify.test_model.linear_gaussian import LinearRows
 from snrmjax.identify.test_model.states import TestStates
 
@@ -37,6 +37,7 @@ class Balance(NamedTuple):
         states, places = self.states, self.places
         omega, level = states.frequency, states.level
         gain, phase, stiffer, lossier = unknowns[places.levels][level].T
+        stiffer = stiffer + unknowns[TREND] * states.trend
         velocity = np.exp(errors[:, 1] + 1j * (errors[:, 2] - phase - unknowns[PHASE]))
         velocity = states.velocity * velocity * np.exp(0.0 if states.force_is_free else -gain)
         force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
@@ -117,10 +118,12 @@ class Balance(NamedTuple):
         slope = 0.0 * now.slope if first else now.slope
         slopes = now._replace(slope=slope).by_error
         stiffer, lossier = unknowns[places.levels][states.level].T[2:]
+        stiffer = stiffer + unknowns[TREND] * states.trend
         design = np.zeros((len(omega), len(unknowns)), dtype=complex)
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
         design[:, PHASE] = -1j * own
         design[:, OFFSET] = -own * np.min(states.force) / now.force
+        design[:, TREND] = states.trend * now.stiffness
         design[:, places.stiffness] = ((1 + stiffer) * self.units[0])[:, None] * now.values
         design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
             :, None

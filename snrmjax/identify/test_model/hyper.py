@@ -16,7 +16,7 @@ _MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not
 ALONG = 14  # functions of phase and amplitude of a discrepancy, for each part
 
 
-MASS, PHASE, OFFSET = 0, 1, 2  # where the unknowns stand that all states share
+MASS, PHASE, OFFSET, TREND = 0, 1, 2, 3  # where the unknowns stand that all states share
 
 
 class Hyper(NamedTuple):
@@ -32,7 +32,8 @@ class Hyper(NamedTuple):
 class Places(NamedTuple):
     """Where the unknowns stand, and the squared frequency that stiffness is counted from.
 
-    The modal mass comes first, then the instruments' phase and the offset of the force.
+    The modal mass comes first, then the instruments' phase, the offset of the force and a trend
+    of the stiffness.
     """
 
     stiffness: slice
@@ -49,7 +50,7 @@ class Places(NamedTuple):
 
 def places_of(basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float) -> Places:
     """The places for so many levels, with or without a discrepancy."""
-    start = OFFSET + 1
+    start = TREND + 1
     middle = start + basis.n_functions
     first = middle + basis.n_functions
     levels = first + np.arange(4 * n_levels).reshape(n_levels, 4)
@@ -115,8 +116,8 @@ def prior_variances(
     along = slice(FIRST_ALONG, end)
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
     variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
-    variance[[MASS, PHASE, OFFSET]] = np.square(
-        [states.mass_std, states.phase_std, states.offset_std]
+    variance[[MASS, PHASE, OFFSET, TREND]] = np.square(
+        [states.mass_std, states.phase_std, states.offset_std, states.trend_std]
     )
     for k, own in enumerate((places.stiffness, places.damping)):
         log_variance, by = basis.log_variances(np.log(hyper.bends[k]), hyper.along)

@@ -35,6 +35,7 @@ from snrmjax.identify.test_model.hyper import (
     MASS,
     OFFSET,
     PHASE,
+    TREND,
     Hyper,
     Places,
     bounds_of,
@@ -61,6 +62,7 @@ _LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks lik
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
 _FARTHEST = np.array([1.0, 1.0, 0.5, 0.5])  # of a level's errors, relative or rad
+_STIFFNESS = 2  # of `LEVEL_ERRORS`
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
 
 
@@ -106,6 +108,11 @@ class TestPosterior(NamedTuple):
         return float(self.mean[OFFSET])
 
     @property
+    def trend(self) -> tuple[float, float]:
+        """Relative change of the stiffness per unit of the states' trend, and its 1σ."""
+        return float(self.mean[TREND]), float(np.sqrt(self.covariance[TREND, TREND]))
+
+    @property
     def level_errors(self) -> Float[np.ndarray, "level error"]:
         """Most likely errors of every level: gain and phase (rad) of its record, and relative
         deviations of stiffness and damping.
@@ -141,13 +148,17 @@ def fit_test(
     rounds: int = _ROUNDS,
     most_knots: int | None = None,
     tempered: bool = False,
+    levels_apart: bool = False,
+    compare_levels: bool = True,
 ) -> TestPosterior:
     """The posterior of a test.
 
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t);
     curves have `most_knots` at most; with `tempered` states whose neighbours miss the curves alike
-    count as fewer.
+    count as fewer; with `levels_apart` one start has natural frequencies of levels apart from the
+    beginning, which levels that lie bandwidths apart need; without `compare_levels` nothing is
+    said on which errors levels differ by (`differing`), which takes half the time.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -166,9 +177,10 @@ def fit_test(
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
     # that bend as they like from the first, which arches are: the more probable goes on.
+    starts = [(True, False), (False, False), *[(False, True)] * levels_apart]
     walks = [
-        _Walk(balance, straight=straight, robust=robust, tempered=tempered)
-        for straight in (True, False)
+        _Walk(balance, straight=straight, apart=apart, robust=robust, tempered=tempered)
+        for straight, apart in starts
     ]
     for walk in walks:
         walk.advance(min(_TRIED, rounds))
@@ -204,7 +216,7 @@ def fit_test(
         last.arms_of_stiffness,
         float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
         places,
-        _differing(flat, found.point, bounds, states),
+        _differing(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
     )
 
 
@@ -231,10 +243,14 @@ class _Found(NamedTuple):
 class _Walk:
     """Rounds of making the problem straight and solving it, from one start on."""
 
-    def __init__(self, balance: Balance, *, straight: bool, robust: bool, tempered: bool):
-        """From the records; the first rounds with `straight` lines over a² if asked."""
+    def __init__(
+        self, balance: Balance, *, straight: bool, apart: bool, robust: bool, tempered: bool
+    ):
+        """From the records; the first rounds with `straight` lines over a², the very first with
+        natural frequencies of levels `apart`, if asked.
+        """
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
-        self.balance, self.straight = balance, straight
+        self.balance, self.straight, self.apart = balance, straight, apart
         self.robust, self.tempered = robust, tempered
         self.start = starting_point(balance.states, balance.basis, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
@@ -273,7 +289,10 @@ class _Walk:
         bounds = bounds_of(states, basis, self.point)
         along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
         if k == 0:  # no level differs from another yet, and bends are of one size
-            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
+            bounds[LEVELS] = [
+                own if self.apart and kind == _STIFFNESS else (own[0], own[0])
+                for kind, own in enumerate(bounds[LEVELS])
+            ]
             bounds[along] = [(0.0, 0.0)] * (along.stop - along.start)
         if k < _SETTLED and self.straight:
             bounds[BENDS] = [(low, low) for low, _ in bounds[BENDS]]
