@@ -4,21 +4,20 @@ Every hypothesis is fitted by the one model of a test (`identify.test_model`): i
 density of what was recorded, however it is read, so that hypotheses compare directly.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.priors import CLEARLY, FITS_WELL, PER_STATE, SCATTER
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL
+from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.states import TestStates
 
-_ROUNDS, _FINE = 4, 12  # of a fit: for most; for what is to be said
-_STEP, _WIDER = 0.18, 1.8  # of a search for ln κ: its first step and by what it grows
-_SEARCHED = 8  # fits of that search, at most
-_GUESSED = 1e3  # 1σ of κ where nothing is known of it
-_SIGN = 4.0  # 1σ from which on its sign is known
+_ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
+_KNOTS = 24  # of its curves, at most
+_STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
+_SEARCHED = 4  # fits of a modal mass, at most
 
 
 class Judged(NamedTuple):
@@ -71,13 +70,19 @@ class Judged(NamedTuple):
     def beats(self, recorded: "Judged") -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
-        Much less where it leaves more than instruments do: then curves are not what it takes.
+        Odds count by the share of states that tell something of their own: where neighbours still
+        miss the curves alike, what was undone is not what is wrong.
         """
         return self._clearly_above(recorded) and self._finer()._clearly_above(recorded._finer())
 
     def _clearly_above(self, recorded: "Judged") -> bool:
-        each = PER_STATE if self.misfit < SCATTER else 4 * PER_STATE
-        return self.fits and self.gain(recorded) > max(CLEARLY, each * len(self.states.level))
+        return self.fits and self.share * self.gain(recorded) > CLEARLY
+
+    @property
+    def share(self) -> float:
+        """Of independent states."""
+        left = self.posterior.residuals
+        return share_told_by(left, self.states.level, self.states.frequency)
 
     def _finer(self) -> "Judged":
         """Fitted with as many rounds as the steepest curves need."""
@@ -92,16 +97,27 @@ class Scale(NamedTuple):
     std: float  # of its logarithm
 
 
-def judge(states: TestStates, log_jacobian: float = 0.0, rounds: int = _ROUNDS) -> Judged:
-    """Fit states with the modal mass held.
+def judge(
+    states: TestStates,
+    log_jacobian: float = 0.0,
+    rounds: int = _ROUNDS,
+    start: Judged | None = None,
+) -> Judged:
+    """Fit states by the model of a test.
 
     Arguments: `log_jacobian` of the recorded to these phasors, both as logarithms;
-    `rounds` of the fit.
+    `rounds` of the fit, which go on from `start` where that is of nearly these states.
     """
-    held = states._replace(mass_std=0.0)
     for fewer in (rounds, 2, 1):
         try:
-            posterior = fit_test(held, rounds=fewer)
+            posterior = fit_test(
+                states,
+                rounds=fewer,
+                most_knots=_KNOTS,
+                levels_apart=states.n_levels > 1,
+                compare_levels=False,
+                start=None if start is None else start.posterior,
+            )
             break
         except np.linalg.LinAlgError:  # of phasors that are no mode's
             if fewer == 1:
@@ -109,80 +125,19 @@ def judge(states: TestStates, log_jacobian: float = 0.0, rounds: int = _ROUNDS) 
     return Judged(states, posterior, posterior.log_evidence + log_jacobian)
 
 
-def guessed_mass(states: TestStates) -> float:
-    """κ of a quick fit that leaves it free: its sign and size, where curves are not steep.
-
-    NaN where that fit does not tell its sign.
-    """
-    scale = 1.0
-    for _ in range(4):
-        found = fit_test(states._replace(mass_std=_GUESSED), rounds=3)
-        mass, std = found.modal_mass
-        step = max(abs(mass), 1e-3 * std, 1e-12)
-        states, scale = with_mass(states, step), scale * step
-        if abs(np.log(step)) < 1.0:
-            return float(np.copysign(scale, mass)) if abs(mass) > _SIGN * std else np.nan
-    return np.nan
+def any_mass(states: TestStates, log_jacobian: float = 0.0) -> Scale:
+    """The fit with the likeliest modal mass, whatever the model's is."""
+    states, scale = states._replace(mass_std=ANY_MASS), 1.0
+    for _ in range(_SEARCHED):
+        judged = judge(states, log_jacobian)
+        mass, std = judged.posterior.modal_mass
+        size = max(abs(mass), 1e-2)
+        if abs(np.log(size)) < _STAYS:
+            break
+        states, scale = with_mass(states, size), scale * size
+    return Scale(judged, scale * mass, std / abs(mass)) if mass > 0 else Scale(judged, 1.0, np.inf)
 
 
 def with_mass(states: TestStates, mass: float) -> TestStates:
     """Forces divided by κ."""
     return states._replace(force=states.force / mass)
-
-
-def best_scale(states: TestStates, start: float, first: Judged, log_jacobian: float) -> Scale:
-    """The modal mass of the largest evidence, from `start` on, where the fit is `first`."""
-    top = climbed(
-        lambda x: judge(with_mass(states, float(np.exp(x))), log_jacobian),
-        *(float(np.log(start)), _STEP, first),
-    )
-    mass, std = float(np.exp(top.value)), top.std
-    # Where a free fit stays here it is finer than the parabola's steps.
-    free, free_std = fit_test(
-        top.judged.states._replace(mass_std=_GUESSED), rounds=_ROUNDS
-    ).modal_mass
-    if abs(free - 1) < _STEP and free_std < std:
-        mass, std = mass * free, free_std
-    return Scale(top.judged, mass, std)
-
-
-class Top(NamedTuple):
-    """The most likely value of one parameter."""
-
-    value: float
-    std: float  # of a parabola through its neighbours
-    judged: Judged
-
-
-def climbed(fit: Callable[[float], Judged], start: float, step: float, first: Judged) -> Top:
-    """The value of the largest evidence uphill from `start`, where the fit is `first`."""
-    known = {start: first}
-
-    def loss(x: float) -> float:
-        if x not in known:
-            known[x] = fit(x)
-        return -known[x].evidence
-
-    at = [start - step, start, start + step]
-    for _ in range(_SEARCHED - 2):
-        values = [loss(one) for one in at]
-        if values[1] <= min(values):
-            break
-        if values[0] < values[2]:
-            at = [at[0] - _WIDER * (at[1] - at[0]), at[0], at[1]]
-        else:
-            at = [at[1], at[2], at[2] + _WIDER * (at[2] - at[1])]
-    while True:
-        values = [loss(one) for one in at]
-        left, right = ((values[1] - values[k]) / (at[1] - at[k]) for k in (0, 2))
-        curvature = 2 * (right - left) / (at[2] - at[0])
-        lowest = 0.5 * (at[0] + at[1]) - left / curvature if curvature > 0 else at[1]
-        near = abs(lowest - at[1]) < 0.1 * step
-        if len(known) >= _SEARCHED or near or not at[0] < lowest < at[2]:
-            break
-        best = min((lowest, at[1]), key=loss)
-        below = max(one for one in known if one < best)
-        above = min(one for one in known if one > best)
-        at = [below, best, above]
-    std = float(1 / np.sqrt(curvature)) if curvature > 0 else np.inf
-    return Top(at[1], std, known[at[1]])

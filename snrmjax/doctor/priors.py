@@ -27,6 +27,19 @@ AS_STATED = 1.15
 FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""
 
+MODAL_MASS = 0.05
+"""1σ of the modal mass over a linear test's: shapes and calibrations are good to some per cent."""
+
+ANY_MASS = 1.0
+"""1σ of a modal mass of which nothing is known, over where the states have it."""
+
+MOVES = 0.1
+"""1σ of what a stiffness changes along a test or from a structure to another: 5 % of frequency, as
+joints run in, masses are added or a room warms up."""
+
+OTHER_GAIN = 0.4
+"""1σ of the force's gain of a level on another range, or in volts."""
+
 OTHER_SCALE = 0.125
 """|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
 

@@ -8,8 +8,8 @@ from jaxtyping import Complex, Float
 
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Finding, Kind, Repair, percent
-from snrmjax.doctor.judgement import Judged, Scale, best_scale, guessed_mass, judge, with_mass
-from snrmjax.doctor.priors import OTHER_SCALE, SCATTER, WILD
+from snrmjax.doctor.judgement import Judged, Scale, any_mass, judge
+from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER, WILD
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
@@ -51,6 +51,9 @@ CONJUGATED_OPPOSITE = Meaning(
     "negate `velocity_re_m_s`; or import again with the other phase sign, and turn the sensor's.",
 )
 OTHERS = (
+    OPPOSITE,
+    CONJUGATED,
+    CONJUGATED_OPPOSITE,
     Meaning(
         lambda v, w: v / (1j * w),
         "acceleration_as_velocity",
@@ -103,18 +106,34 @@ class Reading(NamedTuple):
     """A table as it may be meant."""
 
     meaning: Meaning
-    states: TestStates
-    judged: Judged
-    mass: float  # κ with which it fits: 1 where the model's does
+    as_modelled: Judged | None  # with the model's modal mass, where there is a model
+    scale: Scale | None  # with any, where that was looked at
 
     @property
-    def log_jacobian(self) -> float:
-        """Of all states."""
-        return len(self.states.level) * self.meaning.log_jacobian
+    def rescaled(self) -> bool:
+        """Whether another modal mass than the model's is clearly likelier."""
+        if self.as_modelled is None or self.scale is None:
+            return self.as_modelled is None
+        return self.scale.judged.gain(self.as_modelled) > CLEARLY
 
-    def best_scale(self) -> Scale:
-        """The likeliest modal mass about the one that fits."""
-        return best_scale(self.states, self.mass, self.judged, self.log_jacobian)
+    @property
+    def judged(self) -> Judged:
+        """The likelier fit."""
+        found = self.scale.judged if self.rescaled and self.scale else self.as_modelled
+        if found is None:
+            raise ValueError("a reading that was not judged has no fit.")
+        return found
+
+    def of_any_mass(self) -> "Reading":
+        """With its likeliest modal mass, too."""
+        if self.scale is not None or self.as_modelled is None:
+            return self
+        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self)))
+
+
+def _jacobian(one: Reading) -> float:
+    """Of all states."""
+    return one.judged.evidence - one.judged.posterior.log_evidence
 
 
 def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Reading]:
@@ -123,30 +142,54 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     Arguments: `known_mass` says whether a model states the modal mass: it is tried first, another
     scale where that does not fit.
     """
-    mass = guessed_mass(seen.test)
-    recorded = _read(seen, AS_RECORDED, known_mass, mass)
+    recorded = _judged(AS_RECORDED, seen.test, known_mass)
+    near = seen.noise if np.isfinite(seen.noise) else 0.0
+    enough = max(SCATTER, 3 * near)
+    first = recorded.judged
+    if not (first.damped and first.misfit < enough and _about_one(first)):
+        recorded = recorded.of_any_mass()
     sized = _of_sizes(seen, recorded) if known_mass else None
     if sized is not None:
         return recorded, sized
-    near = seen.noise if np.isfinite(seen.noise) else 0.0
-    if recorded.judged.damped and recorded.judged.misfit < max(SCATTER, 3 * near):
-        return recorded, recorded
-    turned = (CONJUGATED, OPPOSITE, CONJUGATED_OPPOSITE)
-    tried = [recorded, *(_read(seen, one, known_mass, mass) for one in turned)]
-    tried += [_read(seen, one, known_mass, None) for one in OTHERS]
-    if not any(one.judged.fits for one in tried):
-        lattice = _in_degrees(seen, known_mass)
-        tried += [] if lattice is None else [lattice]
+    # Conjugates of a held response pass for curves as steep as their noise asks for.
+    enough = recorded.judged.damped and recorded.judged.misfit < enough
+    others = (CONJUGATED,) if enough else OTHERS
+    meant = [(one, seen.read(one.change(seen.recorded, seen.test.frequency))) for one in others]
+    # A motion that mostly gains energy from its force has no odds.
+    tried = [_judged(one, states, known_mass) for one, states in meant if _takes_energy(states)]
+    if not enough and not any(one.judged.fits for one in (recorded, *tried)):
+        tried = [one.of_any_mass() for one in tried]
+    if not any(one.judged.fits for one in (recorded, *tried)):
+        tried += _in_degrees(seen, known_mass)
     best = max((one for one in tried if one.judged.damped), key=_evidence, default=recorded)
     return recorded, best if best.judged.beats(recorded.judged) else recorded
 
 
+def _takes_energy(states: TestStates) -> bool:
+    """Whether the force works on the motion in most states."""
+    return bool(np.median(states.velocity.real) > 0)
+
+
+def _about_one(judged: Judged) -> bool:
+    """Whether states are content with the model's modal mass."""
+    return abs(judged.posterior.modal_mass[0] - 1) < MODAL_MASS
+
+
+def _judged(meaning: Meaning, states: TestStates, known_mass: bool) -> Reading:
+    jacobian = len(states.level) * meaning.log_jacobian
+    if known_mass:
+        return Reading(meaning, judge(states, jacobian), None)
+    return Reading(meaning, None, any_mass(states, jacobian))
+
+
 def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
     """Amplitudes of another quantity with phases of velocities, where these make κ off by Ω."""
+    if recorded.scale is None or not recorded.rescaled:
+        return None
     log_omega = float(np.log(np.median(seen.test.frequency)))
     for meaning, off in zip(OF_SIZES, (-log_omega, log_omega), strict=True):
-        if abs(off) > 1.0 and abs(np.log(recorded.mass) - off) < OTHER_SCALE:
-            found = _read(seen, meaning, True, 1.0)
+        if abs(off) > 1.0 and abs(np.log(recorded.scale.mass) - off) < OTHER_SCALE:
+            found = _judged(meaning, seen.read(meaning.change(seen.recorded, seen.test.frequency)), True)
             return found if found.judged.fits else None
     return None
 
@@ -172,67 +215,55 @@ def misread(recorded: Judged, best: Reading, where: str) -> Finding:
     )
 
 
-def _read(seen: CheckedStates, meaning: Meaning, known_mass: bool, mass: float | None) -> Reading:
-    states = seen.read(meaning.change(seen.recorded, seen.test.frequency))
-    return _fitted(meaning, states, known_mass, mass)
-
-
-def _fitted(
-    meaning: Meaning, states: TestStates, known_mass: bool, mass: float | None = None
-) -> Reading:
-    """With the model's modal mass, or with the guessed one where that has more evidence."""
-    jacobian = len(states.level) * meaning.log_jacobian
-    first = Reading(meaning, states, judge(states, jacobian), 1.0) if known_mass else None
-    if first is not None and meaning is not AS_RECORDED and first.judged.fits:
-        return first
-    mass = guessed_mass(states) if mass is None else mass
-    size = abs(mass) if np.isfinite(mass) else 1.0
-    if first is not None and abs(np.log(size)) < OTHER_SCALE:
-        return first
-    other = Reading(meaning, states, judge(with_mass(states, size), jacobian), size)
-    if first is None or (other.judged.damped and other.judged.gain(first.judged) > 0):
-        return other
-    return first
-
-
-def _in_degrees(seen: CheckedStates, known_mass: bool) -> Reading | None:
+def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
     """Phases in degrees that were read as radians: wrapped dozens of times, 6.3° apart.
 
-    A mode's amplitudes say where each phase lies to some degrees; the wrapped one says it exactly.
+    A mode's amplitudes say to some degrees how far from resonance each state is, the wrapped phase
+    says it exactly; which states lie below their resonance is tried.
     """
     recorded = np.angle(seen.recorded)
-    guess = _phases_of_amplitudes(seen)
-    if guess is None:
-        return None
     spacing = 2 * np.pi / _DEGREES
-    found = None
-    for _ in range(_LATTICE_TURNS):
-        nearest = np.round((guess - recorded / _DEGREES) / spacing)
-        phase = recorded / _DEGREES + spacing * nearest
-        states = seen.read(np.abs(seen.recorded) * np.exp(1j * phase))
-        if found is not None and np.allclose(states.velocity, found.states.velocity):
+    tried = []
+    for guess in _phases_of_amplitudes(seen):
+        found, velocity = None, seen.recorded
+        for _ in range(_LATTICE_TURNS):
+            nearest = np.round((guess - recorded / _DEGREES) / spacing)
+            phase = recorded / _DEGREES + spacing * nearest
+            states = seen.read(np.abs(seen.recorded) * np.exp(1j * phase))
+            if found is not None and np.allclose(states.velocity, velocity):
+                break
+            found, velocity = _judged(IN_DEGREES, states, known_mass), states.velocity
+            # The phase that the curves have at this amplitude and frequency.
+            omega, judged = states.frequency, found.judged
+            stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
+            guess = np.pi / 2 - np.angle(stiffness)
+        if found is not None:
+            tried.append(found)
+        if found is not None and found.judged.misfit < SCATTER:
             break
-        found = _fitted(IN_DEGREES, states, known_mass)
-        # The phase that the curves have at this amplitude and frequency.
-        omega, judged = states.frequency, found.judged
-        stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
-        guess = np.pi / 2 - np.angle(stiffness)
-    return found
+    return tried
 
 
-def _phases_of_amplitudes(seen: CheckedStates) -> Float[np.ndarray, " state"] | None:
-    """Phases by cos φ in proportion to |V|/F, positive below each level's largest."""
+def _phases_of_amplitudes(seen: CheckedStates) -> list[Float[np.ndarray, " state"]]:
+    """Phases by cos φ in proportion to |V|/F, with what may tell their sign.
+
+    Below each level's largest they are positive; where a resonance moves by many bandwidths all of
+    a sweep lies on one side, or on both by turns: then below the others of its amplitude.
+    """
     states, mobility = seen.test, seen.mobility
-    phase = np.zeros(len(mobility))
+    size, top, turns = np.zeros(len(mobility)), np.zeros(len(mobility)), np.zeros(len(mobility))
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
         if len(mine) < 3:
-            return None
-        top = mine[np.argmax(mobility[mine])]
-        cosine = np.minimum(mobility[mine] / (1.02 * mobility[top]), 1.0)
-        side = np.sign(states.frequency[top] - states.frequency[mine])
-        phase[mine] = side * np.arccos(cosine)
-    return phase
+            return []
+        peak = mine[np.argmax(mobility[mine])]
+        size[mine] = np.arccos(np.minimum(mobility[mine] / (1.02 * mobility[peak]), 1.0))
+        top[mine] = np.sign(states.frequency[peak] - states.frequency[mine])
+        mine = mine[np.argsort(mobility[mine])]
+        omega = states.frequency[mine]
+        beside = np.interp(np.arange(len(mine)) + 0.5, np.arange(len(mine) - 1) + 0.5, 0.5 * (omega[1:] + omega[:-1]))
+        turns[mine] = np.sign(beside - omega)
+    return [top * size, size, -size, turns * size]
 
 
 def wild_phases(seen: CheckedStates) -> Finding | None:

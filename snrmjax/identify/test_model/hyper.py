@@ -78,6 +78,12 @@ def hyper_at(point: np.ndarray, basis: CurveBasis) -> Hyper:
     )
 
 
+def point_of(hyper: Hyper) -> np.ndarray:
+    """The point of these hyperparameters, without a discrepancy."""
+    sizes = np.log([hyper.noise, *hyper.bends, *hyper.level_std])
+    return np.concatenate([sizes, hyper.along])
+
+
 def starting_point(states: TestStates, basis: CurveBasis, discrepancy: bool) -> np.ndarray:
     """The point from which the most likely one is looked for."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE

@@ -42,6 +42,7 @@ from snrmjax.identify.test_model.hyper import (
     hyper_at,
     objective_of,
     places_of,
+    point_of,
     prior_variances,
     starting_point,
 )
@@ -150,6 +151,7 @@ def fit_test(
     tempered: bool = False,
     levels_apart: bool = False,
     compare_levels: bool = True,
+    start: "TestPosterior | None" = None,
 ) -> TestPosterior:
     """The posterior of a test.
 
@@ -158,7 +160,8 @@ def fit_test(
     curves have `most_knots` at most; with `tempered` states whose neighbours miss the curves alike
     count as fewer; with `levels_apart` one start has natural frequencies of levels apart from the
     beginning, which levels that lie bandwidths apart need; without `compare_levels` nothing is
-    said on which errors levels differ by (`differing`), which takes half the time.
+    said on which errors levels differ by (`differing`), which takes half the time; rounds go on
+    from `start`, of states that are nearly these and without discrepancy, instead of anew.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -172,6 +175,8 @@ def fit_test(
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
     basis = CurveBasis.of(states.amplitude, most_knots or MOST_KNOTS)
+    if start is not None:
+        basis, units, reference = start.basis, start.units, start.places.reference
     places = places_of(basis, states.n_levels, discrepancy, reference)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
@@ -182,6 +187,8 @@ def fit_test(
         _Walk(balance, straight=straight, apart=apart, robust=robust, tempered=tempered)
         for straight, apart in starts
     ]
+    if start is not None:
+        walks = [walks[0].from_(start)]
     for walk in walks:
         walk.advance(min(_TRIED, rounds))
     share = min(walk.share for walk in walks)
@@ -258,6 +265,12 @@ class _Walk:
         self.mean[places.damping.start] = 1.0
         self.found: _Found | None = None
         self.turn, self.still, self.share = 0, False, 1.0
+
+    def from_(self, start: TestPosterior) -> "_Walk":
+        """The same, going on from what was found for other states."""
+        self.mean, self.errors, self.point = start.mean, start.corrections, point_of(start.hyper)
+        self.turn = _SETTLED + 1
+        return self
 
     @property
     def likelihood(self) -> float:
