@@ -10,7 +10,14 @@ from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged, judge
-from snrmjax.doctor.priors import AS_STATED, CLEARLY, FORCE_FALLS, GAIN_MATTERS, MOVES, OTHER_GAIN, SCATTER
+from snrmjax.doctor.priors import (
+    CLEARLY,
+    FORCE_FALLS,
+    GAIN_MATTERS,
+    MOVES,
+    OTHER_GAIN,
+    SCATTER,
+)
 from snrmjax.identify.test_model.states import TestStates
 
 _LIMITS = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # of a channel, over its largest recorded fundamental
@@ -31,15 +38,12 @@ class TestCorrection(NamedTuple):
 def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """Each correction with its likeliest parameter.
 
-    What leaves scatter of the states is not looked for where they scatter as they should.
     Arguments: `states` as they are read; `base` how they fit.
     """
     yield _moving("drift", "frequency", states, seen.order - 0.5)
     yield from _of_files(seen, states)
-    scattered = base.noise > AS_STATED * seen.noise or not np.isfinite(seen.noise)
-    scattered = scattered and base.misfit > SCATTER
     gains = base.posterior.level_errors[:, 0]
-    if states.n_levels > 1 and (scattered or np.ptp(gains) > GAIN_MATTERS):
+    if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
         yield _of_other_gains(states)
     yield from _clipped(states, base)
     yield from _unsettled(seen, states, base)
@@ -54,11 +58,12 @@ def _moving(kind: Kind, name: str, states: TestStates, along: np.ndarray) -> Tes
 
 def _of_files(seen: CheckedStates, states: TestStates) -> Iterator[TestCorrection]:
     """A file whose structure has natural frequencies of its own."""
-    files = [np.isin(states.level, levels) for levels in seen.files]
-    if len(files) == 2:
-        files = files[1:]
-    for own in files:
-        yield _moving("different_structures", "file", states, own - float(np.mean(own)))
+    for k, levels in enumerate(seen.files):
+        if k == 0 and len(seen.files) == 2:
+            continue  # it differs from the second as the second from it
+        own = np.isin(states.level, levels)
+        name = f"file {k + 1}"
+        yield _moving("different_structures", name, states, own - float(np.mean(own)))
 
 
 class _Tried(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, LEAST_SHARE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.states import TestStates
@@ -17,7 +17,10 @@ from snrmjax.identify.test_model.states import TestStates
 _ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
 _KNOTS = 24  # of its curves, at most
 _STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
-_SEARCHED = 4  # fits of a modal mass, at most
+_SEARCHED = 3  # fits of a modal mass from one start, at most
+_SMALLEST = 0.01  # of such a fit over the last
+_MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
+_GUESSED = 1e3  # its 1σ in the first of them
 
 
 class Judged(NamedTuple):
@@ -29,11 +32,11 @@ class Judged(NamedTuple):
 
     @property
     def misfit(self) -> float:
-        """Relative error of independent states that have the same density, curves and levels paid.
+        """Relative error of independent states as likely as these, curves and levels paid.
 
         n states with an error σ of amplitude and phase have ln p = −n(2 ln σ + ln 2π + 1).
         """
-        each = self.evidence / len(self.states.level)
+        each = self.posterior.log_evidence / len(self.states.level)
         return float(np.exp(min(-0.5 * (each + np.log(2 * np.pi) + 1), 99.0)))
 
     @property
@@ -73,20 +76,31 @@ class Judged(NamedTuple):
         Odds count by the share of states that tell something of their own: where neighbours still
         miss the curves alike, what was undone is not what is wrong.
         """
-        return self._clearly_above(recorded) and self._finer()._clearly_above(recorded._finer())
+        return self.fits and self.explains(recorded)
 
-    def _clearly_above(self, recorded: "Judged") -> bool:
-        return self.fits and self.share * self.gain(recorded) > CLEARLY
+    def explains(self, recorded: "Judged") -> bool:
+        """Whether the table as recorded is clearly less likely."""
+
+        def clearly(here: "Judged", there: "Judged") -> bool:
+            return here.share * here.gain(there) > CLEARLY
+
+        return clearly(self, recorded) and clearly(self._finer(), recorded._finer())
 
     @property
     def share(self) -> float:
         """Of independent states."""
         left = self.posterior.residuals
-        return share_told_by(left, self.states.level, self.states.frequency)
+        return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
 
     def _finer(self) -> "Judged":
-        """Fitted with as many rounds as the steepest curves need."""
-        return judge(self.states, self.evidence - self.posterior.log_evidence, _FINE)
+        """Fitted with as many rounds as the steepest curves need.
+
+        And beside what one mode leaves off resonance, where that is likelier: then nothing else
+        need be wrong.
+        """
+        jacobian = self.evidence - self.posterior.log_evidence
+        fits = [judge(self.states, jacobian, _FINE, discrepancy=one) for one in (False, True)]
+        return max(fits, key=lambda one: one.evidence)
 
 
 class Scale(NamedTuple):
@@ -102,11 +116,14 @@ def judge(
     log_jacobian: float = 0.0,
     rounds: int = _ROUNDS,
     start: Judged | None = None,
+    *,
+    discrepancy: bool = False,
 ) -> Judged:
     """Fit states by the model of a test.
 
     Arguments: `log_jacobian` of the recorded to these phasors, both as logarithms;
-    `rounds` of the fit, which go on from `start` where that is of nearly these states.
+    `rounds` of the fit, which go on from `start` where that is of nearly these states;
+    with `discrepancy` beside what one mode leaves off resonance.
     """
     for fewer in (rounds, 2, 1):
         try:
@@ -116,6 +133,7 @@ def judge(
                 most_knots=_KNOTS,
                 levels_apart=states.n_levels > 1,
                 compare_levels=False,
+                discrepancy=discrepancy,
                 start=None if start is None else start.posterior,
             )
             break
@@ -126,16 +144,32 @@ def judge(
 
 
 def any_mass(states: TestStates, log_jacobian: float = 0.0) -> Scale:
-    """The fit with the likeliest modal mass, whatever the model's is."""
-    states, scale = states._replace(mass_std=ANY_MASS), 1.0
-    for _ in range(_SEARCHED):
-        judged = judge(states, log_jacobian)
-        mass, std = judged.posterior.modal_mass
-        size = max(abs(mass), 1e-2)
-        if abs(np.log(size)) < _STAYS:
+    """The fit with the likeliest modal mass, whatever the model's is.
+
+    From where a first fit that knows nothing of it puts it; or where its best fit leaves more than
+    instruments do, and so was no good guide, from other orders of magnitude.
+    """
+    first = judge(states._replace(mass_std=_GUESSED), log_jacobian)
+    mass, std = first.posterior.modal_mass
+    found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
+    if found.judged.misfit < SCATTER:
+        return found
+    tried = [found, *(_about(states, one, log_jacobian, 1) for one in _MAGNITUDES)]
+    best = max(tried, key=lambda one: one.judged.evidence)
+    return best if best is found else _about(states, best.mass, log_jacobian)
+
+
+def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _SEARCHED) -> Scale:
+    """The likeliest modal mass from some on: forces are divided by it until it stays."""
+    mass, std = start, np.inf
+    for _ in range(steps):
+        scale = mass
+        judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
+        step, std = judged.posterior.modal_mass
+        mass = scale * max(step, _SMALLEST)
+        if abs(np.log(mass / scale)) < _STAYS:
             break
-        states, scale = with_mass(states, size), scale * size
-    return Scale(judged, scale * mass, std / abs(mass)) if mass > 0 else Scale(judged, 1.0, np.inf)
+    return Scale(judged, mass, std / step if step > 0 else np.inf)
 
 
 def with_mass(states: TestStates, mass: float) -> TestStates:

@@ -11,18 +11,12 @@ of measured beams, and twelve states pay for their curves with as much."""
 SCATTER = 0.012
 """Relative error of a state that needs no error of the test: analysers and levels leave it."""
 
-PER_STATE = 0.35
-"""ln of the density of one state, by which a hypothesis must beat the table as recorded.
-
-Errors smaller by a sixth; four times that, half the errors, where it leaves more than `SCATTER`:
-what a single mode leaves of real structures moves by less."""
-
 CLEARLY = 12.0
 """ln of the odds, before priors, of what is said: e¹², after twenty hypotheses that are each true
 in one table of a hundred, leaves one wrong answer in about a hundred."""
 
-AS_STATED = 1.15
-"""Noise over the stated one, up to which nothing is left to explain: ten states tell no more."""
+LEAST_SHARE = 0.1
+"""Of states that tell something of their own: from curves that are far off fewer seem to."""
 
 FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""
@@ -63,9 +57,6 @@ HELD = 0.05
 
 TOGETHER = 0.6
 """Correlation of the logarithms of force, mobility and response where one makes the other."""
-
-WILD = 0.5
-"""Mean resultant of steps of phase at random, and the step of ln mobility of smooth ones."""
 
 FAR_FREQUENCY, FAR_DAMPING = 0.05, 3.0
 """Of the lowest level from the linear mode, relative and as a ratio: beyond any drift."""

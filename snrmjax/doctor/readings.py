@@ -9,11 +9,11 @@ from jaxtyping import Complex, Float
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Finding, Kind, Repair, percent
 from snrmjax.doctor.judgement import Judged, Scale, any_mass, judge
-from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER, WILD
+from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
-_LATTICE_TURNS = 4
+_LATTICES, _LATTICE_TURNS = 2, 8  # that go on, and how long at most
 
 Phasors = Complex[np.ndarray, " state"]
 
@@ -175,10 +175,13 @@ def _about_one(judged: Judged) -> bool:
     return abs(judged.posterior.modal_mass[0] - 1) < MODAL_MASS
 
 
-def _judged(meaning: Meaning, states: TestStates, known_mass: bool) -> Reading:
+def _judged(
+    meaning: Meaning, states: TestStates, known_mass: bool, start: Reading | None = None
+) -> Reading:
     jacobian = len(states.level) * meaning.log_jacobian
     if known_mass:
-        return Reading(meaning, judge(states, jacobian), None)
+        begin = None if start is None else start.as_modelled
+        return Reading(meaning, judge(states, jacobian, start=begin), None)
     return Reading(meaning, None, any_mass(states, jacobian))
 
 
@@ -189,7 +192,9 @@ def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
     log_omega = float(np.log(np.median(seen.test.frequency)))
     for meaning, off in zip(OF_SIZES, (-log_omega, log_omega), strict=True):
         if abs(off) > 1.0 and abs(np.log(recorded.scale.mass) - off) < OTHER_SCALE:
-            found = _judged(meaning, seen.read(meaning.change(seen.recorded, seen.test.frequency)), True)
+            found = _judged(
+                meaning, seen.read(meaning.change(seen.recorded, seen.test.frequency)), True
+            )
             return found if found.judged.fits else None
     return None
 
@@ -221,26 +226,26 @@ def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
     A mode's amplitudes say to some degrees how far from resonance each state is, the wrapped phase
     says it exactly; which states lie below their resonance is tried.
     """
-    recorded = np.angle(seen.recorded)
+    recorded, size = np.angle(seen.recorded) / _DEGREES, np.abs(seen.recorded)
     spacing = 2 * np.pi / _DEGREES
-    tried = []
-    for guess in _phases_of_amplitudes(seen):
-        found, velocity = None, seen.recorded
+
+    def nearest(guess: np.ndarray, start: Reading | None) -> Reading:
+        phase = recorded + spacing * np.round((guess - recorded) / spacing)
+        states = seen.read(size * np.exp(1j * phase))
+        return _judged(IN_DEGREES, states, known_mass, start)
+
+    tried = [nearest(guess, None) for guess in _phases_of_amplitudes(seen)]
+    tried = sorted(tried, key=_evidence)[-_LATTICES:]
+    for k, found in enumerate(tried):
         for _ in range(_LATTICE_TURNS):
-            nearest = np.round((guess - recorded / _DEGREES) / spacing)
-            phase = recorded / _DEGREES + spacing * nearest
-            states = seen.read(np.abs(seen.recorded) * np.exp(1j * phase))
-            if found is not None and np.allclose(states.velocity, velocity):
-                break
-            found, velocity = _judged(IN_DEGREES, states, known_mass), states.velocity
-            # The phase that the curves have at this amplitude and frequency.
-            omega, judged = states.frequency, found.judged
+            # The phase that the curves have at these amplitudes and frequencies.
+            judged = found.judged
+            omega = judged.states.frequency
             stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
-            guess = np.pi / 2 - np.angle(stiffness)
-        if found is not None:
-            tried.append(found)
-        if found is not None and found.judged.misfit < SCATTER:
-            break
+            again = nearest(0.5 * np.pi - np.angle(stiffness), found)
+            if _evidence(again) <= _evidence(found):
+                break
+            tried[k] = found = again
     return tried
 
 
@@ -261,27 +266,10 @@ def _phases_of_amplitudes(seen: CheckedStates) -> list[Float[np.ndarray, " state
         top[mine] = np.sign(states.frequency[peak] - states.frequency[mine])
         mine = mine[np.argsort(mobility[mine])]
         omega = states.frequency[mine]
-        beside = np.interp(np.arange(len(mine)) + 0.5, np.arange(len(mine) - 1) + 0.5, 0.5 * (omega[1:] + omega[:-1]))
+        beside = np.interp(
+            np.arange(len(mine)) + 0.5,
+            np.arange(len(mine) - 1) + 0.5,
+            0.5 * (omega[1:] + omega[:-1]),
+        )
         turns[mine] = np.sign(beside - omega)
     return [top * size, size, -size, turns * size]
-
-
-def wild_phases(seen: CheckedStates) -> Finding | None:
-    """Phases that jump at random from state to state where the amplitudes are smooth."""
-    states = seen.test
-    turns, steps = [np.zeros(0)], [np.zeros(0)]
-    for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        mine = mine[np.argsort(states.frequency[mine])]
-        turns.append(np.exp(1j * np.diff(np.angle(states.velocity[mine]))))
-        steps.append(np.abs(np.diff(np.log(seen.mobility[mine]))))
-    turn, step = np.concatenate(turns), np.concatenate(steps)
-    if len(turn) < 8 or abs(turn.mean()) > WILD or np.median(step) > WILD:
-        return None
-    return Finding(
-        *("degrees_for_radians", "error", ""),
-        f"phases jump at random from state to state (mean of e^iΔφ {abs(turn.mean()):.2f}) where "
-        "amplitudes are smooth, as phases in degrees do that were read as radians.",
-        IN_DEGREES.mend,
-        repairs=(Repair(phase_unit="deg"),),
-    )

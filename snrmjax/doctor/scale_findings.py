@@ -5,16 +5,19 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.doctor.findings import Finding, Repair, Severity, percent
-from snrmjax.doctor.judgement import Judged, Scale
+from snrmjax.doctor.judgement import Judged, Scale, judge
 from snrmjax.doctor.priors import CERTAIN, MASS_TOLD, MORE_DAMPING, OTHER_SCALE, SAME_FACTOR
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
-    """Whether the states tell a modal mass that is no linear test's, better than the model's."""
-    told = scale.std < MASS_TOLD and abs(np.log(scale.mass)) > OTHER_SCALE
-    return told and scale.judged.beats(as_modelled)
+    """Whether the states tell a modal mass that is no linear test's, better than the model's own."""
+    if scale.std > MASS_TOLD or abs(np.log(scale.mass)) < OTHER_SCALE:
+        return False
+    jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
+    held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)
+    return scale.judged.beats(held)
 
 
 def scale_findings(

@@ -7,13 +7,13 @@ from snrmjax.doctor.corrections import TestCorrection, corrections
 from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged
-from snrmjax.doctor.priors import CLEARLY, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS
-from snrmjax.doctor.readings import best_reading, misread, wild_phases
+from snrmjax.doctor.priors import GAIN_MATTERS, MOVED_MATTERS
+from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 
-_NO_MODE = 1.0  # misfit beyond which nothing that is small can have gone wrong
+_NO_MODE = 0.3  # misfit beyond which nothing that is small can have gone wrong
 
 
 def mode_findings(
@@ -30,8 +30,6 @@ def mode_findings(
         found.append(misread(recorded.judged, best, where))
         if best.meaning.kind == "degrees_for_radians":
             return found, best.judged
-    elif not best.judged.fits and (wild := wild_phases(seen)) is not None and not drive:
-        return [wild._replace(where=where)], best.judged
     base, instead = best.judged, None
     if known_mass and best.scale is not None and is_other_scale(best.scale, best.as_modelled):
         # What bends a test may pass for another modal mass, where it explains more.
@@ -53,32 +51,26 @@ def mode_findings(
 
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
-    """The likeliest of all believed corrections."""
+    """The likeliest correction that matters and beats the table as it is read."""
     if base.misfit > _NO_MODE:
         return None
-    told = [one for one in corrections(seen, base.states, base) if _believed(one, base)]
-    return max(told, key=lambda one: one.judged.evidence, default=None)
+    told = [one for one in corrections(seen, base.states, base) if _matters(one, base)]
+    told = sorted(told, key=lambda one: -one.judged.evidence)
+    return next((one for one in told if one.judged.beats(base)), None)
 
 
-def _believed(one: TestCorrection, base: Judged) -> bool:
-    """Whether a correction is likely, and large enough to be spoken of."""
-    judged = one.judged
-    if one.kind == "force_dropout":
-        # Its noise is no misfit, but a force within it is none.
-        told = judged.noise < FITS_WELL and one.value < base.states.force.min()
-        return told and judged.damped and judged.gain(base) > CLEARLY
+def _matters(one: TestCorrection, base: Judged) -> bool:
+    """Whether a correction is large enough to be spoken of."""
     if one.kind in ("drift", "different_structures"):
-        width = float(np.median(judged.damping / base.states.frequency))
-        if abs(one.value) < MOVED_MATTERS * width:
-            return False
-    if one.kind == "volts_as_force" and np.ptp(one.gains) < GAIN_MATTERS:
-        return False
-    return judged.beats(base)
+        width = float(np.median(one.judged.damping / base.states.frequency))
+        return abs(one.value) > MOVED_MATTERS * width
+    if one.kind == "volts_as_force":
+        return float(np.ptp(one.gains)) > GAIN_MATTERS
+    # A force that lies within the noise of its cell is none.
+    return one.kind != "force_dropout" or one.value < base.states.force.min()
 
 
-def _mended(
-    seen: CheckedStates, base: Judged, one: TestCorrection, where: str
-) -> Finding:
+def _mended(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
     states = base.states
     left = (
         f"; so read a state is missed by {percent(one.judged.misfit)}, not {percent(base.misfit)}."
@@ -94,8 +86,8 @@ def _mended(
     if one.kind == "different_structures":
         return Finding(
             *("different_structures", "error", where),
-            f"at equal amplitude natural frequencies differ by {100 * one.value:.3g} % between "
-            f"file{left}",
+            f"at equal amplitude the natural frequency of {one.name} is {100 * one.value:.3g} % "
+            f"from {'file 1' if len(seen.files) == 2 else 'the others'}'s{left}",
             "identify them apart: one call and one model for each structure or assembly.",
             repairs=(Repair(apart=True),),
         )
