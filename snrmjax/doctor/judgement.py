@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, LEAST_SHARE, SCATTER
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, LEAST_SHARE, NO_MODE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.states import TestStates
@@ -70,21 +70,24 @@ class Judged(NamedTuple):
             return -np.inf
         return self.evidence - recorded.evidence if recorded.damped else np.inf
 
-    def beats(self, recorded: "Judged") -> bool:
+    def beats(self, recorded: "Judged", *, beside: bool = True) -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
         Odds count by the share of states that tell something of their own: where neighbours still
         miss the curves alike, what was undone is not what is wrong.
         """
-        return self.fits and self.explains(recorded)
+        return self.fits and self.explains(recorded, beside=beside)
 
-    def explains(self, recorded: "Judged") -> bool:
-        """Whether the table as recorded is clearly less likely."""
+    def explains(self, recorded: "Judged", *, beside: bool = True) -> bool:
+        """Whether the table as recorded is clearly less likely.
+
+        Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
+        """
 
         def clearly(here: "Judged", there: "Judged") -> bool:
             return here.share * here.gain(there) > CLEARLY
 
-        return clearly(self, recorded) and clearly(self._finer(), recorded._finer())
+        return clearly(self, recorded) and clearly(self._finer(beside), recorded._finer(beside))
 
     @property
     def share(self) -> float:
@@ -92,14 +95,11 @@ class Judged(NamedTuple):
         left = self.posterior.residuals
         return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
 
-    def _finer(self) -> "Judged":
-        """Fitted with as many rounds as the steepest curves need.
-
-        And beside what one mode leaves off resonance, where that is likelier: then nothing else
-        need be wrong.
-        """
+    def _finer(self, beside: bool) -> "Judged":
+        """Fitted with as many rounds as the steepest curves need."""
         jacobian = self.evidence - self.posterior.log_evidence
-        fits = [judge(self.states, jacobian, _FINE, discrepancy=one) for one in (False, True)]
+        kinds = (False, True) if beside else (False,)
+        fits = [judge(self.states, jacobian, _FINE, discrepancy=one) for one in kinds]
         return max(fits, key=lambda one: one.evidence)
 
 
@@ -152,7 +152,7 @@ def any_mass(states: TestStates, log_jacobian: float = 0.0) -> Scale:
     first = judge(states._replace(mass_std=_GUESSED), log_jacobian)
     mass, std = first.posterior.modal_mass
     found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
-    if found.judged.misfit < SCATTER:
+    if not SCATTER < found.judged.misfit < NO_MODE:
         return found
     tried = [found, *(_about(states, one, log_jacobian, 1) for one in _MAGNITUDES)]
     best = max(tried, key=lambda one: one.judged.evidence)

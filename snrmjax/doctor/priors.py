@@ -11,6 +11,9 @@ of measured beams, and twelve states pay for their curves with as much."""
 SCATTER = 0.012
 """Relative error of a state that needs no error of the test: analysers and levels leave it."""
 
+NO_MODE = 0.3
+"""Misfit beyond which nothing that is small can have gone wrong, and phases are no mode's."""
+
 CLEARLY = 12.0
 """ln of the odds, before priors, of what is said: e¹², after twenty hypotheses that are each true
 in one table of a hundred, leaves one wrong answer in about a hundred."""

@@ -13,6 +13,7 @@ from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
+_TURN = 1.05 * np.pi  # that a phase may be at most, with its noise
 _LATTICES, _LATTICE_TURNS = 2, 8  # that go on, and how long at most
 
 Phasors = Complex[np.ndarray, " state"]
@@ -156,7 +157,9 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     others = (CONJUGATED,) if enough else OTHERS
     meant = [(one, seen.read(one.change(seen.recorded, seen.test.frequency))) for one in others]
     # A motion that mostly gains energy from its force has no odds.
-    tried = [_judged(one, states, known_mass) for one, states in meant if _takes_energy(states)]
+    tried = [
+        _judged(one, states, known_mass) for one, states in meant if _possible(seen, one, states)
+    ]
     if not enough and not any(one.judged.fits for one in (recorded, *tried)):
         tried = [one.of_any_mass() for one in tried]
     if not any(one.judged.fits for one in (recorded, *tried)):
@@ -165,9 +168,11 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     return recorded, best if best.judged.beats(recorded.judged) else recorded
 
 
-def _takes_energy(states: TestStates) -> bool:
-    """Whether the force works on the motion in most states."""
-    return bool(np.median(states.velocity.real) > 0)
+def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:
+    """Whether the force works on the motion in most states, and phases are less than a turn."""
+    turned = np.max(np.abs(np.angle(seen.recorded))) * np.exp(meaning.log_jacobian)
+    whole = meaning.log_jacobian == 0 or turned < _TURN
+    return bool(whole and np.median(states.velocity.real) > 0)
 
 
 def _about_one(judged: Judged) -> bool:

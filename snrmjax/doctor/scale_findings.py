@@ -12,12 +12,13 @@ from snrmjax.model.structures import Structure
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
-    """Whether the states tell a modal mass that is no linear test's, better than the model's own."""
+    """Whether states tell a modal mass that is no linear test's, better than the model's own."""
     if scale.std > MASS_TOLD or abs(np.log(scale.mass)) < OTHER_SCALE:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
     held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)
-    return scale.judged.beats(held)
+    # What a mode leaves off resonance is some per cent of its damping: no other modal mass.
+    return scale.judged.beats(held, beside=False)
 
 
 def scale_findings(

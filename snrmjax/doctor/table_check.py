@@ -7,13 +7,11 @@ from snrmjax.doctor.corrections import TestCorrection, corrections
 from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged
-from snrmjax.doctor.priors import GAIN_MATTERS, MOVED_MATTERS
+from snrmjax.doctor.priors import GAIN_MATTERS, MOVED_MATTERS, NO_MODE
 from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
-
-_NO_MODE = 0.3  # misfit beyond which nothing that is small can have gone wrong
 
 
 def mode_findings(
@@ -52,7 +50,7 @@ def mode_findings(
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     """The likeliest correction that matters and beats the table as it is read."""
-    if base.misfit > _NO_MODE:
+    if base.misfit > NO_MODE:
         return None
     told = [one for one in corrections(seen, base.states, base) if _matters(one, base)]
     told = sorted(told, key=lambda one: -one.judged.evidence)
