@@ -143,16 +143,16 @@ def judge(
     return Judged(states, posterior, posterior.log_evidence + log_jacobian)
 
 
-def any_mass(states: TestStates, log_jacobian: float = 0.0) -> Scale:
+def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False) -> Scale:
     """The fit with the likeliest modal mass, whatever the model's is.
 
     From where a first fit that knows nothing of it puts it; or where its best fit leaves more than
-    instruments do, and so was no good guide, from other orders of magnitude.
+    instruments do, and so was no good guide, from other orders of magnitude (`far`).
     """
     first = judge(states._replace(mass_std=_GUESSED), log_jacobian)
     mass, std = first.posterior.modal_mass
     found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
-    if not SCATTER < found.judged.misfit < NO_MODE:
+    if not (far and SCATTER < found.judged.misfit < NO_MODE):
         return found
     tried = [found, *(_about(states, one, log_jacobian, 1) for one in _MAGNITUDES)]
     best = max(tried, key=lambda one: one.judged.evidence)

@@ -129,7 +129,7 @@ class Reading(NamedTuple):
         """With its likeliest modal mass, too."""
         if self.scale is not None or self.as_modelled is None:
             return self
-        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self)))
+        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self), far=True))
 
 
 def _jacobian(one: Reading) -> float:
@@ -146,26 +146,33 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     recorded = _judged(AS_RECORDED, seen.test, known_mass)
     near = seen.noise if np.isfinite(seen.noise) else 0.0
     enough = max(SCATTER, 3 * near)
-    first = recorded.judged
-    if not (first.damped and first.misfit < enough and _about_one(first)):
-        recorded = recorded.of_any_mass()
+    recorded = _rescaled(recorded, enough)
     sized = _of_sizes(seen, recorded) if known_mass else None
     if sized is not None:
         return recorded, sized
     # Conjugates of a held response pass for curves as steep as their noise asks for.
-    enough = recorded.judged.damped and recorded.judged.misfit < enough
-    others = (CONJUGATED,) if enough else OTHERS
+    well = recorded.judged.damped and recorded.judged.misfit < enough
+    others = (CONJUGATED,) if well else OTHERS
     meant = [(one, seen.read(one.change(seen.recorded, seen.test.frequency))) for one in others]
     # A motion that mostly gains energy from its force has no odds.
     tried = [
         _judged(one, states, known_mass) for one, states in meant if _possible(seen, one, states)
     ]
-    if not enough and not any(one.judged.fits for one in (recorded, *tried)):
+    if not well and not any(one.judged.fits for one in (recorded, *tried)):
         tried = [one.of_any_mass() for one in tried]
     if not any(one.judged.fits for one in (recorded, *tried)):
         tried += _in_degrees(seen, known_mass)
     best = max((one for one in tried if one.judged.damped), key=_evidence, default=recorded)
-    return recorded, best if best.judged.beats(recorded.judged) else recorded
+    if not best.judged.beats(recorded.judged):
+        return recorded, recorded
+    return recorded, _rescaled(best, SCATTER)
+
+
+def _rescaled(one: Reading, enough: float) -> Reading:
+    """With its likeliest modal mass, too, where the model's is not what the states ask for."""
+    first = one.judged
+    content = abs(first.posterior.modal_mass[0] - 1) < MODAL_MASS
+    return one if first.damped and first.misfit < enough and content else one.of_any_mass()
 
 
 def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:
@@ -173,11 +180,6 @@ def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool
     turned = np.max(np.abs(np.angle(seen.recorded))) * np.exp(meaning.log_jacobian)
     whole = meaning.log_jacobian == 0 or turned < _TURN
     return bool(whole and np.median(states.velocity.real) > 0)
-
-
-def _about_one(judged: Judged) -> bool:
-    """Whether states are content with the model's modal mass."""
-    return abs(judged.posterior.modal_mass[0] - 1) < MODAL_MASS
 
 
 def _judged(

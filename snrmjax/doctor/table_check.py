@@ -53,8 +53,8 @@ def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     if base.misfit > NO_MODE:
         return None
     told = [one for one in corrections(seen, base.states, base) if _matters(one, base)]
-    told = sorted(told, key=lambda one: -one.judged.evidence)
-    return next((one for one in told if one.judged.beats(base)), None)
+    best = max(told, key=lambda one: one.judged.evidence, default=None)
+    return best if best is not None and best.judged.beats(base) else None
 
 
 def _matters(one: TestCorrection, base: Judged) -> bool:
