@@ -82,12 +82,16 @@ class Judged(NamedTuple):
         """Whether the table as recorded is clearly less likely.
 
         Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
+        And also from where this hypothesis has curves and levels: of two fits that might both go
+        there none is less likely for having stopped on the way.
         """
 
         def clearly(here: "Judged", there: "Judged") -> bool:
             return here.share * here.gain(there) > CLEARLY
 
-        return clearly(self, recorded) and clearly(self._finer(beside), recorded._finer(beside))
+        if not clearly(self, recorded):
+            return False
+        return clearly(self._finer(beside), recorded._finer(beside, self))
 
     @property
     def share(self) -> float:
@@ -95,12 +99,14 @@ class Judged(NamedTuple):
         left = self.posterior.residuals
         return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
 
-    def _finer(self, beside: bool) -> "Judged":
-        """Fitted with as many rounds as the steepest curves need."""
+    def _finer(self, beside: bool, other: "Judged | None" = None) -> "Judged":
+        """Fitted with as many rounds as the steepest curves need, and from another fit on."""
         jacobian = self.evidence - self.posterior.log_evidence
         kinds = (False, True) if beside else (False,)
         fits = [judge(self.states, jacobian, _FINE, discrepancy=one) for one in kinds]
-        return max(fits, key=lambda one: one.evidence)
+        if other is not None and np.allclose(other.states.amplitude, self.states.amplitude, rtol=1):
+            fits.append(judge(self.states, jacobian, _FINE, other))
+        return max(fits, key=lambda one: (one.damped, one.evidence))
 
 
 class Scale(NamedTuple):

@@ -125,11 +125,11 @@ class Reading(NamedTuple):
             raise ValueError("a reading that was not judged has no fit.")
         return found
 
-    def of_any_mass(self) -> "Reading":
-        """With its likeliest modal mass, too."""
+    def of_any_mass(self, *, far: bool = False) -> "Reading":
+        """With its likeliest modal mass, too, also `far` from the model's."""
         if self.scale is not None or self.as_modelled is None:
             return self
-        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self), far=True))
+        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self), far=far))
 
 
 def _jacobian(one: Reading) -> float:
@@ -172,7 +172,7 @@ def _rescaled(one: Reading, enough: float) -> Reading:
     """With its likeliest modal mass, too, where the model's is not what the states ask for."""
     first = one.judged
     content = abs(first.posterior.modal_mass[0] - 1) < MODAL_MASS
-    return one if first.damped and first.misfit < enough and content else one.of_any_mass()
+    return one if first.damped and first.misfit < enough and content else one.of_any_mass(far=True)
 
 
 def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:

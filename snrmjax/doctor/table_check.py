@@ -7,7 +7,7 @@ from snrmjax.doctor.corrections import TestCorrection, corrections
 from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged
-from snrmjax.doctor.priors import GAIN_MATTERS, MOVED_MATTERS, NO_MODE
+from snrmjax.doctor.priors import FITS_WELL, GAIN_MATTERS, MOVED_MATTERS, NO_MODE
 from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.identify.test_model.states import TestStates
@@ -54,7 +54,12 @@ def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
         return None
     told = [one for one in corrections(seen, base.states, base) if _matters(one, base)]
     best = max(told, key=lambda one: one.judged.evidence, default=None)
-    return best if best is not None and best.judged.beats(base) else None
+    if best is None:
+        return None
+    if best.kind == "force_dropout":  # the noise of a cell is no misfit
+        told = best.judged.noise < FITS_WELL and best.judged.explains(base)
+        return best if told else None
+    return best if best.judged.beats(base) else None
 
 
 def _matters(one: TestCorrection, base: Judged) -> bool:

@@ -198,3 +198,16 @@ def test_noise_in_short_steps_is_no_transient():
     samples, rate = stepped_record(20, 0.08)
     samples[1] += 0.1 * np.random.default_rng(1).normal(size=samples.shape[1])
     assert raised([], None, [recording(samples, rate)]) == []
+
+
+@pytest.mark.parametrize("levels", [(1.0, 0.35), (0.35, 1.0)])
+def test_another_level_of_less_force_is_no_drop_of_it(levels):
+    """Two sweeps of six steps; the mode loses three times as much at the larger force."""
+    parts = [stepped_record(150, {1.0: 0.03, 0.35: 0.01}[one], frequencies=6) for one in levels]
+    rate = parts[0][1]
+    scale = {1.0: 1.0, 0.35: 0.35 * 3.0}  # |V|/F over the other level's, at resonance
+    samples = [
+        np.stack([force * one, v * one * (scale[one] / one)])
+        for one, ((force, v), _) in zip(levels, parts, strict=True)
+    ]
+    assert raised([], None, [recording(np.concatenate(samples, axis=1), rate)]) == []
