@@ -18,7 +18,6 @@ _ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
 _KNOTS = 24  # of its curves, at most
 _STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
 _SEARCHED = 3  # fits of a modal mass from one start, at most
-_SMALLEST = 0.01  # of such a fit over the last
 _MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
 _GUESSED = 1e3  # its 1σ in the first of them
 
@@ -172,7 +171,7 @@ def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _
         scale = mass
         judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
         step, std = judged.posterior.modal_mass
-        mass = scale * max(step, _SMALLEST)
+        mass = scale * max(step, 1 / _GUESSED)
         if abs(np.log(mass / scale)) < _STAYS:
             break
     return Scale(judged, mass, std / step if step > 0 else np.inf)

@@ -25,7 +25,9 @@ FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""
 
 MODAL_MASS = 0.05
-"""1σ of the modal mass over a linear test's: shapes and calibrations are good to some per cent."""
+"""1σ of the modal mass over a linear test's: shapes and calibrations are good to some per cent.
+
+States tell a modal mass where they do so better; within it a factor is √2 or a unit's."""
 
 ANY_MASS = 1.0
 """1σ of a modal mass of which nothing is known, over where the states have it."""
@@ -39,12 +41,6 @@ OTHER_GAIN = 0.4
 
 OTHER_SCALE = 0.125
 """|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
-
-MASS_TOLD = 0.05
-"""1σ of ln κ, at most, with which states say it."""
-
-SAME_FACTOR = 0.05
-"""|ln| within which a factor is √2, a unit's or Ω: 1σ of a linear test's modal mass."""
 
 MOVED_MATTERS = 0.25
 """Change of a natural frequency over its bandwidth, from which on it bends curves."""

@@ -13,7 +13,6 @@ from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
-_TURN = 1.05 * np.pi  # that a phase may be at most, with its noise
 _LATTICES, _LATTICE_TURNS = 2, 8  # that go on, and how long at most
 
 Phasors = Complex[np.ndarray, " state"]
@@ -178,7 +177,7 @@ def _rescaled(one: Reading, enough: float) -> Reading:
 def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:
     """Whether the force works on the motion in most states, and phases are less than a turn."""
     turned = np.max(np.abs(np.angle(seen.recorded))) * np.exp(meaning.log_jacobian)
-    whole = meaning.log_jacobian == 0 or turned < _TURN
+    whole = meaning.log_jacobian == 0 or turned <= np.pi
     return bool(whole and np.median(states.velocity.real) > 0)
 
 

@@ -6,14 +6,14 @@ import numpy as np
 
 from snrmjax.doctor.findings import Finding, Repair, Severity, percent
 from snrmjax.doctor.judgement import Judged, Scale, judge
-from snrmjax.doctor.priors import CERTAIN, MASS_TOLD, MORE_DAMPING, OTHER_SCALE, SAME_FACTOR
+from snrmjax.doctor.priors import CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
     """Whether states tell a modal mass that is no linear test's, better than the model's own."""
-    if scale.std > MASS_TOLD or abs(np.log(scale.mass)) < OTHER_SCALE:
+    if scale.std > MODAL_MASS or abs(np.log(scale.mass)) < OTHER_SCALE:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
     held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)
@@ -34,7 +34,7 @@ def scale_findings(
     both = percent(scale.judged.misfit), percent(as_modelled.misfit)
     size = f"{own} (a state is missed by {both[0]} so, with the model's by {both[1]})"
     off = float(np.log(kappa))
-    near = float(np.hypot(SAME_FACTOR, 3 * scale.std))
+    near = float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:
         columns, repair = "velocity columns", Repair(response=2**0.5)
         if off < 0:
