@@ -9,8 +9,13 @@ from snrmjax.diagnose import evidence, priors
 from snrmjax.diagnose.checks.cross_validation import rms_misfit
 from snrmjax.diagnose.checks.neighbours import neighbour_noise
 from snrmjax.diagnose.decide import most_probable
-from snrmjax.diagnose.misfit.effect_fit import at_phases_of, baseline_fit
-from snrmjax.diagnose.misfit.level_errors import at_level_errors, with_harmonics
+from snrmjax.diagnose.misfit.effect_fit import (
+    EffectFit,
+    at_phases_of,
+    baseline_fit,
+    values_of,
+)
+from snrmjax.diagnose.misfit.level_errors import at_likely_errors, with_harmonics
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
 from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
@@ -25,7 +30,8 @@ from snrmjax.model.effects import EFFECTS
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 _ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
-_CORRECTIONS, _BETTER = 2, 0.9  # of large errors of levels: at most, and share of χ² that is left
+_CORRECTIONS = 4  # of the records, at most
+_BETTER = 0.9  # share of χ² that is left with many harmonics
 _BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
 _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
 
@@ -49,6 +55,7 @@ class Search(NamedTuple):
     scales: MotionScales
     kinds: tuple[str, ...]
     further_starts: Mapping[str, tuple[float, ...]]
+    data: SteadyStates  # as it was measured
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
@@ -79,56 +86,60 @@ class Search(NamedTuple):
         found = self.found(misfit)
         for _ in range(0 if stated else _ROUNDS):
             size = misfit.predictions.error_scale
-            factor = max(rms_misfit(found.misfit, found.fit), least / size)
+            factor = max(rms_misfit(*self.refined(found.misfit, found.fit)), least / size)
             if _NEAR < factor < 1 / _NEAR:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
             found = self.found(misfit)
-        weights = evidence.weights_of(found)
+        weights = evidence.weights_of(found, self.refined)
         return Answered(most_probable(found, weights), weights)
 
+    def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
+        """A fit again where the records are corrected for the errors that it finds in them."""
+        for _ in range(_CORRECTIONS):
+            straight = at_likely_errors(misfit, fit, self.data)
+            if straight is None:
+                break
+            again = refitted(straight, self.scales, fit)
+            if not np.isfinite(again.chi_square):
+                break
+            misfit, fit = straight, again
+        return misfit, fit
 
-def best_answer(search: Search, predictions: Predictions, data: SteadyStates) -> Answered:
+
+def best_answer(search: Search, predictions: Predictions) -> Answered:
     """The most probable answer, refined where it leaves more than noise.
 
     First to a higher order; then with errors of levels that nobody stated.
     """
     answered = search.answered(predictions)
-    if leaves_more_than_noise(answered):
-        answered = refined(answered, search.among(answered, _NEAR_ANSWERS), data)
+    answered = with_more_harmonics(answered, search.among(answered, _NEAREST_ANSWERS))
     if leaves_more_than_noise(answered) and levels_may_differ(predictions):
         now = (answered.coarse or answered.found).misfit.predictions
         near = search.among(answered, _NEAR_ANSWERS)
-        apart = refined(near.answered(with_unstated_level_errors(now)), near, data)
+        apart = near.answered(with_unstated_level_errors(now))
+        apart = with_more_harmonics(apart, search.among(apart, _NEAREST_ANSWERS))
         if apart.log_weight + np.log(priors.LEVELS_APART) > answered.log_weight:
             return apart
     return answered
 
 
-def refined(answered: Answered, search: Search, data: SteadyStates) -> Answered:
-    """An answer that leaves more than noise, found again to a higher order.
+def with_more_harmonics(answered: Answered, search: Search) -> Answered:
+    """An answer that leaves more than noise, found again with many harmonics.
 
-    At the levels' most likely errors, where these are large; and with many harmonics, since kinks
-    and slip have no last one.
+    Kinks and slip have no last one.
     """
-    for _ in range(_CORRECTIONS):
-        found = answered.found
-        predictions = at_level_errors(found.misfit, found.fit.rows, data)
-        if predictions is None or not leaves_more_than_noise(answered):
-            break
-        again = search.answered(predictions)
-        if again.found.fit.chi_square > _BETTER * found.fit.chi_square:
-            break
-        answered = again
     found = answered.found
     kinked = any(issubclass(EFFECTS[kind], _WITHOUT_LAST_HARMONIC) for kind in found.fit.kinds)
     if not kinked or not leaves_more_than_noise(answered):
         return answered
-    many = with_harmonics(found.misfit.predictions, data, MANY_HARMONICS)
-    winner = refitted(weighted_misfit(many), search.scales, found.fit)
+    many = with_harmonics(found.misfit, search.data, MANY_HARMONICS)
+    winner = refitted(
+        found.misfit.about(many, values_of(found.misfit, found.fit)), search.scales, found.fit
+    )
     if winner.chi_square > _BETTER * found.fit.chi_square:
         return answered
-    return search.among(answered, _NEAREST_ANSWERS).answered(many)._replace(coarse=found)
+    return search.answered(many)._replace(coarse=found)
 
 
 def leaves_more_than_noise(answered: Answered) -> bool:

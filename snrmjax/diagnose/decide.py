@@ -20,6 +20,7 @@ from snrmjax.diagnose.checks.patterns import left_curve, pattern
 from snrmjax.diagnose.checks.predicted_levels import missed_levels
 from snrmjax.diagnose.checks.shared_gains import doubts_on_gains
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.diagnose.verdict import Verdict
@@ -54,7 +55,12 @@ def most_probable(found: FoundEffects, weights: Weights) -> FoundEffects:
             group = classes[lost[0] if lost else 0]
             if kind not in group:
                 group.append(kind)
-    return found._replace(fit=best.fit, classes=tuple(tuple(group) for group in classes))
+    return found._replace(
+        misfit=best.misfit,
+        fit=best.fit,
+        baseline=baseline_fit(best.misfit),
+        classes=tuple(tuple(group) for group in classes),
+    )
 
 
 def decide(

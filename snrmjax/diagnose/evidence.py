@@ -37,6 +37,7 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 _AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
+_REFINED = 8  # answers that are made straight at their own errors
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
 
@@ -45,6 +46,7 @@ class Weighed(NamedTuple):
     """An answer with the logarithm of its prior odds times its evidence."""
 
     kinds: frozenset[str]
+    misfit: WeightedMisfit  # made straight at its own most likely errors, where it was refined
     fit: EffectFit
     log_weight: float
 
@@ -102,38 +104,61 @@ class _Sizes(NamedTuple):
     noise_bounds: tuple[float, float]
 
 
-def weights_of(found: FoundEffects) -> Weights:
+Refined = Callable[[WeightedMisfit, EffectFit], tuple[WeightedMisfit, EffectFit]]
+
+
+def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     """All answers that a search considered, weighed.
 
     `unknown` has the weight of answers beside a discrepancy of unknown size, and of laws that act
-    like one. `noise_rejected` has that
-    of all answers with noise of another size, where noise is stated.
+    like one. `noise_rejected` has that of all answers with noise of another size, where noise is
+    stated. The likeliest answers, and nothing at all, are `refined` before they are compared.
     """
-    misfit = found.misfit
-    sizes = _sizes_of(misfit)
-    best: dict[frozenset[str], Weighed] = {}
-    marginals: dict[frozenset[str], Marginal] = {}
-    wrong: dict[frozenset[str], float] = {}
-    for fit in (found.baseline, found.fit, *found.considered):
-        marginal = marginal_of(misfit, fit)
-        if marginal is None:
-            continue
-        kinds = frozenset(fit.kinds)
-        evidence = log_evidence(marginal, sizes)
-        weight = _log_prior(len(kinds)) + evidence.right
-        if kinds not in best or weight > best[kinds].log_weight:
-            best[kinds], marginals[kinds] = Weighed(kinds, fit, weight), marginal
-            wrong[kinds] = _log_prior(len(kinds)) + evidence.wrong
-    answers = tuple(sorted(best.values(), key=lambda one: -one.log_weight))
-    unknown = [np.log(priors.UNNAMED) + one.log_weight for one in answers if one.kinds]
-    directions = list(discrepancies(misfit))
-    for one in answers[:_BESIDE]:
+    sizes = _sizes_of(found.misfit)
+    every = (found.baseline, found.fit, *found.considered)
+    best: dict[frozenset[str], _Compared] = {}
+    for fit in every:
+        one = _compared(found.misfit, fit, sizes)
+        if one is not None and (one.kinds not in best or one.right > best[one.kinds].right):
+            best[one.kinds] = one
+    for kinds in _worth_refining(best) if refined is not None else ():
+        again = _compared(*refined(best[kinds].misfit, best[kinds].fit), sizes)
+        if again is not None:
+            best[kinds] = again
+    ranked = sorted(best.values(), key=lambda one: -one.right)
+    unknown = [np.log(priors.UNNAMED) + one.right for one in ranked if one.kinds]
+    for one in ranked[:_BESIDE]:
+        directions = list(discrepancies(one.misfit))
         prior = np.log(priors.DISCREPANCY / len(directions)) + _log_prior(len(one.kinds))
         for columns in directions:
-            beside = with_discrepancy(misfit, one.fit, marginals[one.kinds], columns)
+            beside = with_discrepancy(one.misfit, one.fit, one.marginal, columns)
             unknown.append(prior + log_evidence(beside, sizes).right)
-    rejected = float(np.log(priors.WRONG_NOISE) + logsumexp(list(wrong.values())))
-    return Weights(answers, float(logsumexp(unknown)), rejected)
+    rejected = np.log(priors.WRONG_NOISE) + logsumexp([one.wrong for one in ranked])
+    answers = tuple(Weighed(one.kinds, one.misfit, one.fit, one.right) for one in ranked)
+    return Weights(answers, float(logsumexp(unknown)), float(rejected))
+
+
+class _Compared(NamedTuple):
+    kinds: frozenset[str]
+    misfit: WeightedMisfit
+    fit: EffectFit
+    marginal: "Marginal"
+    right: float  # ln of prior odds times evidence, for noise as stated
+    wrong: float  # and for noise stated wrong
+
+
+def _compared(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> _Compared | None:
+    marginal = marginal_of(misfit, fit)
+    if marginal is None:
+        return None
+    evidence, prior = log_evidence(marginal, sizes), _log_prior(len(fit.kinds))
+    pair = prior + evidence.right, prior + evidence.wrong
+    return _Compared(frozenset(fit.kinds), misfit, fit, marginal, *pair)
+
+
+def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:
+    ranked = sorted(best, key=lambda kinds: -best[kinds].right)
+    return list(dict.fromkeys([frozenset[str](), *ranked[:_REFINED]]))
 
 
 def marginal_of(misfit: WeightedMisfit, fit: EffectFit) -> Marginal | None:

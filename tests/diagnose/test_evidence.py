@@ -57,7 +57,7 @@ def fit(misfit):
 
 def weighed(name, log_weight):
     kinds = frozenset() if name == "none" else frozenset(name.split("+"))
-    return Weighed(kinds, fit_to(noise()), log_weight)
+    return Weighed(kinds, None, fit_to(noise()), log_weight)  # names and weights alone count
 
 
 def test_probabilities_are_weights_over_their_sum():

@@ -1,8 +1,9 @@
-"""Levels whose records are off by more than a straight line follows: corrected before a fit.
+"""Records corrected for their most likely errors, where a hypothesis is compared with them.
 
-A gain of 15 % moves a stop or a steep curve beyond first order. The states are compared at the most
-likely errors of their levels, and the misfit is carried back to the record by its slopes there, so
-that the errors keep their priors.
+A gain of 15 % moves a stop or a steep curve beyond first order, and so does the error of a single
+state on a curve that is steep enough. States are compared as a hypothesis has them without these
+errors, and the misfit is carried back to the record by its slopes there, so that errors keep their
+priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908085).
 """
 
 import dataclasses
@@ -10,80 +11,115 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, values_of
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
-from snrmjax.diagnose.misfit.reference import as_weighed, reference_of
-from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
+from snrmjax.diagnose.misfit.reference import as_weighed
+from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.measure.states import SteadyStates
 
-_SMALL = 0.03  # relative or rad, up to which errors of levels are linear
+_SMALL = 0.003  # relative or rad, by which errors that are made straight again have moved
+_FARTHEST = 0.5  # relative or rad, of an error that is corrected
 
 
-def at_level_errors(
-    misfit: WeightedMisfit, rows: Float[np.ndarray, " row"], data: SteadyStates
-) -> Predictions | None:
-    """Predictions at the levels' most likely errors; None where these are small.
+def at_likely_errors(
+    misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates
+) -> WeightedMisfit | None:
+    """The misfit made straight at a fit's most likely errors; None where it is straight there.
 
-    Arguments: `rows` are the misfits that a fit leaves; `data` as it was measured.
+    `data` are the records as they were measured.
     """
-    gain, phase = _added(misfit, rows)
-    if max(np.max(np.abs(gain)), np.max(np.abs(phase))) < _SMALL:
-        return None
     old = misfit.predictions
-    return _at(old, data, (gain, phase), old.compared.harmonic_order)
+    added = likely_errors(misfit, fit.rows)
+    before = np.zeros_like(added) if old.added is None else old.added
+    if np.max(np.abs(added - before), initial=0.0) < _SMALL:
+        return None
+    new = _at(old, data, added, misfit.passed_on.by_error, None)
+    return misfit.about(new, values_of(misfit, fit))
 
 
-def with_harmonics(old: Predictions, data: SteadyStates, harmonics: int) -> Predictions:
-    """The same predictions by motions with other harmonics."""
-    none = np.zeros(len(old.chosen.rows))
-    return _at(old, data, old.added or (none, none), harmonics)
+def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> WeightedMisfit:
+    """The misfit made straight at the errors that smooth curves find, whatever the law is.
+
+    Fits of effects begin there.
+    """
+    old = misfit.predictions
+    reference = old.reference
+    if reference is None or reference.posterior.states.force_is_free:
+        return misfit
+    found, error = reference.posterior, np.asarray(old.chosen.states.error)
+    n_sensors = (error.shape[1] - 1) // 2
+    added, level = np.zeros_like(error), found.states.level
+    own = found.corrections[:, 1:] - found.level_errors[level][:, :2]
+    added[reference.rows, 1 : n_sensors + 1] = own[:, [0]]
+    added[reference.rows, n_sensors + 1 :] = own[:, [1]]
+    added = np.clip(added, -_FARTHEST, _FARTHEST)
+    new = _at(old, data, added, misfit.passed_on.by_error, None)
+    return misfit.about(new, old.group.values)
+
+
+def with_harmonics(misfit: WeightedMisfit, data: SteadyStates, harmonics: int) -> Predictions:
+    """The predictions of a misfit by motions with other harmonics."""
+    old = misfit.predictions
+    none = np.zeros((len(old.chosen.rows), np.asarray(old.chosen.states.error).shape[1]))
+    added = none if old.added is None else old.added
+    return _at(old, data, added, misfit.passed_on.by_error, harmonics)
 
 
 def _at(
-    old: Predictions, data: SteadyStates, added: tuple[np.ndarray, np.ndarray], harmonics: int
+    old: Predictions,
+    data: SteadyStates,
+    added: Float[np.ndarray, "state input"],
+    by_error: Float[np.ndarray, "state column input"],
+    harmonics: int | None,
 ) -> Predictions:
-    gain, phase = added
-    corrected = with_corrected_levels(data, old.chosen.rows, gain, phase)
-    new = predictions_of(old.given, corrected, old.force_gain_std, harmonics=harmonics)
-    new = as_weighed(new, old)
-    if not np.any(gain) and not np.any(phase):
-        return new
-    new = dataclasses.replace(new, reference=reference_of(new))
-    by_error = weighted_misfit(new).passed_on.by_error
-    n = np.asarray(new.chosen.states.velocity).shape[1]
-    of_gain, of_phase = by_error[:, :, 1 : n + 1].sum(axis=2), by_error[:, :, n + 1 :].sum(axis=2)
-    offset = -(of_gain * gain[:, None] + of_phase * phase[:, None])
+    corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
+    order = old.compared.harmonic_order if harmonics is None else harmonics
+    new = as_weighed(predictions_of(old.given, corrected, old.force_gain_std, harmonics=order), old)
+    offset = -np.einsum("sci,si->sc", by_error, added)
     return dataclasses.replace(new, offset=offset, added=added)
 
 
-def _added(
+def likely_errors(
     misfit: WeightedMisfit, rows: Float[np.ndarray, " row"]
-) -> tuple[Float[np.ndarray, " state"], Float[np.ndarray, " state"]]:
-    """What a fit adds to the logarithm of the velocity and to the phase (rad) of every state."""
-    noise = misfit.noise
+) -> Float[np.ndarray, "state input"]:
+    """What a fit adds to logarithms of velocities and to phases: of levels and of single states."""
+    noise, states = misfit.noise, misfit.predictions.chosen.states
+    level, error = np.asarray(states.level), np.asarray(states.error)
+    n, n_inputs = error.shape
+    n_sensors = (n_inputs - 1) // 2
+    pull = np.zeros(noise.known.shape)
+    pull[noise.known] = noise.without_shared(rows)
+    pull = np.einsum("sij,si->sj", noise.whiten, pull)
+    added = -np.einsum("sci,sc->si", misfit.passed_on.by_error, pull) * error**2
+    added[:, 0] = 0.0  # of a force: straight as it is
     moved = noise.shared_errors(rows)
-    level = np.asarray(misfit.predictions.chosen.states.level)
-    found = []
-    for std, kind in zip(misfit.predictions.model.level_stds[:2], (0, 1), strict=True):
-        own = moved[noise.shared_kind == kind]
-        found.append(std * own[level] if own.size else np.zeros(len(level)))
-    return found[0], found[1]
+    ends = slice(1, 1 + n_sensors), slice(1 + n_sensors, n_inputs)
+    for std, kind, own in zip(misfit.predictions.model.level_stds[:2], (0, 1), ends, strict=True):
+        shared = moved[noise.shared_kind == kind]
+        if shared.size:
+            added[:, own] += (std * shared[level])[:, None]
+    unknown = np.asarray(misfit.predictions.chosen.phase_unknown)[:, 0]
+    added[unknown] = 0.0  # of sizes alone nothing is straight
+    return np.clip(np.where(np.isfinite(added), added, 0.0), -_FARTHEST, _FARTHEST)
 
 
-def with_corrected_levels(
+def with_corrected_records(
     data: SteadyStates,
     rows: Int[np.ndarray, " state"],
-    gain: Float[np.ndarray, " state"],
-    phase: Float[np.ndarray, " state"],
+    sensors: tuple[int, ...],
+    added: Float[np.ndarray, "state input"],
 ) -> SteadyStates:
-    """The data with errors of their levels taken away, of the states in `rows`."""
-    size, turn = np.ones(data.n_states), np.zeros(data.n_states)
-    size[rows], turn[rows] = np.exp(gain), phase
+    """The data with errors of velocities and phases taken away, of the states in `rows`."""
+    n = len(sensors)
+    size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
+    size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
+    back = np.argsort(sensors)
+    size, turn = size[:, back], turn[:, back]
     orders = np.array(data.harmonic_order, dtype=int)
-    by_order = np.exp(1j * turn[:, None] * orders)[:, None, :]
     return dataclasses.replace(
         data,
-        velocity=data.velocity * (size * np.exp(1j * turn))[:, None],
-        velocity_std=data.velocity_std * size[:, None],
-        harmonics=data.harmonics * size[:, None, None] * by_order,
-        harmonic_std=data.harmonic_std * size[:, None],
+        velocity=data.velocity * (size * np.exp(1j * turn)),
+        velocity_std=data.velocity_std * size,
+        harmonics=data.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
+        harmonic_std=data.harmonic_std * size,
     )

@@ -101,9 +101,11 @@ def with_reference(predictions: Predictions) -> Predictions:
 
 def as_weighed(predictions: Predictions, other: Predictions) -> Predictions:
     """Predictions of the same states weighed as others of them are."""
+    predictions = predictions.with_errors_scaled(other.error_scale)
     return dataclasses.replace(
         predictions,
         model=other.model,
+        free_level_forces=other.free_level_forces,
         reference=other.reference,
         level_sizes=other.level_sizes,
         unstated_levels=other.unstated_levels,

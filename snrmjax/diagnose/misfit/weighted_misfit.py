@@ -150,6 +150,21 @@ class WeightedMisfit:
         """The same misfit with errors passed on in another way."""
         return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
 
+    def about(
+        self, predictions: Predictions, values: Float[np.ndarray, " parameter"]
+    ) -> "WeightedMisfit":
+        """The misfit of the same records made straight about others, with the weights it has.
+
+        Parameters of the baseline move it as they do beside effects of some `values`.
+        """
+        baseline, slopes = _baseline_of(predictions)
+        errors = self.errors._replace(slopes=slopes)
+        if np.any(values != predictions.group.values):
+            own = by_baseline(predictions, predictions.group, values).slopes[0]
+            slopes = np.where(np.isfinite(own), own, slopes)
+        passed_on = self.passed_on._replace(slopes=slopes)
+        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
         return dataclasses.replace(self, predictions=self.predictions.with_phases(phase))
@@ -163,23 +178,38 @@ class WeightedMisfit:
 def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     """The baseline's misfit, weighted with the stated noise as the baseline passes it on."""
     group = predictions.group
-    found = by_baseline(predictions, group, group.values)
-    baseline = BaselinePrediction(
-        found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
-    )
-    errors = ErrorPropagation(*predictions.by_error(group, group.values), found.slopes[0])
+    baseline, slopes = _baseline_of(predictions)
+    errors = ErrorPropagation(*predictions.by_error(group, group.values), slopes)
     missing = _of_missing_force(predictions, baseline, errors)
     passed_on = errors._replace(by_error=errors.by_error + missing)
     return _weighted(predictions, baseline, errors, passed_on, StartChanges())
 
 
+def _baseline_of(
+    predictions: Predictions,
+) -> tuple[BaselinePrediction, Float[np.ndarray, "state column direction"]]:
+    group = predictions.group
+    found = by_baseline(predictions, group, group.values)
+    baseline = BaselinePrediction(
+        found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
+    )
+    return baseline, found.slopes[0]
+
+
 def by_baseline(
     predictions: Predictions, group: Group, values: Float[np.ndarray, " parameter"]
 ) -> Predicted:
-    """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two."""
-    stated, j = predictions.stated, predictions.model.modes.mode_of_interest + 1
-    two = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
+    """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two.
+
+    Of these by its natural frequency as stiffness changes it: 2ζω stays as it is.
+    """
+    stated, modes = predictions.stated, predictions.model.modes
+    j = modes.mode_of_interest
+    two = (f"mode_{j + 1}.natural_frequency", f"mode_{j + 1}.damping_ratio")
     found = predictions.of(group, values[None], (*stated, *two))
+    share = float(modes.damping_ratio[j]) / float(modes.natural_frequency[j])
+    for slopes in (found.slopes, found.force_slopes):
+        slopes[..., -2] -= share * slopes[..., -1]
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     return found._replace(slopes=found.slopes * std, force_slopes=found.force_slopes * std)
 
