@@ -15,7 +15,7 @@ from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     values_of,
 )
-from snrmjax.diagnose.misfit.level_errors import at_likely_errors, with_harmonics
+from snrmjax.diagnose.misfit.level_errors import at_likely_errors, at_records, with_harmonics
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
 from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
@@ -31,6 +31,7 @@ _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 _ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
 _CORRECTIONS = 4  # of the records, at most
+_DIVERGED = 3.0  # times χ², at which an answer has no errors that explain the records
 _BETTER = 0.9  # share of χ² that is left with many harmonics
 _BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
 _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
@@ -95,7 +96,15 @@ class Search(NamedTuple):
         return Answered(most_probable(found, weights), weights)
 
     def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
-        """A fit again where the records are corrected for the errors that it finds in them."""
+        """A fit again where the records are corrected for the errors that it finds in them.
+
+        From where it is, or from the records as they are: smooth curves may miss a kink.
+        """
+        plain = at_records(misfit, fit, self.data)
+        again = refitted(plain, self.scales, fit)
+        if again.chi_square < fit.chi_square:
+            misfit, fit = plain, again
+        worst = _DIVERGED * max(fit.chi_square, misfit.n_rows)
         for _ in range(_CORRECTIONS):
             straight = at_likely_errors(misfit, fit, self.data)
             if straight is None:
@@ -104,34 +113,40 @@ class Search(NamedTuple):
             if not np.isfinite(again.chi_square):
                 break
             misfit, fit = straight, again
+            if fit.chi_square > worst:
+                break
         return misfit, fit
 
 
 def best_answer(search: Search, predictions: Predictions) -> Answered:
-    """The most probable answer, refined where it leaves more than noise.
+    """The most probable answer, whether levels differ by what nobody stated or not.
 
-    First to a higher order; then with errors of levels that nobody stated.
+    That is asked where an answer leaves more than noise, or does what such levels would do.
     """
     answered = search.answered(predictions)
     answered = with_more_harmonics(answered, search.among(answered, _NEAREST_ANSWERS))
-    if leaves_more_than_noise(answered) and levels_may_differ(predictions):
-        now = (answered.coarse or answered.found).misfit.predictions
-        near = search.among(answered, _NEAR_ANSWERS)
-        apart = near.answered(with_unstated_level_errors(now))
-        apart = with_more_harmonics(apart, search.among(apart, _NEAREST_ANSWERS))
-        if apart.log_weight + np.log(priors.LEVELS_APART) > answered.log_weight:
-            return apart
-    return answered
+    alike = any(EFFECTS[kind].is_linear for kind in answered.found.fit.kinds)
+    if not (alike or leaves_more_than_noise(answered)) or not levels_may_differ(predictions):
+        return answered
+    now = (answered.coarse or answered.found).misfit.predictions
+    near = search.among(answered, _NEAR_ANSWERS)
+    apart = near.answered(with_unstated_level_errors(now))
+    apart = with_more_harmonics(apart, search.among(apart, _NEAREST_ANSWERS))
+    odds = float(np.log(priors.LEVELS_APART))
+    weights = evidence.either(answered.weights, apart.weights, odds)
+    likelier = apart if apart.log_weight + odds > answered.log_weight else answered
+    return likelier._replace(found=most_probable(likelier.found, weights), weights=weights)
 
 
 def with_more_harmonics(answered: Answered, search: Search) -> Answered:
-    """An answer that leaves more than noise, found again with many harmonics.
+    """An answer that leaves more than noise, or beside noise of unknown size, with many harmonics.
 
     Kinks and slip have no last one.
     """
     found = answered.found
     kinked = any(issubclass(EFFECTS[kind], _WITHOUT_LAST_HARMONIC) for kind in found.fit.kinds)
-    if not kinked or not leaves_more_than_noise(answered):
+    stated = found.misfit.predictions.chosen.noise_stated
+    if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
     many = with_harmonics(found.misfit, search.data, MANY_HARMONICS)
     winner = refitted(
@@ -154,4 +169,4 @@ def leaves_more_than_noise(answered: Answered) -> bool:
 def levels_may_differ(predictions: Predictions) -> bool:
     """Whether errors of levels that nobody stated, and smooth curves hide, may be in the way."""
     stated = all(std > 0 for std in predictions.given.level_stds)
-    return predictions.reference is not None and predictions.chosen.n_levels > 1 and not stated
+    return predictions.reference is not None and not stated

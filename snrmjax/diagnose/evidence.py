@@ -8,7 +8,7 @@ the sizes of noise, of levels' errors and of the discrepancy by their most likel
 Laplace's approximation, each answer with its own.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import comb
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -38,6 +39,7 @@ NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 _AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
 _REFINED = 8  # answers that are made straight at their own errors
+_FAR = 25.0  # of ln p, behind an answer that fits
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
 
@@ -104,6 +106,22 @@ class _Sizes(NamedTuple):
     noise_bounds: tuple[float, float]
 
 
+def either(one: Weights, other: Weights, odds: float) -> Weights:
+    """Weights where one of two descriptions of the same data holds, the other with log odds."""
+    best = {answer.kinds: answer for answer in one.answers}
+    for answer in other.answers:
+        new = answer._replace(log_weight=answer.log_weight + odds)
+        old = best.get(new.kinds, new._replace(log_weight=-np.inf))
+        likelier = max(old, new, key=lambda each: each.log_weight)
+        both = float(np.logaddexp(old.log_weight, new.log_weight))
+        best[new.kinds] = likelier._replace(log_weight=both)
+    return Weights(
+        tuple(sorted(best.values(), key=lambda answer: -answer.log_weight)),
+        float(np.logaddexp(one.unknown, other.unknown + odds)),
+        float(np.logaddexp(one.noise_rejected, other.noise_rejected + odds)),
+    )
+
+
 Refined = Callable[[WeightedMisfit, EffectFit], tuple[WeightedMisfit, EffectFit]]
 
 
@@ -121,10 +139,14 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
         one = _compared(found.misfit, fit, sizes)
         if one is not None and (one.kinds not in best or one.right > best[one.kinds].right):
             best[one.kinds] = one
+    done: list[_Compared] = []
     for kinds in _worth_refining(best) if refined is not None else ():
+        if _is_far_behind(best[kinds], done):
+            continue
         again = _compared(*refined(best[kinds].misfit, best[kinds].fit), sizes)
         if again is not None:
             best[kinds] = again
+            done.append(again)
     ranked = sorted(best.values(), key=lambda one: -one.right)
     unknown = [np.log(priors.UNNAMED) + one.right for one in ranked if one.kinds]
     for one in ranked[:_BESIDE]:
@@ -156,9 +178,21 @@ def _compared(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> _Compa
     return _Compared(frozenset(fit.kinds), misfit, fit, marginal, *pair)
 
 
+def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
+    """Whether a refined answer fits and makes this one, as it is, improbable."""
+    if not done:
+        return False
+    best = max(done, key=lambda each: each.right)
+    freedom = best.misfit.n_rows - len(best.fit.values)
+    fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
+    return fits and one.right < best.right - _FAR
+
+
 def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:
+    """Nothing, the likeliest effects alone, and then the likeliest answers of any size."""
     ranked = sorted(best, key=lambda kinds: -best[kinds].right)
-    return list(dict.fromkeys([frozenset[str](), *ranked[:_REFINED]]))
+    alone = [kinds for kinds in ranked if len(kinds) <= 1][:_REFINED]
+    return list(dict.fromkeys([*alone, frozenset[str](), *ranked[:_REFINED]]))
 
 
 def marginal_of(misfit: WeightedMisfit, fit: EffectFit) -> Marginal | None:

@@ -37,6 +37,14 @@ def at_likely_errors(
     return misfit.about(new, values_of(misfit, fit))
 
 
+def at_records(misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates) -> WeightedMisfit:
+    """The misfit made straight at the records as they are."""
+    old = misfit.predictions
+    none = np.zeros_like(np.asarray(old.chosen.states.error))
+    new = _at(old, data, none, misfit.passed_on.by_error, None)
+    return misfit.about(new, values_of(misfit, fit))
+
+
 def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> WeightedMisfit:
     """The misfit made straight at the errors that smooth curves find, whatever the law is.
 
@@ -85,7 +93,7 @@ def likely_errors(
     """What a fit adds to logarithms of velocities and to phases: of levels and of single states."""
     noise, states = misfit.noise, misfit.predictions.chosen.states
     level, error = np.asarray(states.level), np.asarray(states.error)
-    n, n_inputs = error.shape
+    n_inputs = error.shape[1]
     n_sensors = (n_inputs - 1) // 2
     pull = np.zeros(noise.known.shape)
     pull[noise.known] = noise.without_shared(rows)
