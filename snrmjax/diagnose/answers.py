@@ -13,9 +13,14 @@ from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     at_phases_of,
     baseline_fit,
-    values_of,
 )
-from snrmjax.diagnose.misfit.level_errors import at_likely_errors, at_records, with_harmonics
+from snrmjax.diagnose.misfit.level_errors import (
+    FARTHEST,
+    at_likely_errors,
+    at_records,
+    with_harmonics,
+)
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
 from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
@@ -30,8 +35,8 @@ from snrmjax.model.effects import EFFECTS
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 _ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
-_CORRECTIONS = 4  # of the records, at most
-_DIVERGED = 3.0  # times χ², at which an answer has no errors that explain the records
+_CORRECTIONS = 6  # of the records, at most
+_STILL = 0.02  # relative or rad, that errors may have moved in the last of them
 _BETTER = 0.9  # share of χ² that is left with many harmonics
 _BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
 _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
@@ -98,24 +103,31 @@ class Search(NamedTuple):
     def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
         """A fit again where the records are corrected for the errors that it finds in them.
 
-        From where it is, or from the records as they are: smooth curves may miss a kink.
+        From where it is, and, unless that explains them, from the records as they are: smooth
+        curves may miss a kink.
         """
+        found = self._corrected(misfit, fit)
+        if found is not None and is_noise(*found):
+            return found
         plain = at_records(misfit, fit, self.data)
-        again = refitted(plain, self.scales, fit)
-        if again.chi_square < fit.chi_square:
-            misfit, fit = plain, again
-        worst = _DIVERGED * max(fit.chi_square, misfit.n_rows)
+        other = self._corrected(plain, refitted(plain, self.scales, fit))
+        both = [pair for pair in (found, other) if pair is not None]
+        return min(both, key=lambda pair: pair[1].chi_square, default=(misfit, fit))
+
+    def _corrected(
+        self, misfit: WeightedMisfit, fit: EffectFit
+    ) -> tuple[WeightedMisfit, EffectFit] | None:
+        """The fit where nothing moves any more; None where no errors explain the records."""
         for _ in range(_CORRECTIONS):
-            straight = at_likely_errors(misfit, fit, self.data)
-            if straight is None:
-                break
-            again = refitted(straight, self.scales, fit)
-            if not np.isfinite(again.chi_square):
-                break
-            misfit, fit = straight, again
-            if fit.chi_square > worst:
-                break
-        return misfit, fit
+            if not np.isfinite(fit.chi_square):
+                return None
+            straight, moved, largest = at_likely_errors(misfit, fit, self.data)
+            if largest > FARTHEST:
+                return None
+            if straight is misfit:
+                return misfit, fit
+            misfit, fit = straight, refitted(straight, self.scales, fit)
+        return (misfit, fit) if moved < _STILL else None
 
 
 def best_answer(search: Search, predictions: Predictions) -> Answered:
@@ -149,12 +161,16 @@ def with_more_harmonics(answered: Answered, search: Search) -> Answered:
     if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
     many = with_harmonics(found.misfit, search.data, MANY_HARMONICS)
-    winner = refitted(
-        found.misfit.about(many, values_of(found.misfit, found.fit)), search.scales, found.fit
-    )
+    winner = refitted(weighted_misfit(many), search.scales, found.fit)
     if winner.chi_square > _BETTER * found.fit.chi_square:
         return answered
     return search.answered(many)._replace(coarse=found)
+
+
+def is_noise(misfit: WeightedMisfit, fit: EffectFit) -> bool:
+    """Whether a fit leaves no more than the noise is taken to be."""
+    freedom = misfit.n_rows - len(fit.values)
+    return chi_square_p_value(fit.chi_square, freedom) > priors.REJECTED
 
 
 def leaves_more_than_noise(answered: Answered) -> bool:

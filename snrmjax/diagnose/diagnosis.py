@@ -109,7 +109,7 @@ def diagnose_model(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
-    predictions = at_reference(misfit, data).predictions
+    predictions = at_reference(misfit, data)
     scales = scales_of(predictions)
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)

@@ -236,7 +236,11 @@ class Evidence(NamedTuple):
 
 
 def _units(misfit: WeightedMisfit) -> float:
-    """ln of the units of all rows, so that answers under other noise can be compared."""
+    """ln of the units of all rows, so that answers under other noise can be compared.
+
+    At a fit that explains its records χ² is the square of their distance from it, whatever its own
+    slopes are: these are no part of the units.
+    """
     return -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
 
 

@@ -7,6 +7,7 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,52 +18,60 @@ from snrmjax.diagnose.misfit.reference import as_weighed
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.measure.states import SteadyStates
 
-_SMALL = 0.003  # relative or rad, by which errors that are made straight again have moved
-_FARTHEST = 0.5  # relative or rad, of an error that is corrected
+_SMALL = 0.003  # relative or rad, of errors that have moved: straight as it is
+FARTHEST = 0.5
+"""Relative or rad: an answer that needs larger errors explains nothing."""
 
 
-def at_likely_errors(
-    misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates
-) -> WeightedMisfit | None:
-    """The misfit made straight at a fit's most likely errors; None where it is straight there.
+class Corrected(NamedTuple):
+    """A misfit made straight at a fit's most likely errors."""
+
+    misfit: WeightedMisfit
+    moved: float  # relative or rad: by how much errors have moved, at most
+    largest: float  # of all errors
+
+
+def at_likely_errors(misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates) -> Corrected:
+    """The misfit made straight at a fit's most likely errors; the same where it is straight there.
 
     `data` are the records as they were measured.
     """
     old = misfit.predictions
     added = likely_errors(misfit, fit.rows)
     before = np.zeros_like(added) if old.added is None else old.added
-    if np.max(np.abs(added - before), initial=0.0) < _SMALL:
-        return None
-    new = _at(old, data, added, misfit.passed_on.by_error, None)
-    return misfit.about(new, values_of(misfit, fit))
+    moved = float(np.max(np.abs(added - before), initial=0.0))
+    largest = float(np.max(np.abs(added), initial=0.0))
+    if moved < _SMALL or largest > FARTHEST:
+        return Corrected(misfit, moved, largest)
+    there = misfit.about(_at(old, data, added), values_of(misfit, fit), added)
+    return Corrected(there, moved, largest)
 
 
 def at_records(misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates) -> WeightedMisfit:
     """The misfit made straight at the records as they are."""
     old = misfit.predictions
     none = np.zeros_like(np.asarray(old.chosen.states.error))
-    new = _at(old, data, none, misfit.passed_on.by_error, None)
-    return misfit.about(new, values_of(misfit, fit))
+    return misfit.about(_at(old, data, none), values_of(misfit, fit), none)
 
 
-def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> WeightedMisfit:
-    """The misfit made straight at the errors that smooth curves find, whatever the law is.
+def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> Predictions:
+    """Predictions of the records without the errors that smooth curves find, whatever the law is.
 
     Fits of effects begin there.
     """
     old = misfit.predictions
     reference = old.reference
     if reference is None or reference.posterior.states.force_is_free:
-        return misfit
+        return old
     found, error = reference.posterior, np.asarray(old.chosen.states.error)
     n_sensors = (error.shape[1] - 1) // 2
     added, level = np.zeros_like(error), found.states.level
     own = found.corrections[:, 1:] - found.level_errors[level][:, :2]
     added[reference.rows, 1 : n_sensors + 1] = own[:, [0]]
     added[reference.rows, n_sensors + 1 :] = own[:, [1]]
-    added = np.clip(added, -_FARTHEST, _FARTHEST)
-    new = _at(old, data, added, misfit.passed_on.by_error, None)
-    return misfit.about(new, old.group.values)
+    added = np.clip(added, -FARTHEST, FARTHEST)
+    offset = -np.einsum("sci,si->sc", misfit.passed_on.by_error, added)
+    return dataclasses.replace(_at(old, data, added), offset=offset, added=added)
 
 
 def with_harmonics(misfit: WeightedMisfit, data: SteadyStates, harmonics: int) -> Predictions:
@@ -70,21 +79,21 @@ def with_harmonics(misfit: WeightedMisfit, data: SteadyStates, harmonics: int) -
     old = misfit.predictions
     none = np.zeros((len(old.chosen.rows), np.asarray(old.chosen.states.error).shape[1]))
     added = none if old.added is None else old.added
-    return _at(old, data, added, misfit.passed_on.by_error, harmonics)
+    new = _at(old, data, added, harmonics)
+    return dataclasses.replace(new, offset=old.offset, added=old.added)
 
 
 def _at(
     old: Predictions,
     data: SteadyStates,
     added: Float[np.ndarray, "state input"],
-    by_error: Float[np.ndarray, "state column input"],
-    harmonics: int | None,
+    harmonics: int | None = None,
 ) -> Predictions:
+    """Predictions of records with something added to them."""
     corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
     order = old.compared.harmonic_order if harmonics is None else harmonics
-    new = as_weighed(predictions_of(old.given, corrected, old.force_gain_std, harmonics=order), old)
-    offset = -np.einsum("sci,si->sc", by_error, added)
-    return dataclasses.replace(new, offset=offset, added=added)
+    new = predictions_of(old.given, corrected, old.force_gain_std, harmonics=order)
+    return as_weighed(new, old)
 
 
 def likely_errors(
@@ -108,7 +117,7 @@ def likely_errors(
             added[:, own] += (std * shared[level])[:, None]
     unknown = np.asarray(misfit.predictions.chosen.phase_unknown)[:, 0]
     added[unknown] = 0.0  # of sizes alone nothing is straight
-    return np.clip(np.where(np.isfinite(added), added, 0.0), -_FARTHEST, _FARTHEST)
+    return np.where(np.isfinite(added), added, 0.0)
 
 
 def with_corrected_records(

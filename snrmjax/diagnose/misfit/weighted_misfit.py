@@ -151,19 +151,29 @@ class WeightedMisfit:
         return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
 
     def about(
-        self, predictions: Predictions, values: Float[np.ndarray, " parameter"]
+        self,
+        predictions: Predictions,
+        values: Float[np.ndarray, " parameter"],
+        added: Float[np.ndarray, "state input"],
     ) -> "WeightedMisfit":
-        """The misfit of the same records made straight about others, with the weights it has.
+        """The misfit of the records made straight where they are without some errors.
 
-        Parameters of the baseline move it as they do beside effects of some `values`.
+        Errors are passed on as a model with effects of some `values` does there.
+        Arguments: `predictions` of the corrected records; `added` is by how much these differ.
         """
+        group = predictions.group
+        there = by_baseline(predictions, group, values)
+        by_error, phasors = predictions.by_error(group, values)
+        by_error = by_error + _of_missing_force(predictions, there.columns[0], by_error)
+        good = np.isfinite(by_error).all(axis=(1, 2))
+        by_error[~good] = self.passed_on.by_error[~good]
+        offset = -np.einsum("sci,si->sc", by_error, added)
+        predictions = dataclasses.replace(predictions, offset=offset, added=added)
         baseline, slopes = _baseline_of(predictions)
+        own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
-        if np.any(values != predictions.group.values):
-            own = by_baseline(predictions, predictions.group, values).slopes[0]
-            slopes = np.where(np.isfinite(own), own, slopes)
-        passed_on = self.passed_on._replace(slopes=slopes)
-        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+        passed_on = ErrorPropagation(by_error, phasors, own)
+        return _weighted_as(predictions, baseline, errors, passed_on, StartChanges())
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -180,7 +190,7 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     group = predictions.group
     baseline, slopes = _baseline_of(predictions)
     errors = ErrorPropagation(*predictions.by_error(group, group.values), slopes)
-    missing = _of_missing_force(predictions, baseline, errors)
+    missing = _of_missing_force(predictions, baseline.columns, errors.by_error)
     passed_on = errors._replace(by_error=errors.by_error + missing)
     return _weighted(predictions, baseline, errors, passed_on, StartChanges())
 
@@ -215,16 +225,18 @@ def by_baseline(
 
 
 def _of_missing_force(
-    predictions: Predictions, baseline: BaselinePrediction, errors: ErrorPropagation
+    predictions: Predictions,
+    columns: Float[np.ndarray, "state column"],
+    by_error: Float[np.ndarray, "state column input"],
 ) -> Float[np.ndarray, "state column input"]:
-    """What errors of the velocity do to the part of the force that the baseline lacks.
+    """What errors of the velocity do to the part of the force that a model lacks.
 
-    That force turns with the velocity, and is taken to grow with it: a baseline that lacks most
-    of the damping would otherwise pass on too little of the errors.
+    That force turns with the velocity, and is taken to grow with it: a model that lacks most of the
+    damping would otherwise pass on too little of the errors.
     """
     sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
-    missing = -(baseline.columns[:, 0] + 1j * baseline.columns[:, 1])
-    change = np.zeros_like(errors.by_error)
+    missing = -(columns[:, 0] + 1j * columns[:, 1])
+    change = np.zeros_like(by_error)
     for place, part in ((1, missing), (1 + sensors, 1j * missing)):
         change[:, 0, place], change[:, 1, place] = part.real, part.imag
     known = np.asarray(predictions.chosen.states.known)
@@ -242,6 +254,17 @@ def _weighted(
         n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
         by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
         passed_on = passed_on._replace(by_error=by_error)
+    return _weighted_as(predictions, baseline, errors, passed_on, starts)
+
+
+def _weighted_as(
+    predictions: Predictions,
+    baseline: BaselinePrediction,
+    errors: ErrorPropagation,
+    passed_on: ErrorPropagation,
+    starts: StartChanges,
+) -> WeightedMisfit:
+    """Weighted as errors are `passed_on`."""
     measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
