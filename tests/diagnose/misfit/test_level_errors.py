@@ -118,7 +118,8 @@ def test_records_as_they_are_carry_nothing_over():
     there = weighted_misfit(at_reference(weighted_misfit(predictions), data))
     assert np.max(np.abs(there.predictions.added)) > 0.05
     back = at_records(there, baseline_fit(there), data)
-    assert np.all(back.predictions.added == 0) and np.all(back.predictions.offset == 0)
+    assert np.all(back.predictions.added == 0)
+    assert np.all(back.predictions.offset == 0)
     plain = weighted_misfit(predictions)
     np.testing.assert_allclose(back.baseline.columns, plain.baseline.columns, rtol=1e-6, atol=1e-9)
 
