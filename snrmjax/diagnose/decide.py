@@ -119,12 +119,16 @@ def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Dou
         return []
     part = part_of(fit.kinds)
     stepped = np.asarray(misfit.predictions.chosen.states.frequency)
+    own_power = power_of_answer(misfit, found.baseline, fit, part) if part else None
+    # Where the answer itself is seen to follow no power of the amplitude the data need not either.
+    if own_power is None and not misfit.predictions.chosen.phase_unknown.any():
+        located = tuple(one for one in located if one.part != part)
     return doubts(
         fit.kinds,
         located,
         misfit.predictions.chosen.orders,
         frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind)),
-        power_of_answer(misfit, found.baseline, fit, part) if part else None,
+        own_power,
         frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0),
         frozenset(k for k in fit.kinds if wider_than_measured(k, fit.of_kind(k)[1:], stepped)),
     )
