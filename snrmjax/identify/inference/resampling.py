@@ -15,11 +15,11 @@ from snrmjax.identify.inference.fitted_curves import (
 )
 from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.inference.table_result import AbstractTable
-from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import BalanceProblem, weighting_at
+from snrmjax.identify.joint.family_fit import SOLVER
+from snrmjax.identify.joint.force_balance import BalanceProblem
 from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import corrected_residuals, on_levels
+from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable
 
@@ -52,7 +52,7 @@ def bootstrap(
     problem, (vector, unravel, own) = padded_problem(fit.problem), fit.packed()
     std = np.sqrt(np.diag(fit.packed().padded_covariance(fit.covariance)))
     every = np.stack([filled(row, len(problem.data.level), 0.0) for row in weights])
-    settings = (vector, unravel, problem, np.array(fit.corrected), jnp.asarray(std))
+    settings = (vector, unravel, problem, jnp.asarray(std))
     return np.asarray(_resampled(*settings, jnp.asarray(every)))[:, own]
 
 
@@ -61,18 +61,16 @@ def _resampled(
     vector: Array,
     unravel: Unravel,
     problem: BalanceProblem,
-    correcting: Array,
     std: Array,
     weights: Array,
 ) -> Float[Array, "sample unknown"]:
-    weighting = weighting_at(unravel(vector), problem)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(weight: Array) -> Array:
-        given = (unravel, problem.with_data(weight=weight), weighting, correcting)
+        given = (unravel, problem.with_data(weight=weight))
         found: optx.Solution = optx.least_squares(
             lambda y, _: corrected_residuals(vector + y * unit, *given),
-            *(on_levels(SOLVER, unravel, problem.data), jnp.zeros_like(vector)),
+            *(SOLVER, jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
         )
@@ -98,12 +96,9 @@ def sample_posterior(
     vector, unravel = fit.vector()
     values, directions = np.linalg.eigh(fit.covariance)
     root = jnp.asarray(directions * np.sqrt(np.maximum(values, 0.0)))
-    weighting = weighting_at(unravel(vector), fit.problem)
 
     def potential(z: Array) -> Array:
-        point = vector + root @ z
-        given = (fit.problem, weighting, jnp.asarray(fit.corrected))
-        return 0.5 * jnp.sum(corrected_residuals(point, unravel, *given) ** 2)
+        return 0.5 * jnp.sum(corrected_residuals(vector + root @ z, unravel, fit.problem) ** 2)
 
     chain = MCMC(
         NUTS(potential_fn=potential), num_warmup=warmup, num_samples=n_samples, progress_bar=False

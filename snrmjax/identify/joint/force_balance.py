@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
@@ -29,10 +31,6 @@ STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 
 _STEPS = 4  # towards every state's most likely errors
 _FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
-_UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
-
-LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
-"""What all states of a level may have in common, relative or in rad."""
 
 
 class BalanceData(eqx.Module):
@@ -148,12 +146,6 @@ def stated_prior(
     return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
 
 
-def with_known_mass(problem: BalanceProblem) -> BalanceProblem:
-    """The problem with the model's modal mass for certain."""
-    linear = problem.prior.linear.at[-1].set(0.0)
-    return dataclasses.replace(problem, prior=dataclasses.replace(problem.prior, linear=linear))
-
-
 def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
     """The states with a measured velocity, and whether their noise is stated.
 
@@ -172,7 +164,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     if not known:
         far = off_resonance_error_factor(velocity)
         errors = np.stack([far, far, far], axis=1)
-    of_force = np.where(errors[:, 0] > 0, errors[:, 0], _UNSTATED_FORCE * errors[:, 1])
+    of_force = np.where(errors[:, 0] > 0, errors[:, 0], FORCE_TO_VELOCITY * errors[:, 1])
     errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
     levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
     return (
@@ -340,15 +332,14 @@ def _weighting(slopes: Float[Array, "state part input"], data: BalanceData) -> W
 
 
 def nearest_errors(
-    unknowns: Unknowns, problem: BalanceProblem, correcting: Bool[Array, ""] | bool = True
+    unknowns: Unknowns, problem: BalanceProblem
 ) -> tuple[Float[Array, "state input"], Weighting]:
     """The most likely errors with which every state balances, from its present correction on.
 
     Each step solves the balance made straight at the last one's end: what is left of the balance
     falls by the ratio of a state's error to the curves' length.
-    Returns the errors, as they are unless `correcting`, and the weighting there.
+    Returns the errors, and the weighting there.
     """
-    steps = jnp.where(correcting, _STEPS, 0) if isinstance(correcting, jax.Array) else _STEPS
 
     def step(_: Array, state: tuple[Array, Array, Weighting]) -> tuple[Array, Array, Weighting]:
         # One more evaluation than steps, for the weighting at the end: a second copy of it outside
@@ -366,7 +357,7 @@ def nearest_errors(
     start = problem.data.correction
     n = len(start)
     none = Weighting(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
-    _, errors, weighting = jax.lax.fori_loop(0, steps + 1, step, (start, start, none))
+    _, errors, weighting = jax.lax.fori_loop(0, _STEPS + 1, step, (start, start, none))
     return errors, weighting
 
 

@@ -13,13 +13,13 @@ from jaxtyping import Array, Float, Int
 
 from snrmjax.identify.curves.packed_curve import packed
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,
     Unknowns,
     recorded_motion,
 )
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 _FEWEST_STATES, _LEVELS = 48, 8  # that there is room for; levels come in so many
 

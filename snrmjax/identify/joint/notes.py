@@ -1,18 +1,18 @@
 """What a joint fit says in words of its data: families, noise, levels, and where the states lie."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2, norm
 
-from snrmjax.identify.joint.fitting import NoiseAndLevels
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceProblem,
     Motion,
     Unknowns,
 )
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
@@ -28,6 +28,24 @@ _COMMON = {
     "damping": "the force or the modal mass has an error",
 }
 """What an error that all levels share may be."""
+
+
+class NoiseAndLevels(NamedTuple):
+    """1σ of the noise and of the errors that the states of a level share."""
+
+    noise: float  # by which the residuals exceed the stated noise
+    noise_std: float
+    level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
+
+    @property
+    def contradicts_upward(self) -> bool:
+        """Whether the residuals are too large for the stated noise."""
+        return self.noise - 3 * self.noise_std > 1
+
+    @property
+    def contradicts_downward(self) -> bool:
+        """Whether they are too small for it."""
+        return self.noise + 3 * self.noise_std < 1
 
 
 def notes_on_noise(

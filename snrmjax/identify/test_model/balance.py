@@ -38,7 +38,8 @@ class Balance(NamedTuple):
         omega, level = states.frequency, states.level
         gain, phase, stiffer, lossier = unknowns[places.levels][level].T
         velocity = np.exp(errors[:, 1] + 1j * (errors[:, 2] - phase - unknowns[PHASE]))
-        velocity = states.velocity * velocity * np.exp(0.0 if states.force_is_free else -gain)
+        velocity = velocity * np.exp(0.0 if states.force_is_free else -gain)
+        velocity = self.own_velocity(unknowns) * velocity
         force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
         force = force + unknowns[OFFSET] * np.min(states.force)
         z = 1j * omega * states.constant * force / velocity
@@ -49,9 +50,17 @@ class Balance(NamedTuple):
         slope = (1 + stiffer) * k * (by_log @ unknowns[places.stiffness]) + 1j * omega * (
             1 + lossier
         ) * d * (by_log @ unknowns[places.damping])
-        model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
+        wander = errors[:, 3] if errors.shape[1] > 3 else 0.0
+        model = (1 + stiffer + wander) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
-        return BalancedStates(force, z, model, slope, values, stiffness, damping)
+        inputs = errors.shape[1]
+        return BalancedStates(force, z, model, slope, values, stiffness, damping, inputs)
+
+    def own_velocity(self, unknowns: np.ndarray) -> Complex[np.ndarray, " state"]:
+        """The mode's own velocity as it was recorded, by what the other modes' parameters are."""
+        if self.states.beside is None:
+            return self.states.velocity
+        return self.states.velocity - self.states.beside @ unknowns[self.places.others]
 
     def with_discrepancy(self, unknowns: np.ndarray, errors: np.ndarray) -> "Balance":
         """With functions of what one mode leaves off resonance: of phase and log amplitude.
@@ -125,6 +134,9 @@ class Balance(NamedTuple):
         design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
             :, None
         ] * now.values
+        if states.beside is not None:
+            moved = -states.beside / self.own_velocity(unknowns)[:, None]
+            design[:, places.others] = own[:, None] * moved + slope[:, None] * moved.real
         of_gain = own if states.force_is_free else -own - slope
         columns = (of_gain, -1j * own, now.stiffness, now.damping)
         for k, column in enumerate(columns):
@@ -162,11 +174,15 @@ class BalancedStates(NamedTuple):
     values: Float[np.ndarray, "state function"]
     stiffness: Float[np.ndarray, " state"]  # κK
     damping: Complex[np.ndarray, " state"]  # iΩκδ
+    inputs: int  # errors that a state may have
 
     @property
     def by_error(self) -> Complex[np.ndarray, "state input"]:
-        """Derivatives of what is left by relative errors of force and velocity, and of phase."""
-        return np.stack([self.z, -self.z - self.slope, -1j * self.z], axis=1)
+        """Derivatives of what is left by relative errors of force and velocity, of phase, and of
+        a stiffness that wanders.
+        """
+        columns = [self.z, -self.z - self.slope, -1j * self.z, -self.stiffness + 0j]
+        return np.stack(columns[: self.inputs], axis=1)
 
 
 class Straight(NamedTuple):

@@ -7,8 +7,8 @@ from truths.joint_fits import noisy_fit
 
 import snrmjax as sj
 from snrmjax.identify.inference.sensitivity import contributions
-from snrmjax.identify.joint.fitting import NoiseAndLevels
 from snrmjax.identify.joint.notes import (
+    NoiseAndLevels,
     notes_on_autocorrelation,
     notes_on_level_errors,
     notes_on_noise,
