@@ -14,6 +14,7 @@ from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
 from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
 from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.joint.posterior_view import LEAST_LEFT
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
@@ -25,7 +26,6 @@ MOST_STEPS = 200  # of Levenberg–Marquardt in a fit
 _ROUNDS = 6  # of fitting and estimating the noise anew, at most
 _SETTLED = 0.01  # relative change of the noise, in the last of them
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
-_LEAST_LEFT = 0.25  # of the residuals, that no number of unknowns can take
 
 
 class FitStatus(IntEnum):
@@ -92,7 +92,7 @@ def fit_families(
         level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))
         told = share_told_by(residuals, level, frequency)
         rows = told * residuals.size
-        left = max(rows - degrees_spent(jacobian, answer.residuals.size), _LEAST_LEFT * rows)
+        left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
         found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
         noise = noise._replace(noise=found, noise_std=found / float(np.sqrt(2 * left)))
         wanted = 1.0 if believed and not noise.contradicts_upward else max(found, 1e-12)
