@@ -89,6 +89,9 @@ class TestPosterior(NamedTuple):
     effective_unknowns: float  # that the states, and not their priors, tell
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
+    weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
+    share: float  # of the states that count, where neighbours err alike
+    settled: bool  # whether the last round moved nothing by more than its error
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -114,22 +117,25 @@ class TestPosterior(NamedTuple):
 
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
-        values, slopes = self.basis.values(amplitude)
-        mass = 1 + self.mean[MASS]
-        reference = self.places.reference
-        n = len(values)
-        rows = np.zeros((n, 2, len(self.mean)))
-        found = np.zeros((n, 2))
-        steep = np.zeros((n, 2))
-        for k, (own, unit) in enumerate(
-            zip((self.places.stiffness, self.places.damping), self.units, strict=True)
-        ):
-            found[:, k] = unit * (values @ self.mean[own]) / mass
-            steep[:, k] = unit * (slopes @ self.mean[own]) / mass
-            rows[:, k, own] = unit * values / mass
-            rows[:, k, MASS] = -found[:, k] / mass
+        values, by_log = self.basis.values(amplitude)
+        found, steep = (self._rows(terms) @ self.mean for terms in (values, by_log))
+        rows = self.slopes(amplitude)
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
-        return CurveValues(found[:, 0] + reference, found[:, 1], covariance, steep)
+        return CurveValues(found[:, 0] + self.places.reference, found[:, 1], covariance, steep)
+
+    def slopes(self, amplitude: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point two n"]:
+        """Derivatives of ω̃² and δ at displacement amplitudes (m) by all unknowns."""
+        rows = self._rows(self.basis.values(amplitude)[0])
+        rows[:, :, MASS] = -(rows @ self.mean) / (1 + self.mean[MASS])
+        return rows
+
+    def _rows(self, terms: Float[np.ndarray, "point function"]) -> Float[np.ndarray, "point two n"]:
+        """Curves of these functions by the unknowns, at their modal mass."""
+        rows = np.zeros((len(terms), 2, len(self.mean)))
+        both = zip((self.places.stiffness, self.places.damping), self.units, strict=True)
+        for k, (own, unit) in enumerate(both):
+            rows[:, k, own] = unit * terms / (1 + self.mean[MASS])
+        return rows
 
 
 @on_one_core
@@ -161,7 +167,8 @@ def fit_test(
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
     basis = CurveBasis.of(states.amplitude, most_knots or MOST_KNOTS)
-    places = places_of(basis, states.n_levels, discrepancy, reference)
+    n_others = 0 if states.beside is None else states.beside.shape[1]
+    places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
@@ -205,6 +212,9 @@ def fit_test(
         float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
         places,
         _differing(flat, found.point, bounds, states),
+        walk.balance.weight,
+        found.equations.share,
+        walk.still,
     )
 
 
@@ -238,7 +248,7 @@ class _Walk:
         self.robust, self.tempered = robust, tempered
         self.start = starting_point(balance.states, balance.basis, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
-        self.mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * discrepancy)
+        self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
         self.found: _Found | None = None
         self.turn, self.still, self.share = 0, False, 1.0
