@@ -140,10 +140,11 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
         if one is not None and (one.kinds not in best or one.right > best[one.kinds].right):
             best[one.kinds] = one
     done: list[_Compared] = []
-    for kinds in _worth_refining(best) if refined is not None else ():
-        if _is_far_behind(best[kinds], done):
+    for kinds in _worth_refining(best):
+        if refined is None or _is_far_behind(best[kinds], done):
             continue
-        again = _compared(*refined(best[kinds].misfit, best[kinds].fit), sizes)
+        misfit, fit = refined(best[kinds].misfit, best[kinds].fit)
+        again = _compared(misfit, fit, sizes)
         if again is not None:
             best[kinds] = again
             done.append(again)

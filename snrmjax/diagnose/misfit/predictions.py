@@ -111,9 +111,9 @@ class Predictions:
     reference: Any = None  # `misfit.reference.Reference`, once it is known
     level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
     unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
-    # What is added to the columns where levels were corrected for errors that count as shared ones.
+    # What is added to the columns where records were corrected for errors that still count.
     offset: Float[np.ndarray, "state column"] | None = None
-    added: tuple[np.ndarray, np.ndarray] | None = None  # to log velocities and phases, by levels
+    added: Float[np.ndarray, "state input"] | None = None  # to log velocities and phases
     error_scale: float = 1.0  # of errors over those that were stated or assumed
     free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
