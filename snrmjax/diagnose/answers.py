@@ -9,16 +9,16 @@ from snrmjax.diagnose import evidence, priors
 from snrmjax.diagnose.checks.cross_validation import rms_misfit
 from snrmjax.diagnose.checks.neighbours import neighbour_noise
 from snrmjax.diagnose.decide import most_probable
+from snrmjax.diagnose.misfit.corrected_records import (
+    already_added,
+    likely_errors,
+    with_harmonics,
+    without_errors,
+)
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     at_phases_of,
     baseline_fit,
-)
-from snrmjax.diagnose.misfit.level_errors import (
-    FARTHEST,
-    at_likely_errors,
-    at_records,
-    with_harmonics,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions
@@ -36,7 +36,7 @@ _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 _ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
 _CORRECTIONS = 6  # of the records, at most
-_STILL = 0.02  # relative or rad, that errors may have moved in the last of them
+_STRAIGHT = 0.003  # relative or rad, within which the misfit is straight
 _BETTER = 0.9  # share of χ² that is left with many harmonics
 _BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
 _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
@@ -109,7 +109,8 @@ class Search(NamedTuple):
         found = self._corrected(misfit, fit)
         if found is not None and is_noise(*found):
             return found
-        plain = at_records(misfit, fit, self.data)
+        none = np.zeros_like(already_added(misfit.predictions))
+        plain = without_errors(misfit, fit, self.data, none)
         other = self._corrected(plain, refitted(plain, self.scales, fit))
         both = [pair for pair in (found, other) if pair is not None]
         return min(both, key=lambda pair: pair[1].chi_square, default=(misfit, fit))
@@ -118,16 +119,19 @@ class Search(NamedTuple):
         self, misfit: WeightedMisfit, fit: EffectFit
     ) -> tuple[WeightedMisfit, EffectFit] | None:
         """The fit where nothing moves any more; None where no errors explain the records."""
+        moved = np.inf
         for _ in range(_CORRECTIONS):
             if not np.isfinite(fit.chi_square):
                 return None
-            straight, moved, largest = at_likely_errors(misfit, fit, self.data)
-            if largest > FARTHEST:
+            added = likely_errors(misfit, fit.rows)
+            if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
                 return None
-            if straight is misfit:
+            moved = np.max(np.abs(added - already_added(misfit.predictions)), initial=0.0)
+            if moved < _STRAIGHT:
                 return misfit, fit
-            misfit, fit = straight, refitted(straight, self.scales, fit)
-        return (misfit, fit) if moved < _STILL else None
+            misfit = without_errors(misfit, fit, self.data, added)
+            fit = refitted(misfit, self.scales, fit)
+        return (misfit, fit) if moved < priors.SETTLED_ERROR else None
 
 
 def best_answer(search: Search, predictions: Predictions) -> Answered:
@@ -160,7 +164,7 @@ def with_more_harmonics(answered: Answered, search: Search) -> Answered:
     stated = found.misfit.predictions.chosen.noise_stated
     if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
-    many = with_harmonics(found.misfit, search.data, MANY_HARMONICS)
+    many = with_harmonics(found.misfit.predictions, search.data, MANY_HARMONICS)
     winner = refitted(weighted_misfit(many), search.scales, found.fit)
     if winner.chi_square > _BETTER * found.fit.chi_square:
         return answered

@@ -32,9 +32,9 @@ from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimat
 from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
+from snrmjax.diagnose.misfit.corrected_records import at_reference
 from snrmjax.diagnose.misfit.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
-from snrmjax.diagnose.misfit.level_errors import at_reference
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
@@ -109,7 +109,7 @@ def diagnose_model(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
-    predictions = at_reference(misfit, data)
+    predictions = at_reference(predictions, data)
     scales = scales_of(predictions)
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)

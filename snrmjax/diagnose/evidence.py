@@ -39,7 +39,6 @@ NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 _AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
 _REFINED = 8  # answers that are made straight at their own errors
-_FAR = 25.0  # of ln p, behind an answer that fits
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
 
@@ -186,7 +185,7 @@ def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
     best = max(done, key=lambda each: each.right)
     freedom = best.misfit.n_rows - len(best.fit.values)
     fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
-    return fits and one.right < best.right - _FAR
+    return fits and one.right < best.right - priors.FAR_BEHIND
 
 
 def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:

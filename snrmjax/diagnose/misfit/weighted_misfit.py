@@ -148,32 +148,28 @@ class WeightedMisfit:
 
     def reweighted(self, passed_on: ErrorPropagation) -> "WeightedMisfit":
         """The same misfit with errors passed on in another way."""
+        passed_on = _by_reference(self.predictions, passed_on)
         return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
 
     def about(
-        self,
-        predictions: Predictions,
-        values: Float[np.ndarray, " parameter"],
-        added: Float[np.ndarray, "state input"],
+        self, predictions: Predictions, values: Float[np.ndarray, " parameter"]
     ) -> "WeightedMisfit":
-        """The misfit of the records made straight where they are without some errors.
+        """The misfit of the records made straight about corrected ones, which `predictions` are of.
 
         Errors are passed on as a model with effects of some `values` does there.
-        Arguments: `predictions` of the corrected records; `added` is by how much these differ.
         """
-        group = predictions.group
-        there = by_baseline(predictions, group, values)
-        by_error, phasors = predictions.by_error(group, values)
-        by_error = by_error + _of_missing_force(predictions, there.columns[0], by_error)
-        good = np.isfinite(by_error).all(axis=(1, 2))
-        by_error[~good] = self.passed_on.by_error[~good]
-        offset = -np.einsum("sci,si->sc", by_error, added)
-        predictions = dataclasses.replace(predictions, offset=offset, added=added)
+        plain = dataclasses.replace(predictions, offset=None)
+        there = by_baseline(plain, plain.group, values)
+        by_error, phasors = plain.by_error(plain.group, values)
+        by_error = by_error + _of_missing_force(plain, there.columns[0], by_error)
+        lost = ~np.isfinite(by_error).all(axis=(1, 2))
+        by_error[lost] = self.passed_on.by_error[lost]
+        predictions = plain.carried_back(by_error)
         baseline, slopes = _baseline_of(predictions)
         own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
         passed_on = ErrorPropagation(by_error, phasors, own)
-        return _weighted_as(predictions, baseline, errors, passed_on, StartChanges())
+        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -186,13 +182,20 @@ class WeightedMisfit:
 
 
 def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
-    """The baseline's misfit, weighted with the stated noise as the baseline passes it on."""
-    group = predictions.group
-    baseline, slopes = _baseline_of(predictions)
-    errors = ErrorPropagation(*predictions.by_error(group, group.values), slopes)
-    missing = _of_missing_force(predictions, baseline.columns, errors.by_error)
-    passed_on = errors._replace(by_error=errors.by_error + missing)
-    return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+    """The baseline's misfit, weighted with the stated noise.
+
+    Errors of the force are passed on as smooth curves do (`misfit.reference`), all else as the
+    baseline does.
+    """
+    plain = dataclasses.replace(predictions, offset=None)
+    baseline, slopes = _baseline_of(plain)
+    errors = ErrorPropagation(*plain.by_error(plain.group, plain.group.values), slopes)
+    missing = _of_missing_force(plain, baseline.columns, errors.by_error)
+    passed_on = _by_reference(plain, errors._replace(by_error=errors.by_error + missing))
+    if plain.added is not None:
+        plain = plain.carried_back(passed_on.by_error)
+        baseline, _ = _baseline_of(plain)
+    return _weighted(plain, baseline, errors, passed_on, StartChanges())
 
 
 def _baseline_of(
@@ -243,21 +246,16 @@ def _of_missing_force(
     return np.where(known[:, :, None], change, 0.0)
 
 
+def _by_reference(predictions: Predictions, passed_on: ErrorPropagation) -> ErrorPropagation:
+    """Errors of the force passed on as smooth curves do, where these are known."""
+    if predictions.reference is None:
+        return passed_on
+    n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
+    by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
+    return passed_on._replace(by_error=by_error)
+
+
 def _weighted(
-    predictions: Predictions,
-    baseline: BaselinePrediction,
-    errors: ErrorPropagation,
-    passed_on: ErrorPropagation,
-    starts: StartChanges,
-) -> WeightedMisfit:
-    if predictions.reference is not None:
-        n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
-        by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
-        passed_on = passed_on._replace(by_error=by_error)
-    return _weighted_as(predictions, baseline, errors, passed_on, starts)
-
-
-def _weighted_as(
     predictions: Predictions,
     baseline: BaselinePrediction,
     errors: ErrorPropagation,

@@ -7,7 +7,6 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 """
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,48 +17,25 @@ from snrmjax.diagnose.misfit.reference import as_weighed
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.measure.states import SteadyStates
 
-_SMALL = 0.003  # relative or rad, of errors that have moved: straight as it is
-FARTHEST = 0.5
-"""Relative or rad: an answer that needs larger errors explains nothing."""
 
-
-class Corrected(NamedTuple):
-    """A misfit made straight at a fit's most likely errors."""
-
-    misfit: WeightedMisfit
-    moved: float  # relative or rad: by how much errors have moved, at most
-    largest: float  # of all errors
-
-
-def at_likely_errors(misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates) -> Corrected:
-    """The misfit made straight at a fit's most likely errors; the same where it is straight there.
+def without_errors(
+    misfit: WeightedMisfit,
+    fit: EffectFit,
+    data: SteadyStates,
+    added: Float[np.ndarray, "state input"],
+) -> WeightedMisfit:
+    """The misfit made straight where records have something added to them, as a fit has it there.
 
     `data` are the records as they were measured.
     """
-    old = misfit.predictions
-    added = likely_errors(misfit, fit.rows)
-    before = np.zeros_like(added) if old.added is None else old.added
-    moved = float(np.max(np.abs(added - before), initial=0.0))
-    largest = float(np.max(np.abs(added), initial=0.0))
-    if moved < _SMALL or largest > FARTHEST:
-        return Corrected(misfit, moved, largest)
-    there = misfit.about(_at(old, data, added), values_of(misfit, fit), added)
-    return Corrected(there, moved, largest)
+    return misfit.about(_at(misfit.predictions, data, added), values_of(misfit, fit))
 
 
-def at_records(misfit: WeightedMisfit, fit: EffectFit, data: SteadyStates) -> WeightedMisfit:
-    """The misfit made straight at the records as they are."""
-    old = misfit.predictions
-    none = np.zeros_like(np.asarray(old.chosen.states.error))
-    return misfit.about(_at(old, data, none), values_of(misfit, fit), none)
-
-
-def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> Predictions:
+def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
     """Predictions of the records without the errors that smooth curves find, whatever the law is.
 
     Fits of effects begin there.
     """
-    old = misfit.predictions
     reference = old.reference
     if reference is None or reference.posterior.states.force_is_free:
         return old
@@ -69,18 +45,18 @@ def at_reference(misfit: WeightedMisfit, data: SteadyStates) -> Predictions:
     own = found.corrections[:, 1:] - found.level_errors[level][:, :2]
     added[reference.rows, 1 : n_sensors + 1] = own[:, [0]]
     added[reference.rows, n_sensors + 1 :] = own[:, [1]]
-    added = np.clip(added, -FARTHEST, FARTHEST)
-    offset = -np.einsum("sci,si->sc", misfit.passed_on.by_error, added)
-    return dataclasses.replace(_at(old, data, added), offset=offset, added=added)
+    return _at(old, data, added)
 
 
-def with_harmonics(misfit: WeightedMisfit, data: SteadyStates, harmonics: int) -> Predictions:
-    """The predictions of a misfit by motions with other harmonics."""
-    old = misfit.predictions
-    none = np.zeros((len(old.chosen.rows), np.asarray(old.chosen.states.error).shape[1]))
-    added = none if old.added is None else old.added
-    new = _at(old, data, added, harmonics)
-    return dataclasses.replace(new, offset=old.offset, added=old.added)
+def with_harmonics(old: Predictions, data: SteadyStates, harmonics: int) -> Predictions:
+    """The same predictions by motions with other harmonics."""
+    return _at(old, data, already_added(old), harmonics)
+
+
+def already_added(predictions: Predictions) -> Float[np.ndarray, "state input"]:
+    """What is added to the records of some predictions."""
+    added = predictions.added
+    return np.zeros_like(np.asarray(predictions.chosen.states.error)) if added is None else added
 
 
 def _at(
@@ -89,11 +65,11 @@ def _at(
     added: Float[np.ndarray, "state input"],
     harmonics: int | None = None,
 ) -> Predictions:
-    """Predictions of records with something added to them."""
+    """Predictions of records with something added to them; it counts once they are weighted."""
     corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
     order = old.compared.harmonic_order if harmonics is None else harmonics
     new = predictions_of(old.given, corrected, old.force_gain_std, harmonics=order)
-    return as_weighed(new, old)
+    return dataclasses.replace(as_weighed(new, old), added=added)
 
 
 def likely_errors(
