@@ -22,13 +22,13 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from scipy.optimize import least_squares
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import values_with_slopes
-from snrmjax.identify.joint.fitting import _solve
-from snrmjax.identify.joint.force_balance import weighting_at
-from snrmjax.identify.joint.residuals import all_residuals
+from snrmjax.identify.joint.family_fit import MOST_STEPS, SOLVER
+from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 
 HERTZ = 2 * np.pi
@@ -155,8 +155,17 @@ def halves(data: sj.measure.SteadyStates, model: sj.model.Structure, free: tuple
 
 
 @compiled
-def _residuals(vector, unravel, problem, weighting):
-    return all_residuals(vector, unravel, problem, weighting)
+def _residuals(vector, unravel, problem):
+    return corrected_residuals(vector, unravel, problem)
+
+
+@compiled
+def _solve(vector, unravel, problem, unit):
+    return optx.least_squares(
+        lambda y, _: corrected_residuals(y * unit, unravel, problem),
+        *(SOLVER, vector / unit),
+        max_steps=MOST_STEPS,
+    ).value * unit  # fmt: skip
 
 
 def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
@@ -168,8 +177,7 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
 
     fit = fit_once()
     vector, unravel = fit.vector()
-    weighting = weighting_at(unravel(vector), fit.problem)
-    given = (unravel, fit.problem, weighting)
+    given = (unravel, fit.problem)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def residuals(y: np.ndarray) -> np.ndarray:
@@ -186,8 +194,7 @@ def speed(data: sj.measure.SteadyStates, model: sj.model.Structure) -> None:
 
     def solve() -> np.ndarray:
         near = jnp.asarray(vector + start * unit)
-        frozen = np.array(False)  # the same residuals: weights and corrections stay
-        return np.asarray(_solve(near, *given, frozen, jnp.asarray(100.0 * unit))[0])
+        return np.asarray(_solve(near, *given, jnp.asarray(100.0 * unit)))
 
     derivatives()
     found, best = (solve() - vector) / unit, least_squares(residuals, start, x_scale=1.0)

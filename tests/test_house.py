@@ -56,9 +56,12 @@ SUB_ROOMS = {
     "identify.joint": {
         *("identify.checks", "identify.curves", "identify.pointwise", "identify.test_model"),
     },
-    "identify.prediction": {"identify.curves", "identify.pointwise", "identify.joint"},
+    "identify.prediction": {
+        *("identify.curves", "identify.pointwise", "identify.joint", "identify.test_model"),
+    },
     "identify.inference": {
         *("identify.curves", "identify.pointwise", "identify.joint", "identify.prediction"),
+        "identify.test_model",
     },
     "identify.calibrate": {"identify.pointwise"},
     "identify.modal": set(),

@@ -33,7 +33,7 @@ from .inference.sensitivity import (
     contributions,
     sensitivity,
 )
-from .joint.fitting import FitStatus
+from .joint.family_fit import FitStatus
 from .joint.joint_fit import JointFit, NoiseEstimate, fit_jointly
 from .modal.base_motion import BaseResponses, relative_to_base
 from .modal.free_decay import DecayModes, fit_free_decay

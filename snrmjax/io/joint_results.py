@@ -16,15 +16,15 @@ from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.located_points import FittedPoint
 from snrmjax.identify.inference.optimal_design import NextMeasurement, NextMeasurements
 from snrmjax.identify.inference.sensitivity import Contribution
-from snrmjax.identify.joint.fitting import FitStatus
+from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     PriorStd,
     Unknowns,
 )
 from snrmjax.identify.joint.joint_fit import JointFit, NoiseEstimate
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.io.files import FilePath, read_text, write_atomically
 from snrmjax.io.results import write_values
 from snrmjax.io.tables import write_table

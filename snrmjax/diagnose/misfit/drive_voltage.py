@@ -50,8 +50,8 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
         # Few need it, and it takes as long to import as half the others.
         from snrmjax.identify.checks.instruments import notes_on_instruments
         from snrmjax.identify.inference.corrected_states import corrected_states
-        from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
         from snrmjax.identify.joint.joint_fit import fit_jointly
+        from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
         fit = fit_jointly(data, model.modes, free=("force_gain",))
         gain = float(np.exp(fit.unknowns.log_force_gain))

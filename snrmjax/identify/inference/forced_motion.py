@@ -10,7 +10,6 @@ from jaxtyping import Array, Complex, Float
 from scipy.linalg import block_diag
 
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     Unknowns,
     log_modal_mass,
     with_deviations,
@@ -18,6 +17,7 @@ from snrmjax.identify.joint.force_balance import (
 from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES, NewLevel
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.blocks import by_blocks
 from snrmjax.numerics.compiled import compiled

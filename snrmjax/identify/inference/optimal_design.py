@@ -16,16 +16,17 @@ from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_re
 from snrmjax.identify.inference.located_points import Kind, point_slopes
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     Unknowns,
+    filled,
     no_errors,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_levels
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import whitened
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.blocks import padded
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable

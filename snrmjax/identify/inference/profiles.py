@@ -9,8 +9,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import BalanceProblem, weighting_at
+from snrmjax.identify.joint.family_fit import SOLVER
+from snrmjax.identify.joint.force_balance import BalanceProblem
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import (
@@ -88,9 +88,7 @@ class Profile(AbstractResult):
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
     """χ² against one unknown, everything else fitted anew at each of its values.
 
-    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile. It
-    takes states for independent, though: where the residuals of neighbours are correlated
-    (`fit.noise.autocorrelation`), it is too narrow, and ±1.96σ is right.
+    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile.
 
     Arguments: `name` one of `fit.names()`; `reach` in standard deviations on either side.
     Raises `ValueError` for a name that the fit does not have.
@@ -105,7 +103,7 @@ def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5)
     values = float(vector[index]) + std[index] * offsets
     cost = np.asarray(
         _pinned(
-            *(vector, unravel, padded_problem(fit.problem), np.array(fit.corrected)),
+            *(vector, unravel, padded_problem(fit.problem)),
             *(jnp.asarray(std), np.array(index), jnp.asarray(values)),
         )
     )
@@ -139,18 +137,16 @@ def _pinned(
     vector: Array,
     unravel: Unravel,
     problem: BalanceProblem,
-    correcting: Array,
     std: Array,
     index: Array,
     values: Array,
 ) -> Float[Array, " value"]:
-    weighting = weighting_at(unravel(vector), problem)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(value: Array) -> Array:
         def residuals(y: Array, _: None = None) -> Array:
             point = vector + y * unit
-            free = corrected_residuals(point, unravel, problem, weighting, correcting)
+            free = corrected_residuals(point, unravel, problem)
             held = _PIN * (point[index] - value) / unit[index]
             return jnp.append(free, held)
 

@@ -9,17 +9,17 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from snrmjax.identify.inference.fitted_curves import (
-    curve_values,
     displacement_near,
+    on_backbone,
     values_with_slopes,
 )
 from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.inference.table_result import AbstractTable
-from snrmjax.identify.joint.fitting import SOLVER
-from snrmjax.identify.joint.force_balance import BalanceProblem, weighting_at
-from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_problem
+from snrmjax.identify.joint.family_fit import SOLVER
+from snrmjax.identify.joint.force_balance import BalanceProblem, filled
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.joint.residuals import corrected_residuals, on_levels
+from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.result import Variable
 
@@ -52,7 +52,7 @@ def bootstrap(
     problem, (vector, unravel, own) = padded_problem(fit.problem), fit.packed()
     std = np.sqrt(np.diag(fit.packed().padded_covariance(fit.covariance)))
     every = np.stack([filled(row, len(problem.data.level), 0.0) for row in weights])
-    settings = (vector, unravel, problem, np.array(fit.corrected), jnp.asarray(std))
+    settings = (vector, unravel, problem, jnp.asarray(std))
     return np.asarray(_resampled(*settings, jnp.asarray(every)))[:, own]
 
 
@@ -61,18 +61,16 @@ def _resampled(
     vector: Array,
     unravel: Unravel,
     problem: BalanceProblem,
-    correcting: Array,
     std: Array,
     weights: Array,
 ) -> Float[Array, "sample unknown"]:
-    weighting = weighting_at(unravel(vector), problem)
     unit = jnp.where(std > 0, std, 1.0)
 
     def one(weight: Array) -> Array:
-        given = (unravel, problem.with_data(weight=weight), weighting, correcting)
+        given = (unravel, problem.with_data(weight=weight))
         found: optx.Solution = optx.least_squares(
             lambda y, _: corrected_residuals(vector + y * unit, *given),
-            *(on_levels(SOLVER, unravel, problem.data), jnp.zeros_like(vector)),
+            *(SOLVER, jnp.zeros_like(vector)),
             max_steps=200,
             throw=False,
         )
@@ -98,12 +96,9 @@ def sample_posterior(
     vector, unravel = fit.vector()
     values, directions = np.linalg.eigh(fit.covariance)
     root = jnp.asarray(directions * np.sqrt(np.maximum(values, 0.0)))
-    weighting = weighting_at(unravel(vector), fit.problem)
 
     def potential(z: Array) -> Array:
-        point = vector + root @ z
-        given = (fit.problem, weighting, jnp.asarray(fit.corrected))
-        return 0.5 * jnp.sum(corrected_residuals(point, unravel, *given) ** 2)
+        return 0.5 * jnp.sum(corrected_residuals(vector + root @ z, unravel, fit.problem) ** 2)
 
     chain = MCMC(
         NUTS(potential_fn=potential), num_warmup=warmup, num_samples=n_samples, progress_bar=False
@@ -196,21 +191,19 @@ def compare_bands(
     """The band of both curves by covariance, implicit derivatives, bootstrap and NUTS.
 
     The bootstrap knows nothing of errors that a level shares: where those rule, it is narrower.
-    Only the fit's own covariance includes the correlation of neighbouring states' residuals.
+    The bootstrap does not know of correlated residuals of neighbouring states either.
     Refits of the bootstrap that do not converge are left out and counted.
     """
     at = np.asarray(velocity, dtype=np.float64)
     values, slopes = values_with_slopes(fit, at)
-    near = jnp.asarray(displacement_near(fit, at))
-    _, unravel, own = fit.packed()
+    near, (_, unravel) = displacement_near(fit, at), fit.vector()
 
     def spread_of(samples: np.ndarray) -> np.ndarray:
-        whole = np.tile(np.asarray(fit.packed().vector), (len(samples), 1))
-        whole[:, own] = samples
-        drawn = np.array(_curves_of(unravel, jnp.asarray(whole), jnp.asarray(at), near))
+        good = samples[np.all(np.isfinite(samples), axis=1)]
+        drawn = np.array([on_backbone(unravel(one), at, near).values for one in good])
         with np.errstate(invalid="ignore"):
             drawn[:, :, 0] = np.sqrt(drawn[:, :, 0])
-        return np.nanstd(drawn, axis=0)
+        return np.nanstd(drawn, axis=0) if len(good) else np.full((len(at), 2), np.nan)
 
     def linear(covariance: np.ndarray) -> np.ndarray:
         std = np.sqrt(np.einsum("acp,pq,acq->ac", slopes, covariance, slopes))
@@ -233,8 +226,3 @@ def compare_bands(
         for a in range(len(at))
     )
     return ComparedBands(rows, int(np.sum(~np.all(np.isfinite(refits), axis=1))))
-
-
-@compiled
-def _curves_of(unravel: Unravel, samples: Array, velocity: Array, near: Array) -> Array:
-    return jax.lax.map(lambda v: curve_values(unravel(v), velocity, near), samples)

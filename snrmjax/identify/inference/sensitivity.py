@@ -15,7 +15,6 @@ from snrmjax.identify.inference.fitted_curves import (
 )
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     STATE_ERRORS,
     BalanceProblem,
     Unknowns,
@@ -31,6 +30,7 @@ from snrmjax.identify.joint.residuals import (
     all_residuals,
     whitened,
 )
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import inverse_of
 from snrmjax.numerics.result import Variable
@@ -115,17 +115,15 @@ def sensitivity(fit: JointFit) -> Sensitivity:
 
     At the minimum of χ²(θ, data) the implicit function theorem gives dθ/dy = −H⁻¹ ∂²χ²/∂θ∂y with
     the whole Hessian H, where Gauss and Newton leave out the residuals' curvature; the covariance
-    of independent errors of the stated size follows. Where states are corrected for
-    their errors, they are so anew; else weights count as given.
-
-    The correlation of neighbouring states' residuals is not in it.
+    of independent errors of the stated size follows. States are corrected for their most likely
+    errors anew.
 
     Returns a `Sensitivity`. One call costs about as much as a fit; its program is compiled anew
     for another number of states, or another family.
     """
     vector, unravel = fit.vector()
-    given = (vector, unravel, fit.problem, np.array(fit.corrected))
-    hessian, mixed = (np.asarray(part) for part in _second_order(*given))
+    found = _second_order(vector, unravel, fit.problem)
+    hessian, mixed = (np.asarray(part) for part in found)
     # In units of the unknowns' own curvature: a value at rest may be known a million times worse.
     curvature = np.diagonal(hessian)
     unit = 1 / np.sqrt(np.where(curvature > 0, curvature, 1.0))
@@ -149,9 +147,8 @@ def _second_order(
     vector: Array,
     unravel: Unravel,
     problem: BalanceProblem,
-    correcting: Array,
 ) -> tuple[Array, Array]:
-    data, weighting = problem.data, weighting_at(unravel(vector), problem)
+    data = problem.data
 
     def anew(unknowns: Unknowns, error: Array) -> Array:
         """Records that err by so much, corrected for their most likely errors again."""
@@ -163,14 +160,10 @@ def _second_order(
         errors, own = nearest_errors(unknowns, erring)
         return whitened(unknowns, erring.with_data(correction=errors), own)
 
-    def as_it_is(unknowns: Unknowns, error: Array) -> Array:
-        erring = problem.with_data(correction=data.correction + error)
-        return whitened(unknowns, erring, weighting)
-
     def gradient(vector: Array, error: Array) -> Array:
         def cost(vector: Array) -> Array:
             unknowns = unravel(vector)
-            points = jax.lax.cond(correcting, anew, as_it_is, unknowns, error)
+            points = anew(unknowns, error)
             curves = (unknowns.squared_frequency, unknowns.modal_damping)
             priors = jnp.sum(unknowns.level**2) + jnp.sum(unknowns.linear**2)
             priors = priors + sum(jnp.sum(c.prior_residuals() ** 2) for c in curves)
@@ -210,8 +203,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. The correlation of
-    neighbouring states' residuals adds to it.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. Where the residuals of
+    neighbouring states are correlated, random errors count for as much more.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
@@ -249,12 +242,6 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
             rows.append((name, kind, column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
-    if np.any(fit.noise.autocorrelation > 0):
-        name = "correlation of neighbouring residuals"
-        unit = np.sqrt(np.diagonal(inverse))
-        added = (fit.covariance - inverse) / np.outer(unit, unit)
-        values, directions = np.linalg.eigh(added)
-        rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
     parts = np.stack(summed)
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()

@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from snrmjax.identify.curves.family_base import AbstractCurve, AbstractFamily
 from snrmjax.identify.pointwise.backbone_points import modal_filter, off_resonance_error_factor
 from snrmjax.identify.pointwise.snrm import reference_sensor
+from snrmjax.identify.test_model.priors import FORCE_TO_VELOCITY
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.states import SteadyStates, check_phases, relative_errors
 from snrmjax.model.modes import UNSTATED_MODAL_MASS_STD, LinearModes, residual_velocity
 from snrmjax.model.structures import Structure
@@ -27,12 +29,9 @@ from snrmjax.numerics.compiled import compiled
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
 
+_FEWEST_STATES = 48  # that programs have room for
 _STEPS = 4  # towards every state's most likely errors
 _FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
-_UNSTATED_FORCE = 0.1  # error of a force of which none is stated, of the velocity's
-
-LEVEL_ERRORS = ("gain", "phase", "stiffness", "damping")
-"""What all states of a level may have in common, relative or in rad."""
 
 
 class BalanceData(eqx.Module):
@@ -148,12 +147,6 @@ def stated_prior(
     return PriorStd(jnp.asarray(level_std), jnp.asarray(np.concatenate(linear)), of_force)
 
 
-def with_known_mass(problem: BalanceProblem) -> BalanceProblem:
-    """The problem with the model's modal mass for certain."""
-    linear = problem.prior.linear.at[-1].set(0.0)
-    return dataclasses.replace(problem, prior=dataclasses.replace(problem.prior, linear=linear))
-
-
 def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, bool]:
     """The states with a measured velocity, and whether their noise is stated.
 
@@ -172,7 +165,7 @@ def balance_data(data: SteadyStates, modes: LinearModes) -> tuple[BalanceData, b
     if not known:
         far = off_resonance_error_factor(velocity)
         errors = np.stack([far, far, far], axis=1)
-    of_force = np.where(errors[:, 0] > 0, errors[:, 0], _UNSTATED_FORCE * errors[:, 1])
+    of_force = np.where(errors[:, 0] > 0, errors[:, 0], FORCE_TO_VELOCITY * errors[:, 1])
     errors = np.column_stack([of_force, errors[:, 1:], np.zeros(len(errors))])  # no stiffness yet
     levels, index = np.unique(np.asarray(data.level)[keep], return_inverse=True)
     return (
@@ -216,7 +209,9 @@ def _measured(
     """The force in N, or the drive in V where only that is known; the states that have all."""
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     force = np.asarray(data.drive if driven else data.force)
-    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
+    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (
+        force > 0
+    )
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
@@ -246,9 +241,33 @@ class Motion(eqx.Module):
 
 
 @compiled
+def _velocity_of_others(modes: LinearModes, frequency: Array, load: Array, share: Array) -> Array:
+    return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
+
+
+def velocity_of_others(
+    modes: LinearModes, data: BalanceData, force: Float[np.ndarray, " state"]
+) -> Complex[np.ndarray, " state"]:
+    """Velocity of all but the mode of interest under forces in N, by the sensors' shares.
+
+    One program serves many numbers of states.
+    """
+    n, size = len(force), with_room(len(force))
+    rows = (filled(rows, size, None) for rows in (data.frequency, force, data.share))
+    return np.asarray(_velocity_of_others(modes, *rows))[:n]
+
+
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
-    """`motion_of` the states as they were recorded."""
-    return motion_of(unknowns, problem, no_errors(problem.data.level.shape[0]))
+    """`motion_of` the states as they were recorded, by the host."""
+    data, prior = problem.data, problem.prior
+    level = np.asarray(unknowns.level * prior.level)[np.asarray(data.level)]
+    of_force = float(prior.gain_of_force) * level[:, 0]
+    force = np.asarray(data.force) * np.exp(float(unknowns.log_force_gain) + of_force)
+    force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))
+    turned = of_force - level[:, 0] - 1j * (level[:, 1] + float(unknowns.instrument_phase))
+    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
+    own = np.asarray(data.velocity) * np.exp(turned) - velocity_of_others(linear, data, force)
+    return Motion(own, np.abs(own) / np.asarray(data.frequency), force)
 
 
 @compiled
@@ -297,6 +316,19 @@ def force_balance(
     return jnp.stack([excess.real, excess.imag], axis=1)
 
 
+def with_room(n_states: int) -> int:
+    """So many states have room for these, so that few sizes compile."""
+    power = 1 << (n_states - 1).bit_length()
+    return max(n_states, _FEWEST_STATES, 3 * power // 4 if n_states <= 3 * power // 4 else power)
+
+
+def filled(rows: Array | np.ndarray, size: int, spare: float | None) -> np.ndarray:
+    """Rows and spare ones, of one number or, without it, copies of the last."""
+    known = np.asarray(rows)
+    missing = np.repeat(known[-1:], size - len(known), axis=0)
+    return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
+
+
 def no_errors(n_states: int) -> Float[Array, "state input"]:
     """States as they were recorded."""
     return jnp.asarray(np.zeros((n_states, len(STATE_ERRORS))))
@@ -340,15 +372,14 @@ def _weighting(slopes: Float[Array, "state part input"], data: BalanceData) -> W
 
 
 def nearest_errors(
-    unknowns: Unknowns, problem: BalanceProblem, correcting: Bool[Array, ""] | bool = True
+    unknowns: Unknowns, problem: BalanceProblem
 ) -> tuple[Float[Array, "state input"], Weighting]:
     """The most likely errors with which every state balances, from its present correction on.
 
     Each step solves the balance made straight at the last one's end: what is left of the balance
     falls by the ratio of a state's error to the curves' length.
-    Returns the errors, as they are unless `correcting`, and the weighting there.
+    Returns the errors, and the weighting there.
     """
-    steps = jnp.where(correcting, _STEPS, 0) if isinstance(correcting, jax.Array) else _STEPS
 
     def step(_: Array, state: tuple[Array, Array, Weighting]) -> tuple[Array, Array, Weighting]:
         # One more evaluation than steps, for the weighting at the end: a second copy of it outside
@@ -366,7 +397,7 @@ def nearest_errors(
     start = problem.data.correction
     n = len(start)
     none = Weighting(jnp.zeros((n, 2, 2)), jnp.zeros((n, 2)))
-    _, errors, weighting = jax.lax.fori_loop(0, steps + 1, step, (start, start, none))
+    _, errors, weighting = jax.lax.fori_loop(0, _STEPS + 1, step, (start, start, none))
     return errors, weighting
 
 

@@ -1,6 +1,6 @@
 """Smooth curves of ω̃² and 2ζ̃ω̃ fitted jointly to all states, levels and sensors."""
 
-import functools
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -9,18 +9,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from snrmjax.identify.checks.instruments import saying_what_is_undetermined
+from snrmjax.identify.checks.residual_autocorrelation import (
+    along_resonance,
+    residual_autocorrelation,
+)
 from snrmjax.identify.curves.families import parse_family
 from snrmjax.identify.curves.splines import SmoothingSpline
-from snrmjax.identify.joint.fitting import (
-    FIT_MESSAGE,
-    FitSettings,
-    FitStatus,
-    Fitted,
-    finite_fit,
-    fitted,
-)
+from snrmjax.identify.joint.family_fit import FIT_MESSAGE, FamilyFit, FitStatus, fit_families
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceData,
     BalanceProblem,
     Motion,
@@ -28,9 +24,9 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     balance_data,
     level_numbers,
+    recorded_motion,
     stated_level_std,
     stated_prior,
-    with_known_mass,
 )
 from snrmjax.identify.joint.free_unknowns import (
     FREE,
@@ -39,9 +35,9 @@ from snrmjax.identify.joint.free_unknowns import (
     named_unknowns,
     packed_unknowns,
     padded_levels,
-    recorded_motion_of,
 )
 from snrmjax.identify.joint.notes import (
+    NoiseAndLevels,
     notes_on_autocorrelation,
     notes_on_level_errors,
     notes_on_modal_mass,
@@ -49,13 +45,13 @@ from snrmjax.identify.joint.notes import (
     notes_on_reach,
     notes_on_stated_errors,
 )
-from snrmjax.identify.joint.posterior_start import (
-    noise_and_levels,
-    posterior_of,
-    unknowns_at,
-    wandering_stiffness,
-    with_levels,
+from snrmjax.identify.joint.posterior_view import (
+    SMOOTH,
+    view_of,
+    viewed_covariance,
+    viewed_unknowns,
 )
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.modes import LinearModes
@@ -64,9 +60,7 @@ from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.result import AbstractResult, Variable
 
 _HERTZ = 2 * np.pi  # rad/s
-_ROUNDS = 2, 12  # of fitting and estimating the noise anew: at least, at most
 _MOVED = 2.0  # standard deviations of a level's error, from which on the fit says so
-_ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
 
 
 class NoiseEstimate(eqx.Module):
@@ -132,11 +126,6 @@ class JointFit(AbstractResult):
         return displacement, velocity
 
     @property
-    def corrected(self) -> bool:
-        """Whether states are corrected for their most likely errors, their noise believed."""
-        return bool(np.any(np.asarray(self.data.correction) != 0))
-
-    @property
     def modes_found(self) -> LinearModes:
         """The linear modes with the modal mass that the fit found for the mode of interest.
 
@@ -154,7 +143,7 @@ class JointFit(AbstractResult):
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        return recorded_motion_of(self.unknowns, self.problem)
+        return recorded_motion(self.unknowns, self.problem)
 
     def recorded_force(self, force: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """What the test records of a force in N: in N, or in V where only the drive is known."""
@@ -264,10 +253,11 @@ def fit_jointly(
 
     The model of a test (`identify.test_model`) says how smooth the curves are, how large the noise
     is and by how much levels differ in gain, phase, stiffness and damping, each with a stated prior
-    and by the largest probability of the data. From its answer Levenberg–Marquardt goes on with the
-    balance as it is. Where the stated noise is believed, every step corrects the states for their
-    most likely errors (orthogonal distance regression). The other modes' frequencies and dampings
-    stay inside their stated errors. The modal mass is an unknown with its stated 1σ
+    and by the largest probability of the data; smooth curves, their bands and all else are its
+    posterior. Families by name start there and are fitted to the balance by Levenberg–Marquardt.
+    Both correct the states for their most likely errors (orthogonal distance regression), and take
+    other modes' frequencies and dampings for unknowns with their stated errors. Where states exceed
+    the stated noise the bands are wider for it. The modal mass is an unknown with its stated 1σ
     (`LinearModesStd.modal_mass`); where none is stated it is the model's, unless states away from
     resonance ask for another. A free force gain is one with it.
 
@@ -303,74 +293,79 @@ def fit_jointly(
         raise ValueError(f"a joint fit needs at least 3 steady states, but only {n} are usable.")
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     released = tuple(name for name in FREE if name in free or (driven and name == "force_gain"))
-    problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
-
     knots = {one.size for one in choices if one.kind == SmoothingSpline.kind and one.size}
     if len(knots) > 1:
         raise ValueError(
             f"smooth curves have their knots in common: give both one size, not {min(knots)} "
             f"and {max(knots)}."
         )
-    asked = functools.partial(posterior_of, robust=robust, knots=max(knots, default=None))
-    first = asked(problem, released, stated)
-    mass, std = first.posterior.modal_mass
-    if modes.modal_mass_std is None and abs(mass - 1) < _ASKED * std:
-        problem = with_known_mass(problem)
-        first = asked(problem, released, stated)
-    found = first.posterior
-    components = noise_and_levels(found)
-    prior = with_levels(problem.prior, components, measured.n_levels)
-    wandering = wandering_stiffness(found)
-    errors = measured.std.at[:, 3].set(wandering)
-    noisy = BalanceProblem(problem.with_data(std=errors).data, modes, prior)
-    start = unknowns_at(first, noisy, released, choices)
-    how = FitSettings(released, stated, robust, _ROUNDS)
-    best = finite_fit(fitted(start, noisy, components, how))
-
+    problem = BalanceProblem(measured, modes, stated_prior(modes, level_std, released))
+    view = view_of(problem, released, stated, robust=robust, knots=max(knots, default=None))
+    found, unknowns = view.posterior, viewed_unknowns(view, choices)
+    best = FamilyFit(
+        *(unknowns, viewed_covariance(view), view.problem, view.noise, found.residuals),
+        FitStatus.CONVERGED if found.settled else FitStatus.NOT_SETTLED,
+    )
+    if not all(one.kind in SMOOTH and one.argument != "velocity" for one in choices):
+        wander = np.full(n, view.wandering / (1.0 if view.believed else view.noise.noise))
+        errors = np.column_stack([np.asarray(measured.std)[:, :3], wander])
+        best = fit_families(
+            *(unknowns, view.problem, released, view.noise, errors), believed=view.believed
+        )
+    level, frequency = np.asarray(measured.level), np.asarray(measured.frequency)
+    autocorrelation = residual_autocorrelation(best.residuals, along_resonance(level, frequency))
     # What levels differ by is said where the data ask for it or the fit made use of it, and stays
     # possible elsewhere.
     differ = np.array(found.differing) | _moved(best)
-    told = np.where(level_std > 0, level_std, np.where(differ, components.level, 0.0))
-    last = best.problem
-    notes: tuple[str, ...] = ()
-    if best.status != FitStatus.CONVERGED:
-        notes = (f"the fit has {FIT_MESSAGE[best.status]}; try a simpler family.",)
-    said = best.components._replace(level=tuple(told.tolist()))
-    alike = bool(best.autocorrelation.any())
-    notes += notes_on_noise(
-        *(said, 0.5 * wandering, level_std, measured.n_levels), stated=stated, alike=alike
-    )
-    level, numbers = np.asarray(last.data.level), level_numbers(data, modes)
-    if np.any((level_std == 0) & (told > 0)):
-        shifts = np.asarray(best.unknowns.level * last.prior.level)
-        force = [np.median(np.asarray(last.data.force)[level == k]) for k in np.unique(level)]
-        of_force = bool(prior.gain_of_force > 0)
-        notes += notes_on_level_errors(shifts, numbers, np.array(force), of_force=of_force)
-    notes += notes_on_stated_errors(np.asarray(best.unknowns.level), level_std)
-    notes += notes_on_modal_mass(best.unknowns, last, best.covariance)
-    notes += notes_on_autocorrelation(best.autocorrelation)
-    notes += notes_on_reach(recorded_motion_of(best.unknowns, last), level)
-    return JointFit(
+    told = np.where(level_std > 0, level_std, np.where(differ, best.noise.level, 0.0))
+    fit = JointFit(
         unknowns=best.unknowns,
         covariance=best.covariance,
-        problem=last,
+        problem=best.problem,
         noise=NoiseEstimate(
-            scale=best.components.noise,
-            scale_std=best.components.noise_std,
-            level_std=told,
-            autocorrelation=best.autocorrelation,
-            stated=stated,
+            *(best.noise.noise, best.noise.noise_std, told, autocorrelation), stated=stated
         ),
         residuals=best.residuals,
         drive_known_only=driven,
         free=released,
-        notes=notes,
+        notes=(),
         status=best.status,
-        level_numbers=numbers,
+        level_numbers=level_numbers(data, modes),
+    )
+    said = best.noise._replace(level=tuple(told.tolist()))
+    return dataclasses.replace(fit, notes=_notes(fit, said, 0.5 * view.wandering, level_std))
+
+
+def _notes(
+    fit: JointFit, noise: NoiseAndLevels, wandering: float, stated: Float[np.ndarray, " error"]
+) -> tuple[str, ...]:
+    """All that a reader of a joint fit should know.
+
+    Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `stated` 1σ
+    of levels' errors.
+    """
+    notes: tuple[str, ...] = ()
+    if not fit.converged:
+        notes = (f"the fit has {FIT_MESSAGE[fit.status]}; try a simpler family.",)
+    level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
+    notes += notes_on_noise(noise, wandering, stated, n_levels, stated=fit.noise.stated)
+    if np.any((stated == 0) & (np.array(noise.level) > 0)):
+        shifts = np.asarray(fit.unknowns.level * fit.prior.level)
+        force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]
+        of_force = bool(fit.prior.gain_of_force > 0)
+        notes += notes_on_level_errors(
+            shifts, fit.level_numbers, np.array(force), of_force=of_force
+        )
+    return (
+        *notes,
+        *notes_on_stated_errors(np.asarray(fit.unknowns.level), stated),
+        *notes_on_modal_mass(fit.unknowns, fit.problem, fit.covariance),
+        *notes_on_autocorrelation(fit.noise.autocorrelation),
+        *notes_on_reach(fit.motion(), level),
     )
 
 
-def _moved(fit: Fitted) -> Bool[np.ndarray, " error"]:
+def _moved(fit: FamilyFit) -> Bool[np.ndarray, " error"]:
     """In which kinds of error a fit moved a level by more than chance does."""
     level, end = np.asarray(fit.unknowns.level), len(fit.covariance) - len(fit.unknowns.linear)
     std = np.sqrt(np.diag(fit.covariance))[end - level.size : end].reshape(level.shape)

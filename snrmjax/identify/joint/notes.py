@@ -1,18 +1,18 @@
 """What a joint fit says in words of its data: families, noise, levels, and where the states lie."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2, norm
 
-from snrmjax.identify.joint.fitting import NoiseAndLevels
 from snrmjax.identify.joint.force_balance import (
-    LEVEL_ERRORS,
     BalanceProblem,
     Motion,
     Unknowns,
 )
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 _BESIDE = 5.0  # degrees from resonance, with every state farther on the same side
 _ALIKE = 1.1  # ratio of levels' amplitudes below which they are one
@@ -30,6 +30,24 @@ _COMMON = {
 """What an error that all levels share may be."""
 
 
+class NoiseAndLevels(NamedTuple):
+    """1σ of the noise and of the errors that the states of a level share."""
+
+    noise: float  # by which the residuals exceed the stated noise
+    noise_std: float
+    level: tuple[float, ...]  # of every kind of error that a level shares, stated or found
+
+    @property
+    def contradicts_upward(self) -> bool:
+        """Whether the residuals are too large for the stated noise."""
+        return self.noise - 3 * self.noise_std > 1
+
+    @property
+    def contradicts_downward(self) -> bool:
+        """Whether they are too small for it."""
+        return self.noise + 3 * self.noise_std < 1
+
+
 def notes_on_noise(
     components: NoiseAndLevels,
     wandering: float,
@@ -37,13 +55,11 @@ def notes_on_noise(
     n_levels: int,
     *,
     stated: bool,
-    alike: bool,
 ) -> tuple[str, ...]:
     """Where the noise and the level-to-level variance are not as stated.
 
     Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `given` the
-    stated 1σ of levels' errors; `alike` whether the residuals of neighbouring states are
-    correlated.
+    stated 1σ of levels' errors.
     """
     notes = []
     size = f"{components.noise:.2g} ± {components.noise_std:.1g}"
@@ -53,10 +69,9 @@ def notes_on_noise(
             f"small or the model is wrong; the bands are {components.noise:.2g} times wider for it."
         )
     if stated and components.contradicts_downward:
-        more = "" if alike else ", and the bands are wider than need be"
         notes.append(
             f"states scatter about the curves by only {size} times the stated noise, errors of "
-            f"whole levels apart: it is overstated{more}."
+            "whole levels apart: it is overstated."
         )
     found_only = np.where(given > 0, 0.0, components.level)
     if wandering > 0:

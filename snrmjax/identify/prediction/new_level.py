@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import linregress
 
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
 from snrmjax.identify.joint.joint_fit import JointFit
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 _FEWEST = 3  # levels, of which a straight line leaves something
 _CHANCE = 0.05  # of a trend where levels differ at random

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import norm
 
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
 from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.prediction.new_level import LevelTrend
 from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 _HERTZ = 2 * np.pi
 _SURE = 0.975  # probability of a resonance that needs no word

@@ -36,10 +36,11 @@ class Balance(NamedTuple):
         """The balance of states whose records are corrected by these errors."""
         states, places = self.states, self.places
         omega, level = states.frequency, states.level
-        gain, phase, stiffer, lossier = unknowns[places.levels][level].T
-        stiffer = stiffer + unknowns[TREND] * states.trend
+        gain, phase, _, lossier = unknowns[places.levels][level].T
+        stiffer = self.stiffer(unknowns, errors)
         velocity = np.exp(errors[:, 1] + 1j * (errors[:, 2] - phase - unknowns[PHASE]))
-        velocity = states.velocity * velocity * np.exp(0.0 if states.force_is_free else -gain)
+        velocity = velocity * np.exp(0.0 if states.force_is_free else -gain)
+        velocity = self.own_velocity(unknowns) * velocity
         force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
         force = force + unknowns[OFFSET] * np.min(states.force)
         z = 1j * omega * states.constant * force / velocity
@@ -52,7 +53,22 @@ class Balance(NamedTuple):
         ) * d * (by_log @ unknowns[places.damping])
         model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
-        return BalancedStates(force, z, model, slope, values, stiffness, damping)
+        inputs = errors.shape[1]
+        return BalancedStates(force, z, model, slope, values, stiffness, damping, inputs)
+
+    def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
+        """Relative deviations of the stiffness: of levels, along a trend, and of states whose own
+        wanders.
+        """
+        of_level = unknowns[self.places.levels][self.states.level][:, 2]
+        shared = of_level + unknowns[TREND] * self.states.trend
+        return shared + errors[:, 3] if errors.shape[1] > 3 else shared
+
+    def own_velocity(self, unknowns: np.ndarray) -> Complex[np.ndarray, " state"]:
+        """The mode's own velocity as it was recorded, by what the other modes' parameters are."""
+        if self.states.beside is None:
+            return self.states.velocity
+        return self.states.velocity - self.states.beside @ unknowns[self.places.others]
 
     def with_discrepancy(self, unknowns: np.ndarray, errors: np.ndarray) -> "Balance":
         """With functions of what one mode leaves off resonance: of phase and log amplitude.
@@ -117,8 +133,8 @@ class Balance(NamedTuple):
         own = now.z if first else now.model
         slope = 0.0 * now.slope if first else now.slope
         slopes = now._replace(slope=slope).by_error
-        stiffer, lossier = unknowns[places.levels][states.level].T[2:]
-        stiffer = stiffer + unknowns[TREND] * states.trend
+        stiffer = self.stiffer(unknowns, errors)
+        lossier = unknowns[places.levels][states.level][:, 3]
         design = np.zeros((len(omega), len(unknowns)), dtype=complex)
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
         design[:, PHASE] = -1j * own
@@ -128,6 +144,9 @@ class Balance(NamedTuple):
         design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
             :, None
         ] * now.values
+        if states.beside is not None:
+            moved = -states.beside / self.own_velocity(unknowns)[:, None]
+            design[:, places.others] = own[:, None] * moved + slope[:, None] * moved.real
         of_gain = own if states.force_is_free else -own - slope
         columns = (of_gain, -1j * own, now.stiffness, now.damping)
         for k, column in enumerate(columns):
@@ -165,11 +184,15 @@ class BalancedStates(NamedTuple):
     values: Float[np.ndarray, "state function"]
     stiffness: Float[np.ndarray, " state"]  # κK
     damping: Complex[np.ndarray, " state"]  # iΩκδ
+    inputs: int  # errors that a state may have
 
     @property
     def by_error(self) -> Complex[np.ndarray, "state input"]:
-        """Derivatives of what is left by relative errors of force and velocity, and of phase."""
-        return np.stack([self.z, -self.z - self.slope, -1j * self.z], axis=1)
+        """Derivatives of what is left by relative errors of force and velocity, of phase, and of
+        a stiffness that wanders.
+        """
+        columns = [self.z, -self.z - self.slope, -1j * self.z, -self.stiffness + 0j]
+        return np.stack(columns[: self.inputs], axis=1)
 
 
 class Straight(NamedTuple):

@@ -41,6 +41,7 @@ class Places(NamedTuple):
     levels: np.ndarray  # (level, error)
     discrepancy: tuple[slice, slice]  # in phase with the motion and in quadrature
     reference: float
+    others: slice  # linear parameters of the other modes, in their own 1σ
 
     @property
     def beside(self) -> slice:
@@ -48,15 +49,18 @@ class Places(NamedTuple):
         return slice(self.discrepancy[0].start, self.discrepancy[1].stop)
 
 
-def places_of(basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float) -> Places:
-    """The places for so many levels, with or without a discrepancy."""
+def places_of(
+    basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
+) -> Places:
+    """The places for so many levels and parameters of others, with or without a discrepancy."""
     start = TREND + 1
     middle = start + basis.n_functions
     first = middle + basis.n_functions
     levels = first + np.arange(4 * n_levels).reshape(n_levels, 4)
     end, wide = first + 4 * n_levels, ALONG * discrepancy
     two = slice(end, end + wide), slice(end + wide, end + 2 * wide)
-    return Places(slice(start, middle), slice(middle, first), levels, two, reference)
+    others = slice(end + 2 * wide, end + 2 * wide + n_others)
+    return Places(slice(start, middle), slice(middle, first), levels, two, reference, others)
 
 
 # In the order of a point of hyperparameters: noise, bends of two curves, four errors of levels,
@@ -117,11 +121,12 @@ def prior_variances(
     hyper: Hyper, basis: CurveBasis, places: Places, states: TestStates
 ) -> tuple[np.ndarray, np.ndarray]:
     """Prior variances of all unknowns, and slopes of their logarithms by the hyperparameters."""
-    n = max(places.levels[-1, -1] + 1, places.discrepancy[1].stop)
+    n = places.others.stop
     end = FIRST_ALONG + basis.directions.shape[1]
     along = slice(FIRST_ALONG, end)
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
     variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
+    variance[places.others] = 1.0
     variance[[MASS, PHASE, OFFSET, TREND]] = np.square(
         [states.mass_std, states.phase_std, states.offset_std, states.trend_std]
     )

@@ -33,6 +33,7 @@ from snrmjax.identify.test_model.hyper import (
     FIRST_ALONG,
     LEVELS,
     MASS,
+    NOISE,
     OFFSET,
     PHASE,
     TREND,
@@ -59,6 +60,8 @@ _ROUNDS = 12  # at most
 _SETTLED = 2  # rounds, until steps are checked and the modal mass is free
 _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
 _TRIED = 4  # rounds of each start
+_MANY = 48  # rounds of each, where all still moves
+_LOST = 3.0  # 1σ of stated noise, beyond which a walk is not where the records are explained
 _LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks like fewer
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
@@ -92,6 +95,9 @@ class TestPosterior(NamedTuple):
     effective_unknowns: float  # that the states, and not their priors, tell
     places: Places
     differing: tuple[bool, bool, bool, bool]  # whether levels differ by more than is stated
+    weight: Float[np.ndarray, " state"]  # 1, or less for an outlier
+    share: float  # of the states that count, where neighbours err alike
+    settled: bool  # whether the last round moved nothing by more than its error
 
     @property
     def modal_mass(self) -> tuple[float, float]:
@@ -122,22 +128,25 @@ class TestPosterior(NamedTuple):
 
     def curves(self, amplitude: Float[np.ndarray, " point"]) -> CurveValues:
         """ω̃² and δ at displacement amplitudes (m), with their covariance."""
-        values, slopes = self.basis.values(amplitude)
-        mass = 1 + self.mean[MASS]
-        reference = self.places.reference
-        n = len(values)
-        rows = np.zeros((n, 2, len(self.mean)))
-        found = np.zeros((n, 2))
-        steep = np.zeros((n, 2))
-        for k, (own, unit) in enumerate(
-            zip((self.places.stiffness, self.places.damping), self.units, strict=True)
-        ):
-            found[:, k] = unit * (values @ self.mean[own]) / mass
-            steep[:, k] = unit * (slopes @ self.mean[own]) / mass
-            rows[:, k, own] = unit * values / mass
-            rows[:, k, MASS] = -found[:, k] / mass
+        values, by_log = self.basis.values(amplitude)
+        found, steep = (self._rows(terms) @ self.mean for terms in (values, by_log))
+        rows = self.slopes(amplitude)
         covariance = np.einsum("npi,ij,nqj->npq", rows, self.covariance, rows)
-        return CurveValues(found[:, 0] + reference, found[:, 1], covariance, steep)
+        return CurveValues(found[:, 0] + self.places.reference, found[:, 1], covariance, steep)
+
+    def slopes(self, amplitude: Float[np.ndarray, " point"]) -> Float[np.ndarray, "point two n"]:
+        """Derivatives of ω̃² and δ at displacement amplitudes (m) by all unknowns."""
+        rows = self._rows(self.basis.values(amplitude)[0])
+        rows[:, :, MASS] = -(rows @ self.mean) / (1 + self.mean[MASS])
+        return rows
+
+    def _rows(self, terms: Float[np.ndarray, "point function"]) -> Float[np.ndarray, "point two n"]:
+        """Curves of these functions by the unknowns, at their modal mass."""
+        rows = np.zeros((len(terms), 2, len(self.mean)))
+        both = zip((self.places.stiffness, self.places.damping), self.units, strict=True)
+        for k, (own, unit) in enumerate(both):
+            rows[:, k, own] = unit * terms / (1 + self.mean[MASS])
+        return rows
 
 
 @on_one_core
@@ -177,7 +186,8 @@ def fit_test(
     basis = CurveBasis.of(states.amplitude, most_knots or MOST_KNOTS)
     if start is not None:
         basis, units, reference = start.basis, start.units, start.places.reference
-    places = places_of(basis, states.n_levels, discrepancy, reference)
+    n_others = 0 if states.beside is None else states.beside.shape[1]
+    places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
@@ -194,6 +204,10 @@ def fit_test(
     share = min(walk.share for walk in walks)
     walk = max(walks, key=lambda one: one.likelihood_of(share))
     walk.advance(rounds - min(_TRIED, rounds))
+    if rounds == _ROUNDS and walk.is_lost:  # among steep curves the way is long
+        for one in walks:
+            one.advance(_MANY - one.turn)
+        walk = max(walks, key=lambda one: one.likelihood_of(share))
     found = walk.found
     if found is None:
         raise ValueError(f"`rounds` must be at least one, not {rounds}.")
@@ -224,6 +238,9 @@ def fit_test(
         float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
         places,
         _differing(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
+        walk.balance.weight,
+        found.equations.share,
+        walk.still,
     )
 
 
@@ -261,7 +278,7 @@ class _Walk:
         self.robust, self.tempered = robust, tempered
         self.start = starting_point(balance.states, balance.basis, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
-        self.mean = np.zeros(places.levels[-1, -1] + 1 + 2 * ALONG * discrepancy)
+        self.mean = np.zeros(places.others.stop)
         self.mean[places.damping.start] = 1.0
         self.found: _Found | None = None
         self.turn, self.still, self.share = 0, False, 1.0
@@ -276,6 +293,19 @@ class _Walk:
     def likelihood(self) -> float:
         """ln of likelihood times prior of what was found."""
         return -np.inf if self.found is None else self.found.likelihood
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether all still moves, and noise, where it is stated, is larger than it ever is.
+
+        Where states count as fewer if neighbours err alike, their share may move for ever.
+        """
+        if self.still or self.found is None:
+            return False
+        if not self.balance.states.stated:
+            return not self.tempered
+        beyond = self.found.point[NOISE] - np.log(priors.STATED_NOISE.median)
+        return bool(beyond > _LOST * priors.STATED_NOISE.spread)
 
     def advance(self, rounds: int) -> None:
         """Some rounds more, or until nothing moves."""

@@ -22,7 +22,8 @@ class TestStates(NamedTuple):
     frequency: Float[np.ndarray, " state"]  # rad/s
     force: Float[np.ndarray, " state"]  # N, or V where only the drive is known
     velocity: Complex[np.ndarray, " state"]  # m/s
-    # 1σ of the logarithms of force and velocity and of the phase (rad); in parts where not stated.
+    # 1σ of the logarithms of force and velocity and of the phase (rad), and, if there is a fourth,
+    # of a relative stiffness that wanders from state to state; in parts where not stated.
     errors: Float[np.ndarray, "state input"]
     stated: bool  # whether these were
     constant: float  # A, 1/kg
@@ -36,6 +37,8 @@ class TestStates(NamedTuple):
     # structure, and 1σ of that change per unit of it.
     trend: Float[np.ndarray, " state"] | float = 0.0
     trend_std: float = 0.0
+    # What other modes move beside it for 1σ of their linear parameters, m/s; None: all are known.
+    beside: Complex[np.ndarray, "state deviation"] | None = None
 
     @property
     def n_levels(self) -> int:
@@ -55,7 +58,8 @@ class TestStates(NamedTuple):
         }
         if isinstance(self.trend, np.ndarray):
             rows["trend"] = self.trend[keep]
-        return self._replace(**rows)
+        beside = None if self.beside is None else self.beside[keep]
+        return self._replace(**rows, beside=beside)
 
 
 def state_errors(

@@ -7,7 +7,7 @@ from truths.exact_states import GAIN, driven, modes
 import snrmjax as sj
 from snrmjax.identify.checks.instruments import notes_on_instruments
 from snrmjax.identify.inference.fitted_curves import as_backbone, values_to_the_largest
-from snrmjax.identify.joint.force_balance import LEVEL_ERRORS
+from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
 
 def on_the_gain(fit):

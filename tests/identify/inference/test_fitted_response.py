@@ -13,7 +13,7 @@ from truths.joint_fits import noisy_fit
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
 from snrmjax.identify.inference.located_points import point_slopes
-from snrmjax.identify.joint.fitting import FitStatus
+from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.identify.prediction.new_level import ON_THE_CURVES
 from snrmjax.io.joint_results import write_next
 

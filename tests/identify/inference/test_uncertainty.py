@@ -32,14 +32,11 @@ def fit():
 def test_derivatives_by_measurements_are_those_of_refits(fit):
     import optimistix as optx
 
-    from snrmjax.identify.joint.fitting import SOLVER
-    from snrmjax.identify.joint.force_balance import weighting_at
-    from snrmjax.identify.joint.free_unknowns import Unravel
+    from snrmjax.identify.joint.family_fit import SOLVER
     from snrmjax.identify.joint.residuals import corrected_residuals
 
     slopes = sensitivity(fit).by_measurement
     vector, unravel = fit.vector()
-    weighting = weighting_at(unravel(vector), fit.problem)
     unit = np.sqrt(np.diag(fit.covariance))
 
     def refit(state, kind, change):
@@ -56,10 +53,7 @@ def test_derivatives_by_measurements_are_those_of_refits(fit):
     @eqx.filter_jit
     def refitted(problem):
         found = optx.least_squares(
-            lambda y, own: corrected_residuals(
-                *(vector + y * unit, Unravel(fit.unknowns, ()), own, weighting),
-                jnp.asarray(True),
-            ),
+            lambda y, own: corrected_residuals(vector + y * unit, unravel, own),
             *(SOLVER, jnp.zeros_like(vector)),
             args=problem,
         )

@@ -95,5 +95,4 @@ def test_a_smoothing_spline_comes_back_from_its_file(fits, tmp_path):
     curve = fits[0].unknowns.squared_frequency
     same = again.unknowns.squared_frequency
     np.testing.assert_array_equal(same.prior_residuals(), curve.prior_residuals())
-    assert again.corrected
     assert described(same) == f"smoothing_spline:{len(curve.parameters)}@displacement"

@@ -11,18 +11,18 @@ from truths.joint_fits import noisy_fit
 import snrmjax as sj
 from snrmjax.identify.inference import located_points
 from snrmjax.identify.inference.located_points import LocatedStatus
-from snrmjax.identify.joint import joint_fit
-from snrmjax.identify.joint.fitting import FitStatus
+from snrmjax.identify.joint import family_fit, joint_fit
+from snrmjax.identify.joint.family_fit import FitStatus
 from snrmjax.io.joint_results import summarise_fit
 
 
 def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
-    whole = joint_fit.fitted
+    whole = joint_fit.fit_families
 
-    def short(*given):
-        return whole(*given)._replace(status=FitStatus.STEP_LIMIT)
+    def short(*given, **named):
+        return whole(*given, **named)._replace(status=FitStatus.STEP_LIMIT)
 
-    monkeypatch.setattr(joint_fit, "fitted", short)
+    monkeypatch.setattr(joint_fit, "fit_families", short)
     fit = sj.fit_jointly(noisy(1, gain=0.01), modes(), level_gain_std=0.01, **TRUE)
     assert fit.status == FitStatus.STEP_LIMIT
     assert not fit.converged
@@ -31,12 +31,13 @@ def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
 
 
 def test_a_fit_that_is_not_finite_is_an_error(monkeypatch):
-    whole = joint_fit.fitted
+    whole = family_fit._linearised
 
     def broken(*given):
-        return whole(*given)._replace(status=FitStatus.NOT_FINITE)
+        answer = whole(*given)
+        return answer._replace(residuals=np.nan * answer.residuals)
 
-    monkeypatch.setattr(joint_fit, "fitted", broken)
+    monkeypatch.setattr(family_fit, "_linearised", broken)
     with pytest.raises(ValueError, match="infinite or undefined"):
         sj.fit_jointly(noisy(1), modes(), **TRUE)
 
@@ -113,7 +114,7 @@ def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):
     everything(31, "viscous_quadratic@velocity")
     found = compiled_programs(caplog, lambda: everything(32, "viscous_quadratic@velocity"))
     own = (
-        *("_linearised", "_solve", "_slopes", "recorded_motion", "_first_order", "_pinned"),
+        *("_linearised", "_solved", "_slopes", "_velocity_of_others", "_first_order", "_pinned"),
         *("_resampled", "_bands", "_point_with_slopes", "_at_velocity", "_at_displacement"),
     )
     assert [name for name in found if any(one in name for one in own)] == []

@@ -1,0 +1,150 @@
+"""Families of curves by name, fitted to the exact force balance by Levenberg–Marquardt."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from snrmjax.identify.checks.residual_autocorrelation import share_told_by
+from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
+from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
+from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.joint.posterior_view import LEAST_LEFT
+from snrmjax.identify.joint.residuals import corrected_residuals
+from snrmjax.numerics.compiled import compiled
+from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
+
+SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
+)
+# A round starts near its end: cost to 1e-7, unknowns to 1 % of their 1σ.
+_ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
+)
+MOST_STEPS = 200  # of Levenberg–Marquardt in a fit
+_ROUNDS = 6  # of fitting and estimating the noise anew, at most
+_SETTLED = 0.01  # relative change of the noise, in the last of them
+_TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
+
+
+class FitStatus(IntEnum):
+    """How a joint fit ended."""
+
+    CONVERGED = 0
+    STEP_LIMIT = 1  # the solver used up its steps
+    NOT_SETTLED = 2  # the rounds of estimating the noise were used up while the cost still fell
+    NOT_FINITE = 3  # residuals that are not finite numbers
+
+
+FIT_MESSAGE: dict[FitStatus, str] = {
+    FitStatus.CONVERGED: "converged",
+    FitStatus.STEP_LIMIT: f"not converged: the solver used up its {MOST_STEPS} steps",
+    FitStatus.NOT_SETTLED: (
+        "not converged: fit and noise estimate still changed one another in the last round"
+    ),
+    FitStatus.NOT_FINITE: "failed: the residuals became infinite or undefined",
+}
+
+
+class FamilyFit(NamedTuple):
+    """Where the fit of named families ended."""
+
+    unknowns: Unknowns
+    covariance: Float[np.ndarray, "unknown unknown"]
+    problem: BalanceProblem  # with the corrections and the noise of the last round
+    noise: NoiseAndLevels
+    residuals: Float[np.ndarray, "state part"]  # of unit variance where the noise is as found
+    status: FitStatus
+
+
+def fit_families(
+    start: Unknowns,
+    problem: BalanceProblem,
+    free: tuple[str, ...],
+    noise: NoiseAndLevels,
+    stated: Float[np.ndarray, "state input"],
+    *,
+    believed: bool,
+) -> FamilyFit:
+    """Fit, estimate anew how large the noise is, and fit again.
+
+    The families may leave more than the smooth curves do, from which the unknowns start: then
+    noise is larger, and states whose neighbours miss the curves alike count as fewer.
+
+    Arguments: `stated` 1σ of the states' errors, of whose size only `noise.noise` is known unless
+    they are `believed`.
+    Raises `ValueError` where residuals are not finite.
+    """
+    program, n = packed_unknowns(start, free, padded_problem(problem).data.n_levels), len(stated)
+    size, status = 1.0 if believed else noise.noise, FitStatus.NOT_SETTLED
+    share = 1.0
+    for _ in range(_ROUNDS):
+        problem = problem.with_data(std=jnp.asarray(stated * size / np.sqrt(share)))
+        given = (program.unravel, padded_problem(problem))
+        size_of = np.linalg.norm(np.asarray(_linearised(program.vector, *given).jacobian), axis=0)
+        unit = jnp.asarray(_TRUST / np.where(size_of > 0, size_of, 1.0))
+        vector, good = _solved(program.vector, *given, unit)
+        program = program._replace(vector=vector)
+        answer = _linearised(vector, *given)
+        jacobian = np.asarray(answer.jacobian)[:, program.own]
+        if not (np.all(np.isfinite(answer.residuals)) and np.all(np.isfinite(jacobian))):
+            raise ValueError(f"{FIT_MESSAGE[FitStatus.NOT_FINITE]}: try other families.")
+        problem = problem.with_data(correction=answer.correction[:n])
+        residuals = np.asarray(answer.residuals)[:n] / np.sqrt(share)
+        level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))
+        told = share_told_by(residuals, level, frequency)
+        rows = told * residuals.size
+        left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
+        found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
+        noise = noise._replace(noise=found, noise_std=found / float(np.sqrt(2 * left)))
+        wanted = 1.0 if believed and not noise.contradicts_upward else max(found, 1e-12)
+        change = np.hypot(np.log(wanted / size), np.log(told / share))
+        size, share = (size, share) if change < _SETTLED else (wanted, told)
+        if change < _SETTLED:
+            status = FitStatus.CONVERGED if bool(good) else FitStatus.STEP_LIMIT
+            break
+    root = root_of_inverse(jacobian)
+    own = Unravel(start, free)(np.asarray(program.vector)[program.own])
+    return FamilyFit(own, root @ root.T, problem, noise, residuals, status)
+
+
+class _Answer(NamedTuple):
+    """The whitened problem at the end of a fit."""
+
+    residuals: Array  # of the states
+    jacobian: Array  # of all residuals, priors included
+    correction: Array  # of every state's record: its most likely error, taken back
+
+
+@compiled
+def _linearised(vector: Array, unravel: Unravel, problem: BalanceProblem) -> _Answer:
+    def residuals(vector: Array) -> tuple[Array, Array]:
+        left = corrected_residuals(vector, unravel, problem)
+        return left, left
+
+    jacobian, left = jax.jacfwd(residuals, has_aux=True)(vector)
+    errors, _ = nearest_errors(unravel(vector), problem)
+    return _Answer(left[: 2 * len(problem.data.level)].reshape(-1, 2), jacobian, errors)
+
+
+@compiled
+def _solved(
+    vector: Array, unravel: Unravel, problem: BalanceProblem, unit: Array
+) -> tuple[Array, Array]:
+    """Levenberg–Marquardt from the present unknowns: where it ended, and whether it converged.
+
+    Every unknown counts in its own `unit`, so that the solver's damping treats all alike; states
+    are corrected for their most likely errors at every step.
+    """
+    found: optx.Solution = optx.least_squares(
+        lambda y, _: corrected_residuals(y * unit, unravel, problem),
+        *(_ROUND, vector / unit),
+        max_steps=MOST_STEPS,
+        throw=False,
+    )
+    return found.value * unit, jnp.asarray(found.result == optx.RESULTS.successful)

@@ -1,0 +1,323 @@
+"""A joint fit as the posterior of a test has it: unknowns, covariance, noise and levels."""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.optimize import minimize
+
+from snrmjax.identify.curves.families import ARGUMENTS, FAMILIES, Choice, values_and_slopes
+from snrmjax.identify.curves.family_base import AbstractFamily, Argument
+from snrmjax.identify.curves.splines import SmoothingSpline, bends_of
+from snrmjax.identify.joint.force_balance import (
+    STATE_ERRORS,
+    BalanceProblem,
+    Unknowns,
+    velocity_of_others,
+    with_deviations,
+)
+from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
+from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
+from snrmjax.identify.test_model.states import TestStates
+
+_FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
+_CLEARLY = 20.0  # of −2 ln p, to believe in a frequency that wanders though nobody stated it
+LEAST_LEFT = 0.25
+"""Of the residuals, that no number of unknowns can take."""
+
+SMOOTH = ("auto", SmoothingSpline.kind)
+"""Families that are the posterior's own curves."""
+
+_ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
+
+
+class View(NamedTuple):
+    """The posterior of a joint fit's states, and how the fit's problem is made of it."""
+
+    posterior: TestPosterior
+    problem: BalanceProblem  # with the noise, levels and corrections that the posterior has
+    gain: complex  # of the force, and phase of the velocity, as guessed beforehand
+    free: tuple[str, ...]
+    noise: NoiseAndLevels
+    wandering: float  # 1σ of relative stiffness from state to state
+    believed: bool  # whether the noise is stated, and not contradicted by the states
+
+
+def view_of(
+    problem: BalanceProblem,
+    free: tuple[str, ...],
+    stated: bool,
+    *,
+    robust: bool,
+    knots: int | None = None,
+) -> View:
+    """The posterior of a joint fit's states.
+
+    Stated noise that the states exceed widens the bands by as much. A modal mass of which
+    nobody stated an error is the model's, unless the states ask for another; a frequency that
+    wanders is an error of every state where the residuals ask for it.
+
+    Arguments: `free` what of the instruments nobody knows; `stated` whether noise is; `knots` how
+    many the curves have at most.
+    """
+    guess = _complex_gain(problem) if {"force_gain", "instrument_phase"} & set(free) else 1.0 + 0j
+    gain = abs(guess) if "force_gain" in free else 1.0
+    guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
+    states = _test_states(problem, free, stated, guess)
+    fit = functools.partial(fit_test, robust=robust, most_knots=knots, tempered=True)
+    found = fit(states)
+    mass, std = found.modal_mass
+    assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
+    if assumed and abs(mass - 1) < _ASKED * std:
+        known = dataclasses.replace(problem.prior, linear=problem.prior.linear.at[-1].set(0.0))
+        problem = dataclasses.replace(problem, prior=known)
+        states = states._replace(mass_std=0.0)
+        found = fit(states)
+    wandering = wandering_stiffness(found)
+    if wandering > 0:
+        own = np.full(len(states.level), wandering / found.hyper.noise)
+        found = fit(states._replace(errors=np.column_stack([states.errors, own])))
+    if "force_gain" in free:
+        found = _with_common_gain_in_the_force(found)
+    noise = noise_and_levels(found)
+    # What a stated noise lets the posterior have may be less than the states show.
+    believed = stated and not noise.contradicts_upward
+    wider = max(noise.noise / found.hyper.noise, 1.0) if stated and not believed else 1.0
+    size = wider * found.hyper.noise / np.sqrt(found.share)
+    errors = np.zeros((len(states.level), len(STATE_ERRORS)))
+    corrections = np.zeros_like(errors)
+    n_inputs = found.corrections.shape[1]
+    errors[:, :n_inputs], corrections[:, :n_inputs] = size * found.states.errors, found.corrections
+    unstated = few_levels_factor(found.states.n_levels) * np.array(noise.level)
+    level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
+    problem = dataclasses.replace(
+        problem.with_data(
+            std=jnp.asarray(errors),
+            weight=jnp.asarray(found.weight),
+            correction=jnp.asarray(corrections),
+        ),
+        prior=dataclasses.replace(problem.prior, level=jnp.asarray(level)),
+    )
+    found = found._replace(covariance=wider**2 * found.covariance)
+    return View(found, problem, guess, free, noise, wandering, believed)
+
+
+def _with_common_gain_in_the_force(found: TestPosterior) -> TestPosterior:
+    """The posterior with all that levels' gains have in common in the free gain of the force.
+
+    Both do the same to every state, and the curves stay what they are. How they share it is left
+    to priors, of which that of the curves' bends prefers small forces.
+    """
+    places, mean = found.places, found.mean.copy()
+    common = float(np.mean(found.level_errors[:, 0]))
+    mean[places.levels[:, 0]] -= common
+    mean[MASS] = (1 + mean[MASS]) * np.exp(common) - 1
+    for scaled in (places.stiffness, places.damping, OFFSET):
+        mean[scaled] *= np.exp(common)
+    return found._replace(mean=mean)
+
+
+def _test_states(
+    problem: BalanceProblem, free: tuple[str, ...], stated: bool, guess: complex
+) -> TestStates:
+    """The states as the model of a test has them, instruments as far off as was guessed."""
+    data, prior = problem.data, problem.prior
+    force = abs(guess) * np.asarray(data.force)
+    spread = np.asarray(prior.linear)
+
+    def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
+        modes = with_deviations(problem.modes, jnp.asarray(deviation), prior.linear[:-1])
+        return velocity_of_others(modes, data, force)
+
+    constant = float(problem.modal_constant)
+    sign = np.sign(constant)
+    known = np.zeros(len(spread) - 1)
+    velocity = np.asarray(data.velocity) * np.exp(-1j * np.angle(guess)) - beside(known)
+    moved = [beside(unit) - beside(known) for unit in np.eye(len(known))[spread[:-1] > 0]]
+    return TestStates(
+        level=np.asarray(data.level),
+        frequency=np.asarray(data.frequency),
+        force=force,
+        velocity=sign * velocity,
+        errors=np.asarray(data.std)[:, :3],
+        stated=stated,
+        constant=abs(constant),
+        level_std=tuple(np.asarray(prior.level).tolist()),
+        mass_std=_FREE if "force_gain" in free else float(spread[-1]),
+        force_is_free="force_gain" in free,
+        phase_std=_FREE if "instrument_phase" in free else 0.0,
+        offset_std=_FREE if "force_offset" in free else 0.0,
+        beside=sign * np.stack(moved, axis=1) if moved else None,
+    )
+
+
+def viewed_unknowns(view: View, choices: tuple[Choice, Choice]) -> Unknowns:
+    """Unknowns of a joint fit at the posterior's mean, with curves of the families asked for."""
+    found, prior = view.posterior, view.problem.prior
+    level, spread = np.asarray(prior.level), np.asarray(prior.linear)
+    mass = found.modal_mass[0]
+    gain, is_free = abs(view.gain), "force_gain" in view.free
+    linear = np.zeros(len(spread))
+    linear[:-1][spread[:-1] > 0] = found.mean[found.places.others]
+    if spread[-1] > 0:
+        linear[-1] = np.log(mass) / spread[-1]
+    return Unknowns(
+        squared_frequency=_curve(found, choices[0], 0),
+        modal_damping=_curve(found, choices[1], 1),
+        log_force_gain=jnp.asarray(np.log(gain / mass) if is_free else 0.0),
+        force_offset=jnp.asarray(found.force_offset * (gain / mass if is_free else 1.0)),
+        instrument_phase=jnp.asarray(float(np.angle(view.gain)) + found.instrument_phase),
+        level=jnp.asarray(found.level_errors * _sign_of_gain(view) / level),
+        linear=jnp.asarray(linear),
+    )
+
+
+def _sign_of_gain(view: View) -> Float[np.ndarray, " error"]:
+    """A record's gain takes from it, a free gain of the force gives to it."""
+    return np.array([-1.0 if "force_gain" in view.free else 1.0, 1.0, 1.0, 1.0])
+
+
+def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
+    """Covariance of a fit's free unknowns, with the posterior's own curves: in their order."""
+    found, prior = view.posterior, view.problem.prior
+    places, mass = found.places, found.modal_mass[0]
+    knots = found.basis.largest * np.sqrt(found.basis.knots)
+    curves = found.slopes(knots)
+    n = len(found.mean)
+
+    def by(**places_and_slopes: float) -> np.ndarray:
+        row = np.zeros(n)
+        for name, slope in places_and_slopes.items():
+            row[{"mass": MASS, "phase": PHASE, "offset": OFFSET}[name]] = slope
+        return row
+
+    scale = abs(view.gain) / mass if "force_gain" in view.free else 1.0
+    of_mass = -scale * found.force_offset / mass if "force_gain" in view.free else 0.0
+    measurement = {
+        "force_gain": by(mass=-1 / mass),
+        "force_offset": by(offset=scale, mass=of_mass),
+        "instrument_phase": by(phase=1.0),
+    }
+    unit = _sign_of_gain(view) / np.asarray(prior.level)
+    levels = np.zeros((places.levels.size, n))
+    levels[np.arange(places.levels.size), places.levels.reshape(-1)] = np.tile(
+        unit, len(places.levels)
+    )
+    spread = np.asarray(prior.linear)
+    linear = np.zeros((len(spread), n))
+    linear[np.flatnonzero(spread[:-1] > 0), np.arange(n)[places.others]] = 1.0
+    if spread[-1] > 0:
+        linear[-1] = by(mass=1 / (mass * spread[-1]))
+    rows = [curves[:, 0], curves[:, 1]]
+    rows += [row[None] for name, row in measurement.items() if name in view.free]
+    slopes = np.concatenate([*rows, levels, linear])
+    covariance = slopes @ found.covariance @ slopes.T
+    # What is known for certain is as far off, in its own 1σ, as its prior says.
+    certain = len(covariance) - len(spread) + np.flatnonzero(spread == 0)
+    covariance[certain, certain] = 1.0
+    return covariance
+
+
+def noise_and_levels(found: TestPosterior) -> NoiseAndLevels:
+    """The noise as the residuals have it, and 1σ of what levels share as the posterior has them."""
+    rows = found.residuals.size
+    left = max(rows - found.effective_unknowns, LEAST_LEFT * rows)
+    noise = found.hyper.noise * float(np.sqrt(np.sum(found.residuals**2) / left))
+    return NoiseAndLevels(noise, noise / np.sqrt(2 * found.share * left), found.hyper.level_std)
+
+
+def wandering_stiffness(found: TestPosterior) -> float:
+    """1σ of relative stiffness from state to state, zero unless the residuals ask for it.
+
+    Errors of force and phase move the balance alike along a response; a natural frequency that
+    wanders moves it most where the mode is driven hardest.
+    """
+    arm = found.arms_of_stiffness / found.hyper.noise
+    length = np.sum(arm**2, axis=1)
+    along = np.sum(arm * found.residuals, axis=1) ** 2
+    size = np.sum(found.residuals**2, axis=1)
+
+    def criterion(point: np.ndarray) -> float:
+        noise, extra = np.exp(2 * point)
+        inner = noise + extra * length
+        squares = (size - along * extra / inner) / noise
+        return float(np.sum(squares + np.log(noise) + np.log(inner)))
+
+    start = np.log([0.5, 0.5 / np.sqrt(np.median(length))])
+    best = minimize(criterion, start, method="Nelder-Mead")
+    alone = 2 * len(size) * (np.log(np.sum(size) / (2 * len(size))) + 1)
+    return float(np.exp(best.x[1])) if best.fun < alone - _CLEARLY else 0.0
+
+
+def _curve(found: TestPosterior, choice: Choice, which: int) -> AbstractFamily:
+    """A curve of the family asked for, near what the posterior has."""
+    if choice.kind in SMOOTH:
+        return _smooth(found, choice.argument or "displacement", which)
+    x = found.states.amplitude
+    curves = found.curves(x)
+    values = (curves.squared_frequency, curves.modal_damping)[which]
+    std = np.sqrt(curves.covariance[:, which, which])
+    family, n = FAMILIES[choice.kind], len(x)
+    sizes = family.sizes(n, found.states.n_levels) if choice.size is None else (choice.size,)
+    tried: list[tuple[float, int, AbstractFamily]] = []
+    for size in sizes:
+        for argument in (choice.argument,) if choice.argument else ARGUMENTS:
+            at = x if argument == "displacement" else np.abs(found.states.velocity)
+            for one in family.starts(size, argument, at, values, 1 / std):
+                if one.parameters.shape[0] >= n:
+                    raise ValueError(
+                        f"{choice.kind}:{size} has {one.parameters.shape[0]} parameters, but "
+                        f"there are {n} states only: choose a smaller family."
+                    )
+                off = np.sqrt(np.mean(((values_and_slopes(one, at)[0] - values) / std) ** 2))
+                tried.append((float(off), one.parameters.shape[0], one))
+    # The simplest that lies in the band of the smooth curve, or else the nearest to it.
+    inside = [row for row in tried if row[0] < 1.0]
+    if inside:
+        return min(inside, key=lambda row: (row[1], row[0]))[2]
+    return min(tried, key=lambda row: row[0])[2]
+
+
+def _smooth(found: TestPosterior, argument: Argument, which: int) -> SmoothingSpline:
+    """The posterior's own curve, with bends of the sizes that it found."""
+    basis = found.basis
+    displacement = basis.largest * np.sqrt(basis.knots)
+    curves = found.curves(displacement)
+    values = (curves.squared_frequency, curves.modal_damping)[which]
+    knots, scale = basis.knots, basis.largest
+    if argument == "velocity":
+        speed = displacement * np.sqrt(curves.squared_frequency)
+        knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
+    blank = SmoothingSpline.through(knots, values, jnp.asarray(scale), argument)
+    size = found.units[which] * found.hyper.bends[which] / found.modal_mass[0]
+    std = size * np.exp(basis.directions @ found.hyper.along)
+    return eqx.tree_at(
+        lambda one: (one.bends, one.bend_std),
+        blank,
+        (jnp.asarray(bends_of(knots)), jnp.asarray(std)),
+    )
+
+
+def _complex_gain(problem: BalanceProblem) -> complex:
+    """G of K X/A = G F with K polynomial in the amplitude, by linear least squares."""
+    data, constant = problem.data, float(problem.modal_constant)
+    omega, velocity, force = (
+        np.asarray(part) for part in (data.frequency, data.velocity, data.force)
+    )
+    x = velocity / (1j * omega) / constant
+    a = np.abs(x) / np.abs(x).max()
+    columns = [x, x * a**2, x * a**4, 1j * omega * x, 1j * omega * x * a, 1j * omega * x * a**2]
+    columns += [-force + 0j, -1j * force]
+    right = omega**2 * x
+    matrix = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
+    target = np.concatenate([right.real, right.imag])
+    weight = np.tile(1.0 / np.maximum(np.abs(x), 1e-300), 2)
+    size = np.linalg.norm(matrix * weight[:, None], axis=0)
+    answer = np.linalg.lstsq(matrix * weight[:, None] / size, target * weight, rcond=1e-13)[0]
+    gain = complex(*(answer / size)[6:])
+    return gain if gain != 0 else 1.0 + 0.0j
