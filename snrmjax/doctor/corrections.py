@@ -1,6 +1,6 @@
 """One thing at a time that may have gone wrong with a test, undone, and how one mode fits then."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.doctor.judgement import Judged, judge
+from snrmjax.doctor.judgement import Judged, judge, likelier
 from snrmjax.doctor.priors import (
     CLEARLY,
     FORCE_FALLS,
@@ -40,30 +40,37 @@ def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterat
 
     Arguments: `states` as they are read; `base` how they fit.
     """
-    yield _moving("drift", "frequency", states, seen.order - 0.5)
-    yield from _of_files(seen, states)
+    yield _moving("drift", "frequency", states, base, seen.order - 0.5)
+    yield from _of_files(seen, states, base)
     gains = base.posterior.level_errors[:, 0]
     if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
-        yield _of_other_gains(states)
+        yield _of_other_gains(states, base)
     yield from _clipped(states, base)
     yield from _unsettled(seen, states, base)
     yield from _noisy_force(states, base)
 
 
-def _moving(kind: Kind, name: str, states: TestStates, along: np.ndarray) -> TestCorrection:
+def _freer(states: TestStates, base: Judged) -> Judged:
+    """The fit of states with more that is unknown: anew, and from the fit without it on."""
+    return likelier((judge(states), judge(states, start=base)))
+
+
+def _moving(
+    kind: Kind, name: str, states: TestStates, base: Judged, along: np.ndarray
+) -> TestCorrection:
     """A natural frequency that changes in proportion to something, by `value` (relative)."""
-    judged = judge(states._replace(trend=along, trend_std=MOVES))
+    judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
     return TestCorrection(kind, name, judged, 0.5 * judged.posterior.trend[0])
 
 
-def _of_files(seen: CheckedStates, states: TestStates) -> Iterator[TestCorrection]:
+def _of_files(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """A file whose structure has natural frequencies of its own."""
     for k, levels in enumerate(seen.files):
         if k == 0 and len(seen.files) == 2:
             continue  # it differs from the second as the second from it
         own = np.isin(states.level, levels)
         name = f"file {k + 1}"
-        yield _moving("different_structures", name, states, own - float(np.mean(own)))
+        yield _moving("different_structures", name, states, base, own - float(np.mean(own)))
 
 
 class _Tried(NamedTuple):
@@ -74,14 +81,15 @@ class _Tried(NamedTuple):
     log_jacobian: float = 0.0
 
 
-def _likeliest(base: Judged, tried: Iterable[_Tried]) -> tuple[float, Judged]:
-    """The likeliest of several values, from what is nearest to the table as it is on.
+def _likeliest(base: Judged, tried: Sequence[_Tried]) -> tuple[float, Judged]:
+    """The likeliest of several values, alike likely before, from what is nearest to the table as
+    it is on.
 
     Each fit goes on from the last; where one is clearly less likely, so are those beyond.
     """
     value, best, last = np.nan, None, base
     for one in tried:
-        last = judge(one.states, one.log_jacobian, start=last)
+        last = judge(one.states, one.log_jacobian - np.log(len(tried)), start=last)
         if best is None or last.evidence > best.evidence:
             value, best = one.value, last
         if last.evidence < max(best.evidence, base.evidence) - CLEARLY:
@@ -92,11 +100,11 @@ def _likeliest(base: Judged, tried: Iterable[_Tried]) -> tuple[float, Judged]:
 def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
     size, force = np.abs(states.velocity), states.force
-    value, judged = _likeliest(base, (_unclipped_response(states, x) for x in _LIMITS))
+    value, judged = _likeliest(base, [_unclipped_response(states, x) for x in _LIMITS])
     yield TestCorrection("clipped_channel", "velocity", judged, value * float(size.max()))
     value, judged = _likeliest(
         base,
-        (_Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS),
+        [_Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS],
     )
     yield TestCorrection("clipped_channel", "force", judged, value * float(force.max()))
 
@@ -172,9 +180,9 @@ def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
 
 
-def _of_other_gains(states: TestStates) -> TestCorrection:
+def _of_other_gains(states: TestStates, base: Judged) -> TestCorrection:
     """A scale of its own for the force of each level."""
     std = (OTHER_GAIN, *states.level_std[1:])
-    judged = judge(states._replace(force_is_free=True, level_std=std))
+    judged = _freer(states._replace(force_is_free=True, level_std=std), base)
     gains = judged.posterior.level_errors[:, 0]
     return TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))

@@ -4,18 +4,21 @@ Every hypothesis is fitted by the one model of a test (`identify.test_model`): i
 density of what was recorded, however it is read, so that hypotheses compare directly.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, LEAST_SHARE, NO_MODE, SCATTER
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, NO_MODE, SCATTER
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
+from snrmjax.identify.test_model.priors import LEAST_SHARE
 from snrmjax.identify.test_model.states import TestStates
 
 _ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
 _KNOTS = 24  # of its curves, at most
+_NEARLY = 1.0  # relative, of amplitudes for which fits may go on from one another
 _STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
 _SEARCHED = 3  # fits of a modal mass from one start, at most
 _MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
@@ -81,7 +84,7 @@ class Judged(NamedTuple):
         """Whether the table as recorded is clearly less likely.
 
         Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
-        And also from where this hypothesis has curves and levels: of two fits that might both go
+        And each also from where the other has curves and levels: of two fits that might both go
         there none is less likely for having stopped on the way.
         """
 
@@ -90,7 +93,12 @@ class Judged(NamedTuple):
 
         if not clearly(self, recorded):
             return False
-        return clearly(self._finer(beside), recorded._finer(beside, self))
+        here, there = self._from(self), recorded._from(recorded)
+        there = there._from(here)
+        here = here._from(there)
+        if beside:
+            here, there = (one._from(None, discrepancy=True) for one in (here, there))
+        return clearly(here, there)
 
     @property
     def share(self) -> float:
@@ -98,14 +106,22 @@ class Judged(NamedTuple):
         left = self.posterior.residuals
         return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
 
-    def _finer(self, beside: bool, other: "Judged | None" = None) -> "Judged":
-        """Fitted with as many rounds as the steepest curves need, and from another fit on."""
+    def _from(self, start: "Judged | None", *, discrepancy: bool = False) -> "Judged":
+        """The likelier of this fit and one with as many rounds as the steepest curves need, from
+        another of nearly these amplitudes on.
+        """
+        if start is not None and start is not self:
+            own, other = self.states.amplitude, start.states.amplitude
+            if not (start.damped and np.allclose(own, other, rtol=_NEARLY)):
+                return self
         jacobian = self.evidence - self.posterior.log_evidence
-        kinds = (False, True) if beside else (False,)
-        fits = [judge(self.states, jacobian, _FINE, discrepancy=one) for one in kinds]
-        if other is not None and np.allclose(other.states.amplitude, self.states.amplitude, rtol=1):
-            fits.append(judge(self.states, jacobian, _FINE, other))
-        return max(fits, key=lambda one: (one.damped, one.evidence))
+        fit = judge(self.states, jacobian, _FINE, start, discrepancy=discrepancy)
+        return likelier((self, fit))
+
+
+def likelier(fits: Iterable[Judged]) -> Judged:
+    """The likeliest of fits, those before all that lose energy."""
+    return max(fits, key=lambda one: (one.damped, one.evidence))
 
 
 class Scale(NamedTuple):

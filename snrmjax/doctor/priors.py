@@ -15,11 +15,8 @@ NO_MODE = 0.3
 """Misfit beyond which nothing that is small can have gone wrong, and phases are no mode's."""
 
 CLEARLY = 12.0
-"""ln of the odds, before priors, of what is said: e¹², after twenty hypotheses that are each true
-in one table of a hundred, leaves one wrong answer in about a hundred."""
-
-LEAST_SHARE = 0.1
-"""Of states that tell something of their own: from curves that are far off fewer seem to."""
+"""ln of the odds, before priors, of what is said: some twenty hypotheses, true in one table of a
+hundred together, leave one wrong answer in a hundred from 20 · 10⁴ on."""
 
 FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""

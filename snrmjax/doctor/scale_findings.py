@@ -6,14 +6,14 @@ import numpy as np
 
 from snrmjax.doctor.findings import Finding, Repair, Severity, percent
 from snrmjax.doctor.judgement import Judged, Scale, judge
-from snrmjax.doctor.priors import CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
+from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
     """Whether states tell a modal mass that is no linear test's, better than the model's own."""
-    if scale.std > MODAL_MASS or abs(np.log(scale.mass)) < OTHER_SCALE:
+    if abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
         return False
     jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
     held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)

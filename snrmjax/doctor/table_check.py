@@ -8,7 +8,7 @@ from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
 from snrmjax.doctor.judgement import Judged
 from snrmjax.doctor.priors import FITS_WELL, GAIN_MATTERS, MOVED_MATTERS, NO_MODE
-from snrmjax.doctor.readings import best_reading, misread
+from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
@@ -21,25 +21,26 @@ def mode_findings(
 
     `drive` says that forces are declared to be volts: then their scale and phase say nothing.
     """
-    known_mass = model is not None and not drive
-    recorded, best = best_reading(seen, known_mass)
+    scaled = model is not None and not drive  # whether the modal mass is known
+    recorded, best = best_reading(seen, scaled)
     found: list[Finding] = []
-    if best is not recorded and not drive:
+    # Without a model nobody said which way the sensor moves for a force.
+    unsigned = model is None and best.meaning is OPPOSITE
+    if best is not recorded and not drive and not unsigned:
         found.append(misread(recorded.judged, best, where))
         if best.meaning.kind == "degrees_for_radians":
             return found, best.judged
-    base, instead = best.judged, None
-    if known_mass and best.scale is not None and is_other_scale(best.scale, best.as_modelled):
-        # What bends a test may pass for another modal mass, where it explains more.
-        instead = _likeliest(seen, best.as_modelled)
-        if instead is None or instead.judged.evidence < best.scale.judged.evidence:
-            instead = None
-            found += scale_findings(best.scale, best.as_modelled, model, where)
-    elif known_mass:
-        base = best.as_modelled
-    base = best.as_modelled if instead is not None else base
+    base, scale, first = best.as_modelled or best.judged, best.scale, None
+    if model is not None and scaled and scale is not None and is_other_scale(scale, base):
+        # Something is wrong; what bends a test may pass for another modal mass.
+        first = _likeliest(seen, base)
+        if first is None or not first.judged.fits or first.judged.gain(scale.judged) <= 0:
+            found += scale_findings(scale, base, model, where)
+            base, first = scale.judged, None
+    if first is None:
+        first = _likeliest(seen, base)
+        first = first if first is not None and _told(first, base) else None
     plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
-    first = instead or _likeliest(seen, base)
     if first is not None:
         found.append(_mended(seen, base, first, where))
         base = first.judged
@@ -49,17 +50,18 @@ def mode_findings(
 
 
 def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
-    """The likeliest correction that matters and beats the table as it is read."""
+    """The likeliest correction that matters."""
     if base.misfit > NO_MODE:
         return None
-    told = [one for one in corrections(seen, base.states, base) if _matters(one, base)]
-    best = max(told, key=lambda one: one.judged.evidence, default=None)
-    if best is None:
-        return None
-    if best.kind == "force_dropout":  # the noise of a cell is no misfit
-        told = best.judged.noise < FITS_WELL and best.judged.explains(base)
-        return best if told else None
-    return best if best.judged.beats(base) else None
+    mattering = (one for one in corrections(seen, base.states, base) if _matters(one, base))
+    return max(mattering, key=lambda one: one.judged.evidence, default=None)
+
+
+def _told(one: TestCorrection, base: Judged) -> bool:
+    """Whether a correction beats the table as it is read."""
+    if one.kind == "force_dropout":  # the noise of a cell is no misfit
+        return one.judged.noise < FITS_WELL and one.judged.explains(base)
+    return one.judged.beats(base)
 
 
 def _matters(one: TestCorrection, base: Judged) -> bool:

@@ -62,7 +62,6 @@ _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not kno
 _TRIED = 4  # rounds of each start
 _MANY = 48  # rounds of each, where all still moves
 _LOST = 3.0  # 1σ of stated noise, beyond which a walk is not where the records are explained
-_LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks like fewer
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
 _FARTHEST = np.array([1.0, 1.0, 0.5, 0.5])  # of a level's errors, relative or rad
@@ -368,7 +367,7 @@ class _Walk:
         self.turn += 1
         if self.tempered:
             told = share_told_by(left, states.level, states.frequency)
-            self.share = max(told, _LEAST_SHARE)
+            self.share = max(told, priors.LEAST_SHARE)
         if self.robust:
             square = np.sum(left**2, axis=1) / hyper.noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
