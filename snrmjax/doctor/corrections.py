@@ -73,7 +73,7 @@ def _of_files(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator
         yield _moving("different_structures", name, states, base, own - float(np.mean(own)))
 
 
-class _Tried(NamedTuple):
+class Tried(NamedTuple):
     """One value of a correction's parameter."""
 
     value: float
@@ -81,7 +81,7 @@ class _Tried(NamedTuple):
     log_jacobian: float = 0.0
 
 
-def _likeliest(base: Judged, tried: Sequence[_Tried]) -> tuple[float, Judged]:
+def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
     """The likeliest of several values, alike likely before, from what is nearest to the table as
     it is on.
 
@@ -100,21 +100,21 @@ def _likeliest(base: Judged, tried: Sequence[_Tried]) -> tuple[float, Judged]:
 def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
     size, force = np.abs(states.velocity), states.force
-    value, judged = _likeliest(base, [_unclipped_response(states, x) for x in _LIMITS])
+    value, judged = likeliest(base, [_unclipped_response(states, x) for x in _LIMITS])
     yield TestCorrection("clipped_channel", "velocity", judged, value * float(size.max()))
-    value, judged = _likeliest(
+    value, judged = likeliest(
         base,
-        [_Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS],
+        [Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS],
     )
     yield TestCorrection("clipped_channel", "force", judged, value * float(force.max()))
 
 
-def _unclipped_response(states: TestStates, limit: float) -> _Tried:
+def _unclipped_response(states: TestStates, limit: float) -> Tried:
     size = np.abs(states.velocity)
     true, stretch = unclipped(size, limit * size.max())
     errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
     moved = states._replace(velocity=states.velocity * true / size, errors=errors)
-    return _Tried(limit, moved, float(np.sum(np.log(stretch))))
+    return Tried(limit, moved, float(np.sum(np.log(stretch))))
 
 
 def unclipped(
@@ -161,8 +161,8 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         stretch = np.abs(states.velocity / (true * (1 - left)))
         errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
         moved = states._replace(velocity=true, errors=errors)
-        tried.append(_Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
-    value, judged = _likeliest(base, tried)
+        tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
+    value, judged = likeliest(base, tried)
     yield TestCorrection("unsettled_steps", "turning", judged, value)
 
 
@@ -175,8 +175,8 @@ def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     for ratio in _FLOORS:
         floor = ratio * least / states.force
         errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
-        tried.append(_Tried(ratio, states._replace(errors=errors)))
-    ratio, judged = _likeliest(base, tried)
+        tried.append(Tried(ratio, states._replace(errors=errors)))
+    ratio, judged = likeliest(base, tried)
     yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
 
 

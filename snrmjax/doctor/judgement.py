@@ -72,6 +72,18 @@ class Judged(NamedTuple):
             return -np.inf
         return self.evidence - recorded.evidence if recorded.damped else np.inf
 
+    def leaves_less(self, recorded: "Judged") -> bool:
+        """Whether one mode misses states by less, once they are read so.
+
+        Where an error is steep in what was recorded, stretched errors alone may be likelier.
+        """
+        return self.misfit < recorded.misfit or not recorded.damped
+
+    def is_likelier(self, other: "Judged") -> bool:
+        """Whether it is the likelier of two that explain a table, and fits in itself."""
+        here, there = (one._from(one) for one in (self, other))
+        return self.fits and here.leaves_less(there) and here.gain(there) > 0
+
     def beats(self, recorded: "Judged", *, beside: bool = True) -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
@@ -81,7 +93,7 @@ class Judged(NamedTuple):
         return self.fits and self.explains(recorded, beside=beside)
 
     def explains(self, recorded: "Judged", *, beside: bool = True) -> bool:
-        """Whether the table as recorded is clearly less likely.
+        """Whether the table as recorded is clearly less likely, and misses its states by more.
 
         Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
         And each also from where the other has curves and levels: of two fits that might both go
@@ -89,7 +101,7 @@ class Judged(NamedTuple):
         """
 
         def clearly(here: "Judged", there: "Judged") -> bool:
-            return here.share * here.gain(there) > CLEARLY
+            return here.leaves_less(there) and here.share * here.gain(there) > CLEARLY
 
         if not clearly(self, recorded):
             return False

@@ -34,7 +34,7 @@ def mode_findings(
     if model is not None and scaled and scale is not None and is_other_scale(scale, base):
         # Something is wrong; what bends a test may pass for another modal mass.
         first = _likeliest(seen, base)
-        if first is None or not first.judged.fits or first.judged.gain(scale.judged) <= 0:
+        if first is None or not first.judged.is_likelier(scale.judged):
             found += scale_findings(scale, base, model, where)
             base, first = scale.judged, None
     if first is None:
@@ -53,7 +53,11 @@ def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
     """The likeliest correction that matters."""
     if base.misfit > NO_MODE:
         return None
-    mattering = (one for one in corrections(seen, base.states, base) if _matters(one, base))
+    mattering = (
+        one
+        for one in corrections(seen, base.states, base)
+        if _matters(one, base) and one.judged.leaves_less(base)
+    )
     return max(mattering, key=lambda one: one.judged.evidence, default=None)
 
 

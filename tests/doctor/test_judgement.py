@@ -5,7 +5,9 @@ import pytest
 from truths.one_mode import model, noisy, states, table
 
 from snrmjax.doctor.checked_states import checked_states
+from snrmjax.doctor.corrections import Tried, corrections, likeliest
 from snrmjax.doctor.judgement import any_mass, judge, with_mass
+from snrmjax.doctor.priors import MOVES
 
 
 def checked():
@@ -51,3 +53,29 @@ def test_a_fit_that_goes_on_finds_what_a_new_one_does():
     anew = judge(moved, rounds=12)
     assert again.evidence == pytest.approx(anew.evidence, abs=3.0)  # of 12 that decide
     assert again.noise == pytest.approx(anew.noise, rel=0.07)  # 90 numbers tell it so
+
+
+def test_a_trend_that_is_nothing_costs_its_prior_and_no_more():
+    """What is freer and begins where the fit without it ended cannot explain less.
+
+    ln of the prior's 1σ over what the states leave of it, some 4, is all that it pays.
+    """
+    seen = checked()
+    base = judge(seen.test)
+    drift = next(iter(corrections(seen, seen.test, base)))
+    assert drift.kind == "drift"
+    _, left = drift.judged.posterior.trend
+    paid = base.evidence - drift.judged.evidence
+    assert paid == pytest.approx(np.log(MOVES / left), abs=2.5)  # a chance of 5 σ²/2 in it
+
+
+def test_values_that_are_tried_share_the_odds():
+    """Of eight values that change nothing each is the table itself, and one in eight."""
+    states = checked().test
+    base = judge(states)
+    fits = [base]
+    for _ in range(8):
+        fits.append(judge(states, start=fits[-1]))
+    _, found = likeliest(base, [Tried(float(k), states) for k in range(8)])
+    best = max(one.evidence for one in fits[1:])
+    assert found.evidence == pytest.approx(best - np.log(8), abs=1e-6)  # the same fits

@@ -53,8 +53,17 @@ def test_an_unsure_modal_mass_is_no_wrong_scale():
     seen = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
     right, wrong = judge(seen.test), judge(with_mass(seen.test, 1.5))
     assert is_other_scale(Scale(right, 1.5, 0.01), wrong)
-    assert not is_other_scale(Scale(right, 1.5, 0.1), wrong)
+    assert not is_other_scale(Scale(right, 1.5, 0.2), wrong)  # its 95 % band has 1.01 in it
+    # Volts of 4.5 V/N need not be known to 5 % for it.
+    assert is_other_scale(Scale(right, 4.5, 0.1), wrong)
     assert not is_other_scale(Scale(right, 1.1, 0.01), wrong)
+
+
+def test_a_sensor_against_the_force_is_wrong_only_where_a_model_says_otherwise():
+    level, w, force, v = states()
+    data = table(level, w, force, -noisy(v))
+    assert raised(data) == []
+    assert raised(data, model()) == ["shape_not_mass_normalised"]
 
 
 @pytest.mark.parametrize("off", [1, 2, 3])
