@@ -439,7 +439,7 @@ def fitted(beam, tmp_path_factory):
             kept(path, content)
 
         patch.setattr(tables, "write_atomically", counted)
-        module = "snrmjax.identify.pointwise.identification"
+        module = "snrmjax.identify.inference.identification"
         patch.setattr(f"{module}.fit_backbone", lambda *_, **__: beside.append(_))
         options = ("--fit", FAMILIES, "--predict-force", "1", "--predict-force", "4", "--next", "2")
         done = run("identify", data, "--model", model, "--out", out, *options)

@@ -48,7 +48,7 @@ def test_examples_run_and_say_what_they_promise(own_files, capsys):
     told = capsys.readouterr().out
     assert Path("backbone.png").stat().st_size > 10_000
     # The beam's own backbone starts at its linear frequency, and its model lacks nothing.
-    values = names["found"].fit.backbone.natural_frequency(np.array([0.0, 0.01]))
+    values = names["found"].backbone.natural_frequency(np.array([0.0, 0.01]))
     assert values[0] / (2 * np.pi) == pytest.approx(79.02, rel=2e-3)
     assert names["answer"].verdict == "none"
     assert "root_damping.coefficient" in names["answer"].detection_limits

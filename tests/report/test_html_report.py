@@ -111,8 +111,8 @@ def simulated(force, velocities, frequencies_hz, events):
 def report(identification, modes):
     curves = [simulated(0.05, [0.05, 0.11, 0.05], [79, 80, 81], ["", "phase_resonance", ""])]
     figures = {
-        "backbone": backbone_figure(identification.points, identification.fit.backbone),
-        "prediction": response_figure(identification.fit.backbone, [], simulated=curves),
+        "backbone": backbone_figure(identification.points, identification.backbone),
+        "prediction": response_figure(identification.backbone, [], simulated=curves),
     }
     return identification_report(
         identification,
@@ -277,9 +277,9 @@ def test_the_result_is_one_sentence(identification, modes):
 
 
 def test_a_curve_that_turns_tells_its_lowest_and_highest_value(identification, modes):
-    squared = identification.fit.backbone.squared_frequency
+    squared = identification.backbone.squared_frequency
     values = squared.values.at[1].set((70.0 * HERTZ) ** 2)
-    dipped = eqx.tree_at(lambda b: b.squared_frequency.values, identification.fit.backbone, values)
+    dipped = eqx.tree_at(lambda b: b.squared_frequency.values, identification.backbone, values)
     fit = dataclasses.replace(identification.fit, backbone=dipped)
     turned = dataclasses.replace(identification, fit=fit)
     rows = dict(identification_summary(turned, modes))
@@ -326,7 +326,7 @@ def test_unstated_noise_and_scatter_of_levels(identification, modes):
 
 
 def test_resonances_beside_the_nearest_of_harmonic_balance(identification):
-    backbone = identification.fit.backbone
+    backbone = identification.backbone
     found = [resonance(2e-3, 0.202, 81.0), resonance(1e-3, 0.1, 80.0, continued=True)]
     curves = [
         simulated(
@@ -351,7 +351,7 @@ def test_resonances_beside_the_nearest_of_harmonic_balance(identification):
 
 
 def test_resonances_alone(identification):
-    table = resonance_table(identification.fit.backbone, [resonance(2.0, 0.02, 81.0)])
+    table = resonance_table(identification.backbone, [resonance(2.0, 0.02, 81.0)])
     assert table.header == [
         "force (N)",
         "velocity (mm/s)",

@@ -6,7 +6,6 @@ curve that the data do not follow, or by a motion that was not steady.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import minimize_scalar
 
 _CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
 _NOTHING = 0.1  # of the noise: the correlation of smaller residuals does not count
@@ -80,85 +79,3 @@ def _correlation(
     product = sum(float(residuals[a[:-lag]] @ residuals[a[lag:]]) for a in levels)
     square = float(residuals @ residuals)
     return (product / square if square > 0 else 0.0), pairs
-
-
-def sizes_off_resonance(
-    residuals: Float[np.ndarray, "state part"],
-    arms: Float[np.ndarray, "state part unknown"],
-    phase: Float[np.ndarray, " state"],
-    assumed: float,
-) -> Float[np.ndarray, " state"]:
-    """Size of the states' errors at resonance and beside it, in units of the 1σ assumed there.
-
-    Where no noise is stated its size at a phase φ is assumed to grow as √(1 + (k sin φ)²), k =
-    `assumed`. Most states are off resonance and tell the noise; if it grows less than that, it is
-    too small at resonance, where damping is read. Here the likeliest k says how large it is.
-    Arguments: whitened `residuals`; `arms` JK with (JᵀJ)⁻¹ = KKᵀ, whose squares are what a state
-    has of its own residual: unknowns that follow it made it smaller; `phase` in rad, of velocity
-    against force.
-    Returns sizes whose squares have the mean of the residuals' as their unit.
-    Reference: for variances as functions, Carroll & Ruppert, Ann. Stat. 10 (1982) 429,
-    doi:10.1214/aos/1176345784.
-    """
-    leverage = np.sum(arms**2, axis=2)
-    square = np.mean(residuals**2 / np.maximum(1 - leverage, _LEAST_FREE), axis=1)
-    far = np.sin(phase) ** 2
-
-    def growth(logarithm: float) -> Float[np.ndarray, " state"]:
-        return (1 + np.exp(2 * logarithm) * far) / (1 + assumed**2 * far)
-
-    def criterion(logarithm: float) -> float:
-        own = growth(logarithm)
-        return float(np.mean(np.log(own)) + np.log(np.mean(square / own)))
-
-    found = growth(minimize_scalar(criterion, bounds=_GROWTHS, method="bounded").x)
-    return np.sqrt(found * np.mean(square / found) / np.mean(square))
-
-
-def added_covariance(
-    root: Float[np.ndarray, "unknown unknown"],
-    jacobian: Float[np.ndarray, "state part unknown"],
-    correlation: Float[np.ndarray, " part"],
-    levels: list[Int[np.ndarray, " place"]],
-    counted: float = 1.0,
-    size: Float[np.ndarray, " state"] | None = None,
-) -> Float[np.ndarray, "unknown unknown"]:
-    """What correlated or unequal residuals add to the covariance (JᵀJ)⁻¹ of a least-squares fit.
-
-    The fit is the same, and its covariance (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with residuals k states apart
-    correlated by the k-th power of that of neighbours. What this process has less of than white
-    noise, differences between neighbours, does not make a band narrower.
-    Arguments: `root` K with (JᵀJ)⁻¹ = KKᵀ; `jacobian` of the states' whitened residuals; the share
-    of the states that the fit `counted`, which is in these residuals already; `size` of the
-    states' errors, in units of what the fit took for their 1σ (`sizes_off_resonance`).
-    References: White, Econometrica 48 (1980) 817, doi:10.2307/1912934; Newey & West, Econometrica
-    55 (1987) 703, doi:10.2307/1913610, with an autoregressive process of first order in place of
-    their weights.
-    """
-    excess = np.zeros((root.shape[1], root.shape[1]))
-    for part, rho in enumerate(correlation):
-        if rho == 0 and counted == 1 and size is None:
-            continue
-        for some in levels:
-            arms = jacobian[some, part] @ root
-            own = arms if size is None else arms * size[some, None]
-            excess += counted * own.T @ (own + _of_neighbours(own, rho)) - arms.T @ arms
-    values, directions = np.linalg.eigh(excess)
-    arms = root @ directions * np.sqrt(np.maximum(values, 0.0))
-    return arms @ arms.T
-
-
-def _of_neighbours(
-    arms: Float[np.ndarray, "place unknown"], rho: float
-) -> Float[np.ndarray, "place unknown"]:
-    """(R − 1)·arms, with R's entries ρ^|i − j|: by its inverse, which has three diagonals."""
-    n = len(arms)
-    if n < 2:
-        return np.zeros_like(arms)
-    from scipy.linalg import solveh_banded  # keeps the package quick to import
-
-    bands = np.zeros((2, n))
-    bands[0, 1:] = -rho
-    bands[1] = 1 + rho**2
-    bands[1, [0, -1]] = 1.0
-    return (1 - rho**2) * solveh_banded(bands, arms) - arms

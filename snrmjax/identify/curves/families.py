@@ -10,7 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import expit
 
-from snrmjax.identify.curves.family_base import AbstractFamily, Argument, Coefficient, linear_start
+from snrmjax.identify.curves.family_base import (
+    AbstractCurve,
+    AbstractFamily,
+    Argument,
+    Coefficient,
+    linear_start,
+)
 from snrmjax.identify.curves.splines import SmoothingSpline, Spline, spline_columns
 
 
@@ -265,7 +271,7 @@ def parse_family(text: str) -> Choice:
 
 
 def values_and_slopes(
-    family: AbstractFamily, amplitude: Float[np.ndarray, " point"]
+    family: AbstractCurve, amplitude: Float[np.ndarray, " point"]
 ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point parameter"]]:
     """Values of a curve and their derivatives by its parameters, on the host.
 
@@ -274,13 +280,20 @@ def values_and_slopes(
     """
     x, parameters = amplitude / float(family.scale), np.asarray(family.parameters)
     if isinstance(family, SumOfPowers):
-        columns = np.stack([x**power for power in family.powers(family.order)], axis=1)
+        powers = np.array(family.powers(family.order))
+        some = np.where(x > 0, x, 1.0)[:, None] ** powers
+        columns = np.where(x[:, None] > 0, some, powers == 0)
+        # Dry friction: its equivalent damping grows without bound towards rest.
+        dry = float(np.sum(parameters[powers < 0]))
+        if dry != 0:
+            values = columns @ parameters
+            return np.where(x > 0, values, np.sign(dry) * np.inf), columns
     elif isinstance(family, Spline):
         columns = spline_columns(family, amplitude)
     elif isinstance(family, PowerLaw):
         exponent = float(family.largest_exponent * expit(parameters[2]))
         term, share = x**exponent, exponent / family.largest_exponent
-        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(x)
+        by_logit = exponent * (1 - share) * parameters[1] * term * np.log(np.where(x > 0, x, 1.0))
         values = parameters[0] + parameters[1] * term
         return values, np.stack([np.ones_like(x), term, by_logit], axis=1)
     else:
@@ -290,5 +303,5 @@ def values_and_slopes(
     return columns @ parameters, columns
 
 
-def _called_with(family: AbstractFamily, parameters: Array, amplitude: Array) -> Array:
+def _called_with(family: AbstractCurve, parameters: Array, amplitude: Array) -> Array:
     return eqx.tree_at(lambda f: f.parameters, family, parameters)(amplitude)

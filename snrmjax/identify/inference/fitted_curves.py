@@ -1,26 +1,23 @@
 """Both curves of a joint fit at amplitudes on the backbone, with bands."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from snrmjax.identify.curves.family_base import AbstractCurve
+from snrmjax.identify.curves.families import values_and_slopes
+from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.force_balance import Unknowns
-from snrmjax.identify.joint.free_unknowns import Unravel
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
-from snrmjax.identify.pointwise.curve_fit import PchipCurve
-from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
-from snrmjax.numerics.blocks import by_blocks
-from snrmjax.numerics.compiled import compiled
+from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
-_BLOCK = 256  # amplitudes that one program works on
+_SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
-_KNOTS = 120  # of the curves for what takes a `Backbone`
+_STEP = 1e-5  # relative, of central differences by the amplitude
+_KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
 
@@ -80,82 +77,123 @@ def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
 
 
 def as_backbone(
-    fit: JointFit, *, largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+    fit: JointFit, *, argument: AmplitudeArgument = "displacement", reach: float = 1.0
 ) -> Backbone:
-    """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
+    """The fitted curves as what responses are predicted from.
 
-    Damping that belongs to the velocity is taken where it lies on the backbone. The knots reach up
-    to `largest_amplitude_ratio` times the largest measured amplitude.
+    The smooth curves are the fit's own, at its own knots. Families by name are drawn through many
+    knots, up to `reach` times the largest measured displacement; damping that belongs to the
+    velocity is then taken where it lies on the backbone. Against velocity the knots are where the
+    backbone has them.
     """
-    displacement = largest_amplitude_ratio * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
-    sampled = values_at_displacement(fit, displacement)
-    # A polynomial may fall below zero beyond the data: there is no motion there.
-    sound = np.append(sampled[0][:, 0] > 0, False).argmin()
-    if sound < _KNOTS:
-        displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
-        sampled = values_at_displacement(fit, displacement)
-    values, slopes = (np.asarray(part) for part in sampled[:2])
-    covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
-    measured = np.asarray(fit.motion().displacement)
-    # Dry friction has no finite damping at rest: there the next knot's value stands.
-    damping = values[:, 1].copy()
-    damping[0] = damping[0] if np.isfinite(damping[0]) else damping[1]
+    largest = fit.largest[argument == "velocity"]
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    smooth = all(
+        isinstance(one, SmoothingSpline) and one.argument == "displacement"
+        for one in (squared, damping)
+    )
+    own = smooth and argument == "displacement"
+    if own:
+        n = squared.parameters.shape[0] + damping.parameters.shape[0]
+        covariance = fit.covariance[:n, :n]
+    else:
+        displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+        if smooth and isinstance(squared, Spline):
+            displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
+        with np.errstate(invalid="ignore"):
+            positive = values_at_displacement(fit, displacement)[0][:, 0] > 0
+        # A polynomial may fall below zero beyond the data: there is no motion there.
+        displacement = displacement[: np.append(positive, False).argmin()]
+        values, slopes, at = values_at_displacement(fit, displacement)
+        if argument == "velocity":
+            values, slopes = values_with_slopes(fit, at)
+        at = displacement if argument == "displacement" else at
+        # Dry friction has no finite damping at rest: there the next knot's value stands.
+        values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
+        squared, damping = (
+            Spline.through((at / at[-1]) ** 2, values[:, k], jnp.asarray(at[-1]), argument)
+            for k in range(2)
+        )
+        rows = np.concatenate([slopes[:, 0], slopes[:, 1]])
+        covariance = rows @ fit.covariance @ rows.T
+    motion = fit.motion()
+    measured = np.abs(motion.velocity) if argument == "velocity" else motion.displacement
     return Backbone(
-        squared_frequency=PchipCurve(jnp.asarray(displacement), jnp.asarray(values[:, 0])),
-        modal_damping=PchipCurve(jnp.asarray(displacement), jnp.asarray(damping)),
-        squared_frequency_covariance=jnp.asarray(covariance[0]),
-        modal_damping_covariance=jnp.asarray(np.nan_to_num(covariance[1])),
+        squared_frequency=squared,
+        modal_damping=damping,
+        covariance=jnp.asarray(covariance),
         modal_constant=fit.problem.constant_of(fit.unknowns),
-        smallest=jnp.asarray(measured.min()),
-        largest=jnp.asarray(fit.largest[0]),
-        argument="displacement",
+        smallest=jnp.asarray(np.min(measured)),
+        largest=jnp.asarray(largest),
+        argument=argument,
         sensor=fit.modes.sensors[fit.data.sensor],
     )
 
 
-def curve_values(
-    unknowns: Unknowns, velocity: Float[Array, " point"], near: Float[Array, " point"]
-) -> Float[Array, "point 2"]:
-    """ω̃² and 2ζ̃ω̃ at velocities on the backbone, `near` displacements; differentiable."""
-    squared, damping = unknowns.squared_frequency, unknowns.modal_damping
+class _OnBackbone(NamedTuple):
+    """Both curves at points on the backbone, where Ω = ω̃."""
 
-    def excess(squared: AbstractCurve, x: Array) -> Array:
-        return x * jnp.sqrt(squared(squared.amplitude(x, velocity))) - velocity
-
-    x = _solved(excess, squared, near)
-    return jnp.stack(
-        [squared(squared.amplitude(x, velocity)), damping(damping.amplitude(x, velocity))], axis=1
-    )
+    values: Float[np.ndarray, "point curve"]
+    slopes: Float[np.ndarray, "point curve parameter"]  # by parameters of one, then of the other
+    displacement: Float[np.ndarray, " point"]
+    velocity: Float[np.ndarray, " point"]
 
 
-def _speed(squared: AbstractCurve, displacement: Float[Array, " point"]) -> Float[Array, " point"]:
-    """Velocity amplitude of the backbone; its derivative is that of the equation's solution."""
+def on_backbone(
+    unknowns: Unknowns, at: Float[np.ndarray, " point"], near: Float[np.ndarray, " point"] | None
+) -> _OnBackbone:
+    """ω̃² and 2ζ̃ω̃ and their derivatives, by the host.
 
-    def excess(squared: AbstractCurve, v: Array) -> Array:
-        return v - displacement * jnp.sqrt(squared(squared.amplitude(displacement, v)))
-
-    start = displacement * jnp.sqrt(squared(jnp.zeros_like(displacement)))
-    return _solved(excess, squared, start)
-
-
-def _solved(
-    excess: Callable[[AbstractCurve, Array], Array], curve: AbstractCurve, start: Array
-) -> Array:
-    """Newton's method for every point by itself; the derivative is the solution's.
-
-    Newton's steps are taken of a curve without derivatives: nothing is pushed through the loop.
+    Arguments: `at` displacements, at which derivatives are taken, or, where displacements `near`
+    them are given, velocities. Where a curve is a function of the other amplitude this is the one
+    that belongs to it, and moves with the curves' parameters.
     """
-    still, start = jax.lax.stop_gradient((curve, start))
+    curves = unknowns.squared_frequency, unknowns.modal_damping
+    n = curves[0].parameters.shape[0]
+    of_velocity = [one.argument == "velocity" for one in curves]
+    given_velocity = near is not None
+    at = np.asarray(at, dtype=float)
+    if of_velocity[0] == given_velocity:
+        squared, by_own, _ = _linearised(curves[0], at)
+        root = np.sqrt(squared)
+        other = at / root if given_velocity else at * root
+        # x = v/√s or v = x√s.
+        moves = (-0.5 if given_velocity else 0.5) * (other / squared)[:, None] * by_own
+    else:
+        other = at * np.sqrt(_linearised(curves[0], 0 * at)[0]) if near is None else near
+        for _ in range(_ITERATIONS + 1):
+            # v − x√s(x) for x, or x√s(v) − v for v.
+            squared, by_own, steep = _linearised(curves[0], other)
+            root = np.sqrt(squared)
+            gap = other * root - at if given_velocity else at * root - other
+            arm = (other if given_velocity else at) / (2 * root)
+            slope = (root if given_velocity else -1.0) + arm * steep
+            moves = -(arm / slope)[:, None] * by_own
+            other = other - gap / slope
+        by_own = by_own + steep[:, None] * moves
+    displacement, velocity = (other, at) if given_velocity else (at, other)
+    damping, by_damping, steep = _linearised(
+        curves[1], velocity if of_velocity[1] else displacement
+    )
+    slopes = np.zeros((len(at), 2, n + by_damping.shape[1]))
+    slopes[:, 0, :n], slopes[:, 1, n:] = by_own, by_damping
+    if of_velocity[1] != given_velocity:
+        slopes[:, 1, :n] = steep[:, None] * moves
+    return _OnBackbone(np.stack([squared, damping], axis=1), slopes, displacement, velocity)
 
-    def values(x: Array) -> tuple[Array, Array]:
-        return jax.jvp(lambda x: excess(still, x), (x,), (jnp.ones_like(x),))
 
-    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        value, slope = values(state[0])
-        return state[0] - value / slope, slope
-
-    found, slope = jax.lax.fori_loop(0, _ITERATIONS, step, (start, jnp.ones_like(start)))
-    return found - excess(curve, found) / slope
+def _linearised(
+    curve: AbstractFamily, amplitude: Float[np.ndarray, " point"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values, derivatives by the parameters, and by the amplitude by central differences."""
+    values, slopes = values_and_slopes(curve, amplitude)
+    step = _STEP * np.maximum(amplitude, 1e-3 * float(curve.scale))
+    (above, _), (below, _) = (
+        values_and_slopes(curve, np.maximum(amplitude + sign * step, 0.0)) for sign in (1, -1)
+    )
+    width = amplitude + step - np.maximum(amplitude - step, 0.0)
+    with np.errstate(invalid="ignore"):
+        return values, slopes, (above - below) / width
 
 
 def values_with_slopes(
@@ -165,10 +203,8 @@ def values_with_slopes(
 
     Raises `ValueError` where the backbone has a velocity at several displacements.
     """
-    vector, unravel, own = fit.packed()
-    near = displacement_near(fit, velocity)
-    found = by_blocks(lambda v, x: _at_velocity(vector, unravel, v, x), _BLOCK, velocity, near)
-    return found[0], found[1][:, :, own]
+    found = on_backbone(fit.unknowns, velocity, displacement_near(fit, velocity))
+    return found.values, _of_all(fit, found.slopes)
 
 
 def values_at_displacement(
@@ -179,9 +215,13 @@ def values_at_displacement(
     Float[np.ndarray, " point"],
 ]:
     """ω̃² and 2ζ̃ω̃, their derivatives by the free unknowns, and the velocity, at displacements."""
-    vector, unravel, own = fit.packed()
-    found = by_blocks(lambda x: _at_displacement(vector, unravel, x), _BLOCK, displacement)
-    return found[0], found[1][:, :, own], found[2]
+    found = on_backbone(fit.unknowns, displacement, None)
+    return found.values, _of_all(fit, found.slopes), found.velocity
+
+
+def _of_all(fit: JointFit, slopes: np.ndarray) -> Float[np.ndarray, "point curve unknown"]:
+    """With columns of zeros for the unknowns after those of the curves."""
+    return np.pad(slopes, ((0, 0), (0, 0), (0, len(fit.covariance) - slopes.shape[2])))
 
 
 def displacement_near(
@@ -217,11 +257,10 @@ class _Reached(NamedTuple):
 
 def _near(fit: JointFit, velocity: float) -> _Reached:
     """The backbone from rest to beyond the measured displacements and a velocity."""
-    vector, unravel, _ = fit.packed()
     reach = fit.largest[0]
     for _ in range(_DOUBLINGS):
-        x = np.linspace(0.0, reach, _BLOCK)
-        speed = np.asarray(_at_displacement(vector, unravel, x)[2])
+        x = np.linspace(0.0, reach, _SCAN)
+        speed = on_backbone(fit.unknowns, x, None).velocity
         turns = np.flatnonzero(~(np.diff(speed) > 0))
         if turns.size and np.min(speed[turns[0] :]) < velocity:
             return _Reached(x, speed, float(speed[turns[0]]))
@@ -230,28 +269,3 @@ def _near(fit: JointFit, velocity: float) -> _Reached:
         reach *= 2
     end = turns[0] + 1 if turns.size else len(x)
     return _Reached(x[:end], speed[:end], None)
-
-
-@compiled
-def _at_velocity(
-    vector: Array, unravel: Unravel, velocity: Array, near: Array
-) -> tuple[Array, Array]:
-    def of(vector: Array) -> tuple[Array, Array]:
-        values = curve_values(unravel(vector), velocity, near)
-        return values, values
-
-    slopes, values = jax.jacfwd(of, has_aux=True)(vector)
-    return values, slopes
-
-
-@compiled
-def _at_displacement(vector: Array, unravel: Unravel, x: Array) -> tuple[Array, Array, Array]:
-    def of(vector: Array) -> tuple[Array, tuple[Array, Array]]:
-        squared, damping = unravel(vector).squared_frequency, unravel(vector).modal_damping
-        speed = _speed(squared, x)
-        pair = [curve(curve.amplitude(x, speed)) for curve in (squared, damping)]
-        values = jnp.stack(pair, axis=1)
-        return values, (values, speed)
-
-    slopes, (values, speed) = jax.jacfwd(of, has_aux=True)(vector)
-    return values, slopes, speed

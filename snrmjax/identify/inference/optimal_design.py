@@ -22,7 +22,7 @@ from snrmjax.identify.joint.force_balance import (
     no_errors,
     weighting_at,
 )
-from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_levels
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_levels
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import whitened
 from snrmjax.identify.test_model.states import LEVEL_ERRORS

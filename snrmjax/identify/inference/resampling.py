@@ -9,15 +9,15 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from snrmjax.identify.inference.fitted_curves import (
-    curve_values,
     displacement_near,
+    on_backbone,
     values_with_slopes,
 )
 from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.family_fit import SOLVER
 from snrmjax.identify.joint.force_balance import BalanceProblem
-from snrmjax.identify.joint.free_unknowns import Unravel, filled, padded_problem
+from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
@@ -196,16 +196,14 @@ def compare_bands(
     """
     at = np.asarray(velocity, dtype=np.float64)
     values, slopes = values_with_slopes(fit, at)
-    near = jnp.asarray(displacement_near(fit, at))
-    _, unravel, own = fit.packed()
+    near, (_, unravel) = displacement_near(fit, at), fit.vector()
 
     def spread_of(samples: np.ndarray) -> np.ndarray:
-        whole = np.tile(np.asarray(fit.packed().vector), (len(samples), 1))
-        whole[:, own] = samples
-        drawn = np.array(_curves_of(unravel, jnp.asarray(whole), jnp.asarray(at), near))
+        good = samples[np.all(np.isfinite(samples), axis=1)]
+        drawn = np.array([on_backbone(unravel(one), at, near).values for one in good])
         with np.errstate(invalid="ignore"):
             drawn[:, :, 0] = np.sqrt(drawn[:, :, 0])
-        return np.nanstd(drawn, axis=0)
+        return np.nanstd(drawn, axis=0) if len(good) else np.full((len(at), 2), np.nan)
 
     def linear(covariance: np.ndarray) -> np.ndarray:
         std = np.sqrt(np.einsum("acp,pq,acq->ac", slopes, covariance, slopes))
@@ -228,8 +226,3 @@ def compare_bands(
         for a in range(len(at))
     )
     return ComparedBands(rows, int(np.sum(~np.all(np.isfinite(refits), axis=1))))
-
-
-@compiled
-def _curves_of(unravel: Unravel, samples: Array, velocity: Array, near: Array) -> Array:
-    return jax.lax.map(lambda v: curve_values(unravel(v), velocity, near), samples)

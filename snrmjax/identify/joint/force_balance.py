@@ -29,6 +29,7 @@ from snrmjax.numerics.compiled import compiled
 STATE_ERRORS = ("force", "velocity", "phase", "stiffness")
 """What every state may err in at random, relative or in rad; stiffness is never stated."""
 
+_FEWEST_STATES = 48  # that programs have room for
 _STEPS = 4  # towards every state's most likely errors
 _FARTHEST = 0.3  # relative or rad, of a state's correction: no measurement is as bad
 
@@ -208,7 +209,9 @@ def _measured(
     """The force in N, or the drive in V where only that is known; the states that have all."""
     driven = not np.any(np.isfinite(np.asarray(data.force)))
     force = np.asarray(data.drive if driven else data.force)
-    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force)
+    return force, np.isfinite(np.abs(velocity)) & (np.abs(velocity) > 0) & np.isfinite(force) & (
+        force > 0
+    )
 
 
 def with_deviations(modes: LinearModes, deviation: Array, spread: Array) -> LinearModes:
@@ -238,9 +241,33 @@ class Motion(eqx.Module):
 
 
 @compiled
+def _velocity_of_others(modes: LinearModes, frequency: Array, load: Array, share: Array) -> Array:
+    return jnp.sum(share * residual_velocity(modes, frequency, load), axis=1)
+
+
+def velocity_of_others(
+    modes: LinearModes, data: BalanceData, force: Float[np.ndarray, " state"]
+) -> Complex[np.ndarray, " state"]:
+    """Velocity of all but the mode of interest under forces in N, by the sensors' shares.
+
+    One program serves many numbers of states.
+    """
+    n, size = len(force), with_room(len(force))
+    rows = (filled(rows, size, None) for rows in (data.frequency, force, data.share))
+    return np.asarray(_velocity_of_others(modes, *rows))[:n]
+
+
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
-    """`motion_of` the states as they were recorded."""
-    return motion_of(unknowns, problem, no_errors(problem.data.level.shape[0]))
+    """`motion_of` the states as they were recorded, by the host."""
+    data, prior = problem.data, problem.prior
+    level = np.asarray(unknowns.level * prior.level)[np.asarray(data.level)]
+    of_force = float(prior.gain_of_force) * level[:, 0]
+    force = np.asarray(data.force) * np.exp(float(unknowns.log_force_gain) + of_force)
+    force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))
+    turned = of_force - level[:, 0] - 1j * (level[:, 1] + float(unknowns.instrument_phase))
+    linear = with_deviations(problem.modes, unknowns.linear, prior.linear)
+    own = np.asarray(data.velocity) * np.exp(turned) - velocity_of_others(linear, data, force)
+    return Motion(own, np.abs(own) / np.asarray(data.frequency), force)
 
 
 @compiled
@@ -287,6 +314,19 @@ def force_balance(
     unit = jax.lax.stop_gradient(motion.force * jnp.exp(-error[:, 0])) * jnp.exp(error[:, 0])
     excess = (needed - motion.force) / unit
     return jnp.stack([excess.real, excess.imag], axis=1)
+
+
+def with_room(n_states: int) -> int:
+    """So many states have room for these, so that few sizes compile."""
+    power = 1 << (n_states - 1).bit_length()
+    return max(n_states, _FEWEST_STATES, 3 * power // 4 if n_states <= 3 * power // 4 else power)
+
+
+def filled(rows: Array | np.ndarray, size: int, spare: float | None) -> np.ndarray:
+    """Rows and spare ones, of one number or, without it, copies of the last."""
+    known = np.asarray(rows)
+    missing = np.repeat(known[-1:], size - len(known), axis=0)
+    return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
 
 
 def no_errors(n_states: int) -> Float[Array, "state input"]:

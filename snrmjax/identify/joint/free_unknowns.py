@@ -15,13 +15,13 @@ from snrmjax.identify.curves.packed_curve import packed
 from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
-    Motion,
     Unknowns,
-    recorded_motion,
+    filled,
+    with_room,
 )
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
-_FEWEST_STATES, _LEVELS = 48, 8  # that there is room for; levels come in so many
+_LEVELS = 8  # come in so many
 
 FREE = ("force_gain", "force_offset", "instrument_phase")
 """Unknowns of the measurement that a fit may free."""
@@ -102,9 +102,7 @@ def packed_unknowns(
 
 def padded_data(data: BalanceData) -> BalanceData:
     """The data with padding states of no weight and padding levels: few sizes compile."""
-    n, levels = len(data.level), data.n_levels
-    power = 1 << (n - 1).bit_length()
-    size = max(n, _FEWEST_STATES, 3 * power // 4 if n <= 3 * power // 4 else power)
+    size, levels = with_room(len(data.level)), data.n_levels
     roomy = jax.tree.map(lambda a: filled(a, size, None), data)
     weight = filled(data.weight, size, 0.0)
     return dataclasses.replace(roomy, weight=weight, n_levels=padded_levels(levels))
@@ -115,24 +113,9 @@ def padded_levels(n_levels: int) -> int:
     return _LEVELS * -(-n_levels // _LEVELS)
 
 
-def recorded_motion_of(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
-    """`recorded_motion` by a program that serves every family and number of states."""
-    n, padded = len(problem.data.level), padded_problem(problem)
-    whole = packed_unknowns(unknowns, (), padded.data.n_levels).unravel.unknowns
-    motion = recorded_motion(whole, padded)
-    return jax.tree.map(lambda rows: np.asarray(rows)[:n], motion)
-
-
 def padded_problem(problem: BalanceProblem) -> BalanceProblem:
     """The problem with `padded_data`."""
     return dataclasses.replace(problem, data=padded_data(problem.data))
-
-
-def filled(rows: Array, size: int, spare: float | None) -> np.ndarray:
-    """Rows and spare ones, of one number or, without it, copies of the last."""
-    known = np.asarray(rows)
-    missing = np.repeat(known[-1:], size - len(known), axis=0)
-    return np.concatenate([known, missing if spare is None else np.full_like(missing, spare)])
 
 
 def free_unknowns(unknowns: Unknowns, free: tuple[str, ...]) -> Unknowns:

@@ -24,6 +24,7 @@ from snrmjax.identify.joint.force_balance import (
     Unknowns,
     balance_data,
     level_numbers,
+    recorded_motion,
     stated_level_std,
     stated_prior,
 )
@@ -34,7 +35,6 @@ from snrmjax.identify.joint.free_unknowns import (
     named_unknowns,
     packed_unknowns,
     padded_levels,
-    recorded_motion_of,
 )
 from snrmjax.identify.joint.notes import (
     NoiseAndLevels,
@@ -143,7 +143,7 @@ class JointFit(AbstractResult):
 
     def motion(self) -> Motion:
         """The nonlinear mode's motion in the states as the fit sees it."""
-        return recorded_motion_of(self.unknowns, self.problem)
+        return recorded_motion(self.unknowns, self.problem)
 
     def recorded_force(self, force: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """What the test records of a force in N: in N, or in V where only the drive is known."""

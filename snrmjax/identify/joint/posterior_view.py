@@ -17,13 +17,13 @@ from snrmjax.identify.joint.force_balance import (
     STATE_ERRORS,
     BalanceProblem,
     Unknowns,
+    velocity_of_others,
     with_deviations,
 )
 from snrmjax.identify.joint.notes import NoiseAndLevels
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
 from snrmjax.identify.test_model.states import TestStates
-from snrmjax.model.modes import residual_velocity
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
 _CLEARLY = 20.0  # of −2 ln p, to believe in a frequency that wanders though nobody stated it
@@ -80,6 +80,8 @@ def view_of(
     if wandering > 0:
         own = np.full(len(states.level), wandering / found.hyper.noise)
         found = fit(states._replace(errors=np.column_stack([states.errors, own])))
+    if "force_gain" in free:
+        found = _with_common_gain_in_the_force(found)
     noise = noise_and_levels(found)
     # What a stated noise lets the posterior have may be less than the states show.
     believed = stated and not noise.contradicts_upward
@@ -103,17 +105,32 @@ def view_of(
     return View(found, problem, guess, free, noise, wandering, believed)
 
 
+def _with_common_gain_in_the_force(found: TestPosterior) -> TestPosterior:
+    """The posterior with all that levels' gains have in common in the free gain of the force.
+
+    Both do the same to every state, and the curves stay what they are. How they share it is left
+    to priors, of which that of the curves' bends prefers small forces.
+    """
+    places, mean = found.places, found.mean.copy()
+    common = float(np.mean(found.level_errors[:, 0]))
+    mean[places.levels[:, 0]] -= common
+    mean[MASS] = (1 + mean[MASS]) * np.exp(common) - 1
+    for scaled in (places.stiffness, places.damping, OFFSET):
+        mean[scaled] *= np.exp(common)
+    return found._replace(mean=mean)
+
+
 def _test_states(
     problem: BalanceProblem, free: tuple[str, ...], stated: bool, guess: complex
 ) -> TestStates:
     """The states as the model of a test has them, instruments as far off as was guessed."""
     data, prior = problem.data, problem.prior
     force = abs(guess) * np.asarray(data.force)
-    load, share, spread = jnp.asarray(force), np.asarray(data.share), np.asarray(prior.linear)
+    spread = np.asarray(prior.linear)
 
     def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
-        modes = with_deviations(problem.modes, jnp.asarray(deviation), prior.linear)
-        return np.sum(share * np.asarray(residual_velocity(modes, data.frequency, load)), axis=1)
+        modes = with_deviations(problem.modes, jnp.asarray(deviation), prior.linear[:-1])
+        return velocity_of_others(modes, data, force)
 
     constant = float(problem.modal_constant)
     sign = np.sign(constant)

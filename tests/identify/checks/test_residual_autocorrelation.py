@@ -8,10 +8,8 @@ from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.checks.residual_autocorrelation import (
-    added_covariance,
     along_resonance,
     residual_autocorrelation,
-    sizes_off_resonance,
 )
 from snrmjax.identify.joint.joint_fit import fit_jointly
 
@@ -56,83 +54,6 @@ def test_what_is_left_of_exact_states_is_no_matter():
     slow = drawn(np.random.default_rng(7), 0.95, 1, 60).T
     assert residual_autocorrelation(slow, levels) > 0
     assert residual_autocorrelation(1e-6 * slow, levels) == 0
-
-
-def test_the_covariance_is_that_of_repeated_straight_lines():
-    rng, rho = np.random.default_rng(4), 0.8
-    at = np.tile(np.linspace(-1, 1, 30), 3)
-    levels = along_resonance(np.repeat(np.arange(3), 30), at)
-    jacobian = np.stack([np.ones(90), at], axis=1)
-    noise = drawn(rng, rho, 20000, 3, 30).reshape(20000, -1)
-    fits = np.linalg.lstsq(jacobian, noise.T, rcond=None)[0]
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    rows, root = np.stack([jacobian, 0 * jacobian], axis=1), np.linalg.cholesky(inverse)
-    found = inverse + added_covariance(root, rows, np.array([rho, 0.0]), levels)
-    np.testing.assert_allclose(found, np.cov(fits), rtol=0.05, atol=0.02 * found.max())
-
-
-@pytest.mark.parametrize("counted", [1.0, 0.5, 0.3])
-def test_states_that_count_for_less_have_the_covariance_of_what_correlates_them(counted):
-    at, rho = np.linspace(-1, 1, 40), 0.8
-    jacobian = np.stack([np.ones(40), at], axis=1)
-    along = rho ** np.abs(np.arange(40)[:, None] - np.arange(40))
-    solve = np.linalg.pinv(jacobian)
-    wanted = solve @ along @ solve.T  # whatever a fit counted its states for
-    # A share of the states: rows whitened with a noise that is larger by 1/√share.
-    scaled = np.sqrt(counted) * jacobian
-    inverse = np.linalg.inv(scaled.T @ scaled)
-    given = (np.linalg.cholesky(inverse), scaled[:, None, :], np.array([rho]), [np.arange(40)])
-    found = inverse + added_covariance(*given, counted)
-    # A constant and a slope vary by 6 to 9 times what white noise does: no share is above that.
-    np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-12)
-
-
-def test_errors_that_are_largest_at_resonance_count_as_what_they_are():
-    """A straight line by least squares of errors of unequal sizes: its covariance is known."""
-    rows = np.column_stack([np.ones(12), np.linspace(-1, 1, 12)])[:, None, :]
-    size, slopes = np.linspace(1.0, 3.0, 12), rows[:, 0]
-    inverse = np.linalg.inv(slopes.T @ slopes)
-    given = (np.linalg.cholesky(inverse), rows, np.zeros(1), [np.arange(5), np.arange(5, 12)])
-    found = inverse + added_covariance(*given, 1.0, size)
-    expected = inverse @ (slopes.T * size**2) @ slopes @ inverse
-    np.testing.assert_allclose(found, expected, rtol=1e-10)
-
-
-@pytest.mark.parametrize("k", [0.0, 2.0, 8.0])
-def test_how_noise_grows_beside_resonance_is_found(k):
-    """Noise of size √(1 + (k sin φ)²), whitened as if it grew with 4: what is left is its ratio."""
-    random, phase = np.random.default_rng(3), np.radians(np.linspace(-80, 80, 2000))
-    own, assumed = (np.sqrt(1 + (a * np.sin(phase)) ** 2) for a in (k, 4.0))
-    residuals = random.standard_normal((2000, 2)) * (own / assumed)[:, None]
-    found = sizes_off_resonance(residuals, np.zeros((2000, 2, 1)), phase, 4.0)
-    scale = np.sqrt(np.mean(residuals**2))
-    # 4000 numbers tell a size to 1/√8000; those near resonance, a tenth of them, to 4 %.
-    np.testing.assert_allclose(found * scale, own / assumed, rtol=0.08)
-
-
-def test_a_state_that_unknowns_follow_has_left_less_than_its_error():
-    """Residuals of a fit have 1 − h of the errors' variance, h the leverage: the size is known."""
-    random, phase = np.random.default_rng(4), np.radians(np.linspace(-80, 80, 2000))
-    leverage = 0.8 * np.cos(phase) ** 2
-    assumed = np.sqrt(1 + (4 * np.sin(phase)) ** 2)
-    residuals = random.standard_normal((2000, 2)) / assumed[:, None]
-    residuals *= np.sqrt(1 - leverage)[:, None]
-    arms = np.repeat(np.sqrt(leverage)[:, None, None], 2, axis=1)
-    found = sizes_off_resonance(residuals, arms, phase, 4.0)
-    ratio = (found * assumed) / (found * assumed)[0]
-    np.testing.assert_allclose(ratio, 1.0, atol=0.08)
-
-
-def test_no_band_becomes_narrower():
-    jacobian = np.vander(np.linspace(-1, 1, 25), 5)
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    levels, rows = [np.arange(25)], jacobian[:, None, :]
-    added = added_covariance(np.linalg.cholesky(inverse), rows, np.array([0.98]), levels)
-    # Of differences between neighbours this process has far less than white noise.
-    along = np.random.default_rng(6).normal(size=(5, 1000))
-    more = np.sum(along * (added @ along), axis=0) / np.sum(along * (inverse @ along), axis=0)
-    assert more.min() > -1e-9
-    assert more.max() > 1
 
 
 @pytest.mark.long

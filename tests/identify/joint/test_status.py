@@ -114,7 +114,7 @@ def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):
     everything(31, "viscous_quadratic@velocity")
     found = compiled_programs(caplog, lambda: everything(32, "viscous_quadratic@velocity"))
     own = (
-        *("_solved", "_slopes", "recorded_motion", "_first_order", "_pinned"),
+        *("_solved", "_slopes", "_velocity_of_others", "_first_order", "_pinned"),
         *("_resampled", "_bands", "_point_with_slopes", "_at_velocity", "_at_displacement"),
     )
     assert [name for name in found if any(one in name for one in own)] == []

@@ -75,7 +75,7 @@ def crossings(data, model):
 
 class TestMeasuredBeam:
     def test_bands_cover_where_every_level_is_in_phase(self, found, crossings):
-        backbone = found.fit.backbone
+        backbone = found.backbone
         frequency, speed, damping = crossings
         values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
         off = np.abs(values.natural_frequency - frequency) / values.natural_frequency_std
@@ -99,7 +99,7 @@ class TestMeasuredBeam:
         assert 0.5 * stiffness * 80.4 < 0.1  # Hz
 
     def test_the_backbone_softens_and_stiffens(self, found):
-        backbone = found.fit.backbone
+        backbone = found.backbone
         amplitude = np.linspace(float(backbone.smallest), float(backbone.largest), 400)
         values = backbone.values(amplitude)
         hertz = np.asarray(values.natural_frequency) / HERTZ
@@ -114,9 +114,9 @@ class TestMeasuredBeam:
         assert values.damping_ratio[-1] == pytest.approx(0.007, rel=0.1)
 
     def test_scatter_is_told(self, found):
-        assert found.fit.level_frequency_std / HERTZ == pytest.approx(0.05, abs=0.03)
-        assert any("no noise is stated" in note for note in found.notes)
-        assert any("levels differ from one another by 0.0" in note for note in found.notes)
+        # Runs repeat to 0.1 Hz, as those who measured them say.
+        assert found.level_frequency_std / HERTZ == pytest.approx(0.05, abs=0.05)
+        assert any("levels differ from one another by 0.1" in note for note in found.notes)
         # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
         assert any("higher from points 45° below resonance" in note for note in found.notes)
 
@@ -124,10 +124,11 @@ class TestMeasuredBeam:
 class TestLinearMode:
     def test_exact_states_give_the_linear_mode(self):
         found = sj.identify_backbone(linear_test(0, 0.0), MODES)
-        backbone = found.fit.backbone
+        backbone = found.backbone
         at = np.linspace(float(backbone.smallest), float(backbone.largest), 7)
-        np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-8)  # steps of a fit
-        np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-8)
+        # Noise is taken to be 1e-5 at least, and a level's errors as much.
+        np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-7)
+        np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-5)
 
     @pytest.mark.long
     def test_point_errors_that_were_not_stated_come_from_the_scatter(self):
@@ -147,7 +148,7 @@ class TestLinearMode:
         np.testing.assert_array_equal(
             found.points.natural_frequency_std, points.natural_frequency_std
         )
-        assert not any("no noise is stated" in note for note in found.notes)
+        assert found.fit.noise.stated
 
     def test_noise_larger_than_stated_is_noted(self):
         data = linear_test(0, 0.03)
@@ -161,7 +162,7 @@ class TestLinearMode:
             phase_std=little,
         )
         notes = sj.identify_backbone(stated, MODES).notes
-        assert any("times as much as the stated noise" in note for note in notes)
+        assert any("times the stated noise" in note for note in notes)
 
     @pytest.mark.parametrize(("turn", "told"), [(0.0, None), (0.2, "above"), (-0.2, "below")])
     def test_a_phase_that_is_off_shows_in_the_damping(self, turn, told):
@@ -179,7 +180,10 @@ class TestLinearMode:
         velocity[3] = np.nan
         spoilt = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
         found = sj.identify_backbone(spoilt, MODES)
-        assert any(note.startswith("1 of 30 steady states are left out") for note in found.notes)
+        assert any(
+            note.startswith("1 of 30 steady states have no point of their own")
+            for note in found.notes
+        )
 
     @pytest.mark.long
     def test_an_anchor_is_told(self):
