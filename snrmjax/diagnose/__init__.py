@@ -9,9 +9,12 @@
    law. They say how an error of amplitude moves the force, by how much levels differ, and the noise
    where none is stated (`misfit.reference`). Every hypothesis is weighed by these alike
    (`misfit.weighted_misfit`); errors of levels and of the model's own parameters are shared rows.
-4. `search.model_search.find_effects` fits effects alone, in pairs and in threes; `answers` repeats
-   it at large errors of levels, with many harmonics for kinks and slip, and with errors of levels
-   that nobody stated, where an answer leaves more than noise.
+   Fits begin at the records without the errors that these curves find (`misfit.corrected_records`).
+4. `search.model_search.find_effects` fits effects alone, in pairs and in threes. `answers` compares
+   the likeliest, and nothing at all, each with the records that are corrected for the errors that
+   it finds in them itself, until nothing moves; with many harmonics for kinks and slip; and with
+   and without errors of levels that nobody stated, where an answer leaves more than noise or does
+   what such levels do.
 5. `evidence.weights_of` weighs every answer that was fitted, each with its own sizes of noise and
    levels' errors, beside smooth misfits of unknown size (`unknown`) and noise stated wrong.
 6. `decide.decide` reads these probabilities and the checks that can refute them: levels left out of

@@ -9,8 +9,18 @@ from snrmjax.diagnose import evidence, priors
 from snrmjax.diagnose.checks.cross_validation import rms_misfit
 from snrmjax.diagnose.checks.neighbours import neighbour_noise
 from snrmjax.diagnose.decide import most_probable
-from snrmjax.diagnose.misfit.effect_fit import at_phases_of, baseline_fit
-from snrmjax.diagnose.misfit.level_errors import at_level_errors, with_harmonics
+from snrmjax.diagnose.misfit.corrected_records import (
+    already_added,
+    likely_errors,
+    with_harmonics,
+    without_errors,
+)
+from snrmjax.diagnose.misfit.effect_fit import (
+    EffectFit,
+    at_phases_of,
+    baseline_fit,
+)
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.programs import MANY_HARMONICS
 from snrmjax.diagnose.misfit.reference import with_unstated_level_errors
@@ -25,7 +35,9 @@ from snrmjax.model.effects import EFFECTS
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
 _ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
-_CORRECTIONS, _BETTER = 2, 0.9  # of large errors of levels: at most, and share of χ² that is left
+_CORRECTIONS = 6  # of the records, at most
+_STRAIGHT = 0.003  # relative or rad, within which the misfit is straight
+_BETTER = 0.9  # share of χ² that is left with many harmonics
 _BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
 _LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
 
@@ -49,6 +61,7 @@ class Search(NamedTuple):
     scales: MotionScales
     kinds: tuple[str, ...]
     further_starts: Mapping[str, tuple[float, ...]]
+    data: SteadyStates  # as it was measured
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
@@ -79,56 +92,89 @@ class Search(NamedTuple):
         found = self.found(misfit)
         for _ in range(0 if stated else _ROUNDS):
             size = misfit.predictions.error_scale
-            factor = max(rms_misfit(found.misfit, found.fit), least / size)
+            factor = max(rms_misfit(*self.refined(found.misfit, found.fit)), least / size)
             if _NEAR < factor < 1 / _NEAR:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
             found = self.found(misfit)
-        weights = evidence.weights_of(found)
+        weights = evidence.weights_of(found, self.refined)
         return Answered(most_probable(found, weights), weights)
 
+    def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
+        """A fit again where the records are corrected for the errors that it finds in them.
 
-def best_answer(search: Search, predictions: Predictions, data: SteadyStates) -> Answered:
-    """The most probable answer, refined where it leaves more than noise.
+        From where it is, and, unless that explains them, from the records as they are: smooth
+        curves may miss a kink.
+        """
+        found = self._corrected(misfit, fit)
+        if found is not None and is_noise(*found):
+            return found
+        none = np.zeros_like(already_added(misfit.predictions))
+        plain = without_errors(misfit, fit, self.data, none)
+        other = self._corrected(plain, refitted(plain, self.scales, fit))
+        both = [pair for pair in (found, other) if pair is not None]
+        return min(both, key=lambda pair: pair[1].chi_square, default=(misfit, fit))
 
-    First to a higher order; then with errors of levels that nobody stated.
+    def _corrected(
+        self, misfit: WeightedMisfit, fit: EffectFit
+    ) -> tuple[WeightedMisfit, EffectFit] | None:
+        """The fit where nothing moves any more; None where no errors explain the records."""
+        moved = np.inf
+        for _ in range(_CORRECTIONS):
+            if not np.isfinite(fit.chi_square):
+                return None
+            added = likely_errors(misfit, fit.rows)
+            if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
+                return None
+            moved = np.max(np.abs(added - already_added(misfit.predictions)), initial=0.0)
+            if moved < _STRAIGHT:
+                return misfit, fit
+            misfit = without_errors(misfit, fit, self.data, added)
+            fit = refitted(misfit, self.scales, fit)
+        return (misfit, fit) if moved < priors.SETTLED_ERROR else None
+
+
+def best_answer(search: Search, predictions: Predictions) -> Answered:
+    """The most probable answer, whether levels differ by what nobody stated or not.
+
+    That is asked where an answer leaves more than noise, or does what such levels would do.
     """
     answered = search.answered(predictions)
-    if leaves_more_than_noise(answered):
-        answered = refined(answered, search.among(answered, _NEAR_ANSWERS), data)
-    if leaves_more_than_noise(answered) and levels_may_differ(predictions):
-        now = (answered.coarse or answered.found).misfit.predictions
-        near = search.among(answered, _NEAR_ANSWERS)
-        apart = refined(near.answered(with_unstated_level_errors(now)), near, data)
-        if apart.log_weight + np.log(priors.LEVELS_APART) > answered.log_weight:
-            return apart
-    return answered
+    answered = with_more_harmonics(answered, search.among(answered, _NEAREST_ANSWERS))
+    alike = any(EFFECTS[kind].is_linear for kind in answered.found.fit.kinds)
+    if not (alike or leaves_more_than_noise(answered)) or not levels_may_differ(predictions):
+        return answered
+    now = (answered.coarse or answered.found).misfit.predictions
+    near = search.among(answered, _NEAR_ANSWERS)
+    apart = near.answered(with_unstated_level_errors(now))
+    apart = with_more_harmonics(apart, search.among(apart, _NEAREST_ANSWERS))
+    odds = float(np.log(priors.LEVELS_APART))
+    weights = evidence.either(answered.weights, apart.weights, odds)
+    likelier = apart if apart.log_weight + odds > answered.log_weight else answered
+    return likelier._replace(found=most_probable(likelier.found, weights), weights=weights)
 
 
-def refined(answered: Answered, search: Search, data: SteadyStates) -> Answered:
-    """An answer that leaves more than noise, found again to a higher order.
+def with_more_harmonics(answered: Answered, search: Search) -> Answered:
+    """An answer that leaves more than noise, or beside noise of unknown size, with many harmonics.
 
-    At the levels' most likely errors, where these are large; and with many harmonics, since kinks
-    and slip have no last one.
+    Kinks and slip have no last one.
     """
-    for _ in range(_CORRECTIONS):
-        found = answered.found
-        predictions = at_level_errors(found.misfit, found.fit.rows, data)
-        if predictions is None or not leaves_more_than_noise(answered):
-            break
-        again = search.answered(predictions)
-        if again.found.fit.chi_square > _BETTER * found.fit.chi_square:
-            break
-        answered = again
     found = answered.found
     kinked = any(issubclass(EFFECTS[kind], _WITHOUT_LAST_HARMONIC) for kind in found.fit.kinds)
-    if not kinked or not leaves_more_than_noise(answered):
+    stated = found.misfit.predictions.chosen.noise_stated
+    if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
-    many = with_harmonics(found.misfit.predictions, data, MANY_HARMONICS)
+    many = with_harmonics(found.misfit.predictions, search.data, MANY_HARMONICS)
     winner = refitted(weighted_misfit(many), search.scales, found.fit)
     if winner.chi_square > _BETTER * found.fit.chi_square:
         return answered
-    return search.among(answered, _NEAREST_ANSWERS).answered(many)._replace(coarse=found)
+    return search.answered(many)._replace(coarse=found)
+
+
+def is_noise(misfit: WeightedMisfit, fit: EffectFit) -> bool:
+    """Whether a fit leaves no more than the noise is taken to be."""
+    freedom = misfit.n_rows - len(fit.values)
+    return chi_square_p_value(fit.chi_square, freedom) > priors.REJECTED
 
 
 def leaves_more_than_noise(answered: Answered) -> bool:
@@ -143,4 +189,4 @@ def leaves_more_than_noise(answered: Answered) -> bool:
 def levels_may_differ(predictions: Predictions) -> bool:
     """Whether errors of levels that nobody stated, and smooth curves hide, may be in the way."""
     stated = all(std > 0 for std in predictions.given.level_stds)
-    return predictions.reference is not None and predictions.chosen.n_levels > 1 and not stated
+    return predictions.reference is not None and not stated

@@ -20,6 +20,7 @@ from snrmjax.diagnose.checks.patterns import left_curve, pattern
 from snrmjax.diagnose.checks.predicted_levels import missed_levels
 from snrmjax.diagnose.checks.shared_gains import doubts_on_gains
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer
 from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.diagnose.verdict import Verdict
@@ -54,7 +55,12 @@ def most_probable(found: FoundEffects, weights: Weights) -> FoundEffects:
             group = classes[lost[0] if lost else 0]
             if kind not in group:
                 group.append(kind)
-    return found._replace(fit=best.fit, classes=tuple(tuple(group) for group in classes))
+    return found._replace(
+        misfit=best.misfit,
+        fit=best.fit,
+        baseline=baseline_fit(best.misfit),
+        classes=tuple(tuple(group) for group in classes),
+    )
 
 
 def decide(
@@ -113,12 +119,16 @@ def imitations_of(found: FoundEffects, located: tuple[Located, ...]) -> list[Dou
         return []
     part = part_of(fit.kinds)
     stepped = np.asarray(misfit.predictions.chosen.states.frequency)
+    own_power = power_of_answer(misfit, found.baseline, fit, part) if part else None
+    # Where the answer itself is seen to follow no power of the amplitude the data need not either.
+    if own_power is None and not misfit.predictions.chosen.phase_unknown.any():
+        located = tuple(one for one in located if one.part != part)
     return doubts(
         fit.kinds,
         located,
         misfit.predictions.chosen.orders,
         frozenset(kind for kind in fit.kinds if acts_both_ways(misfit, fit, kind)),
-        power_of_answer(misfit, found.baseline, fit, part) if part else None,
+        own_power,
         frozenset(k for k in fit.kinds if grows(k) and fit.of_kind(k)[0] < 0),
         frozenset(k for k in fit.kinds if wider_than_measured(k, fit.of_kind(k)[1:], stepped)),
     )

@@ -32,6 +32,7 @@ from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimat
 from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
+from snrmjax.diagnose.misfit.corrected_records import at_reference
 from snrmjax.diagnose.misfit.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
@@ -108,11 +109,12 @@ def diagnose_model(
             "the model has no motion of the measured amplitude for some states: it is too far "
             "from the data to be compared."
         )
+    predictions = at_reference(predictions, data)
     scales = scales_of(predictions)
     excluded = excluded_kinds(model, force_gain_std, phases=not unknown.all())
     kinds = tuple(kind for kind in EFFECTS if kind not in excluded)
-    search = Search(scales, kinds, former.starts if former else {})
-    answered = best_answer(search, predictions, data)
+    search = Search(scales, kinds, former.starts if former else {}, data)
+    answered = best_answer(search, predictions)
     found, weights = answered.found, answered.weights
     as_recorded, rival = found, None
     if predictions.chosen.noise_stated and estimable:
@@ -276,22 +278,34 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
             f"no noise is stated: what is left ({100 * size:.2g} % of velocity, "
             f"{np.degrees(size):.2g}°) is taken for it, so a good fit proves nothing."
         )
-    gain, phase, stiffness, damping = (
-        size if free else 0.0
-        for size, free in zip(predictions.level_sizes, predictions.unstated_levels, strict=True)
+    found = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
+    free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
+    seen, allowed = (
+        _level_sizes(*np.where(found, free, 0.0)),
+        _level_sizes(*np.where(found, 0.0, free)),
     )
+    if seen:
+        notes.append(
+            f"levels differ by {seen} (1σ), which nobody stated: taken for errors that the states "
+            "of a level share. State them in [measurement] if they are known."
+        )
+    if allowed:
+        notes.append(
+            f"nobody stated by how much levels may be off: {allowed} (1σ) are allowed for. State "
+            "them in [measurement] if they are known."
+        )
+    return notes
+
+
+def _level_sizes(gain: float, phase: float, stiffness: float, damping: float) -> str:
+    """1σ of levels' errors in words."""
     parts = [
         *([f"{100 * gain:.2g} % in gain"] if gain > 0 else []),
         *([f"{np.degrees(phase):.2g}° in phase"] if phase > 0 else []),
         *([f"{50 * stiffness:.2g} % in frequency"] if stiffness > 0 else []),
         *([f"{100 * damping:.2g} % in damping"] if damping > 0 else []),
     ]
-    if parts:
-        notes.append(
-            f"levels differ by {', '.join(parts)} (1σ), which nobody stated: taken for errors that "
-            "the states of a level share. State them in [measurement] if they are known."
-        )
-    return notes
+    return ", ".join(parts)
 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:

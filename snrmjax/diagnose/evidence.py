@@ -8,7 +8,7 @@ the sizes of noise, of levels' errors and of the discrepancy by their most likel
 Laplace's approximation, each answer with its own.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import comb
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -37,6 +38,7 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
 _AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
+_REFINED = 8  # answers that are made straight at their own errors
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
 
@@ -45,6 +47,7 @@ class Weighed(NamedTuple):
     """An answer with the logarithm of its prior odds times its evidence."""
 
     kinds: frozenset[str]
+    misfit: WeightedMisfit  # made straight at its own most likely errors, where it was refined
     fit: EffectFit
     log_weight: float
 
@@ -102,38 +105,94 @@ class _Sizes(NamedTuple):
     noise_bounds: tuple[float, float]
 
 
-def weights_of(found: FoundEffects) -> Weights:
+def either(one: Weights, other: Weights, odds: float) -> Weights:
+    """Weights where one of two descriptions of the same data holds, the other with log odds."""
+    best = {answer.kinds: answer for answer in one.answers}
+    for answer in other.answers:
+        new = answer._replace(log_weight=answer.log_weight + odds)
+        old = best.get(new.kinds, new._replace(log_weight=-np.inf))
+        likelier = max(old, new, key=lambda each: each.log_weight)
+        both = float(np.logaddexp(old.log_weight, new.log_weight))
+        best[new.kinds] = likelier._replace(log_weight=both)
+    return Weights(
+        tuple(sorted(best.values(), key=lambda answer: -answer.log_weight)),
+        float(np.logaddexp(one.unknown, other.unknown + odds)),
+        float(np.logaddexp(one.noise_rejected, other.noise_rejected + odds)),
+    )
+
+
+Refined = Callable[[WeightedMisfit, EffectFit], tuple[WeightedMisfit, EffectFit]]
+
+
+def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     """All answers that a search considered, weighed.
 
     `unknown` has the weight of answers beside a discrepancy of unknown size, and of laws that act
-    like one. `noise_rejected` has that
-    of all answers with noise of another size, where noise is stated.
+    like one. `noise_rejected` has that of all answers with noise of another size, where noise is
+    stated. The likeliest answers, and nothing at all, are `refined` before they are compared.
     """
-    misfit = found.misfit
-    sizes = _sizes_of(misfit)
-    best: dict[frozenset[str], Weighed] = {}
-    marginals: dict[frozenset[str], Marginal] = {}
-    wrong: dict[frozenset[str], float] = {}
-    for fit in (found.baseline, found.fit, *found.considered):
-        marginal = marginal_of(misfit, fit)
-        if marginal is None:
+    sizes = _sizes_of(found.misfit)
+    every = (found.baseline, found.fit, *found.considered)
+    best: dict[frozenset[str], _Compared] = {}
+    for fit in every:
+        one = _compared(found.misfit, fit, sizes)
+        if one is not None and (one.kinds not in best or one.right > best[one.kinds].right):
+            best[one.kinds] = one
+    done: list[_Compared] = []
+    for kinds in _worth_refining(best):
+        if refined is None or _is_far_behind(best[kinds], done):
             continue
-        kinds = frozenset(fit.kinds)
-        evidence = log_evidence(marginal, sizes)
-        weight = _log_prior(len(kinds)) + evidence.right
-        if kinds not in best or weight > best[kinds].log_weight:
-            best[kinds], marginals[kinds] = Weighed(kinds, fit, weight), marginal
-            wrong[kinds] = _log_prior(len(kinds)) + evidence.wrong
-    answers = tuple(sorted(best.values(), key=lambda one: -one.log_weight))
-    unknown = [np.log(priors.UNNAMED) + one.log_weight for one in answers if one.kinds]
-    directions = list(discrepancies(misfit))
-    for one in answers[:_BESIDE]:
+        misfit, fit = refined(best[kinds].misfit, best[kinds].fit)
+        again = _compared(misfit, fit, sizes)
+        if again is not None:
+            best[kinds] = again
+            done.append(again)
+    ranked = sorted(best.values(), key=lambda one: -one.right)
+    unknown = [np.log(priors.UNNAMED) + one.right for one in ranked if one.kinds]
+    for one in ranked[:_BESIDE]:
+        directions = list(discrepancies(one.misfit))
         prior = np.log(priors.DISCREPANCY / len(directions)) + _log_prior(len(one.kinds))
         for columns in directions:
-            beside = with_discrepancy(misfit, one.fit, marginals[one.kinds], columns)
+            beside = with_discrepancy(one.misfit, one.fit, one.marginal, columns)
             unknown.append(prior + log_evidence(beside, sizes).right)
-    rejected = float(np.log(priors.WRONG_NOISE) + logsumexp(list(wrong.values())))
-    return Weights(answers, float(logsumexp(unknown)), rejected)
+    rejected = np.log(priors.WRONG_NOISE) + logsumexp([one.wrong for one in ranked])
+    answers = tuple(Weighed(one.kinds, one.misfit, one.fit, one.right) for one in ranked)
+    return Weights(answers, float(logsumexp(unknown)), float(rejected))
+
+
+class _Compared(NamedTuple):
+    kinds: frozenset[str]
+    misfit: WeightedMisfit
+    fit: EffectFit
+    marginal: "Marginal"
+    right: float  # ln of prior odds times evidence, for noise as stated
+    wrong: float  # and for noise stated wrong
+
+
+def _compared(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> _Compared | None:
+    marginal = marginal_of(misfit, fit)
+    if marginal is None:
+        return None
+    evidence, prior = log_evidence(marginal, sizes), _log_prior(len(fit.kinds))
+    pair = prior + evidence.right, prior + evidence.wrong
+    return _Compared(frozenset(fit.kinds), misfit, fit, marginal, *pair)
+
+
+def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
+    """Whether a refined answer fits and makes this one, as it is, improbable."""
+    if not done:
+        return False
+    best = max(done, key=lambda each: each.right)
+    freedom = best.misfit.n_rows - len(best.fit.values)
+    fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
+    return fits and one.right < best.right - priors.FAR_BEHIND
+
+
+def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:
+    """Nothing, the likeliest effects alone, and then the likeliest answers of any size."""
+    ranked = sorted(best, key=lambda kinds: -best[kinds].right)
+    alone = [kinds for kinds in ranked if len(kinds) <= 1][:_REFINED]
+    return list(dict.fromkeys([*alone, frozenset[str](), *ranked[:_REFINED]]))
 
 
 def marginal_of(misfit: WeightedMisfit, fit: EffectFit) -> Marginal | None:
@@ -177,7 +236,11 @@ class Evidence(NamedTuple):
 
 
 def _units(misfit: WeightedMisfit) -> float:
-    """ln of the units of all rows, so that answers under other noise can be compared."""
+    """ln of the units of all rows, so that answers under other noise can be compared.
+
+    At a fit that explains its records χ² is the square of their distance from it, whatever its own
+    slopes are: these are no part of the units.
+    """
     return -misfit.n_rows * float(np.log(misfit.predictions.error_scale))
 
 

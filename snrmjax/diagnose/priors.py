@@ -58,3 +58,16 @@ REJECTED = 1e-3
 
 OPEN = 0.1
 """Share of their probability that refuted answers keep: checks rest on approximations too."""
+
+# --- records corrected for the errors that an answer finds in them
+
+FARTHEST_ERROR = 0.5
+"""Relative or rad: an answer that needs larger errors of a velocity explains nothing; published
+levels differ by 15 %."""
+
+SETTLED_ERROR = 0.02
+"""The same, that an answer's errors may move by in the last round: its square is below noise."""
+
+FAR_BEHIND = 25.0
+"""Of ln p behind an answer that fits, from which on others are not corrected for their errors: that
+moves the ln p of answers near it by ten or so."""

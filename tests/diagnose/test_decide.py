@@ -109,9 +109,11 @@ def turned():
 
 def weights(found, answer=0.0, unknown=-9.0, noise_rejected=-9.0, others=()):
     """Weights by their logarithms, of an answer, of none, and of others with the same fit."""
-    every = [Weighed(frozenset(found.fit.kinds), found.fit, answer)]
-    every += [Weighed(frozenset(kinds), found.fit, weight) for kinds, weight in others]
-    every.append(Weighed(frozenset(), found.baseline, -30.0))
+    every = [Weighed(frozenset(found.fit.kinds), found.misfit, found.fit, answer)]
+    every += [
+        Weighed(frozenset(kinds), found.misfit, found.fit, weight) for kinds, weight in others
+    ]
+    every.append(Weighed(frozenset(), found.misfit, found.baseline, -30.0))
     answers = sorted(every, key=lambda one: -one.log_weight)
     return Weights(tuple(answers), unknown, noise_rejected)
 
@@ -159,14 +161,16 @@ def test_to_a_class_belongs_what_has_so_much_of_the_best_odds(turned, factor, ve
 
 def test_a_rival_counts_for_the_effect_that_it_lacks(turned):
     pair = turned.fit._replace(kinds=("cubic_stiffness", "quadratic_damping"))
-    best = Weighed(frozenset(pair.kinds), pair, 0.0)
+    best = Weighed(frozenset(pair.kinds), turned.misfit, pair, 0.0)
     others = [
         (("cubic_stiffness", "cubic_damping"), -1.0),
         (("quadratic_damping", "quintic_stiffness"), -1.5),
         (("close_mode",), -2.0),
         (("jenkins_slider",), -20.0),
     ]
-    rest = [Weighed(frozenset(kinds), turned.fit, weight) for kinds, weight in others]
+    rest = [
+        Weighed(frozenset(kinds), turned.misfit, turned.fit, weight) for kinds, weight in others
+    ]
     given = Weights((best, *rest), -9.0, -9.0)
     classes = most_probable(turned, given).classes
     assert classes == (

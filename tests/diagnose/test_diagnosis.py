@@ -129,6 +129,20 @@ def test_an_effect_that_no_one_knows_is_not_named():
     assert found.checks.p_value < 1e-3
 
 
+def test_softening_by_many_bandwidths_is_named_whatever_power_its_curve_seems_to_have():
+    """25 half-power bandwidths, levels' gains 5 % and frequencies 0.5 % off (set by another code).
+
+    By the linear balance the stiffness changes with the power 0.7 of the amplitude.
+    """
+    model, data = files("softening", "strong")
+    found = sj.diagnose_model(model, data)
+    assert found.verdict == "named"
+    assert found.effects == ("cubic_stiffness",)
+    value = found.answer.parameters["cubic_stiffness.coefficient"]
+    assert abs(value.value + 1.512024737e9) < 3 * value.std
+    assert value.std < 0.01 * 1.512e9
+
+
 @pytest.mark.long
 def test_two_simple_effects_are_not_read_as_a_further_mode():
     # A 1:2 resonance with free frequency and damping fits as well, with one parameter more.

@@ -21,6 +21,7 @@ from snrmjax.diagnose.evidence import (
     _sizes_of,
     answer_name,
     discrepancies,
+    either,
     hat_functions,
     log_evidence,
     marginal_of,
@@ -57,7 +58,22 @@ def fit(misfit):
 
 def weighed(name, log_weight):
     kinds = frozenset() if name == "none" else frozenset(name.split("+"))
-    return Weighed(kinds, fit_to(noise()), log_weight)
+    return Weighed(kinds, None, fit_to(noise()), log_weight)  # names and weights alone count
+
+
+def test_two_descriptions_of_the_same_data_are_weighed_together():
+    one = Weights((weighed("none", 0.0), weighed("a", -1.0)), unknown=-2.0, noise_rejected=-np.inf)
+    two = Weights((weighed("a", 1.0), weighed("b", -3.0)), unknown=-4.0, noise_rejected=-5.0)
+    found = either(one, two, np.log(0.4)).probabilities()
+    odds = {
+        "none": 1.0,
+        "a": np.exp(-1) + 0.4 * np.exp(1),
+        "b": 0.4 * np.exp(-3),
+        "unknown": np.exp(-2) + 0.4 * np.exp(-4),
+        "noise_rejected": 0.4 * np.exp(-5),
+    }
+    assert found == pytest.approx({k: v / sum(odds.values()) for k, v in odds.items()})
+    assert next(iter(found)) == "a"
 
 
 def test_probabilities_are_weights_over_their_sum():

@@ -154,7 +154,7 @@ def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMis
 
     An effect that turns or scales a quantity turns and scales its errors too.
     """
-    predictions, known, values = misfit.predictions, misfit.errors, _values(misfit, fit)
+    predictions, known, values = misfit.predictions, misfit.errors, values_of(misfit, fit)
     if not fit.kinds:
         return misfit.reweighted(known)
     slopes = by_baseline(predictions, predictions.group, values).slopes[0]
@@ -169,12 +169,12 @@ def at_phases_of(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
     """The misfit with velocities of unknown phase where a fit has them."""
     force = misfit.baseline.force
     if fit.kinds:
-        own = misfit.predictions.of(misfit.predictions.group, _values(misfit, fit)[None])
+        own = misfit.predictions.of(misfit.predictions.group, values_of(misfit, fit)[None])
         force = own.phasors[0, :, 0]
     return misfit.with_phases(-np.angle(force))
 
 
-def _values(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " parameter"]:
+def values_of(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " parameter"]:
     """A fit's parameters among those of all effects."""
     group = misfit.predictions.group
     values = group.values.copy()

@@ -111,15 +111,24 @@ class Predictions:
     reference: Any = None  # `misfit.reference.Reference`, once it is known
     level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
     unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
-    # What is added to the columns where levels were corrected for errors that count as shared ones.
+    added: Float[np.ndarray, "state input"] | None = (
+        None  # to log velocities and phases as recorded
+    )
+    # What is added to the columns for that: errors that the records were corrected for still count.
     offset: Float[np.ndarray, "state column"] | None = None
-    added: tuple[np.ndarray, np.ndarray] | None = None  # to log velocities and phases, by levels
     error_scale: float = 1.0  # of errors over those that were stated or assumed
     free_level_forces: tuple[int, ...] = ()  # places of levels whose force has a gain of its own
 
     def with_level_forces_free(self, places: tuple[int, ...]) -> "Predictions":
         """The same with forces of levels, by their places, that have gains of their own."""
         return dataclasses.replace(self, free_level_forces=places)
+
+    def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
+        """The same as the records have it, by what errors do to the columns."""
+        if self.added is None:
+            return self
+        offset = -np.einsum("sci,si->sc", by_error, self.added)
+        return dataclasses.replace(self, offset=offset)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""

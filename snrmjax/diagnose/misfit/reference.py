@@ -39,11 +39,15 @@ def reference_of(predictions: Predictions) -> Reference | None:
         return None
     states = test_states_of(predictions, rows)
     found = fit_test(states)
-    amplitude = states.amplitude * np.exp(found.corrections[:, 1])
-    curves = found.curves(amplitude)
-    mass, omega = found.modal_mass[0], states.frequency
-    slope = mass * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
-    z = 1j * omega * states.constant * states.force / states.velocity
+    # What errors move belongs to the motion that was there: the records without any of them.
+    levels = found.level_errors[states.level]
+    own = found.corrections[:, 1] - (0.0 if states.force_is_free else levels[:, 0])
+    turn = found.corrections[:, 2] - levels[:, 1] - found.instrument_phase
+    velocity = states.velocity * np.exp(own + 1j * turn)
+    omega = states.frequency
+    curves = found.curves(np.abs(velocity) / omega)
+    slope = found.modal_mass[0] * (curves.slopes[:, 0] + 1j * omega * curves.slopes[:, 1])
+    z = 1j * omega * states.constant * states.force / velocity
     ones = np.ones(len(rows), dtype=complex)
     return Reference(found, rows, ones + slope / z, 1j * ones)
 
@@ -101,9 +105,11 @@ def with_reference(predictions: Predictions) -> Predictions:
 
 def as_weighed(predictions: Predictions, other: Predictions) -> Predictions:
     """Predictions of the same states weighed as others of them are."""
+    predictions = predictions.with_errors_scaled(other.error_scale)
     return dataclasses.replace(
         predictions,
         model=other.model,
+        free_level_forces=other.free_level_forces,
         reference=other.reference,
         level_sizes=other.level_sizes,
         unstated_levels=other.unstated_levels,

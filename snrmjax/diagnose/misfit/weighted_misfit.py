@@ -148,7 +148,28 @@ class WeightedMisfit:
 
     def reweighted(self, passed_on: ErrorPropagation) -> "WeightedMisfit":
         """The same misfit with errors passed on in another way."""
+        passed_on = _by_reference(self.predictions, passed_on)
         return _weighted(self.predictions, self.baseline, self.errors, passed_on, self.starts)
+
+    def about(
+        self, predictions: Predictions, values: Float[np.ndarray, " parameter"]
+    ) -> "WeightedMisfit":
+        """The misfit of the records made straight about corrected ones, which `predictions` are of.
+
+        Errors are passed on as a model with effects of some `values` does there.
+        """
+        plain = dataclasses.replace(predictions, offset=None)
+        there = by_baseline(plain, plain.group, values)
+        by_error, phasors = plain.by_error(plain.group, values)
+        by_error = by_error + _of_missing_force(plain, there.columns[0], by_error)
+        lost = ~np.isfinite(by_error).all(axis=(1, 2))
+        by_error[lost] = self.passed_on.by_error[lost]
+        predictions = plain.carried_back(by_error)
+        baseline, slopes = _baseline_of(predictions)
+        own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
+        errors = self.errors._replace(slopes=slopes)
+        passed_on = ErrorPropagation(by_error, phasors, own)
+        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -161,44 +182,77 @@ class WeightedMisfit:
 
 
 def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
-    """The baseline's misfit, weighted with the stated noise as the baseline passes it on."""
+    """The baseline's misfit, weighted with the stated noise.
+
+    Errors of the force are passed on as smooth curves do (`misfit.reference`), all else as the
+    baseline does.
+    """
+    plain = dataclasses.replace(predictions, offset=None)
+    baseline, slopes = _baseline_of(plain)
+    errors = ErrorPropagation(*plain.by_error(plain.group, plain.group.values), slopes)
+    missing = _of_missing_force(plain, baseline.columns, errors.by_error)
+    passed_on = _by_reference(plain, errors._replace(by_error=errors.by_error + missing))
+    if plain.added is not None:
+        plain = plain.carried_back(passed_on.by_error)
+        baseline, _ = _baseline_of(plain)
+    return _weighted(plain, baseline, errors, passed_on, StartChanges())
+
+
+def _baseline_of(
+    predictions: Predictions,
+) -> tuple[BaselinePrediction, Float[np.ndarray, "state column direction"]]:
     group = predictions.group
     found = by_baseline(predictions, group, group.values)
     baseline = BaselinePrediction(
         found.columns[0], found.phasors[0, :, 0], found.force_slopes[0, :, -2:]
     )
-    errors = ErrorPropagation(*predictions.by_error(group, group.values), found.slopes[0])
-    missing = _of_missing_force(predictions, baseline, errors)
-    passed_on = errors._replace(by_error=errors.by_error + missing)
-    return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+    return baseline, found.slopes[0]
 
 
 def by_baseline(
     predictions: Predictions, group: Group, values: Float[np.ndarray, " parameter"]
 ) -> Predicted:
-    """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two."""
-    stated, j = predictions.stated, predictions.model.modes.mode_of_interest + 1
-    two = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
+    """Slopes by the baseline's uncertain parameters, times 1σ, and by the linear mode's two.
+
+    Of these by its natural frequency as stiffness changes it: 2ζω stays as it is.
+    """
+    stated, modes = predictions.stated, predictions.model.modes
+    j = modes.mode_of_interest
+    two = (f"mode_{j + 1}.natural_frequency", f"mode_{j + 1}.damping_ratio")
     found = predictions.of(group, values[None], (*stated, *two))
+    share = float(modes.damping_ratio[j]) / float(modes.natural_frequency[j])
+    for slopes in (found.slopes, found.force_slopes):
+        slopes[..., -2] -= share * slopes[..., -1]
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     return found._replace(slopes=found.slopes * std, force_slopes=found.force_slopes * std)
 
 
 def _of_missing_force(
-    predictions: Predictions, baseline: BaselinePrediction, errors: ErrorPropagation
+    predictions: Predictions,
+    columns: Float[np.ndarray, "state column"],
+    by_error: Float[np.ndarray, "state column input"],
 ) -> Float[np.ndarray, "state column input"]:
-    """What errors of the velocity do to the part of the force that the baseline lacks.
+    """What errors of the velocity do to the part of the force that a model lacks.
 
-    That force turns with the velocity, and is taken to grow with it: a baseline that lacks most
-    of the damping would otherwise pass on too little of the errors.
+    That force turns with the velocity, and is taken to grow with it: a model that lacks most of the
+    damping would otherwise pass on too little of the errors.
     """
     sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
-    missing = -(baseline.columns[:, 0] + 1j * baseline.columns[:, 1])
-    change = np.zeros_like(errors.by_error)
+    missing = -(columns[:, 0] + 1j * columns[:, 1])
+    change = np.zeros_like(by_error)
     for place, part in ((1, missing), (1 + sensors, 1j * missing)):
         change[:, 0, place], change[:, 1, place] = part.real, part.imag
     known = np.asarray(predictions.chosen.states.known)
     return np.where(known[:, :, None], change, 0.0)
+
+
+def _by_reference(predictions: Predictions, passed_on: ErrorPropagation) -> ErrorPropagation:
+    """Errors of the force passed on as smooth curves do, where these are known."""
+    if predictions.reference is None:
+        return passed_on
+    n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
+    by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
+    return passed_on._replace(by_error=by_error)
 
 
 def _weighted(
@@ -208,10 +262,7 @@ def _weighted(
     passed_on: ErrorPropagation,
     starts: StartChanges,
 ) -> WeightedMisfit:
-    if predictions.reference is not None:
-        n_sensors = np.asarray(predictions.chosen.states.velocity).shape[1]
-        by_error = passed_on_by(predictions.reference, passed_on.by_error, n_sensors)
-        passed_on = passed_on._replace(by_error=by_error)
+    """Weighted as errors are `passed_on`."""
     measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]

@@ -131,8 +131,20 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
 
 
 def refitted(misfit: WeightedMisfit, scales: MotionScales, fit: EffectFit) -> EffectFit:
-    """The same effects fitted to another misfit, from where they were."""
-    return _only(misfit, {kind: candidate(kind, scales) for kind in fit.kinds}, fit, fit.kinds)
+    """The same effects fitted to another misfit, all together from where they were."""
+    if not fit.kinds:
+        return baseline_fit(misfit)
+    *others, last = fit.kinds
+    n = len(fit.values) - len(fit.of_kind(last))
+    before = fit._replace(
+        kinds=tuple(others),
+        labels=fit.labels[:n],
+        values=fit.values[:n],
+        lower=fit.lower[:n],
+        upper=fit.upper[:n],
+    )
+    begun = candidate(last, scales)._replace(starts=(fit.of_kind(last),))
+    return fit_effect(misfit, begun, before)
 
 
 def _compared_with(

@@ -9,8 +9,6 @@ from jaxtyping import Float, Int
 
 _CERTAIN = 4.0  # standard deviations of white noise's correlation, beyond which one is real
 _NOTHING = 0.1  # of the noise: the correlation of smaller residuals does not count
-_LEAST_FREE = 0.1  # of a residual's variance, that unknowns leave at a state
-_GROWTHS = float(np.log(0.03)), float(np.log(30.0))  # of noise off resonance, its k's logarithm
 _LARGEST = 0.98  # correlation: an estimate may exceed what a band can be widened by
 
 

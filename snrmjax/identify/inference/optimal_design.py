@@ -19,6 +19,7 @@ from snrmjax.identify.joint.force_balance import (
     BalanceData,
     BalanceProblem,
     Unknowns,
+    filled,
     no_errors,
     weighting_at,
 )

@@ -88,9 +88,7 @@ class Profile(AbstractResult):
 def profile(fit: JointFit, name: str, *, n_points: int = 15, reach: float = 3.5) -> Profile:
     """χ² against one unknown, everything else fitted anew at each of its values.
 
-    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile. It
-    takes states for independent, though: where the residuals of neighbours are correlated
-    (`fit.noise.autocorrelation`), it is too narrow, and ±1.96σ is right.
+    Where the interval differs from ±1.96σ the unknown is not quadratic: believe the profile.
 
     Arguments: `name` one of `fit.names()`; `reach` in standard deviations on either side.
     Raises `ValueError` for a name that the fit does not have.

@@ -16,7 +16,7 @@ from snrmjax.identify.inference.fitted_curves import (
 from snrmjax.identify.inference.sensitivity import sensitivity
 from snrmjax.identify.inference.table_result import AbstractTable
 from snrmjax.identify.joint.family_fit import SOLVER
-from snrmjax.identify.joint.force_balance import BalanceProblem
+from snrmjax.identify.joint.force_balance import BalanceProblem, filled
 from snrmjax.identify.joint.free_unknowns import Unravel, padded_problem
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.joint.residuals import corrected_residuals
@@ -191,7 +191,7 @@ def compare_bands(
     """The band of both curves by covariance, implicit derivatives, bootstrap and NUTS.
 
     The bootstrap knows nothing of errors that a level shares: where those rule, it is narrower.
-    Only the fit's own covariance includes the correlation of neighbouring states' residuals.
+    The bootstrap does not know of correlated residuals of neighbouring states either.
     Refits of the bootstrap that do not converge are left out and counted.
     """
     at = np.asarray(velocity, dtype=np.float64)

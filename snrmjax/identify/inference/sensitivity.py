@@ -118,8 +118,6 @@ def sensitivity(fit: JointFit) -> Sensitivity:
     of independent errors of the stated size follows. States are corrected for their most likely
     errors anew.
 
-    The correlation of neighbouring states' residuals is not in it.
-
     Returns a `Sensitivity`. One call costs about as much as a fit; its program is compiled anew
     for another number of states, or another family.
     """
@@ -205,8 +203,8 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
     """What noise, every level's errors and every linear parameter add to the bands of both curves.
 
     To first order, as the fit's own covariance: (JᵀJ)⁻¹ = Σ (dθ/dy σ)² over every error y, with
-    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. The correlation of
-    neighbouring states' residuals adds to it.
+    dθ/dy = −(JᵀJ)⁻¹Jᵀ ∂r/∂y and weights that go along with the error. Where the residuals of
+    neighbouring states are correlated, random errors count for as much more.
 
     Returns shares of the variance between the smallest and the largest measured displacement,
     largest first; they sum to one but for rounding.
@@ -244,12 +242,6 @@ def contributions(fit: JointFit, *, n_amplitudes: int = 25) -> Contributions:
             rows.append((name, kind, column[:, None]))
     name = "smoothness of the curves"
     rows.append((name, name, inverse @ _bend_slopes(fit).T))
-    if np.any(fit.noise.autocorrelation > 0):
-        name = "correlation of neighbouring residuals"
-        unit = np.sqrt(np.diagonal(inverse))
-        added = (fit.covariance - inverse) / np.outer(unit, unit)
-        values, directions = np.linalg.eigh(added)
-        rows.append((name, name, unit[:, None] * directions * np.sqrt(np.maximum(values, 0.0))))
     summed = [np.sum((slopes @ columns) ** 2, axis=2) for *_, columns in rows]
     parts = np.stack(summed)
     shares = np.mean(parts / np.sum(parts, axis=0), axis=1).tolist()

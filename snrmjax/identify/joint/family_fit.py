@@ -14,6 +14,7 @@ from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.joint.force_balance import BalanceProblem, Unknowns, nearest_errors
 from snrmjax.identify.joint.free_unknowns import Unravel, packed_unknowns, padded_problem
 from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.joint.posterior_view import LEAST_LEFT
 from snrmjax.identify.joint.residuals import corrected_residuals
 from snrmjax.numerics.compiled import compiled
 from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
@@ -21,11 +22,14 @@ from snrmjax.numerics.least_squares import degrees_spent, root_of_inverse
 SOLVER: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
     rtol=1e-10, atol=1e-10, linear_solver=lx.QR()
 )
+# A round starts near its end: cost to 1e-7, unknowns to 1 % of their 1σ.
+_ROUND: optx.AbstractLeastSquaresSolver = optx.LevenbergMarquardt(
+    rtol=1e-7, atol=1e-4, linear_solver=lx.QR()
+)
 MOST_STEPS = 200  # of Levenberg–Marquardt in a fit
 _ROUNDS = 6  # of fitting and estimating the noise anew, at most
 _SETTLED = 0.01  # relative change of the noise, in the last of them
 _TRUST = 100.0  # columns' size to the solver: its damping, one at first, is 1e-4 of theirs
-_LEAST_LEFT = 0.25  # of the residuals, that no number of unknowns can take
 
 
 class FitStatus(IntEnum):
@@ -82,8 +86,11 @@ def fit_families(
     for _ in range(_ROUNDS):
         problem = problem.with_data(std=jnp.asarray(stated * size / np.sqrt(share)))
         given = (program.unravel, padded_problem(problem))
-        vector, answer, good = _solved(program.vector, *given)
+        size_of = np.linalg.norm(np.asarray(_linearised(program.vector, *given).jacobian), axis=0)
+        unit = jnp.asarray(_TRUST / np.where(size_of > 0, size_of, 1.0))
+        vector, good = _solved(program.vector, *given, unit)
         program = program._replace(vector=vector)
+        answer = _linearised(vector, *given)
         jacobian = np.asarray(answer.jacobian)[:, program.own]
         if not (np.all(np.isfinite(answer.residuals)) and np.all(np.isfinite(jacobian))):
             raise ValueError(f"{FIT_MESSAGE[FitStatus.NOT_FINITE]}: try other families.")
@@ -92,7 +99,7 @@ def fit_families(
         level, frequency = (np.asarray(a) for a in (problem.data.level, problem.data.frequency))
         told = share_told_by(residuals, level, frequency)
         rows = told * residuals.size
-        left = max(rows - degrees_spent(jacobian, answer.residuals.size), _LEAST_LEFT * rows)
+        left = max(rows - degrees_spent(jacobian, answer.residuals.size), LEAST_LEFT * rows)
         found = size * float(np.sqrt(told * np.sum(residuals**2) / left))
         noise = noise._replace(noise=found, noise_std=found / float(np.sqrt(2 * left)))
         wanted = 1.0 if believed and not noise.contradicts_upward else max(found, 1e-12)
@@ -115,25 +122,29 @@ class _Answer(NamedTuple):
 
 
 @compiled
+def _linearised(vector: Array, unravel: Unravel, problem: BalanceProblem) -> _Answer:
+    def residuals(vector: Array) -> tuple[Array, Array]:
+        left = corrected_residuals(vector, unravel, problem)
+        return left, left
+
+    jacobian, left = jax.jacfwd(residuals, has_aux=True)(vector)
+    errors, _ = nearest_errors(unravel(vector), problem)
+    return _Answer(left[: 2 * len(problem.data.level)].reshape(-1, 2), jacobian, errors)
+
+
+@compiled
 def _solved(
-    vector: Array, unravel: Unravel, problem: BalanceProblem
-) -> tuple[Array, _Answer, Array]:
+    vector: Array, unravel: Unravel, problem: BalanceProblem, unit: Array
+) -> tuple[Array, Array]:
     """Levenberg–Marquardt from the present unknowns: where it ended, and whether it converged.
 
-    Every unknown counts in its own unit, so that the solver's damping treats all alike; states are
-    corrected for their most likely errors at every step.
+    Every unknown counts in its own `unit`, so that the solver's damping treats all alike; states
+    are corrected for their most likely errors at every step.
     """
-
-    def residuals(vector: Array, _: None = None) -> Array:
-        return corrected_residuals(vector, unravel, problem)
-
-    size = jnp.linalg.norm(jax.jacfwd(residuals)(vector), axis=0)
-    unit = _TRUST / jnp.where(size > 0, size, 1.0)
     found: optx.Solution = optx.least_squares(
-        lambda y, _: residuals(y * unit), SOLVER, vector / unit, max_steps=MOST_STEPS, throw=False
+        lambda y, _: corrected_residuals(y * unit, unravel, problem),
+        *(_ROUND, vector / unit),
+        max_steps=MOST_STEPS,
+        throw=False,
     )
-    vector = found.value * unit
-    errors, _ = nearest_errors(unravel(vector), problem)
-    left = residuals(vector)[: 2 * len(problem.data.level)].reshape(-1, 2)
-    answer = _Answer(left, jax.jacfwd(residuals)(vector), errors)
-    return vector, answer, jnp.asarray(found.result == optx.RESULTS.successful)
+    return found.value * unit, jnp.asarray(found.result == optx.RESULTS.successful)

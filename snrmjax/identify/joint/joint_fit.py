@@ -253,10 +253,11 @@ def fit_jointly(
 
     The model of a test (`identify.test_model`) says how smooth the curves are, how large the noise
     is and by how much levels differ in gain, phase, stiffness and damping, each with a stated prior
-    and by the largest probability of the data. From its answer Levenberg–Marquardt goes on with the
-    balance as it is. Where the stated noise is believed, every step corrects the states for their
-    most likely errors (orthogonal distance regression). The other modes' frequencies and dampings
-    stay inside their stated errors. The modal mass is an unknown with its stated 1σ
+    and by the largest probability of the data; smooth curves, their bands and all else are its
+    posterior. Families by name start there and are fitted to the balance by Levenberg–Marquardt.
+    Both correct the states for their most likely errors (orthogonal distance regression), and take
+    other modes' frequencies and dampings for unknowns with their stated errors. Where states exceed
+    the stated noise the bands are wider for it. The modal mass is an unknown with its stated 1σ
     (`LinearModesStd.modal_mass`); where none is stated it is the model's, unless states away from
     resonance ask for another. A free force gain is one with it.
 
@@ -347,10 +348,7 @@ def _notes(
     if not fit.converged:
         notes = (f"the fit has {FIT_MESSAGE[fit.status]}; try a simpler family.",)
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
-    alike = bool(fit.noise.autocorrelation.any())
-    notes += notes_on_noise(
-        *(noise, wandering, stated, n_levels), stated=fit.noise.stated, alike=alike
-    )
+    notes += notes_on_noise(noise, wandering, stated, n_levels, stated=fit.noise.stated)
     if np.any((stated == 0) & (np.array(noise.level) > 0)):
         shifts = np.asarray(fit.unknowns.level * fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]

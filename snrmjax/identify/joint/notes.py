@@ -55,13 +55,11 @@ def notes_on_noise(
     n_levels: int,
     *,
     stated: bool,
-    alike: bool,
 ) -> tuple[str, ...]:
     """Where the noise and the level-to-level variance are not as stated.
 
     Arguments: `wandering` 1σ of the natural frequency from state to state, relative; `given` the
-    stated 1σ of levels' errors; `alike` whether the residuals of neighbouring states are
-    correlated.
+    stated 1σ of levels' errors.
     """
     notes = []
     size = f"{components.noise:.2g} ± {components.noise_std:.1g}"
@@ -71,10 +69,9 @@ def notes_on_noise(
             f"small or the model is wrong; the bands are {components.noise:.2g} times wider for it."
         )
     if stated and components.contradicts_downward:
-        more = "" if alike else ", and the bands are wider than need be"
         notes.append(
             f"states scatter about the curves by only {size} times the stated noise, errors of "
-            f"whole levels apart: it is overstated{more}."
+            "whole levels apart: it is overstated."
         )
     found_only = np.where(given > 0, 0.0, components.level)
     if wandering > 0:

@@ -27,10 +27,12 @@ from snrmjax.identify.test_model.states import TestStates
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
 _CLEARLY = 20.0  # of −2 ln p, to believe in a frequency that wanders though nobody stated it
+LEAST_LEFT = 0.25
+"""Of the residuals, that no number of unknowns can take."""
+
 SMOOTH = ("auto", SmoothingSpline.kind)
 """Families that are the posterior's own curves."""
 
-_LEAST_LEFT = 0.25  # of the residuals, that no number of unknowns can take
 _ASKED = 3.0  # standard deviations from the model's modal mass where nobody stated its error
 
 
@@ -224,7 +226,7 @@ def viewed_covariance(view: View) -> Float[np.ndarray, "unknown unknown"]:
 def noise_and_levels(found: TestPosterior) -> NoiseAndLevels:
     """The noise as the residuals have it, and 1σ of what levels share as the posterior has them."""
     rows = found.residuals.size
-    left = max(rows - found.effective_unknowns, _LEAST_LEFT * rows)
+    left = max(rows - found.effective_unknowns, LEAST_LEFT * rows)
     noise = found.hyper.noise * float(np.sqrt(np.sum(found.residuals**2) / left))
     return NoiseAndLevels(noise, noise / np.sqrt(2 * found.share * left), found.hyper.level_std)
 

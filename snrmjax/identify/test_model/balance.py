@@ -36,7 +36,8 @@ class Balance(NamedTuple):
         """The balance of states whose records are corrected by these errors."""
         states, places = self.states, self.places
         omega, level = states.frequency, states.level
-        gain, phase, stiffer, lossier = unknowns[places.levels][level].T
+        gain, phase, _, lossier = unknowns[places.levels][level].T
+        stiffer = self.stiffer(unknowns, errors)
         velocity = np.exp(errors[:, 1] + 1j * (errors[:, 2] - phase - unknowns[PHASE]))
         velocity = velocity * np.exp(0.0 if states.force_is_free else -gain)
         velocity = self.own_velocity(unknowns) * velocity
@@ -50,11 +51,15 @@ class Balance(NamedTuple):
         slope = (1 + stiffer) * k * (by_log @ unknowns[places.stiffness]) + 1j * omega * (
             1 + lossier
         ) * d * (by_log @ unknowns[places.damping])
-        wander = errors[:, 3] if errors.shape[1] > 3 else 0.0
-        model = (1 + stiffer + wander) * stiffness - mass * omega**2 + (1 + lossier) * damping
+        model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
         inputs = errors.shape[1]
         return BalancedStates(force, z, model, slope, values, stiffness, damping, inputs)
+
+    def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
+        """Relative deviations of the stiffness, of levels and of states whose own wanders."""
+        of_level = unknowns[self.places.levels][self.states.level][:, 2]
+        return of_level + errors[:, 3] if errors.shape[1] > 3 else of_level
 
     def own_velocity(self, unknowns: np.ndarray) -> Complex[np.ndarray, " state"]:
         """The mode's own velocity as it was recorded, by what the other modes' parameters are."""
@@ -125,7 +130,8 @@ class Balance(NamedTuple):
         own = now.z if first else now.model
         slope = 0.0 * now.slope if first else now.slope
         slopes = now._replace(slope=slope).by_error
-        stiffer, lossier = unknowns[places.levels][states.level].T[2:]
+        stiffer = self.stiffer(unknowns, errors)
+        lossier = unknowns[places.levels][states.level][:, 3]
         design = np.zeros((len(omega), len(unknowns)), dtype=complex)
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
         design[:, PHASE] = -1j * own

@@ -33,6 +33,7 @@ from snrmjax.identify.test_model.hyper import (
     FIRST_ALONG,
     LEVELS,
     MASS,
+    NOISE,
     OFFSET,
     PHASE,
     Hyper,
@@ -57,6 +58,8 @@ _ROUNDS = 12  # at most
 _SETTLED = 2  # rounds, until steps are checked and the modal mass is free
 _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not known
 _TRIED = 4  # rounds of each start
+_MANY = 48  # rounds of each, where all still moves
+_LOST = 3.0  # 1σ of stated noise, beyond which a walk is not where the records are explained
 _LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks like fewer
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
@@ -182,6 +185,10 @@ def fit_test(
     share = min(walk.share for walk in walks)
     walk = max(walks, key=lambda one: one.likelihood_of(share))
     walk.advance(rounds - min(_TRIED, rounds))
+    if rounds == _ROUNDS and walk.is_lost:  # among steep curves the way is long
+        for one in walks:
+            one.advance(_MANY - one.turn)
+        walk = max(walks, key=lambda one: one.likelihood_of(share))
     found = walk.found
     if found is None:
         raise ValueError(f"`rounds` must be at least one, not {rounds}.")
@@ -257,6 +264,19 @@ class _Walk:
     def likelihood(self) -> float:
         """ln of likelihood times prior of what was found."""
         return -np.inf if self.found is None else self.found.likelihood
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether all still moves, and noise, where it is stated, is larger than it ever is.
+
+        Where states count as fewer if neighbours err alike, their share may move for ever.
+        """
+        if self.still or self.found is None:
+            return False
+        if not self.balance.states.stated:
+            return not self.tempered
+        beyond = self.found.point[NOISE] - np.log(priors.STATED_NOISE.median)
+        return bool(beyond > _LOST * priors.STATED_NOISE.spread)
 
     def advance(self, rounds: int) -> None:
         """Some rounds more, or until nothing moves."""

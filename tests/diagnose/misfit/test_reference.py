@@ -10,6 +10,7 @@ from truths.balanced_sets import (
     SHAPE,
     ZETA,
     balanced,
+    files,
     linear_model,
     quadratic,
 )
@@ -148,3 +149,14 @@ def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():
     np.testing.assert_allclose(error[:, 0], FORCE_TO_VELOCITY * error[:, 1])
     error = np.asarray(predicted(stated=True).chosen.states.error)
     np.testing.assert_allclose(error[:, 0], 0.003, rtol=0.02)
+
+
+def test_noise_of_a_steep_set_is_found_however_long_the_way():
+    """Softening by 93 bandwidths, levels' frequencies 1 % off; noise as stated (by another code).
+
+    Twelve rounds end anywhere between 0.9 and 12 times of it, as rounding has it.
+    """
+    model, data = files("softening_far", "strong")
+    posterior = with_reference(predictions_of(model, data)).reference.posterior
+    assert posterior.settled
+    assert posterior.hyper.noise == pytest.approx(1.0, abs=0.2)

@@ -83,6 +83,8 @@ def test_a_free_force_gain_moves_no_velocity():
     data = sj.measure.steady_states(level, frequency, none, velocity, drive=force / 3)
     fit = sj.fit_jointly(data, modes())
     assert fit.noise.level_std[0] > 0.01
+    # Gains of 1 on the mean; what levels have in common is the instrument's.
+    assert float(np.exp(fit.unknowns.log_force_gain)) == pytest.approx(3.0, rel=0.02)
     assert fit.largest[1] == pytest.approx(np.max(np.abs(velocity)), rel=1e-12)
     (note,) = (note for note in fit.notes if "scaled the forces" in note)
     assert "1 to 4 by +" in note

@@ -13,6 +13,8 @@ from truths.exact_states import (
     LEVELS,
     NOISE,
     OMEGA,
+    PARTICIPATION,
+    SHAPE,
     TRUE,
     damping,
     exact,
@@ -417,6 +419,35 @@ def test_noise_far_above_the_stated_one_leads_nowhere_else(families):
     assert np.max(np.abs(off)) < 3
     off = np.asarray(values.modal_damping - want[1]) / values.modal_damping_std
     assert np.max(np.abs(off)) < 3
+
+
+def test_what_is_open_of_other_modes_is_in_the_bands_and_moves_no_exact_curve():
+    """A second mode beside the nonlinear one, its frequency and damping with a stated 1σ."""
+
+    def two(std):
+        return sj.model.linear_modes(
+            *([OMEGA, 3 * OMEGA], [0.012, 0.01], [[SHAPE, 2.0]], [PARTICIPATION, 3.0]), std=std
+        )
+
+    level, omega, force, velocity = exact()
+    other = np.asarray(sj.model.residual_velocity(two(None), jnp.asarray(omega), force))[:, 0]
+    data = stated(level, omega, force, velocity + other)
+    known, told = (
+        fit_jointly(data, two(std), level_gain_std=0.01)
+        for std in (None, sj.model.LinearModesStd([0.0, 300.0], [0.0, 0.0]))
+    )
+    alone = fit_jointly(stated(level, omega, force, velocity), modes(), level_gain_std=0.01)
+    own, values, wide = (sj.identify.fitted_values(fit, SPEEDS) for fit in (alone, known, told))
+    for name in ("natural_frequency", "modal_damping"):
+        without = np.asarray(getattr(own, name))
+        # The stated errors of magnitudes that hold another mode are other ones.
+        for found, most in ((values, 0.05), (wide, 0.3)):
+            off = np.asarray(getattr(found, name)) - without
+            assert np.max(np.abs(off / np.asarray(getattr(found, f"{name}_std")))) < most
+    # Its flexibility moves the natural frequency, if its own frequency is a fifth off.
+    assert np.max(wide.natural_frequency_std / values.natural_frequency_std) > 1.02
+    place = told.names().index("linear_0")
+    assert 0 < told.covariance[place, place] <= 1 + 1e-9
 
 
 def test_parse_family():

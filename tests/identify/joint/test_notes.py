@@ -19,7 +19,7 @@ from snrmjax.io.joint_results import read_joint_fit, write_joint_fit
 
 def of_noise(*, stated, noise=15.0):
     found = NoiseAndLevels(noise, 0.6, (0.041, 0.0, 0.0, 0.0))
-    return notes_on_noise(found, 1.8e-4, np.zeros(4), 4, stated=stated, alike=False)
+    return notes_on_noise(found, 1.8e-4, np.zeros(4), 4, stated=stated)
 
 
 def test_the_wandering_frequency_is_the_one_of_the_error_table():

@@ -31,13 +31,13 @@ def test_a_fit_that_used_up_its_steps_says_so(monkeypatch):
 
 
 def test_a_fit_that_is_not_finite_is_an_error(monkeypatch):
-    whole = family_fit._solved
+    whole = family_fit._linearised
 
     def broken(*given):
-        vector, answer, good = whole(*given)
-        return vector, answer._replace(residuals=np.nan * answer.residuals), good
+        answer = whole(*given)
+        return answer._replace(residuals=np.nan * answer.residuals)
 
-    monkeypatch.setattr(family_fit, "_solved", broken)
+    monkeypatch.setattr(family_fit, "_linearised", broken)
     with pytest.raises(ValueError, match="infinite or undefined"):
         sj.fit_jointly(noisy(1), modes(), **TRUE)
 
@@ -114,7 +114,7 @@ def test_one_set_of_programs_serves_all_sizes_of_data_and_families(caplog):
     everything(31, "viscous_quadratic@velocity")
     found = compiled_programs(caplog, lambda: everything(32, "viscous_quadratic@velocity"))
     own = (
-        *("_solved", "_slopes", "_velocity_of_others", "_first_order", "_pinned"),
+        *("_linearised", "_solved", "_slopes", "_velocity_of_others", "_first_order", "_pinned"),
         *("_resampled", "_bands", "_point_with_slopes", "_at_velocity", "_at_displacement"),
     )
     assert [name for name in found if any(one in name for one in own)] == []

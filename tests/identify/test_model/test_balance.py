@@ -11,27 +11,32 @@ from snrmjax.identify.test_model.hyper import ALONG, OFFSET, PHASE, places_of
 LEVELS, OMEGA, CONSTANT = 3, 500.0, 6.0
 
 
-def balance(*, force_is_free=False, discrepancy=True):
+def balance(*, force_is_free=False, discrepancy=True, others=0):
     """States drawn near a mode, as no law has them, and unknowns of plausible sizes."""
     rng = np.random.default_rng(0)
     level = np.repeat(np.arange(LEVELS), 7)
     n = len(level)
     omega = OMEGA * (1 + 0.02 * rng.normal(size=n))
     velocity = (0.2 + 0.3 * level) * np.exp(0.1 * rng.normal(size=n) + 1j * rng.uniform(-1, 1, n))
+    # With other modes, whose parameters are not known for certain, a stiffness that wanders too.
+    std = [0.001, 0.01, 0.01, 0.003] if others else [0.001, 0.01, 0.01]
+    beside = 0.01 * rng.normal(size=(2, n, others)).T @ [1, 1j] if others else None
     states = measured.TestStates(
-        *(level, omega, 1.0 + rng.uniform(size=n), velocity, np.tile([0.001, 0.01, 0.01], (n, 1))),
+        *(level, omega, 1.0 + rng.uniform(size=n), velocity, np.tile(std, (n, 1))),
         *(True, CONSTANT, (0.0, 0.01, 0.0, 0.0), 0.05, force_is_free, 0.1, 0.1),
+        None if beside is None else beside.T,
     )
     basis = CurveBasis.of(states.amplitude, 8)
-    places = places_of(basis, LEVELS, discrepancy, OMEGA**2)
+    places = places_of(basis, LEVELS, discrepancy, OMEGA**2, others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     own = Balance(states, basis, places, (1e4, 10.0), np.ones(n), beside)
-    unknowns = np.zeros(max(places.levels[-1, -1] + 1, places.beside.stop))
+    unknowns = np.zeros(places.others.stop)
+    unknowns[places.others] = 0.5
     unknowns[places.stiffness] = 0.1 * rng.normal(size=basis.n_functions)
     unknowns[places.damping] = 1 + 0.1 * rng.normal(size=basis.n_functions)
     unknowns[[0, PHASE, OFFSET]] = 0.02, 0.03, 0.0
     unknowns[places.levels] = 0.05 * rng.normal(size=(LEVELS, 4))
-    errors = 0.01 * rng.normal(size=(n, 3))
+    errors = 0.01 * rng.normal(size=(n, len(std)))
     return own.with_discrepancy(unknowns, errors), unknowns, errors
 
 
@@ -39,9 +44,11 @@ def balanced(own, unknowns, errors):
     """Forces and phases with which the states, corrected for these errors, lie on the curves."""
     now = own.at(unknowns, errors)
     ratio, states = now.model / now.z, own.states
+    turn = np.exp(-1j * np.angle(ratio))
     states = states._replace(
         force=states.force * np.abs(ratio),
-        velocity=states.velocity * np.exp(-1j * np.angle(ratio)),
+        velocity=states.velocity * turn,
+        beside=None if states.beside is None else states.beside * turn[:, None],
     )
     own = own._replace(states=states)
     now = own.at(unknowns, errors)
@@ -55,8 +62,9 @@ def left(own, unknowns, errors):
 
 
 @pytest.mark.parametrize("force_is_free", [False, True])
-def test_slopes_by_unknowns_are_differences(force_is_free):
-    own, unknowns, errors = balance(force_is_free=force_is_free)
+@pytest.mark.parametrize("others", [0, 2])
+def test_slopes_by_unknowns_are_differences(force_is_free, others):
+    own, unknowns, errors = balance(force_is_free=force_is_free, others=others)
     own = balanced(own, unknowns, errors)
     straight = own.straight(unknowns, errors, apart=False)
     rows = straight.design.reshape(-1, 2, len(unknowns))
@@ -74,9 +82,9 @@ def test_slopes_by_unknowns_are_differences(force_is_free):
 def whitened(own, unknowns, errors, values):
     """Through the inverse root of J C Jᵀ, with J by differences of the balance."""
     std, out = own.states.errors, np.zeros((len(values), 2))
-    jacobian = np.zeros((len(values), 2, 3))
-    for k in range(3):
-        step = np.zeros(3)
+    jacobian = np.zeros((len(values), 2, std.shape[1]))
+    for k in range(std.shape[1]):
+        step = np.zeros(std.shape[1])
         step[k] = 1e-7
         slope = (left(own, unknowns, errors + step) - left(own, unknowns, errors - step)) / 2e-7
         jacobian[:, :, k] = np.stack([slope.real, slope.imag], axis=1)

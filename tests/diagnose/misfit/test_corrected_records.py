@@ -1,0 +1,186 @@
+"""Hypotheses compared with records that are corrected for errors: levels far off, steep curves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from truths.balanced_sets import OMEGA, PARTICIPATION, SHAPE, linear_model
+
+import snrmjax as sj
+from snrmjax.diagnose.answers import Search
+from snrmjax.diagnose.misfit.candidates import candidate
+from snrmjax.diagnose.misfit.corrected_records import (
+    at_reference,
+    likely_errors,
+    with_corrected_records,
+    without_errors,
+)
+from snrmjax.diagnose.misfit.effect_fit import baseline_fit, fit_effect
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.reference import with_reference
+from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+
+RATIO, NOISE = 0.002, 0.003
+GAIN, PHASE = np.array([0.15, -0.1, 0.08, -0.12, 0.05]), np.radians([3.0, -2.0, 1.0, -3.0, 2.0])
+
+
+def hardening(stiffening, gain=GAIN, phase=PHASE, stiffer=0 * GAIN, noise=0.0):
+    """States of one harmonic whose ω̃² grows by a share at the top level, and levels' errors.
+
+    `stiffer` are relative deviations of the levels' linear stiffness; dashpots are all the same.
+    The force that a motion needs is known in closed form: nothing is solved.
+    """
+    rng = np.random.default_rng(3)
+    rows = []
+    for level, tip in enumerate(np.geomspace(1e-3, 2e-4, len(gain))):
+        for theta in np.radians(np.linspace(-60, 60, 9)):
+            x = tip * np.cos(theta)
+            squared = OMEGA**2 * (1 + stiffer[level] + stiffening * (x / 1e-3) ** 2)
+            omega = np.sqrt(squared) * (1 - RATIO * np.tan(theta))
+            needed = squared - omega**2 + 2j * RATIO * OMEGA * omega
+            error = np.exp(gain[level] + 1j * phase[level])
+            velocity = 1j * omega * x * np.exp(-1j * np.angle(needed)) * error
+            rows.append((level, omega, abs(needed) * x / (SHAPE * PARTICIPATION), velocity))
+    level, omega, force, velocity = (np.array(column) for column in zip(*rows, strict=True))
+    velocity = velocity * np.exp(noise * (rng.normal(size=(len(level), 2)) @ [1.0, 1j]))
+    return sj.measure.steady_states(
+        level.real.astype(int),
+        omega.real,
+        force.real,
+        velocity,
+        velocity_std=NOISE * np.abs(velocity),
+        phase_std=np.full((len(level), 1), NOISE),
+        force_std=0.1 * NOISE * force.real,
+    )
+
+
+def compared(data, **settings):
+    """Predictions of one harmonic, with errors of levels as stated."""
+    model = linear_model(damping=RATIO, level_gain_std=0.15, level_phase_std=0.05, **settings)
+    return predictions_of(model, data, harmonics=1)
+
+
+def refined(misfit, fit, data):
+    """A fit with its own most likely errors taken from the records, if there are any."""
+    return Search(scales_of(misfit.predictions), (), {}, data).refined(misfit, fit)
+
+
+def test_large_errors_of_levels_beside_a_steep_curve_are_found():
+    data = hardening(0.3)  # 75 bandwidths
+    misfit = weighted_misfit(at_reference(with_reference(compared(data)), data))
+    fit = fit_effect(misfit, candidate("cubic_stiffness", scales_of(misfit.predictions)))
+    misfit, fit = refined(misfit, fit, data)
+    # Without noise only the levels' errors cost: (0.15/0.15)² …, and what they have in common.
+    assert fit.chi_square < 12.0
+    added = likely_errors(misfit, fit.rows)
+    level = np.asarray(misfit.predictions.chosen.states.level)
+    gain = np.array([added[level == k, 1].mean() for k in range(5)])
+    phase = np.array([added[level == k, 2].mean() for k in range(5)])
+    # A gain that all share is one with the coefficient and the force: only differences are seen.
+    np.testing.assert_allclose(gain - gain.mean(), -(GAIN - GAIN.mean()), atol=0.004)
+    np.testing.assert_allclose(phase, -PHASE, atol=0.003)
+
+
+def test_a_gain_that_all_levels_share_is_theirs_as_long_as_theirs_are_as_large():
+    """What no difference between levels shows: 10 % of 15 % (1σ), beside curves that are steep."""
+    data = hardening(0.3, gain=GAIN + 0.1, noise=NOISE)
+    predictions = at_reference(with_reference(compared(data)), data)
+    kinds = ("cubic_stiffness", "sensor_gain_error", "force_gain_error", "added_mass")
+    found = Search(scales_of(predictions), kinds, {}, data).answered(predictions)
+    assert found.found.fit.kinds == ("cubic_stiffness",)
+    assert found.found.p_value > 0.05
+    first, second = found.weights.answers[:2]
+    assert first.log_weight > second.log_weight + 2
+
+
+def test_errors_move_the_force_as_the_true_curve_does():
+    """Slopes of K(a) − Ω² + iΩδ by log amplitude, over it, at the motion that was there."""
+    data = hardening(0.3, noise=NOISE)
+    predictions = with_reference(compared(data))
+    reference = predictions.reference
+    level = np.asarray(predictions.chosen.states.level)[reference.rows]
+    omega, recorded = np.asarray(data.frequency), np.asarray(data.velocity)[:, 0]
+    x = np.abs(recorded) / np.exp(GAIN[level]) / omega
+    squared = OMEGA**2 * (1 + 0.3 * (x / 1e-3) ** 2)
+    needed = squared - omega**2 + 2j * RATIO * OMEGA * omega
+    wanted = 1 + 2 * (squared - OMEGA**2) / needed
+    off = np.abs(reference.by_velocity - wanted) / np.abs(wanted)
+    # A gain that levels share is not known: its share of the amplitude counts twice.
+    assert np.median(off) < 0.1
+    # Phases of levels, up to 3°, do not turn it. At the largest level, the first, curves end: there
+    # it alone says what its phase and what the damping is.
+    turned = np.angle(reference.by_velocity / wanted)
+    middle = np.array([np.median(turned[level == k]) for k in range(1, 5)])
+    assert np.max(np.abs(middle)) < np.radians(1.0)
+
+
+@pytest.mark.parametrize("kind", [None, "sensor_gain_error", "linear_frequency_shift"])
+def test_errors_do_not_explain_an_answer_that_is_wrong(kind):
+    data = hardening(0.3)
+    misfit = weighted_misfit(at_reference(with_reference(compared(data)), data))
+    fit = baseline_fit(misfit)
+    if kind is not None:
+        fit = fit_effect(misfit, candidate(kind, scales_of(misfit.predictions)))
+    _, fit = refined(misfit, fit, data)
+    assert fit.chi_square > 1e4  # of 90 rows
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"level_gain_std": 0.15, "level_phase_std": 0.05, "level_frequency_std": 0.01 * OMEGA},
+        {},
+    ],
+)
+def test_a_linear_structure_with_errors_of_levels_lacks_nothing(sizes):
+    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **sizes)
+    stiffer = 0.02 * np.array([1.0, -0.7, 0.4, -1.2, 0.3])
+    found = sj.diagnose_model(model, hardening(0.0, stiffer=stiffer, noise=NOISE))
+    assert found.verdict == "none"
+    assert next(iter(found.probabilities)) == "none"
+
+
+def test_an_error_of_the_only_level_is_no_defect_of_the_instruments():
+    """Nobody states how far phases of a level may be off: 0.25° is less than they differ by."""
+    data = hardening(0.0, gain=[0.0], phase=[np.radians(-0.25)], stiffer=[0.0], noise=5e-4)
+    error = 5e-4 * np.abs(np.asarray(data.velocity))
+    data = dataclasses.replace(data, velocity_std=error, phase_std=np.full_like(error, 5e-4))
+    sizes = {
+        "level_gain_std": 0.01,
+        "level_frequency_std": 1e-3 * OMEGA,
+        "level_damping_std": 0.05 * RATIO,
+    }
+    model = linear_model(damping=RATIO, damping_std=0.2 * RATIO, **sizes)
+    found = sj.diagnose_model(model, data)
+    assert found.verdict == "none"
+    assert "sensor_phase_error" in found.probabilities  # seen, and weighed
+
+
+def test_records_as_they_are_carry_nothing_over():
+    data = hardening(0.05)
+    predictions = with_reference(compared(data))
+    there = weighted_misfit(at_reference(predictions, data))
+    assert np.max(np.abs(there.predictions.added)) > 0.05
+    none = np.zeros_like(there.predictions.added)
+    back = without_errors(there, baseline_fit(there), data, none)
+    assert np.all(back.predictions.offset == 0)
+    plain = weighted_misfit(predictions)
+    np.testing.assert_allclose(back.baseline.columns, plain.baseline.columns, rtol=1e-6, atol=1e-9)
+
+
+def test_corrections_turn_harmonics_as_errors_of_time():
+    data = hardening(0.0)
+    n = data.n_states
+    harmonics = np.full((n, 1, 2), 0.1 + 0.05j) * np.abs(np.asarray(data.velocity))[:, :, None]
+    data = dataclasses.replace(
+        data,
+        harmonics=harmonics,
+        harmonic_order=(2, 3),
+        harmonic_std=np.full((n, 1), 1e-4),
+    )
+    added = np.tile([0.0, 0.1, 0.02], (n, 1))
+    new = with_corrected_records(data, np.arange(n), (0,), added)
+    np.testing.assert_allclose(new.velocity, data.velocity * np.exp(0.1 + 0.02j), rtol=1e-12)
+    for k, order in enumerate((2, 3)):
+        turned = harmonics[..., k] * np.exp(0.1 + 0.02j * order)
+        np.testing.assert_allclose(new.harmonics[..., k], turned, rtol=1e-12)
