@@ -69,7 +69,9 @@ def view_of(
     gain = abs(guess) if "force_gain" in free else 1.0
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
     states = _test_states(problem, free, stated, guess)
-    fit = functools.partial(fit_test, robust=robust, most_knots=knots, tempered=True)
+    fit = functools.partial(
+        fit_test, robust=robust, most_knots=knots, tempered=True, over_sizes=True
+    )
     found = fit(states)
     mass, std = found.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None

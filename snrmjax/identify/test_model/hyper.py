@@ -10,6 +10,7 @@ from snrmjax.identify.test_model.curve_basis import CurveBasis
 from snrmjax.identify.test_model.linear_gaussian import LinearRows, Objective
 from snrmjax.identify.test_model.states import TestStates
 
+_STRAIGHT = 1e-4  # size of bends, below which no test sees them
 _NOTHING = 1e-4  # over a prior's scale, that a size is at least
 _FARTHEST = 5.0  # 1σ, of a change of the bends' size
 _MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not one structure's
@@ -97,7 +98,7 @@ def bounds_of(
     states: TestStates, basis: CurveBasis, point: np.ndarray
 ) -> list[tuple[float, float]]:
     """Between which points lie; what is stated is held."""
-    size = (np.log(1e-7), np.log(2.0))
+    size = (np.log(_STRAIGHT), np.log(2.0))
     noise = (np.log(0.02), np.log(1e6)) if states.stated else (np.log(1e-5), np.log(1.0))
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
