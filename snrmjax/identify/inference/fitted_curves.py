@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -54,13 +54,13 @@ def fitted_values(
     slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
     zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
     return BackboneValues(
-        velocity=jnp.asarray(at),
-        natural_frequency=jnp.asarray(omega),
-        natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
-        damping_ratio=jnp.asarray(zeta),
-        damping_ratio_std=jnp.asarray(zeta_std),
-        modal_damping=jnp.asarray(damping),
-        modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
+        velocity=jax.device_put(at),
+        natural_frequency=jax.device_put(omega),
+        natural_frequency_std=jax.device_put(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
+        damping_ratio=jax.device_put(zeta),
+        damping_ratio_std=jax.device_put(zeta_std),
+        modal_damping=jax.device_put(damping),
+        modal_damping_std=jax.device_put(np.sqrt(covariance[:, 1, 1])),
     )
 
 
@@ -111,7 +111,7 @@ def as_backbone(
         # Dry friction has no finite damping at rest: there the next knot's value stands.
         values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
         squared, damping = (
-            Spline.through((at / at[-1]) ** 2, values[:, k], jnp.asarray(at[-1]), argument)
+            Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
             for k in range(2)
         )
         rows = np.concatenate([slopes[:, 0], slopes[:, 1]])
@@ -121,10 +121,10 @@ def as_backbone(
     return Backbone(
         squared_frequency=squared,
         modal_damping=damping,
-        covariance=jnp.asarray(covariance),
+        covariance=jax.device_put(covariance),
         modal_constant=fit.problem.constant_of(fit.unknowns),
-        smallest=jnp.asarray(np.min(measured)),
-        largest=jnp.asarray(largest),
+        smallest=jax.device_put(np.min(measured)),
+        largest=jax.device_put(largest),
         argument=argument,
         sensor=fit.modes.sensors[fit.data.sensor],
     )

@@ -17,7 +17,8 @@ _MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not
 ALONG = 14  # functions of phase and amplitude of a discrepancy, for each part
 
 
-MASS, PHASE, OFFSET = 0, 1, 2  # where the unknowns stand that all states share
+# Where the unknowns stand that all states share: the last two are the exponents of frequency.
+MASS, PHASE, OFFSET, WITH_FREQUENCY = 0, 1, 2, slice(3, 5)
 
 
 class Hyper(NamedTuple):
@@ -33,7 +34,8 @@ class Hyper(NamedTuple):
 class Places(NamedTuple):
     """Where the unknowns stand, and the squared frequency that stiffness is counted from.
 
-    The modal mass comes first, then the instruments' phase and the offset of the force.
+    The modal mass comes first, then the instruments' phase, the offset of the force, and how both
+    curves go with the forcing frequency.
     """
 
     stiffness: slice
@@ -53,7 +55,7 @@ def places_of(
     basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
 ) -> Places:
     """The places for so many levels and parameters of others, with or without a discrepancy."""
-    start = OFFSET + 1
+    start = WITH_FREQUENCY.stop
     middle = start + basis.n_functions
     first = middle + basis.n_functions
     levels = first + np.arange(4 * n_levels).reshape(n_levels, 4)
@@ -121,8 +123,8 @@ def prior_variances(
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
     variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
     variance[places.others] = 1.0
-    variance[[MASS, PHASE, OFFSET]] = np.square(
-        [states.mass_std, states.phase_std, states.offset_std]
+    variance[: WITH_FREQUENCY.stop] = np.square(
+        [states.mass_std, states.phase_std, states.offset_std, *states.off_resonance_std]
     )
     for k, own in enumerate((places.stiffness, places.damping)):
         log_variance, by = basis.log_variances(np.log(hyper.bends[k]), hyper.along)

@@ -206,15 +206,17 @@ def fit_test(
         return variance
 
     def gaussian(point: np.ndarray) -> Gaussian:
-        return equations.posterior(hyper_at(point, basis).noise, wide_variances(point))
+        return Gaussian(*equations.posterior(hyper_at(point, basis).noise, wide_variances(point)))
 
-    hyper, variance = hyper_at(found.point, basis), wide_variances(found.point)
+    variance = wide_variances(found.point)
     objective = objective_of(found.equations, states, basis, places)
     bounds = bounds_of(states, basis, found.point)
-    mean, covariance = gaussian(found.point)
-    if over_sizes:
-        mean, covariance = averaged(sizes_of_bends(objective, found.point, bounds), gaussian)
+    point, (mean, covariance) = found.point, gaussian(found.point)
     told = variance > 0
+    effective_unknowns = float(np.sum(1 - np.diag(covariance)[told] / variance[told]))
+    if over_sizes:
+        sized = sizes_of_bends(objective, found.point, bounds)
+        point, (mean, covariance) = averaged(sized, gaussian)
     flat = objective_of(found.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
@@ -222,12 +224,12 @@ def fit_test(
         units,
         mean,
         covariance,
-        hyper,
+        hyper_at(point, basis),
         laplace_evidence(objective, found.point, bounds),
         found.errors,
-        found.residuals,
+        found.residuals * np.exp(found.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
-        float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
+        effective_unknowns,
         places,
         _differing(flat, found.point, bounds, states),
         walk.balance.weight,
