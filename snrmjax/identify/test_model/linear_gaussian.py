@@ -129,6 +129,8 @@ def maximised(
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     """Inverse and ln determinant of a positive definite matrix, in units that make it even."""
+    if not len(matrix):  # which lapack refuses
+        return matrix, 0.0
     size = np.sqrt(np.diagonal(matrix))
     even = matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix))
     factor, failed = dpotrf(even, lower=True)

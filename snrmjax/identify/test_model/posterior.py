@@ -25,7 +25,6 @@ from scipy.special import ndtri, stdtrit
 
 from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model import priors
-from snrmjax.identify.test_model.averaged import Gaussian, averaged, sizes_of_bends
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import MOST_KNOTS, CurveBasis
 from snrmjax.identify.test_model.hyper import (
@@ -37,13 +36,16 @@ from snrmjax.identify.test_model.hyper import (
     NOISE,
     OFFSET,
     PHASE,
+    Gaussian,
     Hyper,
     Places,
+    averaged,
     bounds_of,
     hyper_at,
     objective_of,
     places_of,
     prior_variances,
+    sizes_of_bends,
     starting_point,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
