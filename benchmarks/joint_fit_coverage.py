@@ -206,7 +206,7 @@ def one_pointwise_test(case: Case, truth: Truth, seed: int, *, level_known: bool
         "damping": np.asarray(damping).tolist(),
         "frequency_band": float(np.mean(values.natural_frequency_std / values.natural_frequency)),
         "damping_band": float(np.mean(values.modal_damping_std / values.modal_damping)),
-        "noise": max(found.fit.noise_scale),
+        "noise": found.fit.noise.scale,
         "families": ["points"],
         "notes": list(found.notes),
     }

@@ -1,8 +1,4 @@
-"""Curves through values at knots: natural cubic splines in the squared amplitude.
-
-The pointwise curves of `identify_backbone` are another family: PCHIP, cubics that keep the shape
-of the values, in the amplitude itself.
-"""
+"""Curves through values at knots: natural cubic splines in the squared amplitude."""
 
 import itertools
 from typing import Any, ClassVar
