@@ -36,13 +36,16 @@ from snrmjax.identify.test_model.hyper import (
     NOISE,
     OFFSET,
     PHASE,
+    Gaussian,
     Hyper,
     Places,
+    averaged,
     bounds_of,
     hyper_at,
     objective_of,
     places_of,
     prior_variances,
+    sizes_of_bends,
     starting_point,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
@@ -150,13 +153,14 @@ def fit_test(
     rounds: int = _ROUNDS,
     most_knots: int | None = None,
     tempered: bool = False,
+    over_sizes: bool = False,
 ) -> TestPosterior:
     """The posterior of a test.
 
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t);
     curves have `most_knots` at most; with `tempered` states whose neighbours miss the curves alike
-    count as fewer.
+    count as fewer; with `over_sizes` curves are averaged over the sizes that their bends may have.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -194,16 +198,27 @@ def fit_test(
         raise ValueError(f"`rounds` must be at least one, not {rounds}.")
     # The size of what few levels differ by is not well known: as Student's t has it. What they have
     # in common may be anything of that size.
-    hyper = hyper_at(found.point, basis)
-    variance, _ = prior_variances(hyper, basis, places, states)
-    for own, std in zip(places.levels.T, states.level_std, strict=True):
-        variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
     last = walk.balance.straight(found.mean, found.errors, apart=False)
     equations = last.equations._replace(share=found.equations.share)
-    mean, covariance = equations.posterior(hyper.noise, variance)
-    told = variance > 0
+
+    def wide_variances(point: np.ndarray) -> np.ndarray:
+        variance, _ = prior_variances(hyper_at(point, basis), basis, places, states)
+        for own, std in zip(places.levels.T, states.level_std, strict=True):
+            variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
+        return variance
+
+    def gaussian(point: np.ndarray) -> Gaussian:
+        return Gaussian(*equations.posterior(hyper_at(point, basis).noise, wide_variances(point)))
+
+    variance = wide_variances(found.point)
     objective = objective_of(found.equations, states, basis, places)
     bounds = bounds_of(states, basis, found.point)
+    point, (mean, covariance) = found.point, gaussian(found.point)
+    told = variance > 0
+    effective_unknowns = float(np.sum(1 - np.diag(covariance)[told] / variance[told]))
+    if over_sizes:
+        sized = sizes_of_bends(objective, found.point, bounds)
+        point, (mean, covariance) = averaged(sized, gaussian)
     flat = objective_of(found.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
@@ -211,12 +226,12 @@ def fit_test(
         units,
         mean,
         covariance,
-        hyper,
+        hyper_at(point, basis),
         laplace_evidence(objective, found.point, bounds),
         found.errors,
-        found.residuals,
+        found.residuals * np.exp(found.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
-        float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
+        effective_unknowns,
         places,
         _differing(flat, found.point, bounds, states),
         walk.balance.weight,

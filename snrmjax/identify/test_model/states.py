@@ -33,6 +33,8 @@ class TestStates(NamedTuple):
     # 1σ of a phase (rad) that all records share, and of an offset of the force over the smallest.
     phase_std: float = 0.0
     offset_std: float = 0.0
+    # 1σ of how what moves both curves goes with the forcing frequency (`priors.OFF_RESONANCE`).
+    off_resonance_std: tuple[float, float] = (0.0, 0.0)
     # What other modes move beside it for 1σ of their linear parameters, m/s; None: all are known.
     beside: Complex[np.ndarray, "state deviation"] | None = None
 
