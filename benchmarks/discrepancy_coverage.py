@@ -159,7 +159,7 @@ def scores(
     joint = sj.identify.fitted_values(fit, speed)
     # Damping is relative to the modal mass that a fit found: compared by the force that it is.
     found = float(fit.problem.modal_mass_of(fit.unknowns) * abs(fit.problem.modal_constant))
-    curve = points.fit.backbone.values(speed / natural)
+    curve = points.backbone.values(speed / natural)
     errors, bands = {}, {}
     for way, values, mass in (("joint", joint, found), ("pointwise", curve, 1.0)):
         std = np.array([values.natural_frequency_std, mass * values.damping_ratio_std])

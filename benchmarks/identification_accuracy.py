@@ -80,7 +80,7 @@ def study(
 ) -> tuple[dict, sj.identify.Backbone]:
     """Errors of points, curve, resonances and force balance against harmonic balance."""
     found = sj.identify_backbone(data, model.modes, amplitude=argument)
-    points, backbone = found.points, found.fit.backbone
+    points, backbone = found.points, found.backbone
     amplitude = np.abs(branch.velocity[:, 1, 0])
     if argument == "displacement":
         amplitude = amplitude / branch.frequency

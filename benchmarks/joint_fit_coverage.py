@@ -198,7 +198,7 @@ def one_pointwise_test(case: Case, truth: Truth, seed: int, *, level_known: bool
     modes, stated = case.model.modes, ERRORS["gain"] if level_known else 0.0
     known = sj.model.structure(modes, level_gain_std=stated)
     found = sj.identify_backbone(erring(case, truth, seed), known)
-    values = found.fit.backbone.values(truth.at)
+    values = found.backbone.values(truth.at)
     frequency = (values.natural_frequency - truth.natural_frequency) / values.natural_frequency_std
     damping = (values.modal_damping - truth.damping) / values.modal_damping_std
     return {
@@ -206,7 +206,7 @@ def one_pointwise_test(case: Case, truth: Truth, seed: int, *, level_known: bool
         "damping": np.asarray(damping).tolist(),
         "frequency_band": float(np.mean(values.natural_frequency_std / values.natural_frequency)),
         "damping_band": float(np.mean(values.modal_damping_std / values.modal_damping)),
-        "noise": max(found.fit.noise_scale),
+        "noise": found.fit.noise.scale,
         "families": ["points"],
         "notes": list(found.notes),
     }

@@ -115,7 +115,7 @@ print(f"velocity:     median {np.median(by_velocity):.4f} %, worst {by_velocity.
 # the unstable part, and the same by harmonic balance for comparison.
 
 # %%
-backbone = found.fit.backbone
+backbone = found.backbone
 resonances = [
     r
     for force in sj.model.FLAT_BEAM_FORCES
@@ -200,7 +200,7 @@ print(f"points: median {np.median(curved_errors):.3f} %, worst {curved_errors.ma
 
 # %%
 curved_responses = sj.forced_response(curved, sj.model.CURVED_BEAM_FORCES, 25 * HERTZ, 140 * HERTZ)
-curved_backbone = curved_found.fit.backbone
+curved_backbone = curved_found.backbone
 show(
     plot.response_figure(
         curved_backbone,

@@ -14,9 +14,9 @@ from . import (
 )
 from .diagnose.diagnosis import diagnose_model
 from .identify.calibrate.calibration import calibrate_model
+from .identify.inference.identification import identify_backbone
 from .identify.inference.optimal_design import next_measurements
 from .identify.joint.joint_fit import fit_jointly
-from .identify.pointwise.identification import identify_backbone
 from .io.compilation_cache import use_compilation_cache
 from .io.models import read_model
 from .io.tables import read_steady_states

@@ -147,9 +147,9 @@ def test_identify_writes_what_the_contract_says(files, tmp_path):
     ]
     summary = json.loads((out / "summary.json").read_text())
     (resonance,) = summary["resonances"]
-    # The states are exact and linear: curves through them are constant to solver tolerance.
-    assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-8)
-    assert resonance["damping_ratio"] == pytest.approx(0.05, rel=1e-8)
+    # The states are exact and linear; noise is taken to be 1e-5 at least.
+    assert resonance["frequency_hz"] == pytest.approx(64.78, rel=1e-7)
+    assert resonance["damping_ratio"] == pytest.approx(0.05, rel=1e-5)
     assert (out / "report.html").exists()
     assert (out / "backbone.png").read_bytes()[:4] == b"\x89PNG"
     assert "backbone: 64.78 Hz and 5 % of critical damping at " in done.stderr
@@ -353,7 +353,7 @@ def test_each_command_starts_in_a_process_of_its_own(files, tmp_path, command, w
         (("--robust",), ("--robust", "--fit auto")),
         (("--fit", "auto", "--anchor"), ("--anchor", "--fit")),
         (("--fit", "auto", "--knots", "5"), ("--knots", "--fit spline:5")),
-        (("--free", "force_gain", "--curve", "spline"), ("--curve", "--free", "--fit spline")),
+        (("--free", "force_gain", "--knots", "5"), ("--knots", "--free", "--fit spline:5")),
         (("--next", "2", "--amplitude", "velocity"), ("--amplitude", "--next", "@velocity")),
         (("--fit", "auto", "--measure", "peak"), ("--measure", "--fit", "fundamental")),
         (("--extrapolate", "2"), ("--extrapolate", "--predict-force")),
@@ -380,7 +380,7 @@ def test_every_option_of_identify_is_joined_to_the_others_or_tried_here(files, t
     command = typer.main.get_command(app).commands["identify"]
     both = {"data", "model", "out", "predict_force", "predict_drive", "extrapolate", "help"}
     both |= {"axis", "day_std", "self_excited"}
-    points = {"amplitude", "measure", "curve", "knots", "anchor"}
+    points = {"amplitude", "measure", "knots", "anchor"}
     joint = {"fit", "free", "robust", "further"}
     assert {one.name for one in command.params} - {"help"} == (both | points | joint) - {"help"}
 
@@ -427,10 +427,10 @@ GAIN = 0.4  # N/V
 
 @pytest.fixture(scope="module")
 def fitted(beam, tmp_path_factory):
-    """What a joint fit writes: the folder, every table, curves fitted beside it."""
+    """What a joint fit writes: the folder, every table."""
     model, data, _ = beam
     out = tmp_path_factory.mktemp("fitted")
-    written, beside = [], []
+    written = []
     with pytest.MonkeyPatch.context() as patch:
         kept = tables.write_atomically
 
@@ -439,12 +439,10 @@ def fitted(beam, tmp_path_factory):
             kept(path, content)
 
         patch.setattr(tables, "write_atomically", counted)
-        module = "snrmjax.identify.pointwise.identification"
-        patch.setattr(f"{module}.fit_backbone", lambda *_, **__: beside.append(_))
         options = ("--fit", FAMILIES, "--predict-force", "1", "--predict-force", "4", "--next", "2")
         done = run("identify", data, "--model", model, "--out", out, *options)
     assert done.code == 0, done.stderr
-    return out, written, beside
+    return out, written
 
 
 def rows(path: Path) -> dict[str, np.ndarray]:
@@ -456,7 +454,7 @@ def rows(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_a_joint_fit_writes_what_the_contract_says(fitted):
-    out, _, _ = fitted
+    out, _ = fitted
     assert columns(out / "next.csv") == [
         "rank",
         "force_n",
@@ -499,12 +497,12 @@ def test_a_joint_fit_writes_what_the_contract_says(fitted):
 
 
 def test_each_table_of_a_joint_fit_is_written_once(fitted):
-    _, written, _ = fitted
+    _, written = fitted
     assert sorted(written) == ["backbone.csv", "next.csv", "points.csv", "prediction.csv"]
 
 
 def test_a_prediction_says_where_a_further_level_would_be(fitted):
-    out, _, _ = fitted
+    out, _ = fitted
     summary = json.loads((out / "summary.json").read_text())
     for tip, one in zip(summary["resonances"], summary["resonance_distributions"], strict=True):
         assert one["force_n"] == tip["force_n"]
@@ -521,7 +519,7 @@ def test_a_prediction_says_where_a_further_level_would_be(fitted):
 
 
 def test_predictions_of_a_joint_fit_lie_on_its_own_curves(fitted):
-    out, _, _ = fitted
+    out, _ = fitted
     found = rows(out / "prediction.csv")
     omega, force = HERTZ * found["frequency_hz"], found["force_n"]
     velocity = found["velocity_re_m_s"] + 1j * found["velocity_im_m_s"]
@@ -546,10 +544,6 @@ def test_predictions_of_a_joint_fit_lie_on_its_own_curves(fitted):
     x = 2e-3 * np.array([0, 1])
     largest = np.sqrt(squared(x[1])) / HERTZ
     assert backbone["natural_frequency_hz"][1] == pytest.approx(largest, rel=1e-9)
-
-
-def test_curves_that_nobody_sees_are_not_fitted(fitted):
-    assert fitted[2] == []
 
 
 @pytest.mark.long

@@ -38,13 +38,6 @@ class Measure(StrEnum):
     peak = "peak"
 
 
-class Family(StrEnum):
-    """How a curve passes through its knots."""
-
-    spline = "spline"
-    piecewise_linear = "piecewise_linear"
-
-
 def identify(
     context: typer.Context,
     data: Annotated[
@@ -134,18 +127,11 @@ def identify(
             rich_help_panel=_CURVES,
         ),
     ] = Measure.fundamental,
-    curve: Annotated[
-        Family,
-        typer.Option(
-            help="Shape between knots: spline (piecewise cubic, no overshoot: PCHIP) or straight.",
-            rich_help_panel=_CURVES,
-        ),
-    ] = Family.spline,
     knots: Annotated[
         int | None,
         typer.Option(
-            help="Knots of each curve. Default: up to 60, and as smooth as predicts left-out "
-            "levels best.",
+            help="Knots of each curve at most. Default: up to 42; curves bend as much as the data "
+            "ask for.",
             min=2,
             rich_help_panel=_CURVES,
         ),
@@ -230,7 +216,7 @@ def identify(
             found = workflow.identify_jointly(measured, structure, settings, loads)
         else:
             curves = workflow.CurveSettings(
-                amplitude.value, measure.value, curve.value, knots, anchor
+                amplitude.value, measure.value, n_knots=knots, anchor=anchor
             )
             found = workflow.identify_by_points(measured, structure, curves, loads)
         for note in found.notes:
@@ -247,7 +233,6 @@ _ASK_FOR_FIT = {"fit", "free", "further"}
 _NOT_WITH_FIT = {
     "amplitude": "name the amplitude with the family, as in `--fit polynomial:2@velocity`",
     "measure": "a joint fit takes the fundamental",
-    "curve": "name the family with `--fit`, as in `--fit spline`",
     "knots": "give the size with the family, as in `--fit spline:5`",
     "anchor": "a joint fit is not tied to the linear mode",
 }

@@ -10,6 +10,7 @@ from .curves.families import FAMILIES
 from .inference.corrected_states import corrected_states
 from .inference.fitted_curves import fitted_values
 from .inference.fitted_response import FittedResponse, fitted_response, predicted_resonance
+from .inference.identification import Anchor, Identification, identify_backbone
 from .inference.located_points import FittedPoint, LocatedStatus
 from .inference.optimal_design import (
     AdviceStatus,
@@ -47,9 +48,8 @@ from .modal.state_responses import (
     levels_by_velocity,
     responses_of_states,
 )
-from .pointwise.backbone import Backbone, BackboneFit, BackboneValues, fit_backbone
+from .pointwise.backbone import Backbone, BackboneValues
 from .pointwise.backbone_points import identify_points
-from .pointwise.identification import Identification, identify_backbone
 from .pointwise.inversion import closed_form, invert_amplitude_phase, invert_phasor
 from .pointwise.inversion_result import PointStatus, SnrmPoints
 from .pointwise.points_result import BackbonePoints
@@ -77,9 +77,9 @@ __all__ = [
     "AddedMassTest",
     "AdviceStatus",
     "AmplitudeDependence",
+    "Anchor",
     "Backbone",
     "BackboneCalibration",
-    "BackboneFit",
     "BackbonePoints",
     "BackboneValues",
     "BaseResponses",
@@ -130,7 +130,6 @@ __all__ = [
     "corrected_states",
     "decay_modes",
     "find_modes",
-    "fit_backbone",
     "fit_free_decay",
     "fit_jointly",
     "fit_linear_modes",

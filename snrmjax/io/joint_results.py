@@ -10,7 +10,6 @@ import numpy as np
 
 from snrmjax.identify.curves.families import FAMILIES
 from snrmjax.identify.curves.family_base import AbstractFamily
-from snrmjax.identify.inference.agreement import Agreement
 from snrmjax.identify.inference.fitted_curves import values_to_the_largest
 from snrmjax.identify.inference.fitted_response import FittedResponse
 from snrmjax.identify.inference.located_points import FittedPoint
@@ -103,30 +102,6 @@ def summarise_fit(
             for p in r.not_located
         ],
         "notes": list(fit.notes),
-    }
-
-
-def summarise_agreement(found: Agreement | None) -> dict | None:
-    """The pointwise curves beside the joint fit's, amplitude by amplitude; None: no points."""
-    if found is None:
-        return None
-    pointwise, joint = found.pointwise, found.joint
-    columns = {
-        "velocity_m_s": pointwise.velocity,
-        "pointwise_natural_frequency_hz": np.asarray(pointwise.natural_frequency) / HERTZ,
-        "joint_natural_frequency_hz": np.asarray(joint.natural_frequency) / HERTZ,
-        "natural_frequency_difference_in_std": found.frequency_difference,
-        "pointwise_damping_ratio": pointwise.damping_ratio,
-        "joint_damping_ratio": joint.damping_ratio,
-        "damping_difference_in_std": found.damping_difference,
-    }
-    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-    return {
-        "agree": found.agree,
-        "largest_difference_in_std": found.largest,
-        "limit_in_std": found.limit,
-        "reasons": list(found.reasons),
-        "table": [dict(zip(columns, row, strict=True)) for row in rows],
     }
 
 

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
-from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.inference.identification import Identification
+from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.identify.pointwise.prediction import PredictedResponse, Resonance
 from snrmjax.identify.prediction.resonance_distribution import QUANTILES, ResonanceDistribution
@@ -126,9 +125,7 @@ def write_backbone(path: FilePath, identification: Identification) -> None:
 
     An anchored backbone starts at zero amplitude.
     """
-    backbone = identification.fit.backbone
-    start = 0.0 if identification.fit.anchor is not None else float(backbone.smallest)
-    write_values(path, _sampled(backbone, start))
+    write_values(path, identification.backbone.sampled(BACKBONE_POINTS))
 
 
 def write_values(path: FilePath, values: BackboneValues) -> None:
@@ -177,22 +174,16 @@ def write_prediction(
     )
 
 
-def values_in_range(identification: Identification) -> BackboneValues:
-    """The backbone from the smallest to the largest measured amplitude."""
-    backbone = identification.fit.backbone
-    return _sampled(backbone, float(backbone.smallest))
-
-
 def summarise(identification: Identification, values: BackboneValues) -> dict:
     """The headline numbers of an identification, by name, in the units of the files.
 
     Arguments: `values` of the curves from the smallest to the largest measured amplitude.
     """
-    points, fit = identification.points, identification.fit
+    points, noise = identification.points, identification.fit.noise
     frequency = np.asarray(values.natural_frequency) / HERTZ
     damping, velocity = values.damping_ratio, values.velocity
     status = np.asarray(points.status)
-    anchor = fit.anchor
+    anchor = identification.anchor
     return {
         "sensor": points.sensor,
         "amplitude": points.argument,
@@ -211,11 +202,10 @@ def summarise(identification: Identification, values: BackboneValues) -> dict:
             "damping_ratio_max": float(np.max(damping)),
         },
         "noise": {
-            "stated": fit.noise_stated,
-            "scale_frequency": fit.noise_scale[0],
-            "scale_damping": fit.noise_scale[1],
-            "level_frequency_std_hz": fit.level_frequency_std / HERTZ,
-            "level_damping_ratio_std": fit.level_damping_std,
+            "stated": noise.stated,
+            "scale": noise.scale,
+            "level_frequency_std_hz": identification.level_frequency_std / HERTZ,
+            "level_damping_ratio_std": identification.level_damping_std,
         },
         "anchor": None
         if anchor is None
@@ -261,11 +251,6 @@ def _place(sensors: tuple[str, ...], name: str | None) -> int:
     if name is not None and name not in sensors:
         raise ValueError(f"`sensor` must be one of {', '.join(sensors)}, but is {name!r}.")
     return 0 if name is None else sensors.index(name)
-
-
-def _sampled(backbone: Backbone, start: float) -> BackboneValues:
-    amplitude = np.linspace(start, float(backbone.largest), BACKBONE_POINTS)
-    return backbone.values(jnp.asarray(amplitude))
 
 
 def _numbered(force: np.ndarray) -> np.ndarray:

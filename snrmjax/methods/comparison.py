@@ -3,12 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.inference.identification import identify_backbone
 from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.pointwise.identification import identify_backbone
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.states import SteadyStates, join_steady_states, with_levels_apart
 from snrmjax.methods.record_comparison import RECORD_METHODS, run_record_method, states_of
@@ -44,12 +43,11 @@ def snrm(data: SteadyStates, modes: LinearModes) -> MethodResult:
     """
     if np.isfinite(np.asarray(data.force)).any():
         found = identify_backbone(data, modes)
-        backbone, notes = found.fit.backbone, found.notes
+        backbone, notes = found.backbone, found.notes
     else:
         joint = fit_jointly(data, modes, free=("instrument_phase",))
         backbone, notes = as_backbone(joint), joint.notes
-    ends = float(backbone.smallest), float(backbone.largest)
-    curve = backbone.values(jnp.linspace(*ends, _SAMPLES))
+    curve = backbone.sampled(_SAMPLES)
     columns = (
         *(curve.velocity, curve.natural_frequency, curve.natural_frequency_std),
         *(curve.damping_ratio, curve.damping_ratio_std),

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.inversion_result import STATUS_MESSAGE, PointStatus
 from snrmjax.identify.pointwise.prediction import (
     PredictedResponse,
@@ -92,7 +92,7 @@ def identification_report(
     forces that were asked for; `further` sections before the last one.
     Returns a `Report` for `write_report`.
     """
-    backbone = identification.fit.backbone
+    backbone = identification.backbone
     caption = BACKBONE_CAPTION + (TRUTH_CAPTION if "nnm" in figures else "")
     shown = [ReportFigure(figures["backbone"], caption)]
     sections = [Section("Backbone and damping", (), shown)]
@@ -150,7 +150,7 @@ class _Course(NamedTuple):
 
 def _courses(identification: Identification) -> tuple[_Course, _Course]:
     """Natural frequency and damping ratio over the amplitudes."""
-    curve = sample_backbone(identification.fit.backbone)
+    curve = sample_backbone(identification.backbone)
     return (
         _Course(curve.velocity, curve.frequency, curve.frequency_error, "Hz"),
         _Course(curve.velocity, curve.damping, curve.damping_error, "%"),
@@ -220,24 +220,24 @@ def _left_out(identification: Identification) -> str:
 
 
 def _phases(identification: Identification) -> str:
-    sign = np.sign(float(identification.fit.backbone.modal_constant))
+    sign = np.sign(float(identification.backbone.modal_constant))
     phase = np.angle(np.asarray(identification.points.mode_velocity) * sign)
     phase = phase[np.isfinite(phase)] / DEGREE
     return minus(f"{phase.min():.0f}° to {phase.max():.0f}°, 0° is resonance")
 
 
 def _noise(identification: Identification) -> str:
-    fit, scale = identification.fit, identification.fit.noise_scale
-    if fit.noise_stated:
-        both = f"{scale[0]:.2g} (frequency) and {scale[1]:.2g} (damping)"
-        return f"stated; the points scatter {both} times as much"
-    both = f"{100 * scale[0]:.2g} % (frequency) and {100 * scale[1]:.2g} % (damping)"
-    return f"not stated; from the scatter {both} of the measured phasor"
+    noise = identification.fit.noise
+    if noise.stated:
+        scale = with_error(noise.scale, noise.scale_std)
+        return f"stated; states scatter about the curves by {scale} times as much"
+    percent = with_error(100 * noise.scale, 100 * noise.scale_std)
+    return f"not stated; states scatter about the curves by {percent} % of the measured phasor"
 
 
 def _level_scatter(identification: Identification) -> str:
-    fit = identification.fit
-    hertz, damping = fit.level_frequency_std / HERTZ, 100 * fit.level_damping_std
+    hertz = identification.level_frequency_std / HERTZ
+    damping = 100 * identification.level_damping_std
     if not hertz > 0 and not damping > 0:
         return NO_SCATTER
     return f"{hertz:.2g} Hz and {damping:.2g} % of critical damping (1σ)"

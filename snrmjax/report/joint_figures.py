@@ -13,7 +13,6 @@ from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.inference.profiles import Profile
 from snrmjax.identify.inference.sensitivity import Contribution, Contributions
 from snrmjax.identify.joint.joint_fit import JointFit
-from snrmjax.identify.pointwise.backbone import Backbone
 from snrmjax.identify.pointwise.backbone_points import BackbonePoints
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.report.sampling import (
@@ -22,7 +21,6 @@ from snrmjax.report.sampling import (
     BackboneSamples,
     ShownAmplitude,
     fit_residuals,
-    sample_backbone,
     sample_fit,
     usable_damping,
     velocity_of,
@@ -72,7 +70,6 @@ def fitted_curves_figure(
     series: Sequence[FitSeries],
     *,
     truth: NormalModeBranch | DampedModeBranch | None = None,
-    pointwise: Backbone | None = None,
     shown: ShownAmplitude = VELOCITY,
 ) -> Figure:
     """Natural frequency and damping of joint fits against amplitude, with 95 % bands.
@@ -81,8 +78,7 @@ def fitted_curves_figure(
     give on their own. Of a single fit whose levels scatter, the paler band holds the curve of one
     further level.
 
-    Arguments: `truth` a mode to compare with, of which a damped one shows its damping too;
-    `pointwise` the curves through the points, which are drawn with their bands.
+    Arguments: `truth` a mode to compare with, of which a damped one shows its damping too.
     Returns the figure. Raises `ValueError` when there is no fit.
     """
     if not series:
@@ -125,15 +121,6 @@ def fitted_curves_figure(
             (seen[1], curve.damping, curve.damping_error),
         ):
             kept += [*(y - error), *(y + error)]
-    if pointwise is not None:
-        curve = sample_backbone(pointwise)
-        x = curve.amplitude(shown) / unit.size
-        _bands(natural, damping, x, curve, SIMULATED, "95 % band of that through the points", 0.6)
-        style = {**CURVE, "color": SIMULATED, "linestyle": "--", "zorder": 5}
-        natural.plot(x, curve.frequency, **style, label="curve through the points")
-        damping.plot(x, curve.damping, **style)
-        seen[0].extend([*curve.frequency])
-        seen[1].extend([*curve.damping])
     if truth is not None:
         x = np.abs(velocity_of(truth, series[0].fit.modes.sensors[series[0].fit.data.sensor]))
         x = shown.of(x, truth.frequency)

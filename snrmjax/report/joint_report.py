@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from snrmjax.identify.inference.agreement import Agreement
 from snrmjax.identify.inference.fitted_response import FittedResponse, fitted_response
 from snrmjax.identify.inference.optimal_design import NextMeasurement
 from snrmjax.identify.inference.sensitivity import Contribution, contributions
@@ -39,8 +38,7 @@ CURVES_CAPTION = (
     "the true curve with a probability of 95 %. Where levels differ from one another, the paler "
     "band contains the curve of one further level. Dots are what single states give on their own, "
     "with the errors that their level shares: dots beside the line on a vertical streak are such "
-    "errors, a line beside all dots is not. Where the curve through the points, with the model's "
-    "modal mass and levels as recorded, differs by more than chance, it is shown too."
+    "errors, a line beside all dots is not."
 )
 RESIDUALS_CAPTION = (
     "Misfit of each point in standard deviations: what the fit leaves of the force balance in "
@@ -67,19 +65,14 @@ class ReportedFit(NamedTuple):
     shares: tuple[Contribution, ...]
     advice: tuple[NextMeasurement, ...]
     responses: tuple[FittedResponse, ...]  # under the advised forces, the main curves
-    agreement: Agreement | None = None  # with the curves through the points; None: no points
 
 
-def reported_fit(
-    fit: JointFit,
-    advice: Sequence[NextMeasurement] = (),
-    agreement: Agreement | None = None,
-) -> ReportedFit:
+def reported_fit(fit: JointFit, advice: Sequence[NextMeasurement] = ()) -> ReportedFit:
     """What contributes to the bands of a fit, and the responses on which its advice lies."""
     forces = sorted({one.force for one in advice})
     responses = [fitted_response(fit, force)[0] for force in forces]
     shares = tuple(contributions(fit))
-    return ReportedFit(fit, shares, tuple(advice), tuple(responses), agreement)
+    return ReportedFit(fit, shares, tuple(advice), tuple(responses))
 
 
 def joint_figures(
@@ -89,11 +82,8 @@ def joint_figures(
 
     `shown` is the amplitude over which curves and residuals are drawn.
     """
-    beside = None
-    if told.agreement is not None and not told.agreement.agree:
-        beside = told.agreement.curves.backbone
     series = [FitSeries("joint fit", told.fit, points)]
-    drawn = fitted_curves_figure(series, pointwise=beside, shown=shown)
+    drawn = fitted_curves_figure(series, shown=shown)
     figures = {
         "joint_fit": drawn,
         "residuals": residuals_figure(told.fit, shown),
@@ -131,50 +121,11 @@ def joint_sections(
             [contribution_table(told.shares)],
         ),
     ]
-    if told.agreement is not None:
-        sections.append(agreement_section(told.agreement))
     if told.advice:
         pictured = [ReportFigure(figures["next"], ADVICE_CAPTION)]
         table = advice_table(told.advice)
         sections.append(Section("What to measure next", (), pictured, [table]))
     return sections
-
-
-def agreement_section(found: Agreement) -> Section:
-    """Whether the curve through the points and the joint fit agree; where not, both in a table."""
-    heading = "Curve through the points, and joint fit"
-    if found.agree:
-        text = (
-            "Both agree within their bands: at most "
-            f"{found.largest:.2g} combined standard deviations apart, of which chance explains up "
-            f"to {found.limit:.2g}."
-        )
-        return Section(heading, [text])
-    unit = unit_for(np.asarray(found.pointwise.velocity), "m/s")
-    of_points, of_fit = found.pointwise, found.joint
-    columns = (
-        np.asarray(of_points.velocity) / unit.size,
-        np.asarray(of_points.natural_frequency) / HERTZ,
-        np.asarray(of_fit.natural_frequency) / HERTZ,
-        found.frequency_difference,
-        100 * np.asarray(of_points.damping_ratio),
-        100 * np.asarray(of_fit.damping_ratio),
-        found.damping_difference,
-    )
-    formats = (".3g", ".6g", ".6g", "+.1f", ".3g", ".3g", "+.1f")
-    rows = [
-        [minus(format(float(one), how)) for one, how in zip(row, formats, strict=True)]
-        for row in zip(*columns, strict=True)
-    ]
-    header = (
-        *(f"velocity ({unit.name})", "points (Hz)", "joint (Hz)", "difference (σ)"),
-        *("points (%)", "joint (%)", "difference (σ)"),
-    )
-    caption = (
-        "Natural frequency and damping ratio, and by how much the joint fit differs from the curve "
-        "through the points, in units of both 1σ combined."
-    )
-    return Section(heading, found.notes(), (), [ReportTable(header, rows, caption)])
 
 
 def curves_in_words(fit: JointFit) -> str:

@@ -13,14 +13,14 @@ from snrmjax.diagnose.diagnosis_result import Diagnosis
 from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
 from snrmjax.identify.calibrate.inverse_force import InverseForce
 from snrmjax.identify.inference.fitted_response import FittedResponse
+from snrmjax.identify.inference.identification import Identification
 from snrmjax.identify.inference.optimal_design import NextMeasurements
 from snrmjax.identify.inference.profiles import Profile
 from snrmjax.identify.inference.sensitivity import Contributions
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.modal.free_decay import DecayModes
 from snrmjax.identify.modal.modal_fit import LinearModalFit
-from snrmjax.identify.pointwise.backbone import Backbone, BackboneFit, BackboneValues
-from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
 from snrmjax.identify.pointwise.points_result import BackbonePoints
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.io.units import HERTZ
@@ -115,7 +115,7 @@ def _(result: Diagnosis, **settings: Any) -> Figure:
 
 @plot_result.register
 def _(result: Identification, **settings: Any) -> Figure:
-    return figures.backbone_figure(result.points, result.fit.backbone, **settings)
+    return figures.backbone_figure(result.points, result.backbone, **settings)
 
 
 @plot_result.register
@@ -130,14 +130,7 @@ def _(result: BackbonePoints) -> Figure:
 
 @plot_result.register
 def _(result: Backbone) -> Figure:
-    ends = float(result.smallest), float(result.largest)
-    values = result.values(jnp.asarray(np.linspace(*ends, 200)))
-    return plot_result(values, sensor=result.sensor)
-
-
-@plot_result.register
-def _(result: BackboneFit) -> Figure:
-    return plot_result(result.backbone)
+    return plot_result(result.sampled(), sensor=result.sensor)
 
 
 @plot_result.register

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -56,11 +55,10 @@ class BackboneSamples(NamedTuple):
 
 
 def sample_backbone(backbone: Backbone, *, reach: float = 1.0) -> BackboneSamples:
-    """A backbone from the start of its curves, zero if anchored, to `reach` times its largest."""
-    start = min(float(backbone.smallest), float(backbone.squared_frequency.knots[0]))
-    amplitude = jnp.asarray(np.linspace(start, reach * float(backbone.largest), _CURVE_POINTS))
-    beyond = np.asarray(amplitude) > float(backbone.largest)
-    return _in_units(backbone.values(amplitude), beyond)
+    """A backbone from its smallest amplitude, zero if anchored, to `reach` times its largest."""
+    values = backbone.sampled(_CURVE_POINTS, reach=reach)
+    ends = float(backbone.smallest), reach * float(backbone.largest)
+    return _in_units(values, np.linspace(*ends, _CURVE_POINTS) > float(backbone.largest))
 
 
 def sample_fit(

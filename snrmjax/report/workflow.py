@@ -6,24 +6,25 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
 from snrmjax.doctor.doubts import doubt, linear_damping_note, with_doubt
-from snrmjax.identify.inference.agreement import compare_with_pointwise
 from snrmjax.identify.inference.corrected_states import corrected_states
 from snrmjax.identify.inference.fitted_curves import fitted_values
+from snrmjax.identify.inference.identification import (
+    Identification,
+    identification_of_fit,
+    identify_backbone,
+)
 from snrmjax.identify.inference.optimal_design import (
     AdviceStatus,
     NextMeasurements,
     next_measurements,
 )
-from snrmjax.identify.inference.pointwise_view import identification_of_fit
 from snrmjax.identify.joint.joint_fit import fit_jointly
-from snrmjax.identify.pointwise.backbone import BackboneValues, CurveFamily
+from snrmjax.identify.pointwise.backbone import BackboneValues
 from snrmjax.identify.pointwise.backbone_points import AmplitudeArgument, AmplitudeMeasure
-from snrmjax.identify.pointwise.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse, Resonance
 from snrmjax.identify.prediction.notes import notes_on_negative_damping, where_in_words
 from snrmjax.io import joint_results, results
@@ -65,7 +66,6 @@ class CurveSettings:
 
     amplitude: AmplitudeArgument = "displacement"
     measure: AmplitudeMeasure = "fundamental"
-    family: CurveFamily = "spline"
     n_knots: int | None = None
     anchor: bool = False
 
@@ -124,16 +124,15 @@ def identify_by_points(
             model,
             amplitude=settings.amplitude,
             measure=settings.measure,
-            family=settings.family,
             n_knots=settings.n_knots,
             anchor=settings.anchor,
         )
     except ValueError as error:
         raise with_doubt(error, data, model) from error
-    backbone = found.fit.backbone
+    backbone = found.backbone
     predictions = predictions_of_points(found, model, loads)
-    reach = (loads.largest_amplitude_ratio if predictions else 1.0) * float(backbone.largest)
-    drawn = backbone.values(jnp.linspace(float(backbone.smallest), reach, _DRAWN))
+    reach = loads.largest_amplitude_ratio if predictions else 1.0
+    drawn = backbone.sampled(_DRAWN, reach=reach)
     notes = (*doubt(data, model, found.points), *found.notes)
     notes += (
         *notes_on_negative_damping(drawn),
@@ -141,9 +140,9 @@ def identify_by_points(
     )
     words = {
         "amplitude": f"{settings.amplitude}, {settings.measure}",
-        "curves": settings.family + (", anchored at the linear mode" if settings.anchor else ""),
+        "curves": "smooth" + (", anchored at the linear mode" if settings.anchor else ""),
     }
-    values = results.values_in_range(found)
+    values = backbone.sampled(results.BACKBONE_POINTS)
     return Findings(data, model, found, predictions, notes, values, words)
 
 
@@ -174,10 +173,8 @@ def identify_jointly(
     found = identification_of_fit(data, fit)
     predictions, trends = predictions_of_fit(fit, loads)
     advice = next_measurements(fit, settings.further) if settings.further else None
-    agreement = compare_with_pointwise(data, model, fit)
     doubts = () if "force_gain" in fit.names() else doubt(data, model, found.points)
     notes = [*doubts, *data.notes, *found.notes, *linear_damping_note(fit, model)]
-    notes += agreement.notes() if agreement is not None else ()
     if fit.drive_known_only:
         place = fit.names().index("force_gain")
         std = float(np.sqrt(fit.covariance[place, place]))
@@ -191,7 +188,7 @@ def identify_jointly(
         * fit.largest[0]
     )
     notes += notes_on_negative_damping(fitted_values(fit, displacement=reach))
-    notes += (*trends, *notes_on_predictions(predictions, found.fit.backbone, data))
+    notes += (*trends, *notes_on_predictions(predictions, found.backbone, data))
     notes += advice.notes if advice else ()
     if advice is not None and advice.status != AdviceStatus.COMPLETE:
         notes.append(
@@ -203,8 +200,8 @@ def identify_jointly(
         "amplitude": "displacement, fundamental",
         "curves": " and ".join(joint_results.described(curve) for curve in pair),
     }
-    fitted = reported_fit(fit, tuple(advice or ()), agreement)
-    ends = float(found.fit.backbone.smallest), float(found.fit.backbone.largest)
+    fitted = reported_fit(fit, tuple(advice or ()))
+    ends = float(found.backbone.smallest), float(found.backbone.largest)
     values = fitted_values(fit, displacement=np.linspace(*ends, results.BACKBONE_POINTS))
     fields = (data, model, found, predictions, tuple(dict.fromkeys(notes)), values, words)
     return Findings(*fields, fitted, advice)
@@ -236,7 +233,7 @@ def headline(found: Findings) -> list[str]:
 
 def identification_figures(found: Findings, shown: ShownAmplitude = VELOCITY) -> dict[str, Figure]:
     """Figures of an identification by the names of their files."""
-    points, backbone = found.identification.points, found.identification.fit.backbone
+    points, backbone = found.identification.points, found.identification.backbone
     modes = found.model.modes
     figures = {
         "backbone": plot.backbone_figure(
@@ -358,7 +355,6 @@ def write_findings(
         banded = [response for one in found.predictions for response in one.banded]
         fit = joint_results.summarise_fit(found.fitted.fit, banded, found.fitted.shares)
         summary["joint_fit"] = fit
-        summary["agreement"] = joint_results.summarise_agreement(found.fitted.agreement)
     for name, of in (("points", "backbone_velocity_m_s"), ("backbone", "velocity_m_s")):
         if shown.power:
             added = of.replace(VELOCITY.column, shown.column)

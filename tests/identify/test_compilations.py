@@ -16,15 +16,15 @@ def states(seed, levels):
 
 def test_points_and_curves_of_as_many_states(compilations):
     found = sj.identify_backbone(states(0, 5), modes())
-    found.fit.backbone.values(np.linspace(*(float(x) for x in ends(found)), 50))
+    found.backbone.values(np.linspace(*(float(x) for x in ends(found)), 50))
     # Most of a first identification's time is compilation: all curves are the host's.
     assert len(compilations) <= 16
     del compilations[:]
     for seed, levels in ((1, 5), (2, 9), (3, 15)):
         again = sj.identify_backbone(states(seed, levels), modes())
-        again.fit.backbone.values(np.linspace(*(float(x) for x in ends(again)), 60 + seed))
+        again.backbone.values(np.linspace(*(float(x) for x in ends(again)), 60 + seed))
     assert len(compilations) == 0
 
 
 def ends(found):
-    return found.fit.backbone.smallest, found.fit.backbone.largest
+    return found.backbone.smallest, found.backbone.largest

@@ -74,7 +74,7 @@ def test_a_backbone_at_other_amplitudes_compiles_nothing(compilations):
         points_per_level=4,
         simulation=sj.simulate.SweepSimulation(harmonic_order=3),
     )
-    backbone = sj.identify_backbone(test.steady_states, beam.modes).fit.backbone
+    backbone = sj.identify_backbone(test.steady_states, beam.modes).backbone
     methods = (backbone.natural_frequency, backbone.damping_ratio, backbone.velocity)
     for method in methods:
         method(2e-4)

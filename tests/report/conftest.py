@@ -33,7 +33,7 @@ def identification(model, virtual):
 
 @pytest.fixture(scope="session")
 def backbone(identification):
-    return identification.fit.backbone
+    return identification.backbone
 
 
 @pytest.fixture(scope="session")

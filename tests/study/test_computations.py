@@ -81,7 +81,7 @@ def test_noise_belongs_to_the_member(linear_model):
     assert len({float(row[0]) for row in together}) == 3
 
 
-def test_an_identification_scales_with_the_participation_of_the_model(linear_model, tmp_path):
+def test_every_member_identifies_with_its_own_model(linear_model, tmp_path):
     omega = np.tile(OMEGA * np.linspace(0.98, 1.02, 6), 3)
     force = np.repeat([0.2, 0.5, 1.0], 6)
     receptance = SHAPE * PARTICIPATION / (OMEGA**2 - omega**2 + 2j * 0.02 * OMEGA * omega)
@@ -90,9 +90,9 @@ def test_an_identification_scales_with_the_participation_of_the_model(linear_mod
     )
     varied = (sj.study.listed("mode_1.participation", [PARTICIPATION, 1.1 * PARTICIPATION]),)
     found = computed(linear_model, sj.study.Identifications(data), varied, tmp_path)
-    # 2 ζ ω v/(φ) = F Φᵀb at resonance: damping is in proportion to Φᵀb.
-    np.testing.assert_allclose(found.damping_ratio[0], 0.02, rtol=1e-3)
-    np.testing.assert_allclose(found.damping_ratio[1], 0.022, rtol=2e-3)
+    # Exact states on both sides of resonance tell the modal mass, and with it the damping that
+    # made them, however wrong the member's is.
+    np.testing.assert_allclose(found.damping_ratio, 0.02, rtol=1e-3)
     assert found.n_solved.values.tolist() == [18, 18]
 
 

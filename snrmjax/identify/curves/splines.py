@@ -1,8 +1,4 @@
-"""Curves through values at knots: natural cubic splines in the squared amplitude.
-
-The pointwise curves of `identify_backbone` are another family: PCHIP, cubics that keep the shape
-of the values, in the amplitude itself.
-"""
+"""Curves through values at knots: natural cubic splines in the squared amplitude."""
 
 import itertools
 from typing import Any, ClassVar
@@ -61,11 +57,11 @@ class Spline(AbstractFamily):
         knots = np.concatenate([[0.0], shares**2])
         if np.min(np.diff(knots)) < 0.02 / order:
             knots = np.linspace(0.0, 1.0, order) ** 2
-        unit = jnp.asarray(scale, dtype=jnp.float64)
+        unit = jax.device_put(scale)
         blank = cls.through(knots, np.zeros(order), unit, argument)
         columns = spline_columns(blank, amplitude)
         start = linear_start(columns, values, weight)
-        return [eqx.tree_at(lambda f: f.parameters, blank, jnp.asarray(start))]
+        return [eqx.tree_at(lambda f: f.parameters, blank, jax.device_put(start))]
 
     @classmethod
     def through(
@@ -76,8 +72,8 @@ class Spline(AbstractFamily):
         argument: Argument,
     ) -> "Spline":
         """The spline through values at knots, which are squares of amplitude/scale."""
-        mix = jnp.asarray(np.linalg.inv(spline_terms(knots, knots)))
-        return cls(jnp.asarray(values), scale, argument, jnp.asarray(knots), mix)
+        mix = jax.device_put(np.linalg.inv(spline_terms(knots, knots)))
+        return cls(jax.device_put(values), scale, argument, jax.device_put(knots), mix)
 
 
 @jax.custom_jvp
@@ -140,12 +136,12 @@ class SmoothingSpline(Spline):
         """
         scale = float(np.max(amplitude))
         knots = np.append(0.0, amplitudes_apart(amplitude / scale, order - 1, _NEAREST) ** 2)
-        unit = jnp.asarray(scale, dtype=jnp.float64)
+        unit = jax.device_put(scale)
         blank = cls.through(knots, np.zeros(len(knots)), unit, argument)
         start = linear_start(spline_columns(blank, amplitude), values, weight)
-        size = jnp.asarray(max(float(np.std(values)), 1e-3 * float(np.max(np.abs(values)))))
+        size = jax.device_put(max(float(np.std(values)), 1e-3 * float(np.max(np.abs(values)))))
         return [
-            eqx.tree_at(lambda f: (f.parameters, f.bend_std), blank, (jnp.asarray(start), size))
+            eqx.tree_at(lambda f: (f.parameters, f.bend_std), blank, (jax.device_put(start), size))
         ]
 
     @classmethod
@@ -157,10 +153,10 @@ class SmoothingSpline(Spline):
         argument: Argument,
     ) -> "SmoothingSpline":
         """See `Spline`; bends of all sizes are alike likely until `bend_std` says otherwise."""
-        mix = jnp.asarray(np.linalg.inv(spline_terms(knots, knots)))
-        bends = jnp.asarray(bends_of(knots))
-        fixed = (scale, argument, jnp.asarray(knots), mix, bends, jnp.asarray(np.inf))
-        return cls(jnp.asarray(values), *fixed)
+        mix = jax.device_put(np.linalg.inv(spline_terms(knots, knots)))
+        bends = jax.device_put(bends_of(knots))
+        fixed = (scale, argument, jax.device_put(knots), mix, bends, jax.device_put(np.inf))
+        return cls(jax.device_put(values), *fixed)
 
 
 def amplitudes_apart(

@@ -2,22 +2,22 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from snrmjax.identify.curves.families import values_and_slopes
 from snrmjax.identify.curves.family_base import AbstractFamily
+from snrmjax.identify.curves.splines import SmoothingSpline, Spline
 from snrmjax.identify.joint.force_balance import Unknowns
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone, BackboneValues
-from snrmjax.identify.pointwise.curve_fit import PchipCurve
-from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
+from snrmjax.identify.pointwise.points_result import AmplitudeArgument
 
 _SCAN = 256  # displacements of the backbone, on which a velocity is looked for
 _ITERATIONS = 12
 _STEP = 1e-5  # relative, of central differences by the amplitude
-_KNOTS = 120  # of the curves for what takes a `Backbone`
+_KNOTS = 120  # of curves of families by name, for what takes a `Backbone`
 _DOUBLINGS = 6  # of the displacement, to reach a velocity
 
 
@@ -54,13 +54,13 @@ def fitted_values(
     slope = np.stack([-zeta / (2 * squared), 1 / (2 * omega)], axis=1)
     zeta_std = np.sqrt(np.einsum("oc,ocd,od->o", slope, covariance, slope))
     return BackboneValues(
-        velocity=jnp.asarray(at),
-        natural_frequency=jnp.asarray(omega),
-        natural_frequency_std=jnp.asarray(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
-        damping_ratio=jnp.asarray(zeta),
-        damping_ratio_std=jnp.asarray(zeta_std),
-        modal_damping=jnp.asarray(damping),
-        modal_damping_std=jnp.asarray(np.sqrt(covariance[:, 1, 1])),
+        velocity=jax.device_put(at),
+        natural_frequency=jax.device_put(omega),
+        natural_frequency_std=jax.device_put(np.sqrt(covariance[:, 0, 0]) / (2 * omega)),
+        damping_ratio=jax.device_put(zeta),
+        damping_ratio_std=jax.device_put(zeta_std),
+        modal_damping=jax.device_put(damping),
+        modal_damping_std=jax.device_put(np.sqrt(covariance[:, 1, 1])),
     )
 
 
@@ -77,35 +77,55 @@ def values_to_the_largest(fit: JointFit, n_points: int) -> BackboneValues:
 
 
 def as_backbone(
-    fit: JointFit, *, largest_amplitude_ratio: float = LARGEST_AMPLITUDE_RATIO
+    fit: JointFit, *, argument: AmplitudeArgument = "displacement", reach: float = 1.0
 ) -> Backbone:
-    """The fitted curves against displacement, through many knots: for what takes a `Backbone`.
+    """The fitted curves as what responses are predicted from.
 
-    Damping that belongs to the velocity is taken where it lies on the backbone. The knots reach up
-    to `largest_amplitude_ratio` times the largest measured amplitude.
+    The smooth curves are the fit's own, at its own knots. Families by name are drawn through many
+    knots, up to `reach` times the largest measured displacement; damping that belongs to the
+    velocity is then taken where it lies on the backbone. Against velocity the knots are where the
+    backbone has them.
     """
-    displacement = largest_amplitude_ratio * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
-    sampled = values_at_displacement(fit, displacement)
-    # A polynomial may fall below zero beyond the data: there is no motion there.
-    sound = np.append(sampled[0][:, 0] > 0, False).argmin()
-    if sound < _KNOTS:
-        displacement = displacement[sound - 1] * np.linspace(0.0, 1.0, _KNOTS)
-        sampled = values_at_displacement(fit, displacement)
-    values, slopes = (np.asarray(part) for part in sampled[:2])
-    covariance = [slopes[:, k] @ fit.covariance @ slopes[:, k].T for k in range(2)]
-    measured = np.asarray(fit.motion().displacement)
-    # Dry friction has no finite damping at rest: there the next knot's value stands.
-    damping = values[:, 1].copy()
-    damping[0] = damping[0] if np.isfinite(damping[0]) else damping[1]
+    largest = fit.largest[argument == "velocity"]
+    squared, damping = fit.unknowns.squared_frequency, fit.unknowns.modal_damping
+    smooth = all(
+        isinstance(one, SmoothingSpline) and one.argument == "displacement"
+        for one in (squared, damping)
+    )
+    own = smooth and argument == "displacement"
+    if own:
+        n = squared.parameters.shape[0] + damping.parameters.shape[0]
+        covariance = fit.covariance[:n, :n]
+    else:
+        displacement = reach * fit.largest[0] * np.linspace(0.0, 1.0, _KNOTS)
+        if smooth and isinstance(squared, Spline):
+            displacement = float(squared.scale) * np.sqrt(np.asarray(squared.knots))
+        with np.errstate(invalid="ignore"):
+            positive = values_at_displacement(fit, displacement)[0][:, 0] > 0
+        # A polynomial may fall below zero beyond the data: there is no motion there.
+        displacement = displacement[: np.append(positive, False).argmin()]
+        values, slopes, at = values_at_displacement(fit, displacement)
+        if argument == "velocity":
+            values, slopes = values_with_slopes(fit, at)
+        at = displacement if argument == "displacement" else at
+        # Dry friction has no finite damping at rest: there the next knot's value stands.
+        values[0] = np.where(np.isfinite(values[0]), values[0], values[1])
+        squared, damping = (
+            Spline.through((at / at[-1]) ** 2, values[:, k], jax.device_put(at[-1]), argument)
+            for k in range(2)
+        )
+        rows = np.concatenate([slopes[:, 0], slopes[:, 1]])
+        covariance = rows @ fit.covariance @ rows.T
+    motion = fit.motion()
+    measured = np.abs(motion.velocity) if argument == "velocity" else motion.displacement
     return Backbone(
-        squared_frequency=PchipCurve(jnp.asarray(displacement), jnp.asarray(values[:, 0])),
-        modal_damping=PchipCurve(jnp.asarray(displacement), jnp.asarray(damping)),
-        squared_frequency_covariance=jnp.asarray(covariance[0]),
-        modal_damping_covariance=jnp.asarray(np.nan_to_num(covariance[1])),
+        squared_frequency=squared,
+        modal_damping=damping,
+        covariance=jax.device_put(covariance),
         modal_constant=fit.problem.constant_of(fit.unknowns),
-        smallest=jnp.asarray(measured.min()),
-        largest=jnp.asarray(fit.largest[0]),
-        argument="displacement",
+        smallest=jax.device_put(np.min(measured)),
+        largest=jax.device_put(largest),
+        argument=argument,
         sensor=fit.modes.sensors[fit.data.sensor],
     )
 

@@ -118,7 +118,8 @@ def fitted_response(
     Raises `ValueError` for a force or a ratio that is not positive.
     """
     ratio = {"largest_amplitude_ratio": largest_amplitude_ratio}
-    rough, level = as_backbone(fit, **ratio), new_level(fit, force) if of is None else of
+    rough = as_backbone(fit, reach=largest_amplitude_ratio)
+    level = new_level(fit, force) if of is None else of
     settings = {"from_frequency": from_frequency, "to_frequency": to_frequency, **ratio}
     curves = predict_response(rough, fit.modes, force, points_per_side=points_per_side, **settings)
     tips = [

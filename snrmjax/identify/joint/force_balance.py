@@ -260,7 +260,7 @@ def velocity_of_others(
 def recorded_motion(unknowns: Unknowns, problem: BalanceProblem) -> Motion:
     """`motion_of` the states as they were recorded, by the host."""
     data, prior = problem.data, problem.prior
-    level = np.asarray(unknowns.level * prior.level)[np.asarray(data.level)]
+    level = (np.asarray(unknowns.level) * np.asarray(prior.level))[np.asarray(data.level)]
     of_force = float(prior.gain_of_force) * level[:, 0]
     force = np.asarray(data.force) * np.exp(float(unknowns.log_force_gain) + of_force)
     force = force + float(unknowns.force_offset) * np.min(np.asarray(data.force))

@@ -118,7 +118,8 @@ class JointFit(AbstractResult):
     @property
     def largest(self) -> tuple[float, float]:
         """Largest displacement (m) and velocity (m/s), as measured: no gain moves them."""
-        motion, level = self.motion(), np.asarray(self.unknowns.level * self.prior.level)
+        motion = self.motion()
+        level = np.asarray(self.unknowns.level) * np.asarray(self.prior.level)
         of_velocity = 1 - float(self.prior.gain_of_force)
         recorded = np.exp(of_velocity * level[np.asarray(self.data.level), 0])
         pair = (np.asarray(motion.displacement), np.abs(np.asarray(motion.velocity)))
@@ -350,7 +351,7 @@ def _notes(
     level, n_levels = np.asarray(fit.data.level), fit.data.n_levels
     notes += notes_on_noise(noise, wandering, stated, n_levels, stated=fit.noise.stated)
     if np.any((stated == 0) & (np.array(noise.level) > 0)):
-        shifts = np.asarray(fit.unknowns.level * fit.prior.level)
+        shifts = np.asarray(fit.unknowns.level) * np.asarray(fit.prior.level)
         force = [np.median(np.asarray(fit.data.force)[level == k]) for k in range(n_levels)]
         of_force = bool(fit.prior.gain_of_force > 0)
         notes += notes_on_level_errors(

@@ -5,7 +5,7 @@ import functools
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import minimize
@@ -23,6 +23,7 @@ from snrmjax.identify.joint.force_balance import (
 from snrmjax.identify.joint.notes import NoiseAndLevels
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
+from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
@@ -69,7 +70,9 @@ def view_of(
     gain = abs(guess) if "force_gain" in free else 1.0
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
     states = _test_states(problem, free, stated, guess)
-    fit = functools.partial(fit_test, robust=robust, most_knots=knots, tempered=True)
+    fit = functools.partial(
+        fit_test, robust=robust, most_knots=knots, tempered=True, over_sizes=True
+    )
     found = fit(states)
     mass, std = found.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
@@ -97,11 +100,11 @@ def view_of(
     level = np.where(np.asarray(problem.prior.level) > 0, problem.prior.level, unstated)
     problem = dataclasses.replace(
         problem.with_data(
-            std=jnp.asarray(errors),
-            weight=jnp.asarray(found.weight),
-            correction=jnp.asarray(corrections),
+            std=jax.device_put(errors),
+            weight=jax.device_put(found.weight),
+            correction=jax.device_put(corrections),
         ),
-        prior=dataclasses.replace(problem.prior, level=jnp.asarray(level)),
+        prior=dataclasses.replace(problem.prior, level=jax.device_put(level)),
     )
     found = found._replace(covariance=wider**2 * found.covariance)
     return View(found, problem, guess, free, noise, wandering, believed)
@@ -131,7 +134,7 @@ def _test_states(
     spread = np.asarray(prior.linear)
 
     def beside(deviation: np.ndarray) -> Complex[np.ndarray, " state"]:
-        modes = with_deviations(problem.modes, jnp.asarray(deviation), prior.linear[:-1])
+        modes = with_deviations(problem.modes, jax.device_put(deviation), prior.linear[:-1])
         return velocity_of_others(modes, data, force)
 
     constant = float(problem.modal_constant)
@@ -152,6 +155,7 @@ def _test_states(
         force_is_free="force_gain" in free,
         phase_std=_FREE if "instrument_phase" in free else 0.0,
         offset_std=_FREE if "force_offset" in free else 0.0,
+        off_resonance_std=OFF_RESONANCE,
         beside=sign * np.stack(moved, axis=1) if moved else None,
     )
 
@@ -169,11 +173,11 @@ def viewed_unknowns(view: View, choices: tuple[Choice, Choice]) -> Unknowns:
     return Unknowns(
         squared_frequency=_curve(found, choices[0], 0),
         modal_damping=_curve(found, choices[1], 1),
-        log_force_gain=jnp.asarray(np.log(gain / mass) if is_free else 0.0),
-        force_offset=jnp.asarray(found.force_offset * (gain / mass if is_free else 1.0)),
-        instrument_phase=jnp.asarray(float(np.angle(view.gain)) + found.instrument_phase),
-        level=jnp.asarray(found.level_errors * _sign_of_gain(view) / level),
-        linear=jnp.asarray(linear),
+        log_force_gain=jax.device_put(np.log(gain / mass) if is_free else 0.0),
+        force_offset=jax.device_put(found.force_offset * (gain / mass if is_free else 1.0)),
+        instrument_phase=jax.device_put(float(np.angle(view.gain)) + found.instrument_phase),
+        level=jax.device_put(found.level_errors * _sign_of_gain(view) / level),
+        linear=jax.device_put(linear),
     )
 
 
@@ -293,13 +297,13 @@ def _smooth(found: TestPosterior, argument: Argument, which: int) -> SmoothingSp
     if argument == "velocity":
         speed = displacement * np.sqrt(curves.squared_frequency)
         knots, scale = (speed / speed[-1]) ** 2, float(speed[-1])
-    blank = SmoothingSpline.through(knots, values, jnp.asarray(scale), argument)
+    blank = SmoothingSpline.through(knots, values, jax.device_put(scale), argument)
     size = found.units[which] * found.hyper.bends[which] / found.modal_mass[0]
     std = size * np.exp(basis.directions @ found.hyper.along)
     return eqx.tree_at(
         lambda one: (one.bends, one.bend_std),
         blank,
-        (jnp.asarray(bends_of(knots)), jnp.asarray(std)),
+        (jax.device_put(bends_of(knots)), jax.device_put(std)),
     )
 
 

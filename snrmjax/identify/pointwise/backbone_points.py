@@ -105,7 +105,7 @@ def _identify(
     )
     velocity, relative_std = data.velocity, relative_errors(raw)
     if measure == "peak":
-        velocity = velocity * _peak_ratio(data)
+        velocity = velocity * peak_ratio(data)
     combined, share, filtered_std, filter_residual = modal_filter(
         data, modes, r, velocity, relative_std
     )
@@ -187,30 +187,6 @@ def moved_by_modal_mass(
     return by_squares, -damping * (1 + by_squares / natural)
 
 
-def own_errors(
-    points: BackbonePoints,
-    component: int,
-    slope: Float[np.ndarray, " state"],
-    *,
-    stated: bool,
-) -> tuple[Float[np.ndarray, "state input"], Float[np.ndarray, " state"]]:
-    """How errors of `INPUTS` move points away from a curve, and the points' own 1σ about it.
-
-    Where no noise is stated: one relative error for amplitude and phase alike, none of the force,
-    and the standard deviations are relative.
-    Arguments: `points` in NumPy; `component` 0 for ω̃² and 1 for 2ζ̃ω̃; `slope` dg/d log a of the
-    curve at the points, along which an error of the amplitude moves them.
-    """
-    sensitivity = np.asarray(points.sensitivity)
-    moved = sensitivity[:, component] - slope[:, None] * sensitivity[:, 2]
-    if stated:
-        linear = np.asarray(points.linear_variance)[:, component]
-        own = np.sum((moved * np.asarray(points.relative_std)) ** 2, axis=1)
-        return moved, np.sqrt(own + linear)
-    far = off_resonance_error_factor(np.asarray(points.mode_velocity))
-    return moved, np.sqrt(np.sum((moved * [0.0, 1.0, 1.0]) ** 2, axis=1)) * far
-
-
 def _ratios_std(
     natural: Array,
     damping: Array,
@@ -238,7 +214,7 @@ def _ratios_std(
     )
 
 
-def _peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
+def peak_ratio(data: SteadyStates) -> Float[Array, "state sensor"]:
     """Peak of the velocity's time signal over the amplitude of its fundamental."""
     orders = tuple(h for h in data.harmonic_order if h != 1)
     keep = [data.harmonic_order.index(h) for h in orders]

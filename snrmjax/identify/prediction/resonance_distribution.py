@@ -7,10 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.identify.pointwise.backbone import BackboneFit
-from snrmjax.identify.pointwise.curve_fit import between_knots_on_host, linearised_on_host
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO
-from snrmjax.identify.prediction.new_level import DayToDay, NewLevel, further_std
+from snrmjax.identify.prediction.new_level import NewLevel
 from snrmjax.model.modes import LinearModes, residual_velocity
 from snrmjax.numerics.result import AbstractResult, Variable
 
@@ -166,51 +164,6 @@ class _Root(NamedTuple):
         if at_rest is not None:
             before = np.where(self.place > 0, before, at_rest)
         return np.where(self.found, here + self.share * (before - here), np.nan)
-
-
-def resonance_of_points(
-    fit: BackboneFit,
-    modes: LinearModes,
-    force: float,
-    level_stds: tuple[float, float, float, float],
-    *,
-    day: DayToDay | None = None,
-    ratio: float = LARGEST_AMPLITUDE_RATIO,
-    self_excited: bool = False,
-) -> ResonanceDistribution:
-    """`resonance_distribution` of curves through points, with what their levels scatter by.
-
-    Arguments: `force` in N; `level_stds` are stated, as `Structure.level_stds` has them; `day` what
-    another day's test differs by; `ratio` and `self_excited` as `resonance_distribution` has them.
-    """
-    backbone = fit.backbone
-    amplitude = amplitudes_to(float(backbone.largest), ratio)
-    values, parts = [], []
-    for curve, covariance in (
-        (backbone.squared_frequency, backbone.squared_frequency_covariance),
-        (backbone.modal_damping, backbone.modal_damping_covariance),
-    ):
-        value, slopes = linearised_on_host(curve, amplitude)
-        between = between_knots_on_host(curve, amplitude)[:, None]
-        values.append(value)
-        parts.append(np.hstack([slopes @ covariance_root(np.asarray(covariance)), between]))
-    first, second = (part.shape[1] for part in parts)
-    errors = np.zeros((len(amplitude), 2, first + second))
-    errors[:, 0, :first], errors[:, 1, first:] = parts
-    # Levels scatter by so much in absolute terms: relative to where the data end.
-    end = backbone.values(jnp.asarray(backbone.largest)[None])
-    frequency = np.hypot(fit.level_frequency_std, level_stds[2]) / end.natural_frequency[0]
-    damping = np.hypot(fit.level_damping_std, level_stds[3]) / abs(end.damping_ratio[0])
-    std = further_std([*level_stds[:2], 2 * frequency, damping], day)
-    load = abs(float(backbone.modal_constant)) * force
-    curves = KnownCurves(np.stack(values, 1), errors, load, np.zeros(first + second))
-    return resonance_distribution(
-        *(force, amplitude, curves, NewLevel(std, another_day=day is not None)),
-        other_modes(modes, modes.sensors.index(backbone.sensor), force),
-        of_velocity=backbone.argument == "velocity",
-        ratio=ratio,
-        self_excited=self_excited,
-    )
 
 
 def other_modes(

@@ -13,12 +13,21 @@ from jaxtyping import Complex, Float
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.curve_basis import CurveBasis
-from snrmjax.identify.test_model.hyper import ALONG, MASS, OFFSET, PHASE, TREND, Places
+from snrmjax.identify.test_model.hyper import (
+    ALONG,
+    MASS,
+    OFFSET,
+    PHASE,
+    TREND,
+    WITH_FREQUENCY,
+    Places,
+)
 from snrmjax.identify.test_model.linear_gaussian import LinearRows
 from snrmjax.identify.test_model.states import TestStates
 
 _STEPS = 4  # towards every state's most likely errors
 _FARTHEST = 0.3  # relative or rad, of a state's error
+_SOFTEST = 1e-3  # of the squared frequencies, that a stiffness is for its logarithm
 _LOST = 1e100  # slopes that no mode has
 
 
@@ -48,13 +57,28 @@ class Balance(NamedTuple):
         mass, (k, d) = 1 + unknowns[MASS], self.units
         stiffness = k * (values @ unknowns[places.stiffness]) + mass * places.reference
         damping = 1j * omega * d * (values @ unknowns[places.damping])
-        slope = (1 + stiffer) * k * (by_log @ unknowns[places.stiffness]) + 1j * omega * (
-            1 + lossier
-        ) * d * (by_log @ unknowns[places.damping])
+        at_rest, _ = self.basis.values(np.zeros(1))
+        added = k * ((values - at_rest) @ unknowns[places.stiffness])
+        with_frequency = np.stack([added, damping], axis=1) * self.away[:, None]
+        softer, faster = self.away * unknowns[WITH_FREQUENCY, None]
+        slope = (1 + stiffer + softer) * k * (by_log @ unknowns[places.stiffness])
+        rate = (1 + lossier + faster) * d * (by_log @ unknowns[places.damping])
+        slope = slope + 1j * omega * rate
         model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
+        model = model + with_frequency @ unknowns[WITH_FREQUENCY]
         inputs = errors.shape[1]
-        return BalancedStates(force, z, model, slope, values, stiffness, damping, inputs)
+        return BalancedStates(
+            force, z, model, slope, values, stiffness, damping, with_frequency, inputs
+        )
+
+    @property
+    def away(self) -> Float[np.ndarray, " state"]:
+        """ln of the forcing frequency over the natural one that the record itself has."""
+        states = self.states
+        z = 1j * states.frequency * states.constant * states.force / states.velocity
+        own = np.maximum(1 + z.real / states.frequency**2, _SOFTEST)
+        return -0.5 * np.log(own)
 
     def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
         """Relative deviations of the stiffness: of levels, along a trend, and of states whose own
@@ -140,8 +164,12 @@ class Balance(NamedTuple):
         design[:, PHASE] = -1j * own
         design[:, OFFSET] = -own * np.min(states.force) / now.force
         design[:, TREND] = states.trend * now.stiffness
-        design[:, places.stiffness] = ((1 + stiffer) * self.units[0])[:, None] * now.values
-        design[:, places.damping] = ((1 + lossier) * 1j * omega * self.units[1])[
+        design[:, WITH_FREQUENCY] = now.with_frequency
+        (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
+        at_rest, _ = self.basis.values(np.zeros(1))
+        added = softer * self.away[:, None] * (now.values - at_rest)
+        design[:, places.stiffness] = k * ((1 + stiffer)[:, None] * now.values + added)
+        design[:, places.damping] = (1j * omega * d * (1 + lossier + faster * self.away))[
             :, None
         ] * now.values
         if states.beside is not None:
@@ -184,6 +212,7 @@ class BalancedStates(NamedTuple):
     values: Float[np.ndarray, "state function"]
     stiffness: Float[np.ndarray, " state"]  # κK
     damping: Complex[np.ndarray, " state"]  # iΩκδ
+    with_frequency: Complex[np.ndarray, "state curve"]  # what exponents of frequency add
     inputs: int  # errors that a state may have
 
     @property

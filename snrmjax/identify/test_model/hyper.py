@@ -1,5 +1,13 @@
-"""The hyperparameters of a test, and where its unknowns stand: sizes of noise, levels, curves."""
+"""The hyperparameters of a test, and where its unknowns stand: sizes of noise, levels, curves.
 
+Curves that bend and levels that differ often explain a test alike: the sizes of the bends are then
+known to a factor of ten only, and the most likely ones say nothing of what curves the others give.
+`averaged` weighs them.
+Reference: for a grid of hyperparameters about their mode, Rue, Martino & Chopin, J. R. Stat. Soc. B
+71 (2009) 319, section 3.1, doi:10.1111/j.1467-9868.2008.00700.x.
+"""
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -7,16 +15,24 @@ from jaxtyping import Float
 
 from snrmjax.identify.test_model import priors
 from snrmjax.identify.test_model.curve_basis import CurveBasis
-from snrmjax.identify.test_model.linear_gaussian import LinearRows, Objective
+from snrmjax.identify.test_model.linear_gaussian import (
+    LinearRows,
+    Objective,
+    laplace_evidence,
+    maximised,
+)
 from snrmjax.identify.test_model.states import TestStates
 
+_STRAIGHT = 1e-4  # size of bends, below which no test sees them
 _NOTHING = 1e-4  # over a prior's scale, that a size is at least
 _FARTHEST = 5.0  # 1σ, of a change of the bends' size
 _MOST = 0.5  # 1σ of a level's error, relative or rad: beyond it levels are not one structure's
+_LEAST = 4.0  # nats below the likeliest, from which on sizes are left out
 ALONG = 14  # functions of phase and amplitude of a discrepancy, for each part
 
 
-MASS, PHASE, OFFSET, TREND = 0, 1, 2, 3  # where the unknowns stand that all states share
+# Where the unknowns stand that all states share: the last two are the exponents of frequency.
+MASS, PHASE, OFFSET, TREND, WITH_FREQUENCY = 0, 1, 2, 3, slice(4, 6)
 
 
 class Hyper(NamedTuple):
@@ -32,8 +48,8 @@ class Hyper(NamedTuple):
 class Places(NamedTuple):
     """Where the unknowns stand, and the squared frequency that stiffness is counted from.
 
-    The modal mass comes first, then the instruments' phase, the offset of the force and a trend
-    of the stiffness.
+    The modal mass comes first, then the instruments' phase, the offset of the force, a trend of
+    the stiffness, and how both curves go with the forcing frequency.
     """
 
     stiffness: slice
@@ -53,7 +69,7 @@ def places_of(
     basis: CurveBasis, n_levels: int, discrepancy: bool, reference: float, n_others: int = 0
 ) -> Places:
     """The places for so many levels and parameters of others, with or without a discrepancy."""
-    start = TREND + 1
+    start = WITH_FREQUENCY.stop
     middle = start + basis.n_functions
     first = middle + basis.n_functions
     levels = first + np.arange(4 * n_levels).reshape(n_levels, 4)
@@ -104,7 +120,7 @@ def bounds_of(
     states: TestStates, basis: CurveBasis, point: np.ndarray
 ) -> list[tuple[float, float]]:
     """Between which points lie; what is stated is held."""
-    size = (np.log(1e-7), np.log(2.0))
+    size = (np.log(_STRAIGHT), np.log(2.0))
     noise = (np.log(0.02), np.log(1e6)) if states.stated else (np.log(1e-5), np.log(1.0))
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
@@ -127,8 +143,11 @@ def prior_variances(
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
     variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
     variance[places.others] = 1.0
-    variance[[MASS, PHASE, OFFSET, TREND]] = np.square(
-        [states.mass_std, states.phase_std, states.offset_std, states.trend_std]
+    variance[: WITH_FREQUENCY.stop] = np.square(
+        [
+            *(states.mass_std, states.phase_std, states.offset_std, states.trend_std),
+            *states.off_resonance_std,
+        ]
     )
     for k, own in enumerate((places.stiffness, places.damping)):
         log_variance, by = basis.log_variances(np.log(hyper.bends[k]), hyper.along)
@@ -179,3 +198,85 @@ def objective_of(
         return likelihood, slopes
 
     return value
+
+
+class Gaussian(NamedTuple):
+    """What is said of the unknowns."""
+
+    mean: Float[np.ndarray, " unknown"]
+    covariance: Float[np.ndarray, "unknown unknown"]
+
+
+class SizedPoint(NamedTuple):
+    """Hyperparameters, likeliest for some sizes of the bends."""
+
+    log_evidence: float  # integrated over the others
+    point: Float[np.ndarray, " hyper"]
+
+
+def sizes_of_bends(
+    objective: Objective,
+    likeliest: Float[np.ndarray, " hyper"],
+    bounds: list[tuple[float, float]],
+) -> list[SizedPoint]:
+    """The points of a grid about the likeliest: from neighbour to neighbour, while they count."""
+    step, (low, high) = priors.CURVE_BENDS.spread, np.transpose(bounds[BENDS])
+    found: dict[tuple[int, int], SizedPoint] = {}
+    queue = [((0, 0), likeliest)]
+    while queue:
+        (a, b), start = queue.pop(0)
+        sizes = likeliest[BENDS] + step * np.array([a, b])
+        if (a, b) in found or np.any((sizes < low - step / 2) | (sizes > high)):
+            continue
+        held, start = list(bounds), start.copy()
+        start[BENDS] = np.maximum(sizes, low)
+        held[BENDS] = [(size, size) for size in start[BENDS]]
+        point = maximised(objective, start, held)
+        one = SizedPoint(laplace_evidence(objective, point, held), point)
+        found[a, b] = one
+        if one.log_evidence > max(each.log_evidence for each in found.values()) - _LEAST:
+            queue += [((a + i, b + j), point) for i, j in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    return list(found.values())
+
+
+def averaged(
+    points: list[SizedPoint], posterior: Callable[[np.ndarray], Gaussian]
+) -> tuple[Float[np.ndarray, " hyper"], Gaussian]:
+    """The mean of the points, and mean and covariance of what each says of the unknowns."""
+    weight = np.array([one.log_evidence for one in points])
+    weight = np.exp(weight - weight.max())
+    weight = weight / weight.sum()
+    each = [posterior(one.point) for one in points]
+    means = np.array([one.mean for one in each])
+    mean = weight @ means
+    within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in each]))
+    off = means - mean
+    point = weight @ np.array([one.point for one in points])
+    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off)
+
+
+def differing_levels(
+    objective: Objective, point: np.ndarray, bounds: list[tuple[float, float]], states: TestStates
+) -> tuple[bool, bool, bool, bool]:
+    """Which unstated errors of levels the likelihood asks for: the others are left out in turn."""
+    kept = [k for k, std in enumerate(states.level_std) if not std > 0]
+    if states.n_levels < 2:
+        kept = []
+    point = maximised(objective, point, bounds)
+    value = objective(point)[0]
+    while kept:
+        trials = []
+        for kind in kept:
+            held = list(bounds)
+            for k in range(4):
+                if not states.level_std[k] > 0 and (k == kind or k not in kept):
+                    low = bounds[LEVELS.start + k][0]
+                    held[LEVELS.start + k] = (low, low)
+            without = maximised(objective, point, held)
+            trials.append((objective(without)[0], kind, without))
+        least, kind, without = max(trials, key=lambda trial: trial[0])
+        if value - least > 0.5 * priors.LEVELS_DIFFER:
+            break
+        kept.remove(kind)
+        point, value = without, least
+    return 0 in kept, 1 in kept, 2 in kept, 3 in kept

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import minimize
 
@@ -47,13 +48,16 @@ class LinearRows(NamedTuple):
     def posterior(
         self, scale: float, variance: Float[np.ndarray, " unknown"]
     ) -> tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, "unknown unknown"]]:
-        """Mean and covariance of the unknowns."""
-        scale = scale / np.sqrt(self.share)
-        by_root = self.triangle * np.sqrt(variance)
-        inverse = _inverse(np.eye(len(variance)) + by_root.T @ by_root / scale**2)[0]
-        covariance = np.sqrt(variance)[:, None] * inverse * np.sqrt(variance)
-        of_rows = _inverse(by_root @ by_root.T + scale**2 * np.eye(len(by_root)))[0]
-        return np.sqrt(variance) * (by_root.T @ (of_rows @ self.along)), covariance
+        """Mean and covariance of the unknowns.
+
+        By orthogonal factors of rows and priors: what several unknowns do alike, of which wide and
+        narrow priors say how they share it, would drown in the rounding of normal equations.
+        """
+        scale, root = scale / np.sqrt(self.share), np.sqrt(variance)
+        stacked = np.vstack([self.triangle * (root / scale), np.eye(len(root))])
+        directions, triangle = np.linalg.qr(stacked)
+        arms = root[:, None] * solve_triangular(triangle, np.eye(len(root)))
+        return arms @ (directions[: len(self.along)].T @ (self.along / scale)), arms @ arms.T
 
     def log_likelihood(
         self, scale: float, variance: Float[np.ndarray, " unknown"]
@@ -125,6 +129,8 @@ def maximised(
 
 def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     """Inverse and ln determinant of a positive definite matrix, in units that make it even."""
+    if not len(matrix):  # which lapack refuses
+        return matrix, 0.0
     size = np.sqrt(np.diagonal(matrix))
     even = matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix))
     factor, failed = dpotrf(even, lower=True)

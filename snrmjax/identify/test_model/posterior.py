@@ -37,19 +37,22 @@ from snrmjax.identify.test_model.hyper import (
     OFFSET,
     PHASE,
     TREND,
+    Gaussian,
     Hyper,
     Places,
+    averaged,
     bounds_of,
+    differing_levels,
     hyper_at,
     objective_of,
     places_of,
     point_of,
     prior_variances,
+    sizes_of_bends,
     starting_point,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
     LinearRows,
-    Objective,
     laplace_evidence,
     maximised,
 )
@@ -160,6 +163,7 @@ def fit_test(
     levels_apart: bool = False,
     compare_levels: bool = True,
     start: "TestPosterior | None" = None,
+    over_sizes: bool = False,
 ) -> TestPosterior:
     """The posterior of a test.
 
@@ -169,7 +173,8 @@ def fit_test(
     count as fewer; with `levels_apart` one start has natural frequencies of levels apart from the
     beginning, which levels that lie bandwidths apart need; without `compare_levels` nothing is
     said on which errors levels differ by (`differing`), which takes half the time; rounds go on
-    from `start`, of states that are nearly these and without discrepancy, instead of anew.
+    from `start`, of states that are nearly these and without discrepancy, instead of anew; with
+    `over_sizes` curves are averaged over the sizes that their bends may have.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -212,16 +217,27 @@ def fit_test(
         raise ValueError(f"`rounds` must be at least one, not {rounds}.")
     # The size of what few levels differ by is not well known: as Student's t has it. What they have
     # in common may be anything of that size.
-    hyper = hyper_at(found.point, basis)
-    variance, _ = prior_variances(hyper, basis, places, states)
-    for own, std in zip(places.levels.T, states.level_std, strict=True):
-        variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
     last = walk.balance.straight(found.mean, found.errors, apart=False)
     equations = last.equations._replace(share=found.equations.share)
-    mean, covariance = equations.posterior(hyper.noise, variance)
-    told = variance > 0
+
+    def wide_variances(point: np.ndarray) -> np.ndarray:
+        variance, _ = prior_variances(hyper_at(point, basis), basis, places, states)
+        for own, std in zip(places.levels.T, states.level_std, strict=True):
+            variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
+        return variance
+
+    def gaussian(point: np.ndarray) -> Gaussian:
+        return Gaussian(*equations.posterior(hyper_at(point, basis).noise, wide_variances(point)))
+
+    variance = wide_variances(found.point)
     objective = objective_of(found.equations, states, basis, places)
     bounds = bounds_of(states, basis, found.point)
+    point, (mean, covariance) = found.point, gaussian(found.point)
+    told = variance > 0
+    effective_unknowns = float(np.sum(1 - np.diag(covariance)[told] / variance[told]))
+    if over_sizes:
+        sized = sizes_of_bends(objective, found.point, bounds)
+        point, (mean, covariance) = averaged(sized, gaussian)
     flat = objective_of(found.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
@@ -229,14 +245,14 @@ def fit_test(
         units,
         mean,
         covariance,
-        hyper,
+        hyper_at(point, basis),
         laplace_evidence(objective, found.point, bounds),
         found.errors,
-        found.residuals,
+        found.residuals * np.exp(found.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
-        float(np.sum(1 - np.diag(covariance)[told] / variance[told])),
+        effective_unknowns,
         places,
-        _differing(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
+        differing_levels(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
         walk.balance.weight,
         found.equations.share,
         walk.still,
@@ -416,30 +432,3 @@ def _step(
             break
         share *= 0.5
     return _Moved(*best[1:])
-
-
-def _differing(
-    objective: Objective, point: np.ndarray, bounds: list[tuple[float, float]], states: TestStates
-) -> tuple[bool, bool, bool, bool]:
-    """Which unstated errors of levels the likelihood asks for: the others are left out in turn."""
-    kept = [k for k, std in enumerate(states.level_std) if not std > 0]
-    if states.n_levels < 2:
-        kept = []
-    point = maximised(objective, point, bounds)
-    value = objective(point)[0]
-    while kept:
-        trials = []
-        for kind in kept:
-            held = list(bounds)
-            for k in range(4):
-                if not states.level_std[k] > 0 and (k == kind or k not in kept):
-                    low = bounds[LEVELS.start + k][0]
-                    held[LEVELS.start + k] = (low, low)
-            without = maximised(objective, point, held)
-            trials.append((objective(without)[0], kind, without))
-        least, kind, without = max(trials, key=lambda trial: trial[0])
-        if value - least > 0.5 * priors.LEVELS_DIFFER:
-            break
-        kept.remove(kind)
-        point, value = without, least
-    return 0 in kept, 1 in kept, 2 in kept, 3 in kept

@@ -85,6 +85,12 @@ LEVEL_DAMPING = HalfNormalSize(0.05)
 INSTRUMENT_PHASE = 0.1
 """rad: 6°, of all records together, where a hypothesis may be that there is one."""
 
+OFF_RESONANCE = (0.5, 1.0)
+"""1σ of d ln(what the motion adds to ω̃², and of 2ζ̃ω̃) / d ln Ω at equal amplitude, of which a
+curve of amplitude knows nothing. Damping: −1 for dry friction and hysteresis, 1 for v|v|, 2 for v³;
+stiffness: 0 where harmonics are small, 0.75 on an arch, whose static and second harmonic soften
+it."""
+
 LEVELS: tuple[HalfNormalSize, ...] = (
     LEVEL_GAIN,
     LEVEL_PHASE,

@@ -37,6 +37,8 @@ class TestStates(NamedTuple):
     # structure, and 1σ of that change per unit of it.
     trend: Float[np.ndarray, " state"] | float = 0.0
     trend_std: float = 0.0
+    # 1σ of how what moves both curves goes with the forcing frequency (`priors.OFF_RESONANCE`).
+    off_resonance_std: tuple[float, float] = (0.0, 0.0)
     # What other modes move beside it for 1σ of their linear parameters, m/s; None: all are known.
     beside: Complex[np.ndarray, "state deviation"] | None = None
 

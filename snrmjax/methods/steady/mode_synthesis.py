@@ -13,11 +13,14 @@ Reference: S. Peter, M. Scheel, M. Krack & R. I. Leine, Mech. Syst. Signal Proce
 doi:10.1016/j.ymssp.2017.09.014.
 """
 
+import interpax
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from snrmjax.identify.curves.family_base import AbstractCurve
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.curve_fit import PchipCurve
 from snrmjax.identify.pointwise.prediction import LARGEST_AMPLITUDE_RATIO, predict_response
 from snrmjax.identify.pointwise.prediction_result import PredictedResponse
 from snrmjax.identify.pointwise.snrm import reference_sensor
@@ -27,6 +30,33 @@ from snrmjax.model.modes import LinearModes
 
 _FEWEST_POINTS = 2
 _SAME = 1e-6  # relative: amplitudes nearer than this are one
+
+
+class ShapePreservingCurve(AbstractCurve):
+    """A monotonicity-preserving cubic (PCHIP) in the squared amplitude, through `parameters`.
+
+    Beyond its knots it goes on straight in the square of the amplitude.
+    """
+
+    knots: Float[Array, " parameter"]  # amplitudes, increasing
+
+    def amplitude(self, displacement: Array, velocity: Array) -> Array:
+        """See `AbstractCurve`."""
+        return displacement
+
+    def __call__(self, amplitude: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """See `AbstractCurve`."""
+        knots = self.knots**2
+        x = jnp.asarray(amplitude) ** 2
+        inside = jnp.clip(x, knots[0], knots[-1])
+        slopes = jax.vmap(jax.grad(lambda u: self._within(u[None])[0]))(knots[jnp.array([0, -1])])
+        below, above = jnp.minimum(x - knots[0], 0.0), jnp.maximum(x - knots[-1], 0.0)
+        value = self._within(inside.reshape(-1)).reshape(x.shape)
+        return value + below * slopes[0] + above * slopes[1]
+
+    def _within(self, square: Float[Array, " point"]) -> Float[Array, " point"]:
+        method = "monotonic" if self.knots.shape[0] > 2 else "linear"
+        return interpax.interp1d(square, self.knots**2, self.parameters, method=method, extrap=True)
 
 
 def backbone_of(result: MethodResult, modes: LinearModes) -> Backbone:
@@ -56,18 +86,22 @@ def backbone_of(result: MethodResult, modes: LinearModes) -> Backbone:
     def mean(values: np.ndarray) -> np.ndarray:
         return np.bincount(group, values[order]) / count
 
-    def variance(values: np.ndarray) -> jnp.ndarray:
+    def variance(values: np.ndarray) -> np.ndarray:
         # Of a mean of independent points.
-        return jnp.diag(jnp.asarray(np.bincount(group, np.nan_to_num(values)[order]) / count**2))
+        return np.bincount(group, np.nan_to_num(values)[order]) / count**2
 
     omega_std = np.asarray(result.natural_frequency_std)[good]
     ratio_std = np.asarray(result.damping_ratio_std)[good]
     at = jnp.asarray(mean(size))
+    both = variance((2 * omega * omega_std) ** 2), variance((2 * ratio_std * omega) ** 2)
+    squared, damping = (
+        ShapePreservingCurve(jnp.asarray(mean(values)), at[-1], at)
+        for values in (omega**2, 2 * ratio * omega)
+    )
     return Backbone(
-        squared_frequency=PchipCurve(at, jnp.asarray(mean(omega**2))),
-        modal_damping=PchipCurve(at, jnp.asarray(mean(2 * ratio * omega))),
-        squared_frequency_covariance=variance((2 * omega * omega_std) ** 2),
-        modal_damping_covariance=variance((2 * ratio_std * omega) ** 2),
+        squared_frequency=squared,
+        modal_damping=damping,
+        covariance=jnp.diag(jnp.asarray(np.concatenate(both))),
         modal_constant=jnp.asarray(drive_point(modes)),
         smallest=at[0],
         largest=at[-1],

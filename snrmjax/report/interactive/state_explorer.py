@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from snrmjax.identify.pointwise.identification import Identification
+from snrmjax.identify.inference.identification import Identification
 from snrmjax.io.units import HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.report.html import LiveFigures

@@ -11,10 +11,10 @@ from snrmjax.identify.inference.fitted_response import (
     fitted_response,
     predicted_resonance,
 )
-from snrmjax.identify.inference.pointwise_view import without_bands
+from snrmjax.identify.inference.identification import Identification
+from snrmjax.identify.inference.plain_prediction import without_bands
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.identification import Identification
 from snrmjax.identify.pointwise.missing_resonance import level_in_resonance
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
@@ -25,10 +25,7 @@ from snrmjax.identify.pointwise.prediction import (
 )
 from snrmjax.identify.prediction.new_level import DayToDay, new_level
 from snrmjax.identify.prediction.notes import notes_on_resonance, notes_on_trends
-from snrmjax.identify.prediction.resonance_distribution import (
-    ResonanceDistribution,
-    resonance_of_points,
-)
+from snrmjax.identify.prediction.resonance_distribution import ResonanceDistribution
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
@@ -66,20 +63,22 @@ def predictions_of_points(
     found: Identification, model: Structure, loads: Loads
 ) -> tuple[Prediction, ...]:
     """What curves through points predict."""
-    backbone, ratio = found.fit.backbone, loads.largest_amplitude_ratio
+    backbone, ratio, self_excited = (
+        found.backbone,
+        loads.largest_amplitude_ratio,
+        loads.self_excited,
+    )
     return tuple(
         Prediction(
             force,
             resonances(backbone, model.modes, force, largest_amplitude_ratio=ratio),
             predict_response(backbone, model.modes, force, largest_amplitude_ratio=ratio),
-            resonance_of_points(
+            predicted_resonance(
                 found.fit,
-                model.modes,
                 force,
-                model.level_stds,
-                day=loads.day,
-                ratio=ratio,
-                self_excited=loads.self_excited,
+                largest_amplitude_ratio=ratio,
+                of=new_level(found.fit, force, day=loads.day),
+                self_excited=self_excited,
             ),
         )
         for force in dict.fromkeys(loads.forces)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -150,7 +151,7 @@ def one_by_one(
     for k, model in enumerate(members.models):
         force = None if members.forces is None else members.forces[k]
         try:
-            parts.append(compute(model, force, members.seeds[k]))
+            parts.append(compute(jax.device_put(model), force, members.seeds[k]))
         except ValueError as error:
             reason = str(error).splitlines()[0]
             parts.append({**failed, "status": np.array([f"refused: {reason}"])})

@@ -3,12 +3,11 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.identify.pointwise.identification import Identification, identify_backbone
+from snrmjax.identify.inference.identification import Identification, identify_backbone
 from snrmjax.identify.pointwise.inversion_result import PointStatus
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
@@ -56,9 +55,8 @@ class AbstractIdentified(AbstractComputation):
     def identified(self, data: SteadyStates, model: Structure) -> dict[str, np.ndarray]:
         """One member's row."""
         found: Identification = identify_backbone(data, model)
-        backbone, status = found.fit.backbone, np.asarray(found.points.status)
-        ends = float(backbone.smallest), float(backbone.largest)
-        values = backbone.values(jnp.asarray(np.linspace(*ends, _POINTS)))
+        backbone, status = found.backbone, np.asarray(found.points.status)
+        values = backbone.sampled(_POINTS)
         row = {
             "velocity_m_s": values.velocity,
             "natural_frequency_hz": np.asarray(values.natural_frequency) / HERTZ,

@@ -8,7 +8,6 @@ from truths.sizes import repeats
 
 import snrmjax as sj
 from snrmjax.identify.checks.residual_autocorrelation import (
-    added_covariance,
     along_resonance,
     residual_autocorrelation,
 )
@@ -55,42 +54,6 @@ def test_what_is_left_of_exact_states_is_no_matter():
     slow = drawn(np.random.default_rng(7), 0.95, 1, 60).T
     assert residual_autocorrelation(slow, levels) > 0
     assert residual_autocorrelation(1e-6 * slow, levels) == 0
-
-
-def test_the_covariance_is_that_of_repeated_straight_lines():
-    rng, rho = np.random.default_rng(4), 0.8
-    at = np.tile(np.linspace(-1, 1, 30), 3)
-    levels = along_resonance(np.repeat(np.arange(3), 30), at)
-    jacobian = np.stack([np.ones(90), at], axis=1)
-    noise = drawn(rng, rho, 20000, 3, 30).reshape(20000, -1)
-    fits = np.linalg.lstsq(jacobian, noise.T, rcond=None)[0]
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    rows, root = np.stack([jacobian, 0 * jacobian], axis=1), np.linalg.cholesky(inverse)
-    found = inverse + added_covariance(root, rows, np.array([rho, 0.0]), levels)
-    np.testing.assert_allclose(found, np.cov(fits), rtol=0.05, atol=0.02 * found.max())
-
-
-def test_the_covariance_is_that_of_what_correlates_the_states():
-    at, rho = np.linspace(-1, 1, 40), 0.8
-    jacobian = np.stack([np.ones(40), at], axis=1)
-    along = rho ** np.abs(np.arange(40)[:, None] - np.arange(40))
-    solve, inverse = np.linalg.pinv(jacobian), np.linalg.inv(jacobian.T @ jacobian)
-    given = (np.linalg.cholesky(inverse), jacobian[:, None, :], np.array([rho]), [np.arange(40)])
-    # A constant and a slope vary by 6 to 9 times what white noise does.
-    found = inverse + added_covariance(*given)
-    np.testing.assert_allclose(found, solve @ along @ solve.T, rtol=1e-10, atol=1e-12)
-
-
-def test_no_band_becomes_narrower():
-    jacobian = np.vander(np.linspace(-1, 1, 25), 5)
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    levels, rows = [np.arange(25)], jacobian[:, None, :]
-    added = added_covariance(np.linalg.cholesky(inverse), rows, np.array([0.98]), levels)
-    # Of differences between neighbours this process has far less than white noise.
-    along = np.random.default_rng(6).normal(size=(5, 1000))
-    more = np.sum(along * (added @ along), axis=0) / np.sum(along * (inverse @ along), axis=0)
-    assert more.min() > -1e-9
-    assert more.max() > 1
 
 
 @pytest.mark.long

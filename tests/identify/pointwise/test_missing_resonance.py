@@ -18,7 +18,7 @@ def identified():
     """States whose top level says to have had four times the force, and their true curves."""
     level, omega, force, velocity = exact(per_level=9)
     found = sj.identify_backbone(stated(level, omega, force, velocity), modes())
-    return found.fit.backbone, stated(level, omega, np.where(level == 4, 4, 1) * force, velocity)
+    return found.backbone, stated(level, omega, np.where(level == 4, 4, 1) * force, velocity)
 
 
 def needed(displacement):

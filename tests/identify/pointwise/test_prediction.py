@@ -11,13 +11,13 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from snrmjax.identify.pointwise.backbone import Backbone
-from snrmjax.identify.pointwise.curve_fit import PchipCurve
 from snrmjax.identify.pointwise.prediction import (
     LARGEST_AMPLITUDE_RATIO,
     predict_response,
     resonance_by_fixed_point,
     resonances,
 )
+from snrmjax.methods.steady.mode_synthesis import ShapePreservingCurve
 from snrmjax.model.modes import RigidBodyModes, linear_modes, residual_velocity
 
 W0 = 500.0
@@ -40,12 +40,10 @@ UNIT = {"displacement": 1.0, "velocity": W0}  # the same motion in either argume
 def backbone(squared, damping, argument="displacement", knots=(0.0, 0.3, 0.45, 0.8, 1.0)):
     """Curves through values at knots, given as parts of the largest amplitude."""
     knots = UNIT[argument] * LARGEST * jnp.asarray(knots)
-    none = jnp.zeros((knots.size, knots.size))
+    pair = (ShapePreservingCurve(jnp.asarray(v), knots[-1], knots) for v in (squared, damping))
     return Backbone(
-        squared_frequency=PchipCurve(knots, jnp.asarray(squared)),
-        modal_damping=PchipCurve(knots, jnp.asarray(damping)),
-        squared_frequency_covariance=none,
-        modal_damping_covariance=none,
+        *pair,
+        covariance=jnp.zeros((2 * knots.size, 2 * knots.size)),
         modal_constant=jnp.asarray(CONSTANT),
         smallest=knots[0],
         largest=knots[-1],
@@ -74,7 +72,7 @@ def curves(which):
     """ω̃² and 2ζ̃ω̃ of an amplitude by scipy, continued along the end slope in its square."""
 
     def of(curve):
-        u, values = np.asarray(curve.knots) ** 2, np.asarray(curve.values)
+        u, values = np.asarray(curve.knots) ** 2, np.asarray(curve.parameters)
         inside = PchipInterpolator(u, values)
         slope = inside.derivative()(u[-1])
         return lambda a: inside(np.minimum(a**2, u[-1])) + slope * np.maximum(a**2 - u[-1], 0)
@@ -341,14 +339,11 @@ class TestResponse:
         (plain,) = predict(DUFFING, MODES, force)
         # Time in another unit: frequencies times 4, displacements at the same forces over 16.
         fast = Backbone(
-            squared_frequency=PchipCurve(
-                DUFFING.squared_frequency.knots / 16, 16 * DUFFING.squared_frequency.values
+            *(
+                ShapePreservingCurve(by * c.parameters, c.scale / 16, c.knots / 16)
+                for c, by in ((DUFFING.squared_frequency, 16), (DUFFING.modal_damping, 4))
             ),
-            modal_damping=PchipCurve(
-                DUFFING.modal_damping.knots / 16, 4 * DUFFING.modal_damping.values
-            ),
-            squared_frequency_covariance=DUFFING.squared_frequency_covariance,
-            modal_damping_covariance=DUFFING.modal_damping_covariance,
+            covariance=DUFFING.covariance,
             modal_constant=DUFFING.modal_constant,
             smallest=DUFFING.smallest / 16,
             largest=DUFFING.largest / 16,

@@ -1,4 +1,4 @@
-"""What the results of a pointwise identification say, label and show."""
+"""What the results of an identification say, label and show."""
 
 import dataclasses
 
@@ -50,9 +50,9 @@ def test_the_points(found):
 
 
 def test_the_curves(found):
-    backbone = found.fit.backbone
+    backbone = found.backbone
     values = backbone.values(np.linspace(0.5, 1.0, 7) * float(backbone.largest))
-    for result in (backbone, found.fit, values):
+    for result in (backbone, values):
         assert repr(result).splitlines()[1].strip() == "natural frequency 79.58 to 79.58 Hz"
         ratio = repr(result).splitlines()[2].split()
         assert float(ratio[2]) == pytest.approx(100 * float(MODES.damping_ratio[0]), rel=1e-3)
@@ -63,7 +63,7 @@ def test_the_curves(found):
 
 
 def test_predictions(found):
-    backbone = found.fit.backbone
+    backbone = found.backbone
     (tip,) = sj.identify.resonances(backbone, MODES, 1.5)
     assert repr(tip).startswith("Resonance under 1.5 N at 79.57")
     assert tip.to_xarray().velocity_m_s.attrs["units"] == "m/s"

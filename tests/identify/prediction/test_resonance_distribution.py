@@ -20,7 +20,6 @@ from snrmjax.identify.prediction.resonance_distribution import (
     amplitudes_to,
     covariance_root,
     resonance_distribution,
-    resonance_of_points,
 )
 
 OMEGA, DELTA = 500.0, 12.0
@@ -151,9 +150,11 @@ def test_a_singular_covariance_has_a_root():
 
 def test_curves_through_points_predict_their_own_resonances():
     level, omega, force, velocity = exact(per_level=9)
-    fit = sj.identify_backbone(stated(level, omega, force, velocity), modes()).fit
+    fit = sj.identify_backbone(stated(level, omega, force, velocity), modes())
     plain, day = (
-        resonance_of_points(fit, modes(), 2.2, (0.0, 0.0, 0.0, 0.0), day=day)
+        sj.identify.predicted_resonance(
+            fit.fit, 2.2, of=sj.identify.new_level(fit.fit, 2.2, day=day)
+        )
         for day in (None, sj.identify.DayToDay(frequency=0.01))
     )
     (tip,) = sj.identify.resonances(fit.backbone, modes(), 2.2)

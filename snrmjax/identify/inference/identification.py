@@ -1,0 +1,368 @@
+"""The whole inverse method in one call: steady states in, backbone and damping out."""
+
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from snrmjax.identify.curves.families import values_and_slopes
+from snrmjax.identify.inference.fitted_curves import as_backbone
+from snrmjax.identify.joint.joint_fit import JointFit, fit_jointly
+from snrmjax.identify.pointwise.backbone import Backbone
+from snrmjax.identify.pointwise.backbone_points import (
+    AmplitudeArgument,
+    AmplitudeMeasure,
+    BackbonePoints,
+    identify_points,
+    moved_by_modal_mass,
+    off_resonance_error_factor,
+    peak_ratio,
+)
+from snrmjax.identify.pointwise.inversion_result import (
+    STATUS_MESSAGE,
+    PointStatus,
+    reasons_in_words,
+)
+from snrmjax.measure.phase_convention import naming_wrong_phases
+from snrmjax.measure.states import SteadyStates
+from snrmjax.model.modes import LinearModes
+from snrmjax.model.structures import Structure, modes_of
+from snrmjax.numerics.blocks import on_one_core
+from snrmjax.numerics.result import AbstractResult, Variable
+
+_HERTZ = 2 * np.pi
+_FEWEST = 2  # points, of which a curve can be told
+
+
+class Anchor(NamedTuple):
+    """How far curves had to be bent to meet the linear mode at zero amplitude."""
+
+    frequency_gap: float  # rad/s, free curve at zero minus linear frequency
+    frequency_gap_std: float  # rad/s
+    damping_gap: float  # free damping ratio at zero minus the linear one
+    damping_gap_std: float
+    largest_frequency_shift: float  # rad/s, anchored minus free curve among the measured points
+    largest_damping_shift: float
+
+
+class Identification(AbstractResult):
+    """Points, curves and everything that a reader of them should know.
+
+    The curves are those of `fit`, the joint fit of all states, unless they were anchored.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ("state", "level", "backbone_amplitude_m_s")
+
+    points: BackbonePoints
+    backbone: Backbone
+    fit: JointFit
+    anchor: Anchor | None
+    notes: tuple[str, ...]
+
+    @property
+    def level_frequency_std(self) -> float:
+        """1σ of the natural frequency (rad/s) that the states of a level share."""
+        j = self.fit.modes.mode_of_interest
+        own = float(self.fit.modes.natural_frequency[j])
+        return 0.5 * float(self.fit.noise.level_std[2]) * own
+
+    @property
+    def level_damping_std(self) -> float:
+        """The same of the damping ratio."""
+        j = self.fit.modes.mode_of_interest
+        return float(self.fit.noise.level_std[3]) * float(self.fit.modes.damping_ratio[j])
+
+    def summary(self) -> tuple[str, ...]:
+        """See `AbstractResult`."""
+        states, *_ = self.points.summary()
+        _, *curves = self.backbone.summary()
+        scale, unit = self.fit.noise.scale, "times the stated noise"
+        if not self.fit.noise.stated:
+            scale, unit = 100 * scale, "% of the measured phasor (1σ)"
+        return (
+            states.replace("BackbonePoints", "Identification", 1),
+            *curves,
+            f"scatter of states about the curves: {scale:.3g} {unit}",
+            f"level to level: {self.level_frequency_std / _HERTZ:.2g} Hz and "
+            f"{100 * self.level_damping_std:.2g} % of critical damping (1σ)",
+            *(f"note: {note}" for note in self.notes),
+        )
+
+    def variables(self) -> dict[str, Variable]:
+        """See `AbstractResult`; those of the points, and of the curves under `backbone_…`."""
+        own = dict(self.points.variables())
+        for name, variable in self.backbone.variables().items():
+            at = "backbone_amplitude_m_s"
+            key = at if name == "velocity_m_s" else f"backbone_{name}"
+            own[key] = variable._replace(dimensions=(at,))
+        return own
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """See `AbstractResult`."""
+        return {
+            **self.backbone.attributes(),
+            "noise_stated": int(self.fit.noise.stated),
+            "level_frequency_std_hz": self.level_frequency_std / _HERTZ,
+            "level_damping_ratio_std": self.level_damping_std,
+            "notes": "\n".join(self.notes),
+        }
+
+
+@on_one_core
+@naming_wrong_phases
+def identify_backbone(
+    data: SteadyStates,
+    modes: LinearModes | Structure,
+    *,
+    amplitude: AmplitudeArgument = "displacement",
+    measure: AmplitudeMeasure = "fundamental",
+    n_knots: int | None = None,
+    anchor: bool = False,
+) -> Identification:
+    """Backbone and damping of the mode of interest from near-resonant steady states.
+
+    Each state has its own point (`identify_points`); the curves and their bands are those of the
+    model of a test, the smooth curves of `fit_jointly`. `modes` may also be the structure that has
+    them: the errors of levels that it states then enter the bands. Where no noise is stated, the
+    standard deviations of the points come from the scatter about the curves.
+
+    Arguments: `amplitude` and `measure` as in `identify_points`; `n_knots` at most of each curve;
+    `anchor` makes both curves start at the linear mode at zero amplitude and reports how far this
+    moves them.
+    Returns an `Identification` whose `notes` say in words what the reader of the file did not use,
+    what was left out, what the noise turned out to be and how far an anchor moved the curves.
+    Raises `ValueError` where fewer than two states have a point, and what `fit_jointly` raises.
+    Not differentiable, since curves are chosen: differentiate `identify_points`.
+    Reference: Kwarta & Allen, section 2.2.
+    """
+    points = identify_points(data, modes_of(modes), amplitude=amplitude, measure=measure)
+    usable = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
+    if usable.sum() < _FEWEST:
+        raise ValueError(
+            f"a backbone needs at least {_FEWEST} solved points, but only {int(usable.sum())} of "
+            f"{usable.size} are: {reasons_in_words(points.status)}."
+        )
+    states = data
+    if measure == "peak":
+        ratio = peak_ratio(data)
+        states = eqx.tree_at(
+            lambda d: (d.velocity, d.velocity_std),
+            data,
+            (data.velocity * ratio, data.velocity_std * ratio),
+        )
+    family = "auto" if n_knots is None else f"smoothing_spline:{n_knots}"
+    fit = fit_jointly(states, modes, backbone=family, damping=family)
+    found = identification_of_fit(data, fit, amplitude=amplitude, measure=measure, anchor=anchor)
+    return eqx.tree_at(lambda f: f.notes, found, (*data.notes, *found.notes))
+
+
+def identification_of_fit(
+    data: SteadyStates,
+    fit: JointFit,
+    *,
+    amplitude: AmplitudeArgument = "displacement",
+    measure: AmplitudeMeasure = "fundamental",
+    anchor: bool = False,
+) -> Identification:
+    """Each steady state's own point beside the curves of a joint fit.
+
+    Points come from the inverse method, with the modal mass that the fit found. Where no noise is
+    stated their 1σ is what the fit found: its noise, and errors of gain, phase, natural frequency
+    and damping that the states of a level share.
+
+    Arguments: `data` are the steady states of the fit, with forces in newtons; the others as in
+    `identify_backbone`.
+    Returns an `Identification` whose `notes` are those of the fit and of the points.
+    """
+    points = identify_points(data, fit.modes_found, amplitude=amplitude, measure=measure)
+    curves, report = as_backbone(fit, argument=amplitude), None
+    if anchor:
+        curves, report = _anchored(curves, points, fit.modes)
+    found = Identification(points, curves, fit, report, ())
+    if not fit.noise.stated:
+        gain, phase = map(float, fit.noise.level_std[:2])
+        j = fit.modes.mode_of_interest
+        own = float(fit.modes.natural_frequency[j])
+        wandering = 0.5 * own * float(np.max(np.asarray(fit.data.std)[:, 3]))
+        points = errors_from_scatter(
+            points,
+            fit.noise.scale,
+            level_gain=gain,
+            level_phase=phase,
+            frequency_std=float(np.hypot(found.level_frequency_std, wandering)),
+            damping_std=found.level_damping_std,
+            modal_mass_std=fit.modes_found.own_modal_mass_std,
+        )
+    freed = "instrument_phase" in fit.free
+    notes = (
+        *fit.notes,
+        *notes_on_points(points, fit.modes, "have no point of their own (the curves use them)"),
+        *notes_on_phases(points, curves, _PHASE_FREED if freed else _FREE_PHASE),
+        *_notes_on_anchor(report),
+    )
+    return Identification(points, curves, fit, report, notes)
+
+
+def _anchored(
+    free: Backbone, points: BackbonePoints, modes: LinearModes
+) -> tuple[Backbone, Anchor]:
+    """Both curves given that they start at the linear mode, and how far this moves them."""
+    j = modes.mode_of_interest
+    omega, zeta = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
+    covariance = np.asarray(free.covariance)
+    n = free.squared_frequency.parameters.shape[0]
+    places = [0, n]  # the first knots are at rest
+    known = np.array([omega**2, 2 * zeta * omega])
+    vector = np.concatenate(
+        [np.asarray(c.parameters) for c in (free.squared_frequency, free.modal_damping)]
+    )
+    arm = np.linalg.solve(covariance[np.ix_(places, places)], covariance[places]).T
+    gap = vector[places] - known
+    moved, left = vector - arm @ gap, covariance - arm @ covariance[places]
+    pinned = eqx.tree_at(
+        lambda b: (
+            *(b.squared_frequency.parameters, b.modal_damping.parameters),
+            *(b.covariance, b.smallest),
+        ),
+        free,
+        jax.device_put((moved[:n], moved[n:], left, np.zeros(()))),
+    )
+    use = np.asarray(points.usable) & np.isfinite(np.asarray(points.amplitude))
+    at = np.asarray(points.amplitude)[use]
+    before, after = free.values(at), pinned.values(at)
+
+    def largest(name: str) -> float:
+        difference = np.asarray(getattr(after, name)) - np.asarray(getattr(before, name))
+        return float(difference[np.argmax(np.abs(difference))])
+
+    std = np.sqrt(np.diag(covariance)[places])
+    return pinned, Anchor(
+        frequency_gap=float(np.sqrt(max(vector[0], 0.0))) - omega,
+        frequency_gap_std=float(std[0]) / (2 * omega),
+        damping_gap=float(vector[n]) / (2 * omega) - zeta,
+        damping_gap_std=float(std[1]) / (2 * omega),
+        largest_frequency_shift=largest("natural_frequency"),
+        largest_damping_shift=largest("damping_ratio"),
+    )
+
+
+def _notes_on_anchor(anchor: Anchor | None) -> tuple[str, ...]:
+    if anchor is None:
+        return ()
+    hz = 1 / _HERTZ
+    return (
+        f"anchored at the linear mode: the free curves miss it at zero amplitude by "
+        f"{anchor.frequency_gap * hz:+.3g} ± {anchor.frequency_gap_std * hz:.2g} Hz and "
+        f"{100 * anchor.damping_gap:+.3g} ± {100 * anchor.damping_gap_std:.2g} % damping; the "
+        f"measured points were moved by up to {anchor.largest_frequency_shift * hz:+.2g} Hz "
+        f"and {100 * anchor.largest_damping_shift:+.2g} %.",
+    )
+
+
+def errors_from_scatter(
+    points: BackbonePoints,
+    noise: float,
+    *,
+    level_gain: float = 0.0,
+    level_phase: float = 0.0,
+    frequency_std: float = 0.0,
+    damping_std: float = 0.0,
+    modal_mass_std: float | Float[Array, ""] | None = None,
+) -> BackbonePoints:
+    """Points whose standard deviations come from the scatter, shared by level or not.
+
+    Arguments: `noise` of amplitude and phase at resonance, relative; `level_gain` (relative) and
+    `level_phase` (rad), where known, are 1σ of the errors of velocity and phase that all states of
+    a level share; `frequency_std` (rad/s) and `damping_std` what the natural frequency and the
+    damping ratio differ by from state to state; `modal_mass_std` (relative) is 1σ of the modal
+    mass, an error that all points share.
+    """
+    sensitivity = np.asarray(points.sensitivity)
+    scale = noise * off_resonance_error_factor(np.asarray(points.mode_velocity))
+    shared = np.array([0.0, level_gain, level_phase])
+    spread = np.hypot(scale[:, None, None] * np.array([0.0, 1.0, 1.0]), shared)
+    own = np.sum((sensitivity[:, :2] * spread) ** 2, axis=2)
+    natural, damping = np.asarray(points.natural_frequency), np.asarray(points.damping_ratio)
+    natural_std = np.hypot(np.sqrt(own[:, 0]) / (2 * natural), frequency_std)
+    of_damping = np.hypot(np.sqrt(own[:, 1]) / (2 * natural), damping_std)
+    of_damping = np.hypot(of_damping, damping * natural_std / natural)
+    if modal_mass_std is not None:
+        of_mass = moved_by_modal_mass(natural, damping, np.asarray(points.frequency))
+        natural_std = np.hypot(natural_std, of_mass[0] * float(modal_mass_std))
+        of_damping = np.hypot(of_damping, of_mass[1] * float(modal_mass_std))
+    return eqx.tree_at(
+        lambda p: (p.natural_frequency_std, p.damping_ratio_std),
+        points,
+        jax.device_put((natural_std, of_damping)),
+    )
+
+
+def notes_on_points(points: BackbonePoints, modes: LinearModes, consequence: str) -> list[str]:
+    """Sentences on states without a point (`consequence` says what follows), roots and sensors."""
+    notes = []
+    status = np.asarray(points.status)
+    for kind in PointStatus:
+        count = int(np.sum(status == kind))
+        if kind != PointStatus.OK and count:
+            notes.append(
+                f"{count} of {len(status)} steady states {consequence}: {STATUS_MESSAGE[kind]}."
+            )
+    other = int(np.sum(np.isfinite(np.asarray(points.alternative_natural_frequency))))
+    if other:
+        notes.append(
+            f"{other} steady states have a second solution that amplitude and phase alone would "
+            "also allow."
+        )
+    if np.asarray(points.filter_residual).max(initial=0.0) > 0.1 and len(modes.sensors) > 1:
+        notes.append(
+            "the sensors do not move as the mode shape says (residual up to "
+            f"{100 * np.nanmax(np.asarray(points.filter_residual)):.0f} %): check the shape, or "
+            "the mode's shape changes with amplitude."
+        )
+    return notes
+
+
+_FREE_PHASE = (
+    "let a joint fit estimate it (`--free instrument_phase`; in Python "
+    '`fit_jointly(…, free=["instrument_phase"])`)'
+)
+_PHASE_FREED = (
+    "since this fit has already estimated it, check the force calibration and trust points near "
+    "resonance"
+)
+
+
+def notes_on_phases(points: BackbonePoints, curves: Backbone, advice: str) -> list[str]:
+    """A sentence when damping changes with the phase inside the levels, which it should not.
+
+    Arguments: `advice` what to do about it.
+    """
+    points = jax.tree.map(np.asarray, points)
+    use = points.usable
+    level = points.level[use]
+    sign = np.sign(float(curves.modal_constant))  # negative: the mode moves against force
+    sine = sign * np.sin(np.angle(np.asarray(points.mode_velocity)))[use]
+    curve, _ = values_and_slopes(curves.modal_damping, np.asarray(points.amplitude)[use])
+    excess = np.asarray(points.modal_damping)[use] / curve - 1
+    _, member = np.unique(level, return_inverse=True)
+    count = np.bincount(member)
+    x, y = (
+        values - (np.bincount(member, weights=values) / count)[member] for values in (sine, excess)
+    )
+    if not np.any(x != 0) or not np.any(y != 0):
+        return []
+    slope = float(x @ y / (x @ x))
+    explained = slope**2 * float(x @ x) / float(y @ y)
+    across = slope * 2 * np.sin(np.pi / 4)
+    if explained < 0.3 or abs(across) < 0.1:
+        return []
+    sides = ["45° below resonance (velocity leads)", "45° above it (velocity lags)"]
+    if across < 0:
+        sides = ["45° above resonance (velocity lags)", "45° below it (velocity leads)"]
+    return [
+        f"damping comes out {100 * abs(across):.0f} % higher from points {sides[0]} than from "
+        f"points {sides[1]}, which a damping that depends on amplitude alone does not do; an error "
+        f"of the instrument's phase does: {advice}."
+    ]

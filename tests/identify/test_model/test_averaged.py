@@ -1,0 +1,53 @@
+"""Curves averaged over how much they bend, where levels differ by what nobody stated."""
+
+import numpy as np
+
+from snrmjax.identify.test_model import states as measured
+from snrmjax.identify.test_model.posterior import fit_test
+from snrmjax.numerics.blocks import on_one_core
+
+AMPLITUDES = np.array([0.06, 0.25, 0.37, 0.5, 0.62, 0.75, 0.87, 1.0])
+PER_LEVEL, NOISE = 9, 0.003
+
+
+def stiffness(a):
+    """A joint that opens and a beam that stiffens: ω̃² falls by 0.7 % and rises by as much."""
+    return 500.0**2 * (1 - 0.010 * np.tanh(3 * a) + 0.012 * a**2)
+
+
+def response_controlled(seed, scatter):
+    """Levels of one amplitude each, whose stiffness differs by `scatter` (1σ): nothing is solved.
+
+    The phase of every state is given, and (K − Ω²) = Ωδ tan φ solved for Ω.
+    """
+    rng = np.random.default_rng(seed)
+    level = np.repeat(np.arange(len(AMPLITUDES)), PER_LEVEL)
+    a = AMPLITUDES[level]
+    phase = np.tile(np.radians(np.linspace(60, -60, PER_LEVEL)), len(AMPLITUDES))
+    own = stiffness(a) * (1 + scatter * rng.normal(size=len(AMPLITUDES))[level])
+    loss = 1.5 * (1 + 4 * a**2)
+    b = 0.5 * np.tan(phase) * loss
+    omega = -b + np.sqrt(b**2 + own)
+    needed = own - omega**2 + 1j * omega * loss
+    velocity = 1j * omega * a * np.abs(needed) / needed
+    n = len(a)
+    velocity = velocity * np.exp(NOISE * (rng.normal(size=n) + 1j * rng.normal(size=n)))
+    errors = np.tile([1e-4, NOISE, NOISE], (n, 1))
+    force = np.abs(needed) * a
+    return measured.TestStates(level, omega, force, velocity, errors, True, 1.0, (0.0,) * 4, 0.0)
+
+
+@on_one_core
+def test_bands_know_that_levels_may_differ_for_what_curves_may_bend():
+    at = np.linspace(AMPLITUDES[0], AMPLITUDES[-1], 25)
+    inside = {True: [], False: []}
+    for seed in range(10):
+        states = response_controlled(seed, 5e-4)
+        for averaged, shares in inside.items():
+            curves = fit_test(states, over_sizes=averaged).curves(at)
+            std = np.sqrt(curves.covariance[:, 0, 0])
+            shares.append(np.abs(curves.squared_frequency - stiffness(at)) < 1.96 * std)
+    # 95 % are meant. Ten tests of eight levels know it to some 5 %.
+    assert np.mean(inside[True]) > 0.9
+    # The likeliest sizes alone mostly miss the lowest level, which is far from its neighbours.
+    assert np.mean(inside[True], axis=0)[0] > np.mean(inside[False], axis=0)[0] + 0.3
