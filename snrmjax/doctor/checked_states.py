@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from snrmjax.doctor.priors import MODAL_MASS
 from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.measure.states import SteadyStates, relative_errors
 from snrmjax.model.modes import residual_velocity
@@ -82,7 +83,7 @@ def checked_states(
     level = np.unique(np.asarray(some.level), return_inverse=True)[1]
     test = TestStates(
         *(level, omega, force, sign * (velocity - beside), errors, False),
-        *(abs(constant) or 1.0, stds, 0.0),
+        *(abs(constant) or 1.0, stds, MODAL_MASS),
     )
     return CheckedStates(test, at, sign * beside, order, noise, files)
 

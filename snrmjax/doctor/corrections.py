@@ -1,6 +1,6 @@
 """One thing at a time that may have gone wrong with a test, undone, and how one mode fits then."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,16 +9,20 @@ from jaxtyping import Float
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Kind
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.doctor.judgement import Judged, climbed, judge
-from snrmjax.doctor.priors import AS_STATED, FORCE_FALLS, GAIN_MATTERS, SCATTER
+from snrmjax.doctor.judgement import Judged, judge, likelier
+from snrmjax.doctor.priors import (
+    CLEARLY,
+    FORCE_FALLS,
+    GAIN_MATTERS,
+    MOVES,
+    OTHER_GAIN,
+    SCATTER,
+)
 from snrmjax.identify.test_model.states import TestStates
 
-_LIMITS = (0.8, 0.85, 0.92)  # of a channel, over its largest recorded fundamental
+_LIMITS = (0.96, 0.93, 0.9, 0.87, 0.84, 0.81)  # of a channel, over its largest recorded fundamental
 _SHARES = (0.2, 0.45, 0.7, 0.85)  # of a transient that are left at the end of a step
-_TREND = 0.5  # of a natural frequency, over its bandwidth: first step of a search
-_WIDEST = 0.1  # a bandwidth over its frequency: of a larger one no drift is told
 _FLOORS = (4.0, 12.0, 40.0)  # noise of the force's cell over that of all else, at the least force
-_WIDE_GAIN = 0.4  # 1σ of a level's gain where forces may have several scales
 
 
 class TestCorrection(NamedTuple):
@@ -34,45 +38,83 @@ class TestCorrection(NamedTuple):
 def corrections(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """Each correction with its likeliest parameter.
 
-    What leaves scatter of the states is not looked for where they scatter as they should.
     Arguments: `states` as they are read; `base` how they fit.
     """
-    yield _drifting(seen, states, base)
-    scattered = base.noise > AS_STATED * seen.noise or not np.isfinite(seen.noise)
-    scattered = scattered and base.misfit > SCATTER
+    yield _moving("drift", "frequency", states, base, seen.order - 0.5)
+    yield from _of_files(seen, states, base)
     gains = base.posterior.level_errors[:, 0]
-    if states.n_levels > 1 and (scattered or np.ptp(gains) > GAIN_MATTERS):
-        yield _of_other_gains(states)
-    if scattered:
-        yield from _clipped(states)
-        yield from _unsettled(seen, states, base)
-        yield from _noisy_force(seen, states)
+    if states.n_levels > 1 and (base.misfit > SCATTER or np.ptp(gains) > GAIN_MATTERS):
+        yield _of_other_gains(states, base)
+    yield from _clipped(states, base)
+    yield from _unsettled(seen, states, base)
+    yield from _noisy_force(states, base)
 
 
-def _likeliest(tried: list[tuple[float, TestStates, float]]) -> tuple[float, Judged]:
-    """The likeliest of several values, each with states and a Jacobian."""
-    judged = [(value, judge(states, jacobian)) for value, states, jacobian in tried]
-    return max(judged, key=lambda one: one[1].evidence)
+def _freer(states: TestStates, base: Judged) -> Judged:
+    """The fit of states with more that is unknown: anew, and from the fit without it on."""
+    return likelier((judge(states), judge(states, start=base)))
 
 
-def _clipped(states: TestStates) -> Iterator[TestCorrection]:
+def _moving(
+    kind: Kind, name: str, states: TestStates, base: Judged, along: np.ndarray
+) -> TestCorrection:
+    """A natural frequency that changes in proportion to something, by `value` (relative)."""
+    judged = _freer(states._replace(trend=along, trend_std=MOVES), base)
+    return TestCorrection(kind, name, judged, 0.5 * judged.posterior.trend[0])
+
+
+def _of_files(seen: CheckedStates, states: TestStates, base: Judged) -> Iterator[TestCorrection]:
+    """A file whose structure has natural frequencies of its own."""
+    for k, levels in enumerate(seen.files):
+        if k == 0 and len(seen.files) == 2:
+            continue  # it differs from the second as the second from it
+        own = np.isin(states.level, levels)
+        name = f"file {k + 1}"
+        yield _moving("different_structures", name, states, base, own - float(np.mean(own)))
+
+
+class Tried(NamedTuple):
+    """One value of a correction's parameter."""
+
+    value: float
+    states: TestStates
+    log_jacobian: float = 0.0
+
+
+def likeliest(base: Judged, tried: Sequence[Tried]) -> tuple[float, Judged]:
+    """The likeliest of several values, alike likely before, from what is nearest to the table as
+    it is on.
+
+    Each fit goes on from the last; where one is clearly less likely, so are those beyond.
+    """
+    value, best, last = np.nan, None, base
+    for one in tried:
+        last = judge(one.states, one.log_jacobian - np.log(len(tried)), start=last)
+        if best is None or last.evidence > best.evidence:
+            value, best = one.value, last
+        if last.evidence < max(best.evidence, base.evidence) - CLEARLY:
+            break
+    return value, best or base
+
+
+def _clipped(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """The response or the force cut off at a limit."""
+    size, force = np.abs(states.velocity), states.force
+    value, judged = likeliest(base, [_unclipped_response(states, x) for x in _LIMITS])
+    yield TestCorrection("clipped_channel", "velocity", judged, value * float(size.max()))
+    value, judged = likeliest(
+        base,
+        [Tried(x, states._replace(force=unclipped(force, x * force.max())[0])) for x in _LIMITS],
+    )
+    yield TestCorrection("clipped_channel", "force", judged, value * float(force.max()))
+
+
+def _unclipped_response(states: TestStates, limit: float) -> Tried:
     size = np.abs(states.velocity)
-    tried = []
-    for limit in _LIMITS:
-        true, stretch = unclipped(size, limit * size.max())
-        errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
-        moved = states._replace(velocity=states.velocity * true / size, errors=errors)
-        tried.append((limit * float(size.max()), moved, float(np.sum(np.log(stretch)))))
-    value, judged = _likeliest(tried)
-    yield TestCorrection("clipped_channel", "velocity", judged, value)
-    force = states.force
-    tried = [
-        (x * float(force.max()), states._replace(force=unclipped(force, x * force.max())[0]), 0.0)
-        for x in _LIMITS
-    ]
-    value, judged = _likeliest(tried)
-    yield TestCorrection("clipped_channel", "force", judged, value)
+    true, stretch = unclipped(size, limit * size.max())
+    errors = states.errors * np.column_stack([np.ones_like(size), stretch, np.ones_like(size)])
+    moved = states._replace(velocity=states.velocity * true / size, errors=errors)
+    return Tried(limit, moved, float(np.sum(np.log(stretch))))
 
 
 def unclipped(
@@ -119,32 +161,12 @@ def _unsettled(seen: CheckedStates, states: TestStates, base: Judged) -> Iterato
         stretch = np.abs(states.velocity / (true * (1 - left)))
         errors = states.errors * np.column_stack([np.ones_like(stretch), stretch, stretch])
         moved = states._replace(velocity=true, errors=errors)
-        tried.append((share, moved, 2 * float(np.sum(np.log(stretch)))))
-    value, judged = _likeliest(tried)
+        tried.append(Tried(share, moved, 2 * float(np.sum(np.log(stretch)))))
+    value, judged = likeliest(base, tried)
     yield TestCorrection("unsettled_steps", "turning", judged, value)
 
 
-def _drifting(seen: CheckedStates, states: TestStates, base: Judged) -> TestCorrection:
-    """A natural frequency that changes along the test.
-
-    Frequencies are divided by e^ν(order − ½): then K, Ω² and Ωδ are all those of the middle.
-    """
-    place = seen.order - 0.5
-    width = min(float(np.median(np.abs(base.damping) / states.frequency)), _WIDEST)
-
-    def moved(change: float) -> TestStates:
-        factor = np.exp(change * place)
-        return states._replace(
-            frequency=states.frequency / factor,
-            velocity=states.velocity / factor,
-            force=states.force / factor**2,
-        )
-
-    top = climbed(lambda change: judge(moved(change)), 0.0, _TREND * width, base)
-    return TestCorrection("drift", "frequency", top.judged, top.value)
-
-
-def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[TestCorrection]:
+def _noisy_force(states: TestStates, base: Judged) -> Iterator[TestCorrection]:
     """A force that falls at resonance into its cell's noise, which is of one size in newtons."""
     if deepest_fall(states) < FORCE_FALLS:
         return
@@ -153,22 +175,14 @@ def _noisy_force(seen: CheckedStates, states: TestStates) -> Iterator[TestCorrec
     for ratio in _FLOORS:
         floor = ratio * least / states.force
         errors = np.hypot(states.errors, np.stack([floor, 0 * floor, floor], axis=1))
-        tried.append((ratio, states._replace(errors=errors), 0.0))
-    ratio, judged = _likeliest(tried)
+        tried.append(Tried(ratio, states._replace(errors=errors)))
+    ratio, judged = likeliest(base, tried)
     yield TestCorrection("force_dropout", "floor", judged, ratio * least * judged.noise)
 
 
-def _of_other_gains(states: TestStates) -> TestCorrection:
+def _of_other_gains(states: TestStates, base: Judged) -> TestCorrection:
     """A scale of its own for the force of each level."""
-    gains = np.zeros(states.n_levels)
-    std = (_WIDE_GAIN, *states.level_std[1:])
-    now = states
-    for _ in range(2):
-        free = now._replace(force_is_free=True, level_std=std)
-        step = judge(free).posterior.level_errors[:, 0]
-        gains = gains + step
-        now = states._replace(force=states.force * np.exp(-gains[states.level]))
-    each = np.log(_WIDE_GAIN * np.sqrt(2 * np.pi) / 0.005)  # a gain found to 0.5 %
-    judged = judge(now)
-    judged = judged._replace(evidence=judged.evidence - each * states.n_levels)
+    std = (OTHER_GAIN, *states.level_std[1:])
+    judged = _freer(states._replace(force_is_free=True, level_std=std), base)
+    gains = judged.posterior.level_errors[:, 0]
     return TestCorrection("volts_as_force", "gain_of_level", judged, gains=tuple(gains.tolist()))

@@ -5,7 +5,6 @@ import numpy as np
 
 from snrmjax.doctor.checked_states import checked_states, leading_sensor, usable_rows
 from snrmjax.doctor.findings import Finding
-from snrmjax.doctor.judgement import judge
 from snrmjax.doctor.priors import BAND, FAR_DAMPING, FAR_FREQUENCY, FEWEST_STATES
 from snrmjax.doctor.readings import best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings
@@ -46,9 +45,8 @@ def doubt(
         if wrong_phases(data, model):
             return ()
         return (_sentence(misread(recorded.judged, best, "")),)
-    as_modelled = best.judged if best.mass == 1.0 else judge(best.states, best.log_jacobian)
-    scale = best.best_scale()
-    if is_other_scale(scale, as_modelled):
+    scale, as_modelled = best.scale, best.as_modelled
+    if scale is not None and as_modelled is not None and is_other_scale(scale, as_modelled):
         found = scale_findings(scale, as_modelled, model, data.sensors[sensor])
         errors = [one for one in found if one.severity == "error"]
         if errors:

@@ -5,7 +5,7 @@ import numpy as np
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent, rows_in_words
 from snrmjax.doctor.judgement import Judged
-from snrmjax.doctor.priors import CERTAIN, FORCE_FALLS, FORCE_HARMONIC, HELD, PER_STATE, TOGETHER
+from snrmjax.doctor.priors import CERTAIN, CLEARLY, FORCE_FALLS, FORCE_HARMONIC, HELD, TOGETHER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
@@ -96,7 +96,7 @@ def harmonic_findings(
         if good.sum() < 8:
             continue
         ratio, error, gain = _of_force(seen, fit, model, h, std, order, good)
-        if ratio > max(FORCE_HARMONIC, CERTAIN * error) and gain > PER_STATE * good.sum():
+        if ratio > max(FORCE_HARMONIC, CERTAIN * error) and gain > CLEARLY:
             found.append(f"{100 * ratio:.3g} ± {100 * error:.1g} % of order {order}")
     if not found:
         return []

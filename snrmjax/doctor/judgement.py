@@ -4,21 +4,25 @@ Every hypothesis is fitted by the one model of a test (`identify.test_model`): i
 density of what was recorded, however it is read, so that hypotheses compare directly.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.doctor.priors import CLEARLY, FITS_WELL, PER_STATE, SCATTER
+from snrmjax.doctor.priors import ANY_MASS, CLEARLY, FITS_WELL, NO_MODE, SCATTER
+from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
+from snrmjax.identify.test_model.priors import LEAST_SHARE
 from snrmjax.identify.test_model.states import TestStates
 
-_ROUNDS, _FINE = 4, 12  # of a fit: for most; for what is to be said
-_STEP, _WIDER = 0.18, 1.8  # of a search for ln κ: its first step and by what it grows
-_SEARCHED = 8  # fits of that search, at most
-_GUESSED = 1e3  # 1σ of κ where nothing is known of it
-_SIGN = 4.0  # 1σ from which on its sign is known
+_ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
+_KNOTS = 24  # of its curves, at most
+_NEARLY = 1.0  # relative, of amplitudes for which fits may go on from one another
+_STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
+_SEARCHED = 3  # fits of a modal mass from one start, at most
+_MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
+_GUESSED = 1e3  # its 1σ in the first of them
 
 
 class Judged(NamedTuple):
@@ -30,11 +34,11 @@ class Judged(NamedTuple):
 
     @property
     def misfit(self) -> float:
-        """Relative error of independent states that have the same density, curves and levels paid.
+        """Relative error of independent states as likely as these, curves and levels paid.
 
         n states with an error σ of amplitude and phase have ln p = −n(2 ln σ + ln 2π + 1).
         """
-        each = self.evidence / len(self.states.level)
+        each = self.posterior.log_evidence / len(self.states.level)
         return float(np.exp(min(-0.5 * (each + np.log(2 * np.pi) + 1), 99.0)))
 
     @property
@@ -68,20 +72,68 @@ class Judged(NamedTuple):
             return -np.inf
         return self.evidence - recorded.evidence if recorded.damped else np.inf
 
-    def beats(self, recorded: "Judged") -> bool:
+    def leaves_less(self, recorded: "Judged") -> bool:
+        """Whether one mode misses states by less, once they are read so.
+
+        Where an error is steep in what was recorded, stretched errors alone may be likelier.
+        """
+        return self.misfit < recorded.misfit or not recorded.damped
+
+    def is_likelier(self, other: "Judged") -> bool:
+        """Whether it is the likelier of two that explain a table, and fits in itself."""
+        here, there = (one._from(one) for one in (self, other))
+        return self.fits and here.leaves_less(there) and here.gain(there) > 0
+
+    def beats(self, recorded: "Judged", *, beside: bool = True) -> bool:
         """Whether it fits in itself, and the table as recorded clearly less.
 
-        Much less where it leaves more than instruments do: then curves are not what it takes.
+        Odds count by the share of states that tell something of their own: where neighbours still
+        miss the curves alike, what was undone is not what is wrong.
         """
-        return self._clearly_above(recorded) and self._finer()._clearly_above(recorded._finer())
+        return self.fits and self.explains(recorded, beside=beside)
 
-    def _clearly_above(self, recorded: "Judged") -> bool:
-        each = PER_STATE if self.misfit < SCATTER else 4 * PER_STATE
-        return self.fits and self.gain(recorded) > max(CLEARLY, each * len(self.states.level))
+    def explains(self, recorded: "Judged", *, beside: bool = True) -> bool:
+        """Whether the table as recorded is clearly less likely, and misses its states by more.
 
-    def _finer(self) -> "Judged":
-        """Fitted with as many rounds as the steepest curves need."""
-        return judge(self.states, self.evidence - self.posterior.log_evidence, _FINE)
+        Also with what one mode leaves off resonance `beside` it: then nothing else need be wrong.
+        And each also from where the other has curves and levels: of two fits that might both go
+        there none is less likely for having stopped on the way.
+        """
+
+        def clearly(here: "Judged", there: "Judged") -> bool:
+            return here.leaves_less(there) and here.share * here.gain(there) > CLEARLY
+
+        if not clearly(self, recorded):
+            return False
+        here, there = self._from(self), recorded._from(recorded)
+        there = there._from(here)
+        here = here._from(there)
+        if beside:
+            here, there = (one._from(None, discrepancy=True) for one in (here, there))
+        return clearly(here, there)
+
+    @property
+    def share(self) -> float:
+        """Of independent states."""
+        left = self.posterior.residuals
+        return max(share_told_by(left, self.states.level, self.states.frequency), LEAST_SHARE)
+
+    def _from(self, start: "Judged | None", *, discrepancy: bool = False) -> "Judged":
+        """The likelier of this fit and one with as many rounds as the steepest curves need, from
+        another of nearly these amplitudes on.
+        """
+        if start is not None and start is not self:
+            own, other = self.states.amplitude, start.states.amplitude
+            if not (start.damped and np.allclose(own, other, rtol=_NEARLY)):
+                return self
+        jacobian = self.evidence - self.posterior.log_evidence
+        fit = judge(self.states, jacobian, _FINE, start, discrepancy=discrepancy)
+        return likelier((self, fit))
+
+
+def likelier(fits: Iterable[Judged]) -> Judged:
+    """The likeliest of fits, those before all that lose energy."""
+    return max(fits, key=lambda one: (one.damped, one.evidence))
 
 
 class Scale(NamedTuple):
@@ -92,16 +144,31 @@ class Scale(NamedTuple):
     std: float  # of its logarithm
 
 
-def judge(states: TestStates, log_jacobian: float = 0.0, rounds: int = _ROUNDS) -> Judged:
-    """Fit states with the modal mass held.
+def judge(
+    states: TestStates,
+    log_jacobian: float = 0.0,
+    rounds: int = _ROUNDS,
+    start: Judged | None = None,
+    *,
+    discrepancy: bool = False,
+) -> Judged:
+    """Fit states by the model of a test.
 
     Arguments: `log_jacobian` of the recorded to these phasors, both as logarithms;
-    `rounds` of the fit.
+    `rounds` of the fit, which go on from `start` where that is of nearly these states;
+    with `discrepancy` beside what one mode leaves off resonance.
     """
-    held = states._replace(mass_std=0.0)
     for fewer in (rounds, 2, 1):
         try:
-            posterior = fit_test(held, rounds=fewer)
+            posterior = fit_test(
+                states,
+                rounds=fewer,
+                most_knots=_KNOTS,
+                levels_apart=states.n_levels > 1,
+                compare_levels=False,
+                discrepancy=discrepancy,
+                start=None if start is None else start.posterior,
+            )
             break
         except np.linalg.LinAlgError:  # of phasors that are no mode's
             if fewer == 1:
@@ -109,80 +176,35 @@ def judge(states: TestStates, log_jacobian: float = 0.0, rounds: int = _ROUNDS) 
     return Judged(states, posterior, posterior.log_evidence + log_jacobian)
 
 
-def guessed_mass(states: TestStates) -> float:
-    """κ of a quick fit that leaves it free: its sign and size, where curves are not steep.
+def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False) -> Scale:
+    """The fit with the likeliest modal mass, whatever the model's is.
 
-    NaN where that fit does not tell its sign.
+    From where a first fit that knows nothing of it puts it; or where its best fit leaves more than
+    instruments do, and so was no good guide, from other orders of magnitude (`far`).
     """
-    scale = 1.0
-    for _ in range(4):
-        found = fit_test(states._replace(mass_std=_GUESSED), rounds=3)
-        mass, std = found.modal_mass
-        step = max(abs(mass), 1e-3 * std, 1e-12)
-        states, scale = with_mass(states, step), scale * step
-        if abs(np.log(step)) < 1.0:
-            return float(np.copysign(scale, mass)) if abs(mass) > _SIGN * std else np.nan
-    return np.nan
+    first = judge(states._replace(mass_std=_GUESSED), log_jacobian)
+    mass, std = first.posterior.modal_mass
+    found = _about(states, max(abs(mass), 1e-3 * std, 1e-12), log_jacobian)
+    if not (far and SCATTER < found.judged.misfit < NO_MODE):
+        return found
+    tried = [found, *(_about(states, one, log_jacobian, 1) for one in _MAGNITUDES)]
+    best = max(tried, key=lambda one: one.judged.evidence)
+    return best if best is found else _about(states, best.mass, log_jacobian)
+
+
+def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _SEARCHED) -> Scale:
+    """The likeliest modal mass from some on: forces are divided by it until it stays."""
+    mass, std = start, np.inf
+    for _ in range(steps):
+        scale = mass
+        judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
+        step, std = judged.posterior.modal_mass
+        mass = scale * max(step, 1 / _GUESSED)
+        if abs(np.log(mass / scale)) < _STAYS:
+            break
+    return Scale(judged, mass, std / step if step > 0 else np.inf)
 
 
 def with_mass(states: TestStates, mass: float) -> TestStates:
     """Forces divided by κ."""
     return states._replace(force=states.force / mass)
-
-
-def best_scale(states: TestStates, start: float, first: Judged, log_jacobian: float) -> Scale:
-    """The modal mass of the largest evidence, from `start` on, where the fit is `first`."""
-    top = climbed(
-        lambda x: judge(with_mass(states, float(np.exp(x))), log_jacobian),
-        *(float(np.log(start)), _STEP, first),
-    )
-    mass, std = float(np.exp(top.value)), top.std
-    # Where a free fit stays here it is finer than the parabola's steps.
-    free, free_std = fit_test(
-        top.judged.states._replace(mass_std=_GUESSED), rounds=_ROUNDS
-    ).modal_mass
-    if abs(free - 1) < _STEP and free_std < std:
-        mass, std = mass * free, free_std
-    return Scale(top.judged, mass, std)
-
-
-class Top(NamedTuple):
-    """The most likely value of one parameter."""
-
-    value: float
-    std: float  # of a parabola through its neighbours
-    judged: Judged
-
-
-def climbed(fit: Callable[[float], Judged], start: float, step: float, first: Judged) -> Top:
-    """The value of the largest evidence uphill from `start`, where the fit is `first`."""
-    known = {start: first}
-
-    def loss(x: float) -> float:
-        if x not in known:
-            known[x] = fit(x)
-        return -known[x].evidence
-
-    at = [start - step, start, start + step]
-    for _ in range(_SEARCHED - 2):
-        values = [loss(one) for one in at]
-        if values[1] <= min(values):
-            break
-        if values[0] < values[2]:
-            at = [at[0] - _WIDER * (at[1] - at[0]), at[0], at[1]]
-        else:
-            at = [at[1], at[2], at[2] + _WIDER * (at[2] - at[1])]
-    while True:
-        values = [loss(one) for one in at]
-        left, right = ((values[1] - values[k]) / (at[1] - at[k]) for k in (0, 2))
-        curvature = 2 * (right - left) / (at[2] - at[0])
-        lowest = 0.5 * (at[0] + at[1]) - left / curvature if curvature > 0 else at[1]
-        near = abs(lowest - at[1]) < 0.1 * step
-        if len(known) >= _SEARCHED or near or not at[0] < lowest < at[2]:
-            break
-        best = min((lowest, at[1]), key=loss)
-        below = max(one for one in known if one < best)
-        above = min(one for one in known if one > best)
-        at = [below, best, above]
-    std = float(1 / np.sqrt(curvature)) if curvature > 0 else np.inf
-    return Top(at[1], std, known[at[1]])

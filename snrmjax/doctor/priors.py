@@ -11,30 +11,33 @@ of measured beams, and twelve states pay for their curves with as much."""
 SCATTER = 0.012
 """Relative error of a state that needs no error of the test: analysers and levels leave it."""
 
-PER_STATE = 0.35
-"""ln of the density of one state, by which a hypothesis must beat the table as recorded.
-
-Errors smaller by a sixth; four times that, half the errors, where it leaves more than `SCATTER`:
-what a single mode leaves of real structures moves by less."""
+NO_MODE = 0.3
+"""Misfit beyond which nothing that is small can have gone wrong, and phases are no mode's."""
 
 CLEARLY = 12.0
-"""ln of the odds, before priors, of what is said: e¹², after twenty hypotheses that are each true
-in one table of a hundred, leaves one wrong answer in about a hundred."""
-
-AS_STATED = 1.15
-"""Noise over the stated one, up to which nothing is left to explain: ten states tell no more."""
+"""ln of the odds, before priors, of what is said: some twenty hypotheses, true in one table of a
+hundred together, leave one wrong answer in a hundred from 20 · 10⁴ on."""
 
 FEWEST_STATES = 8
 """Of a table that is looked at: fewer say nothing of curves of their own."""
 
+MODAL_MASS = 0.05
+"""1σ of the modal mass over a linear test's: shapes and calibrations are good to some per cent.
+
+States tell a modal mass where they do so better; within it a factor is √2 or a unit's."""
+
+ANY_MASS = 1.0
+"""1σ of a modal mass of which nothing is known, over where the states have it."""
+
+MOVES = 0.1
+"""1σ of what a stiffness changes along a test or from a structure to another: 5 % of frequency, as
+joints run in, masses are added or a room warms up."""
+
+OTHER_GAIN = 0.4
+"""1σ of the force's gain of a level on another range, or in volts."""
+
 OTHER_SCALE = 0.125
 """|ln κ| from which on a modal mass is no linear test's: 2.5 times its 5 %."""
-
-MASS_TOLD = 0.05
-"""1σ of ln κ, at most, with which states say it."""
-
-SAME_FACTOR = 0.05
-"""|ln| within which a factor is √2, a unit's or Ω: 1σ of a linear test's modal mass."""
 
 MOVED_MATTERS = 0.25
 """Change of a natural frequency over its bandwidth, from which on it bends curves."""
@@ -50,9 +53,6 @@ HELD = 0.05
 
 TOGETHER = 0.6
 """Correlation of the logarithms of force, mobility and response where one makes the other."""
-
-WILD = 0.5
-"""Mean resultant of steps of phase at random, and the step of ln mobility of smooth ones."""
 
 FAR_FREQUENCY, FAR_DAMPING = 0.05, 3.0
 """Of the lowest level from the linear mode, relative and as a ratio: beyond any drift."""

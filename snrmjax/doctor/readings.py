@@ -8,12 +8,12 @@ from jaxtyping import Complex, Float
 
 from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import Finding, Kind, Repair, percent
-from snrmjax.doctor.judgement import Judged, Scale, best_scale, guessed_mass, judge, with_mass
-from snrmjax.doctor.priors import OTHER_SCALE, SCATTER, WILD
+from snrmjax.doctor.judgement import Judged, Scale, any_mass, judge
+from snrmjax.doctor.priors import CLEARLY, MODAL_MASS, OTHER_SCALE, SCATTER
 from snrmjax.identify.test_model.states import TestStates
 
 _DEGREES = 180 / np.pi
-_LATTICE_TURNS = 4
+_LATTICES, _LATTICE_TURNS = 2, 8  # that go on, and how long at most
 
 Phasors = Complex[np.ndarray, " state"]
 
@@ -51,6 +51,9 @@ CONJUGATED_OPPOSITE = Meaning(
     "negate `velocity_re_m_s`; or import again with the other phase sign, and turn the sensor's.",
 )
 OTHERS = (
+    OPPOSITE,
+    CONJUGATED,
+    CONJUGATED_OPPOSITE,
     Meaning(
         lambda v, w: v / (1j * w),
         "acceleration_as_velocity",
@@ -103,18 +106,34 @@ class Reading(NamedTuple):
     """A table as it may be meant."""
 
     meaning: Meaning
-    states: TestStates
-    judged: Judged
-    mass: float  # κ with which it fits: 1 where the model's does
+    as_modelled: Judged | None  # with the model's modal mass, where there is a model
+    scale: Scale | None  # with any, where that was looked at
 
     @property
-    def log_jacobian(self) -> float:
-        """Of all states."""
-        return len(self.states.level) * self.meaning.log_jacobian
+    def rescaled(self) -> bool:
+        """Whether another modal mass than the model's is clearly likelier."""
+        if self.as_modelled is None or self.scale is None:
+            return self.as_modelled is None
+        return self.scale.judged.gain(self.as_modelled) > CLEARLY
 
-    def best_scale(self) -> Scale:
-        """The likeliest modal mass about the one that fits."""
-        return best_scale(self.states, self.mass, self.judged, self.log_jacobian)
+    @property
+    def judged(self) -> Judged:
+        """The likelier fit."""
+        found = self.scale.judged if self.rescaled and self.scale else self.as_modelled
+        if found is None:
+            raise ValueError("a reading that was not judged has no fit.")
+        return found
+
+    def of_any_mass(self, *, far: bool = False) -> "Reading":
+        """With its likeliest modal mass, too, also `far` from the model's."""
+        if self.scale is not None or self.as_modelled is None:
+            return self
+        return self._replace(scale=any_mass(self.as_modelled.states, _jacobian(self), far=far))
+
+
+def _jacobian(one: Reading) -> float:
+    """Of all states."""
+    return one.judged.evidence - one.judged.posterior.log_evidence
 
 
 def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Reading]:
@@ -123,30 +142,65 @@ def best_reading(seen: CheckedStates, known_mass: bool) -> tuple[Reading, Readin
     Arguments: `known_mass` says whether a model states the modal mass: it is tried first, another
     scale where that does not fit.
     """
-    mass = guessed_mass(seen.test)
-    recorded = _read(seen, AS_RECORDED, known_mass, mass)
+    recorded = _judged(AS_RECORDED, seen.test, known_mass)
+    near = seen.noise if np.isfinite(seen.noise) else 0.0
+    enough = max(SCATTER, 3 * near)
+    recorded = _rescaled(recorded, enough)
     sized = _of_sizes(seen, recorded) if known_mass else None
     if sized is not None:
         return recorded, sized
-    near = seen.noise if np.isfinite(seen.noise) else 0.0
-    if recorded.judged.damped and recorded.judged.misfit < max(SCATTER, 3 * near):
-        return recorded, recorded
-    turned = (CONJUGATED, OPPOSITE, CONJUGATED_OPPOSITE)
-    tried = [recorded, *(_read(seen, one, known_mass, mass) for one in turned)]
-    tried += [_read(seen, one, known_mass, None) for one in OTHERS]
-    if not any(one.judged.fits for one in tried):
-        lattice = _in_degrees(seen, known_mass)
-        tried += [] if lattice is None else [lattice]
+    # Conjugates of a held response pass for curves as steep as their noise asks for.
+    well = recorded.judged.damped and recorded.judged.misfit < enough
+    others = (CONJUGATED,) if well else OTHERS
+    meant = [(one, seen.read(one.change(seen.recorded, seen.test.frequency))) for one in others]
+    # A motion that mostly gains energy from its force has no odds.
+    tried = [
+        _judged(one, states, known_mass) for one, states in meant if _possible(seen, one, states)
+    ]
+    if not well and not any(one.judged.fits for one in (recorded, *tried)):
+        tried = [one.of_any_mass() for one in tried]
+    if not any(one.judged.fits for one in (recorded, *tried)):
+        tried += _in_degrees(seen, known_mass)
     best = max((one for one in tried if one.judged.damped), key=_evidence, default=recorded)
-    return recorded, best if best.judged.beats(recorded.judged) else recorded
+    if not best.judged.beats(recorded.judged):
+        return recorded, recorded
+    return recorded, _rescaled(best, SCATTER)
+
+
+def _rescaled(one: Reading, enough: float) -> Reading:
+    """With its likeliest modal mass, too, where the model's is not what the states ask for."""
+    first = one.judged
+    content = abs(first.posterior.modal_mass[0] - 1) < MODAL_MASS
+    return one if first.damped and first.misfit < enough and content else one.of_any_mass(far=True)
+
+
+def _possible(seen: CheckedStates, meaning: Meaning, states: TestStates) -> bool:
+    """Whether the force works on the motion in most states, and phases are less than a turn."""
+    turned = np.max(np.abs(np.angle(seen.recorded))) * np.exp(meaning.log_jacobian)
+    whole = meaning.log_jacobian == 0 or turned <= np.pi
+    return bool(whole and np.median(states.velocity.real) > 0)
+
+
+def _judged(
+    meaning: Meaning, states: TestStates, known_mass: bool, start: Reading | None = None
+) -> Reading:
+    jacobian = len(states.level) * meaning.log_jacobian
+    if known_mass:
+        begin = None if start is None else start.as_modelled
+        return Reading(meaning, judge(states, jacobian, start=begin), None)
+    return Reading(meaning, None, any_mass(states, jacobian))
 
 
 def _of_sizes(seen: CheckedStates, recorded: Reading) -> Reading | None:
     """Amplitudes of another quantity with phases of velocities, where these make κ off by Ω."""
+    if recorded.scale is None or not recorded.rescaled:
+        return None
     log_omega = float(np.log(np.median(seen.test.frequency)))
     for meaning, off in zip(OF_SIZES, (-log_omega, log_omega), strict=True):
-        if abs(off) > 1.0 and abs(np.log(recorded.mass) - off) < OTHER_SCALE:
-            found = _read(seen, meaning, True, 1.0)
+        if abs(off) > 1.0 and abs(np.log(recorded.scale.mass) - off) < OTHER_SCALE:
+            found = _judged(
+                meaning, seen.read(meaning.change(seen.recorded, seen.test.frequency)), True
+            )
             return found if found.judged.fits else None
     return None
 
@@ -172,85 +226,56 @@ def misread(recorded: Judged, best: Reading, where: str) -> Finding:
     )
 
 
-def _read(seen: CheckedStates, meaning: Meaning, known_mass: bool, mass: float | None) -> Reading:
-    states = seen.read(meaning.change(seen.recorded, seen.test.frequency))
-    return _fitted(meaning, states, known_mass, mass)
-
-
-def _fitted(
-    meaning: Meaning, states: TestStates, known_mass: bool, mass: float | None = None
-) -> Reading:
-    """With the model's modal mass, or with the guessed one where that has more evidence."""
-    jacobian = len(states.level) * meaning.log_jacobian
-    first = Reading(meaning, states, judge(states, jacobian), 1.0) if known_mass else None
-    if first is not None and meaning is not AS_RECORDED and first.judged.fits:
-        return first
-    mass = guessed_mass(states) if mass is None else mass
-    size = abs(mass) if np.isfinite(mass) else 1.0
-    if first is not None and abs(np.log(size)) < OTHER_SCALE:
-        return first
-    other = Reading(meaning, states, judge(with_mass(states, size), jacobian), size)
-    if first is None or (other.judged.damped and other.judged.gain(first.judged) > 0):
-        return other
-    return first
-
-
-def _in_degrees(seen: CheckedStates, known_mass: bool) -> Reading | None:
+def _in_degrees(seen: CheckedStates, known_mass: bool) -> list[Reading]:
     """Phases in degrees that were read as radians: wrapped dozens of times, 6.3° apart.
 
-    A mode's amplitudes say where each phase lies to some degrees; the wrapped one says it exactly.
+    A mode's amplitudes say to some degrees how far from resonance each state is, the wrapped phase
+    says it exactly; which states lie below their resonance is tried.
     """
-    recorded = np.angle(seen.recorded)
-    guess = _phases_of_amplitudes(seen)
-    if guess is None:
-        return None
+    recorded, size = np.angle(seen.recorded) / _DEGREES, np.abs(seen.recorded)
     spacing = 2 * np.pi / _DEGREES
-    found = None
-    for _ in range(_LATTICE_TURNS):
-        nearest = np.round((guess - recorded / _DEGREES) / spacing)
-        phase = recorded / _DEGREES + spacing * nearest
-        states = seen.read(np.abs(seen.recorded) * np.exp(1j * phase))
-        if found is not None and np.allclose(states.velocity, found.states.velocity):
-            break
-        found = _fitted(IN_DEGREES, states, known_mass)
-        # The phase that the curves have at this amplitude and frequency.
-        omega, judged = states.frequency, found.judged
-        stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
-        guess = np.pi / 2 - np.angle(stiffness)
-    return found
+
+    def nearest(guess: np.ndarray, start: Reading | None) -> Reading:
+        phase = recorded + spacing * np.round((guess - recorded) / spacing)
+        states = seen.read(size * np.exp(1j * phase))
+        return _judged(IN_DEGREES, states, known_mass, start)
+
+    tried = [nearest(guess, None) for guess in _phases_of_amplitudes(seen)]
+    tried = sorted(tried, key=_evidence)[-_LATTICES:]
+    for k, found in enumerate(tried):
+        for _ in range(_LATTICE_TURNS):
+            # The phase that the curves have at these amplitudes and frequencies.
+            judged = found.judged
+            omega = judged.states.frequency
+            stiffness = judged.stiffness - omega**2 + 1j * omega * judged.damping
+            again = nearest(0.5 * np.pi - np.angle(stiffness), found)
+            if _evidence(again) <= _evidence(found):
+                break
+            tried[k] = found = again
+    return tried
 
 
-def _phases_of_amplitudes(seen: CheckedStates) -> Float[np.ndarray, " state"] | None:
-    """Phases by cos φ in proportion to |V|/F, positive below each level's largest."""
+def _phases_of_amplitudes(seen: CheckedStates) -> list[Float[np.ndarray, " state"]]:
+    """Phases by cos φ in proportion to |V|/F, with what may tell their sign.
+
+    Below each level's largest they are positive; where a resonance moves by many bandwidths all of
+    a sweep lies on one side, or on both by turns: then below the others of its amplitude.
+    """
     states, mobility = seen.test, seen.mobility
-    phase = np.zeros(len(mobility))
+    size, top, turns = np.zeros(len(mobility)), np.zeros(len(mobility)), np.zeros(len(mobility))
     for k in range(states.n_levels):
         mine = np.flatnonzero(states.level == k)
         if len(mine) < 3:
-            return None
-        top = mine[np.argmax(mobility[mine])]
-        cosine = np.minimum(mobility[mine] / (1.02 * mobility[top]), 1.0)
-        side = np.sign(states.frequency[top] - states.frequency[mine])
-        phase[mine] = side * np.arccos(cosine)
-    return phase
-
-
-def wild_phases(seen: CheckedStates) -> Finding | None:
-    """Phases that jump at random from state to state where the amplitudes are smooth."""
-    states = seen.test
-    turns, steps = [np.zeros(0)], [np.zeros(0)]
-    for k in range(states.n_levels):
-        mine = np.flatnonzero(states.level == k)
-        mine = mine[np.argsort(states.frequency[mine])]
-        turns.append(np.exp(1j * np.diff(np.angle(states.velocity[mine]))))
-        steps.append(np.abs(np.diff(np.log(seen.mobility[mine]))))
-    turn, step = np.concatenate(turns), np.concatenate(steps)
-    if len(turn) < 8 or abs(turn.mean()) > WILD or np.median(step) > WILD:
-        return None
-    return Finding(
-        *("degrees_for_radians", "error", ""),
-        f"phases jump at random from state to state (mean of e^iΔφ {abs(turn.mean()):.2f}) where "
-        "amplitudes are smooth, as phases in degrees do that were read as radians.",
-        IN_DEGREES.mend,
-        repairs=(Repair(phase_unit="deg"),),
-    )
+            return []
+        peak = mine[np.argmax(mobility[mine])]
+        size[mine] = np.arccos(np.minimum(mobility[mine] / (1.02 * mobility[peak]), 1.0))
+        top[mine] = np.sign(states.frequency[peak] - states.frequency[mine])
+        mine = mine[np.argsort(mobility[mine])]
+        omega = states.frequency[mine]
+        beside = np.interp(
+            np.arange(len(mine)) + 0.5,
+            np.arange(len(mine) - 1) + 0.5,
+            0.5 * (omega[1:] + omega[:-1]),
+        )
+        turns[mine] = np.sign(beside - omega)
+    return [top * size, size, -size, turns * size]

@@ -268,12 +268,18 @@ def _unsettled(
 def _dropped(
     force: np.ndarray, x: np.ndarray, steps: list[Step], rate: float, where: str
 ) -> list[Finding]:
-    """Force that falls where the response over it is strongest, in a record of one level."""
+    """Force that falls where the response over it is strongest, and comes back beside it.
+
+    Where it does not come back another level begins, whose force is another.
+    """
     if len(steps) < 5:
         return []
     f, v = (np.array([np.std(c[_middle(one)]) for one in steps]) * 2**0.5 for c in (force, x))
     drop, nominal = fall(f, v / f)
-    if drop < FORCE_FALLS or np.ptp(np.log(v)) < 0.25:
+    least = int(np.argmin(f))
+    beside = min(f[:least].max(initial=0.0), f[least + 1 :].max(initial=0.0))
+    back = beside > nominal * (1 - 0.5 * drop)
+    if drop < FORCE_FALLS or not back or np.ptp(np.log(v)) < 0.25:
         return []
     return [
         Finding(

@@ -5,16 +5,20 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.doctor.findings import Finding, Repair, Severity, percent
-from snrmjax.doctor.judgement import Judged, Scale
-from snrmjax.doctor.priors import CERTAIN, MASS_TOLD, MORE_DAMPING, OTHER_SCALE, SAME_FACTOR
+from snrmjax.doctor.judgement import Judged, Scale, judge
+from snrmjax.doctor.priors import BAND, CERTAIN, MODAL_MASS, MORE_DAMPING, OTHER_SCALE
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
 
 
 def is_other_scale(scale: Scale, as_modelled: Judged) -> bool:
-    """Whether the states tell a modal mass that is no linear test's, better than the model's."""
-    told = scale.std < MASS_TOLD and abs(np.log(scale.mass)) > OTHER_SCALE
-    return told and scale.judged.beats(as_modelled)
+    """Whether states tell a modal mass that is no linear test's, better than the model's own."""
+    if abs(np.log(scale.mass)) < OTHER_SCALE + BAND * scale.std:
+        return False
+    jacobian = as_modelled.evidence - as_modelled.posterior.log_evidence
+    held = judge(as_modelled.states._replace(mass_std=0.0), jacobian)
+    # What a mode leaves off resonance is some per cent of its damping: no other modal mass.
+    return scale.judged.beats(held, beside=False)
 
 
 def scale_findings(
@@ -30,7 +34,7 @@ def scale_findings(
     both = percent(scale.judged.misfit), percent(as_modelled.misfit)
     size = f"{own} (a state is missed by {both[0]} so, with the model's by {both[1]})"
     off = float(np.log(kappa))
-    near = float(np.hypot(SAME_FACTOR, 3 * scale.std))
+    near = float(np.hypot(MODAL_MASS, 3 * scale.std))
     if abs(abs(off) - 0.5 * np.log(2)) < near:
         columns, repair = "velocity columns", Repair(response=2**0.5)
         if off < 0:

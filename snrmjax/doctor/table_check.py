@@ -6,14 +6,12 @@ from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.corrections import TestCorrection, corrections
 from snrmjax.doctor.findings import Finding, Repair, percent, rows_in_words
 from snrmjax.doctor.force_checks import deepest_fall
-from snrmjax.doctor.judgement import Judged, judge, with_mass
-from snrmjax.doctor.priors import CLEARLY, FITS_WELL, GAIN_MATTERS, MOVED_MATTERS
-from snrmjax.doctor.readings import best_reading, misread, wild_phases
+from snrmjax.doctor.judgement import Judged
+from snrmjax.doctor.priors import FITS_WELL, GAIN_MATTERS, MOVED_MATTERS, NO_MODE
+from snrmjax.doctor.readings import OPPOSITE, best_reading, misread
 from snrmjax.doctor.scale_findings import is_other_scale, scale_findings, shaker_damping
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.model.structures import Structure
-
-_NO_MODE = 1.0  # misfit beyond which nothing that is small can have gone wrong
 
 
 def mode_findings(
@@ -23,107 +21,66 @@ def mode_findings(
 
     `drive` says that forces are declared to be volts: then their scale and phase say nothing.
     """
-    known_mass = model is not None and not drive
-    recorded, best = best_reading(seen, known_mass)
+    scaled = model is not None and not drive  # whether the modal mass is known
+    recorded, best = best_reading(seen, scaled)
     found: list[Finding] = []
-    if best is not recorded and not drive:
+    # Without a model nobody said which way the sensor moves for a force.
+    unsigned = model is None and best.meaning is OPPOSITE
+    if best is not recorded and not drive and not unsigned:
         found.append(misread(recorded.judged, best, where))
         if best.meaning.kind == "degrees_for_radians":
             return found, best.judged
-    elif not best.judged.fits and (wild := wild_phases(seen)) is not None and not drive:
-        return [wild._replace(where=where)], best.judged
-    states, base = with_mass(best.states, best.mass), best.judged
-    instead = None
-    if model is not None and not drive:
-        as_modelled = base if best.mass == 1.0 else judge(best.states, best.log_jacobian)
-        scale = best.best_scale()
-        if is_other_scale(scale, as_modelled):
-            # What bends a test may pass for another modal mass, where it explains more.
-            instead = _likeliest(seen, best.states, as_modelled)
-            if instead is None or instead.judged.evidence < scale.judged.evidence:
-                instead = None
-                found += scale_findings(scale, as_modelled, model, where)
-                states, base = scale.judged.states, scale.judged
-        if instead is not None or as_modelled.gain(base) > -CLEARLY:
-            states, base = best.states, as_modelled
+    base, scale, first = best.as_modelled or best.judged, best.scale, None
+    if model is not None and scaled and scale is not None and is_other_scale(scale, base):
+        # Something is wrong; what bends a test may pass for another modal mass.
+        first = _likeliest(seen, base)
+        if first is None or not first.judged.is_likelier(scale.judged):
+            found += scale_findings(scale, base, model, where)
+            base, first = scale.judged, None
+    if first is None:
+        first = _likeliest(seen, base)
+        first = first if first is not None and _told(first, base) else None
     plain = all(one.kind in ("rms_for_peak", "shape_not_mass_normalised") for one in found)
-    apart = _different_structures(seen, states, base, where)
-    if apart is not None:
-        return [*found, apart], base
-    first = instead or _likeliest(seen, states, base)
     if first is not None:
-        found.append(_mended(seen, states, base, first, where))
+        found.append(_mended(seen, base, first, where))
         base = first.judged
     if model is not None and not drive and plain:
         found += shaker_damping(base, model, where)
     return found, base
 
 
-def _likeliest(seen: CheckedStates, states: TestStates, base: Judged) -> TestCorrection | None:
-    """The likeliest of all believed corrections."""
-    if base.misfit > _NO_MODE:
+def _likeliest(seen: CheckedStates, base: Judged) -> TestCorrection | None:
+    """The likeliest correction that matters."""
+    if base.misfit > NO_MODE:
         return None
-    told = [one for one in corrections(seen, states, base) if _believed(one, base, states)]
-    return max(told, key=lambda one: one.judged.evidence, default=None)
-
-
-def _believed(one: TestCorrection, base: Judged, states: TestStates) -> bool:
-    """Whether a correction is likely, and large enough to be spoken of."""
-    judged = one.judged
-    if one.kind == "force_dropout":
-        # Its noise is no misfit, but a force within it is none.
-        told = judged.noise < FITS_WELL and one.value < states.force.min()
-        return told and judged.damped and judged.gain(base) > CLEARLY
-    if one.kind == "drift":
-        width = float(np.median(base.damping / states.frequency))
-        if abs(one.value) < MOVED_MATTERS * width:
-            return False
-    if one.kind == "volts_as_force" and np.ptp(one.gains) < GAIN_MATTERS:
-        return False
-    return judged.beats(base)
-
-
-def _different_structures(
-    seen: CheckedStates, states: TestStates, base: Judged, where: str
-) -> Finding | None:
-    """Files, or levels before and after one, that are likelier of a structure each."""
-    groups = list(seen.files)
-    if len(groups) < 2:
-        return None
-    parts = []
-    for levels in groups:
-        mine = np.isin(states.level, levels)
-        if mine.sum() < 4:
-            return None
-        some = states.some(mine)
-        parts.append(judge(some._replace(level=np.searchsorted(levels, some.level))))
-    gain = sum(one.evidence for one in parts) - base.evidence
-    if gain < CLEARLY or not all(one.fits for one in parts):
-        return None
-    # Where both moved: of no two amplitudes a difference is one of structures.
-    low = max(float(one.states.amplitude.min()) for one in parts)
-    high = min(float(one.states.amplitude.max()) for one in parts)
-    if low > high:
-        return None
-    at = np.array([np.sqrt(low * high)])
-    frequency = np.array([one.posterior.curves(at).squared_frequency[0] for one in parts]) ** 0.5
-    width = float(np.median(base.damping / states.frequency))
-    change = frequency / frequency[0] - 1
-    far = int(np.argmax(np.abs(change)))
-    if not abs(change[far]) > MOVED_MATTERS * width:
-        return None
-    return Finding(
-        *("different_structures", "error", where),
-        f"at equal amplitude the natural frequency of file {far + 1} is {100 * change[far]:.3g} % "
-        f"from file 1's (odds e^{gain:.0f} for structures apart).",
-        "identify them apart: one call and one model for each structure or assembly.",
-        repairs=(Repair(apart=True),),
+    mattering = (
+        one
+        for one in corrections(seen, base.states, base)
+        if _matters(one, base) and one.judged.leaves_less(base)
     )
+    return max(mattering, key=lambda one: one.judged.evidence, default=None)
 
 
-def _mended(
-    seen: CheckedStates, states: TestStates, base: Judged, one: TestCorrection, where: str
-) -> Finding:
+def _told(one: TestCorrection, base: Judged) -> bool:
+    """Whether a correction beats the table as it is read."""
+    if one.kind == "force_dropout":  # the noise of a cell is no misfit
+        return one.judged.noise < FITS_WELL and one.judged.explains(base)
+    return one.judged.beats(base)
+
+
+def _matters(one: TestCorrection, base: Judged) -> bool:
+    """Whether a correction is large enough to be spoken of."""
+    if one.kind in ("drift", "different_structures"):
+        width = float(np.median(one.judged.damping / base.states.frequency))
+        return abs(one.value) > MOVED_MATTERS * width
+    if one.kind == "volts_as_force":
+        return float(np.ptp(one.gains)) > GAIN_MATTERS
+    # A force that lies within the noise of its cell is none.
+    return one.kind != "force_dropout" or one.value < base.states.force.min()
+
+
+def _mended(seen: CheckedStates, base: Judged, one: TestCorrection, where: str) -> Finding:
+    states = base.states
     left = (
         f"; so read a state is missed by {percent(one.judged.misfit)}, not {percent(base.misfit)}."
     )
@@ -134,6 +91,14 @@ def _mended(
             f"{100 * one.value:.3g} %{left}",
             "repeat a level at the end of the test, let the temperature settle, or correct along "
             "`order`.",
+        )
+    if one.kind == "different_structures":
+        return Finding(
+            *("different_structures", "error", where),
+            f"at equal amplitude the natural frequency of {one.name} is {100 * one.value:.3g} % "
+            f"from {'file 1' if len(seen.files) == 2 else 'the others'}'s{left}",
+            "identify them apart: one call and one model for each structure or assembly.",
+            repairs=(Repair(apart=True),),
         )
     if one.kind == "volts_as_force":
         return _of_gains(one, where, left, seen.files)

@@ -1,13 +1,13 @@
 """Evidence of readings on the exact responses of one mode."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from truths.one_mode import model, noisy, states, table
 
 from snrmjax.doctor.checked_states import checked_states
-from snrmjax.doctor.judgement import best_scale, climbed, guessed_mass, judge, with_mass
+from snrmjax.doctor.corrections import Tried, corrections, likeliest
+from snrmjax.doctor.judgement import any_mass, judge, with_mass
+from snrmjax.doctor.priors import MOVES
 
 
 def checked():
@@ -21,6 +21,7 @@ def test_the_misfit_of_right_states_is_their_noise():
     assert judged.noise == pytest.approx(0.003, rel=0.25)  # of 90 numbers, some 20 of them used up
     assert 0.003 < judged.misfit < 0.006
     assert judged.fits
+    assert judged.share > 0.5  # white noise: neighbours of 45 states agree by chance at most so
 
 
 def test_evidence_does_not_depend_on_units():
@@ -37,19 +38,44 @@ def test_conjugated_phasors_do_not_fit_the_models_mass_and_their_conjugates_do()
     assert not wrong.beats(judge(seen.test))
 
 
-def test_a_wrong_scale_is_found_again():
-    states = with_mass(checked().test, 1 / 1.37)
-    assert guessed_mass(states) == pytest.approx(1.37, rel=0.02)
-    scale = best_scale(states, 1.3, judge(with_mass(states, 1.3)), 0.0)
-    assert abs(np.log(scale.mass / 1.37)) < 4 * scale.std  # 4σ: one in 16000 by chance
+@pytest.mark.parametrize("factor", [1.37, 300.0, 0.004])
+def test_a_wrong_scale_is_found_again(factor):
+    scale = any_mass(with_mass(checked().test, 1 / factor))
+    assert abs(np.log(scale.mass / factor)) < 4 * scale.std  # 4σ: one in 16000 by chance
     assert scale.std < 0.01
 
 
-@pytest.mark.parametrize("place", [0.05, -0.4, 1.0])
-def test_the_top_of_a_parabola_is_climbed_exactly(place):
-    def fit(x):
-        return SimpleNamespace(evidence=-0.5 * ((x - place) / 0.02) ** 2)
+def test_a_fit_that_goes_on_finds_what_a_new_one_does():
+    """Forces 3 % larger at one level, from the fit without."""
+    states = checked().test
+    moved = states._replace(force=states.force * np.where(states.level == 1, 1.03, 1.0))
+    again = judge(moved, start=judge(states))
+    anew = judge(moved, rounds=12)
+    assert again.evidence == pytest.approx(anew.evidence, abs=3.0)  # of 12 that decide
+    assert again.noise == pytest.approx(anew.noise, rel=0.07)  # 90 numbers tell it so
 
-    top = climbed(fit, 0.0, 0.1, fit(0.0))
-    assert top.value == pytest.approx(place, abs=0.01)  # a tenth of the step
-    assert top.std == pytest.approx(0.02, rel=1e-6)
+
+def test_a_trend_that_is_nothing_costs_its_prior_and_no_more():
+    """What is freer and begins where the fit without it ended cannot explain less.
+
+    ln of the prior's 1σ over what the states leave of it, some 4, is all that it pays.
+    """
+    seen = checked()
+    base = judge(seen.test)
+    drift = next(iter(corrections(seen, seen.test, base)))
+    assert drift.kind == "drift"
+    _, left = drift.judged.posterior.trend
+    paid = base.evidence - drift.judged.evidence
+    assert paid == pytest.approx(np.log(MOVES / left), abs=2.5)  # a chance of 5 σ²/2 in it
+
+
+def test_values_that_are_tried_share_the_odds():
+    """Of eight values that change nothing each is the table itself, and one in eight."""
+    states = checked().test
+    base = judge(states)
+    fits = [base]
+    for _ in range(8):
+        fits.append(judge(states, start=fits[-1]))
+    _, found = likeliest(base, [Tried(float(k), states) for k in range(8)])
+    best = max(one.evidence for one in fits[1:])
+    assert found.evidence == pytest.approx(best - np.log(8), abs=1e-6)  # the same fits

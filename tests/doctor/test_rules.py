@@ -53,8 +53,17 @@ def test_an_unsure_modal_mass_is_no_wrong_scale():
     seen = checked_states(table(level, w, force, v), model(), 0, np.ones(len(v), dtype=bool))
     right, wrong = judge(seen.test), judge(with_mass(seen.test, 1.5))
     assert is_other_scale(Scale(right, 1.5, 0.01), wrong)
-    assert not is_other_scale(Scale(right, 1.5, 0.1), wrong)
+    assert not is_other_scale(Scale(right, 1.5, 0.2), wrong)  # its 95 % band has 1.01 in it
+    # Volts of 4.5 V/N need not be known to 5 % for it.
+    assert is_other_scale(Scale(right, 4.5, 0.1), wrong)
     assert not is_other_scale(Scale(right, 1.1, 0.01), wrong)
+
+
+def test_a_sensor_against_the_force_is_wrong_only_where_a_model_says_otherwise():
+    level, w, force, v = states()
+    data = table(level, w, force, -noisy(v))
+    assert raised(data) == []
+    assert raised(data, model()) == ["shape_not_mass_normalised"]
 
 
 @pytest.mark.parametrize("off", [1, 2, 3])
@@ -198,3 +207,16 @@ def test_noise_in_short_steps_is_no_transient():
     samples, rate = stepped_record(20, 0.08)
     samples[1] += 0.1 * np.random.default_rng(1).normal(size=samples.shape[1])
     assert raised([], None, [recording(samples, rate)]) == []
+
+
+@pytest.mark.parametrize("levels", [(1.0, 0.35), (0.35, 1.0)])
+def test_another_level_of_less_force_is_no_drop_of_it(levels):
+    """Two sweeps of six steps; the mode loses three times as much at the larger force."""
+    parts = [stepped_record(150, {1.0: 0.03, 0.35: 0.01}[one], frequencies=6) for one in levels]
+    rate = parts[0][1]
+    scale = {1.0: 1.0, 0.35: 0.35 * 3.0}  # |V|/F over the other level's, at resonance
+    samples = [
+        np.stack([force * one, v * one * (scale[one] / one)])
+        for one, ((force, v), _) in zip(levels, parts, strict=True)
+    ]
+    assert raised([], None, [recording(np.concatenate(samples, axis=1), rate)]) == []

@@ -201,7 +201,6 @@ def _relative(fit: LinearModalFit) -> ScaledModes:
         ],
         axis=1,
     )
-    ones = np.ones(fit.n_modes)
     return ScaledModes(
         fit.natural_frequency,
         fit.natural_frequency_std,
@@ -209,7 +208,7 @@ def _relative(fit: LinearModalFit) -> ScaledModes:
         fit.damping_ratio_std,
         shape,
         spread,
-        ones,
+        np.sign(largest),
         np.full(fit.n_modes, np.nan),
         np.full(fit.n_modes, np.nan),
         None,

@@ -18,6 +18,7 @@ from snrmjax.identify.test_model.hyper import (
     MASS,
     OFFSET,
     PHASE,
+    TREND,
     WITH_FREQUENCY,
     Places,
 )
@@ -80,9 +81,12 @@ class Balance(NamedTuple):
         return -0.5 * np.log(own)
 
     def stiffer(self, unknowns: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, " state"]:
-        """Relative deviations of the stiffness, of levels and of states whose own wanders."""
+        """Relative deviations of the stiffness: of levels, along a trend, and of states whose own
+        wanders.
+        """
         of_level = unknowns[self.places.levels][self.states.level][:, 2]
-        return of_level + errors[:, 3] if errors.shape[1] > 3 else of_level
+        shared = of_level + unknowns[TREND] * self.states.trend
+        return shared + errors[:, 3] if errors.shape[1] > 3 else shared
 
     def own_velocity(self, unknowns: np.ndarray) -> Complex[np.ndarray, " state"]:
         """The mode's own velocity as it was recorded, by what the other modes' parameters are."""
@@ -159,6 +163,7 @@ class Balance(NamedTuple):
         design[:, MASS] = (1 + stiffer) * places.reference - omega**2
         design[:, PHASE] = -1j * own
         design[:, OFFSET] = -own * np.min(states.force) / now.force
+        design[:, TREND] = states.trend * now.stiffness
         design[:, WITH_FREQUENCY] = now.with_frequency
         (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
         at_rest, _ = self.basis.values(np.zeros(1))

@@ -32,7 +32,7 @@ ALONG = 14  # functions of phase and amplitude of a discrepancy, for each part
 
 
 # Where the unknowns stand that all states share: the last two are the exponents of frequency.
-MASS, PHASE, OFFSET, WITH_FREQUENCY = 0, 1, 2, slice(3, 5)
+MASS, PHASE, OFFSET, TREND, WITH_FREQUENCY = 0, 1, 2, 3, slice(4, 6)
 
 
 class Hyper(NamedTuple):
@@ -48,8 +48,8 @@ class Hyper(NamedTuple):
 class Places(NamedTuple):
     """Where the unknowns stand, and the squared frequency that stiffness is counted from.
 
-    The modal mass comes first, then the instruments' phase, the offset of the force, and how both
-    curves go with the forcing frequency.
+    The modal mass comes first, then the instruments' phase, the offset of the force, a trend of
+    the stiffness, and how both curves go with the forcing frequency.
     """
 
     stiffness: slice
@@ -98,6 +98,12 @@ def hyper_at(point: np.ndarray, basis: CurveBasis) -> Hyper:
     )
 
 
+def point_of(hyper: Hyper) -> np.ndarray:
+    """The point of these hyperparameters, without a discrepancy."""
+    sizes = np.log([hyper.noise, *hyper.bends, *hyper.level_std])
+    return np.concatenate([sizes, hyper.along])
+
+
 def starting_point(states: TestStates, basis: CurveBasis, discrepancy: bool) -> np.ndarray:
     """The point from which the most likely one is looked for."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
@@ -138,7 +144,10 @@ def prior_variances(
     variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
     variance[places.others] = 1.0
     variance[: WITH_FREQUENCY.stop] = np.square(
-        [states.mass_std, states.phase_std, states.offset_std, *states.off_resonance_std]
+        [
+            *(states.mass_std, states.phase_std, states.offset_std, states.trend_std),
+            *states.off_resonance_std,
+        ]
     )
     for k, own in enumerate((places.stiffness, places.damping)):
         log_variance, by = basis.log_variances(np.log(hyper.bends[k]), hyper.along)
@@ -244,3 +253,30 @@ def averaged(
     off = means - mean
     point = weight @ np.array([one.point for one in points])
     return point, Gaussian(mean, within + (off * weight[:, None]).T @ off)
+
+
+def differing_levels(
+    objective: Objective, point: np.ndarray, bounds: list[tuple[float, float]], states: TestStates
+) -> tuple[bool, bool, bool, bool]:
+    """Which unstated errors of levels the likelihood asks for: the others are left out in turn."""
+    kept = [k for k, std in enumerate(states.level_std) if not std > 0]
+    if states.n_levels < 2:
+        kept = []
+    point = maximised(objective, point, bounds)
+    value = objective(point)[0]
+    while kept:
+        trials = []
+        for kind in kept:
+            held = list(bounds)
+            for k in range(4):
+                if not states.level_std[k] > 0 and (k == kind or k not in kept):
+                    low = bounds[LEVELS.start + k][0]
+                    held[LEVELS.start + k] = (low, low)
+            without = maximised(objective, point, held)
+            trials.append((objective(without)[0], kind, without))
+        least, kind, without = max(trials, key=lambda trial: trial[0])
+        if value - least > 0.5 * priors.LEVELS_DIFFER:
+            break
+        kept.remove(kind)
+        point, value = without, least
+    return 0 in kept, 1 in kept, 2 in kept, 3 in kept

@@ -36,21 +36,23 @@ from snrmjax.identify.test_model.hyper import (
     NOISE,
     OFFSET,
     PHASE,
+    TREND,
     Gaussian,
     Hyper,
     Places,
     averaged,
     bounds_of,
+    differing_levels,
     hyper_at,
     objective_of,
     places_of,
+    point_of,
     prior_variances,
     sizes_of_bends,
     starting_point,
 )
 from snrmjax.identify.test_model.linear_gaussian import (
     LinearRows,
-    Objective,
     laplace_evidence,
     maximised,
 )
@@ -63,10 +65,10 @@ _GUESS = 0.3  # 1σ of the modal mass, from which on it is asked for and not kno
 _TRIED = 4  # rounds of each start
 _MANY = 48  # rounds of each, where all still moves
 _LOST = 3.0  # 1σ of stated noise, beyond which a walk is not where the records are explained
-_LEAST_SHARE = 0.1  # of independent states: curves far off leave what looks like fewer
 _STILL = 0.05  # standard deviations of all unknowns, below which nothing moves any more
 _SHORTEST = 0.05  # share of a step that is still tried
 _FARTHEST = np.array([1.0, 1.0, 0.5, 0.5])  # of a level's errors, relative or rad
+_STIFFNESS = 2  # of `LEVEL_ERRORS`
 _REACH = 3.0  # times the dynamic stiffness, that a natural frequency may lie beside a test
 
 
@@ -115,6 +117,11 @@ class TestPosterior(NamedTuple):
         return float(self.mean[OFFSET])
 
     @property
+    def trend(self) -> tuple[float, float]:
+        """Relative change of the stiffness per unit of the states' trend, and its 1σ."""
+        return float(self.mean[TREND]), float(np.sqrt(self.covariance[TREND, TREND]))
+
+    @property
     def level_errors(self) -> Float[np.ndarray, "level error"]:
         """Most likely errors of every level: gain and phase (rad) of its record, and relative
         deviations of stiffness and damping.
@@ -153,6 +160,9 @@ def fit_test(
     rounds: int = _ROUNDS,
     most_knots: int | None = None,
     tempered: bool = False,
+    levels_apart: bool = False,
+    compare_levels: bool = True,
+    start: "TestPosterior | None" = None,
     over_sizes: bool = False,
 ) -> TestPosterior:
     """The posterior of a test.
@@ -160,7 +170,11 @@ def fit_test(
     Arguments: with `discrepancy` what one mode leaves off resonance is unknown too: smooth in phase
     and amplitude, zero at phase resonance; with `robust` noise has outliers (Student's t);
     curves have `most_knots` at most; with `tempered` states whose neighbours miss the curves alike
-    count as fewer; with `over_sizes` curves are averaged over the sizes that their bends may have.
+    count as fewer; with `levels_apart` one start has natural frequencies of levels apart from the
+    beginning, which levels that lie bandwidths apart need; without `compare_levels` nothing is
+    said on which errors levels differ by (`differing`), which takes half the time; rounds go on
+    from `start`, of states that are nearly these and without discrepancy, instead of anew; with
+    `over_sizes` curves are averaged over the sizes that their bends may have.
     Raises `ValueError` for fewer than two states.
     """
     if len(states.level) < 2:
@@ -174,16 +188,21 @@ def fit_test(
         float(np.quantile(np.abs(z.imag / omega), 0.9) + 1e-12 * np.sqrt(reference)),
     )
     basis = CurveBasis.of(states.amplitude, most_knots or MOST_KNOTS)
+    if start is not None:
+        basis, units, reference = start.basis, start.units, start.places.reference
     n_others = 0 if states.beside is None else states.beside.shape[1]
     places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
     # From straight lines over a², which hardening by hundreds of bandwidths is, and from curves
     # that bend as they like from the first, which arches are: the more probable goes on.
+    starts = [(True, False), (False, False), *[(False, True)] * levels_apart]
     walks = [
-        _Walk(balance, straight=straight, robust=robust, tempered=tempered)
-        for straight in (True, False)
+        _Walk(balance, straight=straight, apart=apart, robust=robust, tempered=tempered)
+        for straight, apart in starts
     ]
+    if start is not None:
+        walks = [walks[0].from_(start)]
     for walk in walks:
         walk.advance(min(_TRIED, rounds))
     share = min(walk.share for walk in walks)
@@ -233,7 +252,7 @@ def fit_test(
         last.arms_of_stiffness,
         effective_unknowns,
         places,
-        _differing(flat, found.point, bounds, states),
+        differing_levels(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
         walk.balance.weight,
         found.equations.share,
         walk.still,
@@ -263,10 +282,14 @@ class _Found(NamedTuple):
 class _Walk:
     """Rounds of making the problem straight and solving it, from one start on."""
 
-    def __init__(self, balance: Balance, *, straight: bool, robust: bool, tempered: bool):
-        """From the records; the first rounds with `straight` lines over a² if asked."""
+    def __init__(
+        self, balance: Balance, *, straight: bool, apart: bool, robust: bool, tempered: bool
+    ):
+        """From the records; the first rounds with `straight` lines over a², the very first with
+        natural frequencies of levels `apart`, if asked.
+        """
         places, discrepancy = balance.places, balance.beside.shape[1] > 0
-        self.balance, self.straight = balance, straight
+        self.balance, self.straight, self.apart = balance, straight, apart
         self.robust, self.tempered = robust, tempered
         self.start = starting_point(balance.states, balance.basis, discrepancy)
         self.point, self.errors = self.start, np.zeros_like(balance.states.errors)
@@ -274,6 +297,12 @@ class _Walk:
         self.mean[places.damping.start] = 1.0
         self.found: _Found | None = None
         self.turn, self.still, self.share = 0, False, 1.0
+
+    def from_(self, start: TestPosterior) -> "_Walk":
+        """The same, going on from what was found for other states."""
+        self.mean, self.errors, self.point = start.mean, start.corrections, point_of(start.hyper)
+        self.turn = _SETTLED + 1
+        return self
 
     @property
     def likelihood(self) -> float:
@@ -318,7 +347,10 @@ class _Walk:
         bounds = bounds_of(states, basis, self.point)
         along = slice(FIRST_ALONG, FIRST_ALONG + basis.directions.shape[1])
         if k == 0:  # no level differs from another yet, and bends are of one size
-            bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
+            bounds[LEVELS] = [
+                own if self.apart and kind == _STIFFNESS else (own[0], own[0])
+                for kind, own in enumerate(bounds[LEVELS])
+            ]
             bounds[along] = [(0.0, 0.0)] * (along.stop - along.start)
         if k < _SETTLED and self.straight:
             bounds[BENDS] = [(low, low) for low, _ in bounds[BENDS]]
@@ -351,7 +383,7 @@ class _Walk:
         self.turn += 1
         if self.tempered:
             told = share_told_by(left, states.level, states.frequency)
-            self.share = max(told, _LEAST_SHARE)
+            self.share = max(told, priors.LEAST_SHARE)
         if self.robust:
             square = np.sum(left**2, axis=1) / hyper.noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
@@ -400,30 +432,3 @@ def _step(
             break
         share *= 0.5
     return _Moved(*best[1:])
-
-
-def _differing(
-    objective: Objective, point: np.ndarray, bounds: list[tuple[float, float]], states: TestStates
-) -> tuple[bool, bool, bool, bool]:
-    """Which unstated errors of levels the likelihood asks for: the others are left out in turn."""
-    kept = [k for k, std in enumerate(states.level_std) if not std > 0]
-    if states.n_levels < 2:
-        kept = []
-    point = maximised(objective, point, bounds)
-    value = objective(point)[0]
-    while kept:
-        trials = []
-        for kind in kept:
-            held = list(bounds)
-            for k in range(4):
-                if not states.level_std[k] > 0 and (k == kind or k not in kept):
-                    low = bounds[LEVELS.start + k][0]
-                    held[LEVELS.start + k] = (low, low)
-            without = maximised(objective, point, held)
-            trials.append((objective(without)[0], kind, without))
-        least, kind, without = max(trials, key=lambda trial: trial[0])
-        if value - least > 0.5 * priors.LEVELS_DIFFER:
-            break
-        kept.remove(kind)
-        point, value = without, least
-    return 0 in kept, 1 in kept, 2 in kept, 3 in kept

@@ -126,3 +126,6 @@ DISCREPANCY_LENGTH = np.radians(30.0)
 
 STUDENT_FREEDOM = 4.0
 """Degrees of freedom of noise with outliers, on request: one state in 20 beyond three times 1σ."""
+
+LEAST_SHARE = 0.1
+"""Of states that tell something of their own: from curves that are far off fewer seem to."""

@@ -33,6 +33,10 @@ class TestStates(NamedTuple):
     # 1σ of a phase (rad) that all records share, and of an offset of the force over the smallest.
     phase_std: float = 0.0
     offset_std: float = 0.0
+    # What a relative change of stiffness may be in proportion to, as the time of a test or another
+    # structure, and 1σ of that change per unit of it.
+    trend: Float[np.ndarray, " state"] | float = 0.0
+    trend_std: float = 0.0
     # 1σ of how what moves both curves goes with the forcing frequency (`priors.OFF_RESONANCE`).
     off_resonance_std: tuple[float, float] = (0.0, 0.0)
     # What other modes move beside it for 1σ of their linear parameters, m/s; None: all are known.
@@ -54,6 +58,8 @@ class TestStates(NamedTuple):
             name: getattr(self, name)[keep]
             for name in ("level", "frequency", "force", "velocity", "errors")
         }
+        if isinstance(self.trend, np.ndarray):
+            rows["trend"] = self.trend[keep]
         beside = None if self.beside is None else self.beside[keep]
         return self._replace(**rows, beside=beside)
 

@@ -6,7 +6,7 @@ import pytest
 from snrmjax.identify.test_model import states as measured
 from snrmjax.identify.test_model.balance import Balance
 from snrmjax.identify.test_model.curve_basis import CurveBasis
-from snrmjax.identify.test_model.hyper import ALONG, OFFSET, PHASE, places_of
+from snrmjax.identify.test_model.hyper import ALONG, OFFSET, PHASE, TREND, places_of
 
 LEVELS, OMEGA, CONSTANT = 3, 500.0, 6.0
 
@@ -24,7 +24,7 @@ def balance(*, force_is_free=False, discrepancy=True, others=0):
     states = measured.TestStates(
         *(level, omega, 1.0 + rng.uniform(size=n), velocity, np.tile(std, (n, 1))),
         *(True, CONSTANT, (0.0, 0.01, 0.0, 0.0), 0.05, force_is_free, 0.1, 0.1),
-        None if beside is None else beside.T,
+        *(np.linspace(-0.5, 0.5, n), 0.1, None if beside is None else beside.T),
     )
     basis = CurveBasis.of(states.amplitude, 8)
     places = places_of(basis, LEVELS, discrepancy, OMEGA**2, others)
@@ -34,7 +34,7 @@ def balance(*, force_is_free=False, discrepancy=True, others=0):
     unknowns[places.others] = 0.5
     unknowns[places.stiffness] = 0.1 * rng.normal(size=basis.n_functions)
     unknowns[places.damping] = 1 + 0.1 * rng.normal(size=basis.n_functions)
-    unknowns[[0, PHASE, OFFSET]] = 0.02, 0.03, 0.0
+    unknowns[[0, PHASE, OFFSET, TREND]] = 0.02, 0.03, 0.0, 0.05
     unknowns[places.levels] = 0.05 * rng.normal(size=(LEVELS, 4))
     errors = 0.01 * rng.normal(size=(n, len(std)))
     return own.with_discrepancy(unknowns, errors), unknowns, errors

@@ -220,3 +220,33 @@ def test_a_phase_of_all_records_is_found_and_is_no_levels():
     found = fitted(turned)
     assert found.instrument_phase == pytest.approx(0.05, abs=0.004)
     assert not found.differing[1]
+
+
+def test_a_natural_frequency_that_moves_along_the_test_is_a_trend():
+    """Frequencies and velocities times eᶜᵖ, forces times e²ᶜᵖ: K, Ω² and Ωδ of a drifting mode."""
+    states = made(0, spread=0.0).states
+    place, change = np.linspace(-0.5, 0.5, len(states.level)), 0.01
+    factor = np.exp(change * place)
+    moved = states._replace(
+        frequency=states.frequency * factor,
+        velocity=states.velocity * factor,
+        force=states.force * factor**2,
+    )
+    without = fitted(moved)
+    found = fitted(moved._replace(trend=place, trend_std=0.1))
+    trend, std = found.trend
+    assert abs(trend - 2 * change) < 3 * std + change**2
+    assert found.log_evidence > without.log_evidence + 12
+    # Of a test without drift nothing is said that was not there.
+    still, std = fitted(states._replace(trend=place, trend_std=0.1)).trend
+    assert abs(still) < 3 * std
+    assert fitted(states).trend == (0.0, 0.0)
+
+
+def test_levels_bandwidths_apart_are_found_by_the_start_that_has_them_apart():
+    """Natural frequencies 2 % apart, where 2ζ is 1 %: the noise that is left is what was put in."""
+    states = made(0, spread=0.02).states
+    found = fitted(states, rounds=4, levels_apart=True, compare_levels=False)
+    assert found.hyper.noise == pytest.approx(1.0, abs=0.15)  # 180 rows say it to 5 %
+    assert found.log_evidence >= fitted(states, rounds=4).log_evidence - 0.1
+    assert found.differing == (False,) * 4
