@@ -89,15 +89,20 @@ class Search(NamedTuple):
                 size = reference.posterior.hyper.noise / ASSUMED_ERROR
             size, least = max(size, _LEAST_NOISE), max(min(least, size), _LEAST_NOISE)
             misfit = weighted_misfit(predictions.with_errors_scaled(size / predictions.error_scale))
-        found = self.found(misfit)
+        found, winner = self.found(misfit), None
         for _ in range(0 if stated else _ROUNDS):
-            size = misfit.predictions.error_scale
-            factor = max(rms_misfit(*self.refined(found.misfit, found.fit)), least / size)
+            winner = self.refined(found.misfit, found.fit)
+            factor = max(rms_misfit(*winner), least / misfit.predictions.error_scale)
             if _NEAR < factor < 1 / _NEAR:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
-            found = self.found(misfit)
-        weights = evidence.weights_of(found, self.refined)
+            found, winner = self.found(misfit), None
+        best = found.fit
+
+        def refined(misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
+            return winner if winner is not None and fit is best else self.refined(misfit, fit)
+
+        weights = evidence.weights_of(found, refined)
         return Answered(most_probable(found, weights), weights)
 
     def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:

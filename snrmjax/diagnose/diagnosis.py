@@ -101,7 +101,7 @@ def diagnose_model(
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)
     # Beside an unknown gain nothing says which level's force is off.
-    estimable = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
+    estimable = force_gain_std == 0 and not predictions.chosen.phase_unknown.any()
     predictions = with_reference(predictions)
     misfit = weighted_misfit(predictions)
     if not np.isfinite(misfit.base).all():

@@ -20,7 +20,6 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -179,13 +178,13 @@ def _compared(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> _Compa
 
 
 def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
-    """Whether a refined answer fits and makes this one, as it is, improbable."""
+    """Whether a refined answer makes this one, as it is, improbable."""
     if not done:
         return False
     best = max(done, key=lambda each: each.right)
-    freedom = best.misfit.n_rows - len(best.fit.values)
-    fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
-    return fits and one.right < best.right - priors.FAR_BEHIND
+    # Where even the best one leaves more than noise, corrections move others so much further.
+    left = best.fit.chi_square / max(best.misfit.n_rows - len(best.fit.values), 1)
+    return one.right < best.right - priors.FAR_BEHIND * max(left, 1.0)
 
 
 def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:
@@ -273,9 +272,21 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
     volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
     top = with_priors(found)[0] - likelihood(found)[0]
     grid = np.linspace(*sizes.noise_bounds, _NOISES)
-    logs = np.array([likelihood(np.append(one, found[1:]))[0] for one in grid])
-    logs += volume + top - model.penalty
+    variance = model.variance * np.exp(2 * (member @ found[1:]))
+    logs = _over_noise(model.rows, np.exp(grid), variance) + volume + top - model.penalty
     return Evidence(*(float(logsumexp(logs + prior(grid))) for prior in sizes.noise))
+
+
+def _over_noise(
+    rows: LinearRows, scale: Float[np.ndarray, " noise"], variance: Float[np.ndarray, " unknown"]
+) -> Float[np.ndarray, " noise"]:
+    """ln p of rows for several sizes of noise: in the principal directions of what is unknown."""
+    directions, size, _ = np.linalg.svd(rows.triangle * np.sqrt(variance), full_matrices=False)
+    noise, others = scale[:, None] ** 2, rows.n_rows - len(size)
+    square = np.sum((rows.along @ directions) ** 2 / (noise + size**2), axis=1)
+    square += rows.across / noise[:, 0]
+    log_det = np.sum(np.log(noise + size**2), axis=1) + others * np.log(noise[:, 0])
+    return rows.offset - 0.5 * (rows.n_rows * np.log(2 * np.pi) + log_det + square)
 
 
 def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any"]]:

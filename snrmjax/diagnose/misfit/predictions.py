@@ -33,6 +33,7 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
+_ROOM = 256  # states that programs have room for: few tests have more, which compile anew
 _GROWN = 16  # of those that are grown, one after the other
 _DIRECTIONS = 8  # derivatives that a call gives, at most
 _LEAST = 1e-6  # of its unit, that a shape counts for at least
@@ -129,6 +130,20 @@ class Predictions:
             return self
         offset = -np.einsum("sci,si->sc", by_error, self.added)
         return dataclasses.replace(self, offset=offset)
+
+    def of_records(
+        self,
+        data: SteadyStates,
+        added: Float[np.ndarray, "state input"],
+        harmonics: int | None = None,
+    ) -> "Predictions":
+        """The same of other records of the same states, to which something was added.
+
+        `harmonics` are those of the motions: as before if None.
+        """
+        order = self.compared.harmonic_order if harmonics is None else harmonics
+        own = _records(self.given, data, order, self.error_scale)
+        return dataclasses.replace(self, **own._asdict(), added=added)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
@@ -263,7 +278,46 @@ def predictions_of(
     forces share; `harmonics` are those of the motions.
     """
     model = dataclasses.replace(model, name="")  # its name would be a part of the programs
-    chosen = _with_errors_of_force(calibration_states(model, data, programs.HARMONICS))
+    records = _records(model, data, harmonics)
+    numbers = parameter_values(model)
+    return Predictions(
+        model=model,
+        given=model,
+        **records._asdict(),
+        level_numbers=np.asarray(data.level)[records.chosen.rows],
+        force_gain_std=force_gain_std,
+        stated={
+            name: (numbers[name], std)
+            for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
+        },
+        group=_all_effects(model, _scales(model, records.chosen)),
+    )
+
+
+class _Records(NamedTuple):
+    """What of `Predictions` depends on the records: see there."""
+
+    chosen: ComparedColumns
+    sizes: Sizes
+    states: CalibrationStates
+    compared: programs.ComparedMotion
+    own_columns: Int[np.ndarray, " column"]
+    motions: programs.Stored
+
+
+def _records(
+    model: Structure, data: SteadyStates, harmonics: int, error_scale: float = 1.0
+) -> _Records:
+    """Records with the baseline's motions at them."""
+    chosen = calibration_states(model, data, programs.HARMONICS)
+    # Operations of JAX compile for every number of states.
+    on_host: Any = jax.tree.map(np.asarray, chosen.states)
+    error = on_host.error
+    # A force errs by a share of the velocity's error where none is stated: beside a steep curve an
+    # error of amplitude shows itself in the frequency, and the damping would be exact.
+    force = np.where(error[:, :1] > 0, error[:, :1], FORCE_TO_VELOCITY * error[:, 1:2])
+    error = error_scale * np.concatenate([force, error[:, 1:]], axis=1)
+    chosen = chosen._replace(states=on_host._replace(error=error))
     columns, orders, own_columns = _widened(chosen)
     compared = programs.ComparedMotion(chosen.sensors, orders, harmonics)
 
@@ -271,38 +325,16 @@ def predictions_of(
         return programs.grown(model, CalibrationStates(*rows), compared)
 
     found = by_blocks(motions, _GROWN, *columns)
-    # Room for a power of two of states: few sizes compile.
-    arrays = jax.device_put([padded(rows) for rows in (*columns, *found)])
-    numbers = parameter_values(model)
+    arrays = jax.device_put([padded(rows, _ROOM) for rows in (*columns, *found)])
     every: list[Any] = columns
-    return Predictions(
-        model=model,
-        given=model,
+    return _Records(
         chosen=chosen,
         sizes=sizes_of(chosen),
         states=CalibrationStates(*every),
         compared=compared,
         own_columns=own_columns,
-        level_numbers=np.asarray(data.level)[chosen.rows],
-        force_gain_std=force_gain_std,
-        stated={
-            name: (numbers[name], std)
-            for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
-        },
-        group=_all_effects(model, _scales(model, chosen)),
         motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
     )
-
-
-def _with_errors_of_force(chosen: ComparedColumns) -> ComparedColumns:
-    """States whose force errs by a share of the velocity's error where none is stated.
-
-    Beside a steep curve an error of amplitude shows itself in the frequency: without any error of
-    the force the damping of such a state would be exact.
-    """
-    error = np.array(chosen.states.error)
-    error[:, 0] = np.where(error[:, 0] > 0, error[:, 0], FORCE_TO_VELOCITY * error[:, 1])
-    return chosen._replace(states=chosen.states._replace(error=jnp.asarray(error)))
 
 
 def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
@@ -386,7 +418,7 @@ def whitened_states(
     chosen: ComparedColumns, by_error: Float[np.ndarray, "state column input"]
 ) -> Measured:
     """The states with the whitening that follows from their errors."""
-    parts = [padded(np.asarray(part)) for part in (*chosen.states, by_error)]
+    parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
     arrays = jax.device_put(parts)
     states = CalibrationStates(*arrays[:-1])
     whiten = np.asarray(state_whitener(states, arrays[-1], jnp.zeros(())))[: len(by_error)]
