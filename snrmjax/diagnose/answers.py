@@ -1,6 +1,6 @@
 """Answers under some errors: what a search finds, weighed, and found again where it misfits."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -65,8 +65,16 @@ class Search(NamedTuple):
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
-        answers = answered.weights.answers[:n]
-        near = {kind for one in answers for kind in one.kinds}
+        return self._among(one.kinds for one in answered.weights.answers[:n])
+
+    def near(self, found: FoundEffects) -> "Search":
+        """A search among the effects of the answers that fit best so far."""
+        n = found.misfit.n_rows
+        ranked = sorted(found.considered, key=lambda fit: fit.criterion(n))
+        return self._among(fit.kinds for fit in ranked[:_NEAR_ANSWERS])
+
+    def _among(self, answers: Iterable[Iterable[str]]) -> "Search":
+        near = {kind for kinds in answers for kind in kinds}
         return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
 
     def found(self, misfit: WeightedMisfit) -> FoundEffects:
@@ -96,7 +104,9 @@ class Search(NamedTuple):
             if _NEAR < factor < 1 / _NEAR:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
-            found, winner = self.found(misfit), None
+            # Smaller noise may need effects that larger noise hid; larger noise needs no others.
+            search = self.near(found) if factor > 1 else self
+            found, winner = search.found(misfit), None
         best = found.fit
 
         def refined(misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:

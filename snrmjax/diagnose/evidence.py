@@ -20,6 +20,7 @@ from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.coordinates import coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
+from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
@@ -182,9 +183,11 @@ def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
     if not done:
         return False
     best = max(done, key=lambda each: each.right)
+    freedom = best.misfit.n_rows - len(best.fit.values)
+    fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
     # Where even the best one leaves more than noise, corrections move others so much further.
-    left = best.fit.chi_square / max(best.misfit.n_rows - len(best.fit.values), 1)
-    return one.right < best.right - priors.FAR_BEHIND * max(left, 1.0)
+    left = 1.0 if fits else best.fit.chi_square / max(freedom, 1)
+    return one.right < best.right - priors.FAR_BEHIND * left
 
 
 def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:

@@ -1,5 +1,6 @@
 """Fits of effects to a weighted misfit."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -72,6 +73,14 @@ def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
     return EffectFit((), (), none, square, misfit.base, empty, none, none)
 
 
+def started(candidate: EffectCandidate) -> EffectFit:
+    """A candidate at its first starting point, where its misfit is not known yet."""
+    values, none = np.array(candidate.starts[0]), np.zeros(0)
+    bounds = np.array(candidate.lower), np.array(candidate.upper)
+    labels = parameter_labels(candidate.kind)
+    return EffectFit((candidate.kind,), labels, values, np.inf, none, none[:, None], *bounds)
+
+
 def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
     """A candidate at its first starting point."""
     kind = candidate.kind
@@ -85,11 +94,15 @@ def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
 
 
 def fit_effect(
-    misfit: WeightedMisfit, candidate: EffectCandidate, beside: EffectFit | None = None
+    misfit: WeightedMisfit,
+    candidate: EffectCandidate,
+    beside: EffectFit | None = None,
+    hopeless: float = np.inf,
 ) -> EffectFit:
     """The best fit of a candidate from all its starting points, beside what was fitted before.
 
-    All parameters are free, those of `beside` too. The `status` says whether a minimum was found.
+    All parameters are free, those of `beside` too. A fit that promises no χ² below `hopeless` is
+    given up. The `status` says whether a minimum was found.
     """
     before = beside or baseline_fit(misfit)
     together = _together(misfit, candidate, before)
@@ -123,7 +136,8 @@ def fit_effect(
         points[lost, 0] *= 0.3  # too strong to have a motion
         for t, one in zip(lost, linearised(points[lost]), strict=True):
             at_points[t] = one
-    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), _RULE)
+    rule = dataclasses.replace(_RULE, hopeless=hopeless)
+    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), rule)
     best = min(ends, key=lambda end: end.sum_of_squares)
     at, values = best.linearised, best.linearised.values
     if np.any(best.last_step):
@@ -143,10 +157,12 @@ def fit_effect(
 
 
 def fit_effects(
-    misfit: WeightedMisfit, jobs: Sequence[tuple[EffectCandidate, EffectFit]]
+    misfit: WeightedMisfit,
+    jobs: Sequence[tuple[EffectCandidate, EffectFit]],
+    hopeless: float = np.inf,
 ) -> list[EffectFit]:
     """The best fit of every candidate beside what was fitted before, over the cores."""
-    return over_cores(lambda job: fit_effect(misfit, *job), jobs)
+    return over_cores(lambda job: fit_effect(misfit, *job, hopeless), jobs)
 
 
 def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:

@@ -11,7 +11,7 @@ from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     fit_effect,
     fit_effects,
-    unfitted,
+    started,
     with_errors_passed_on,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
@@ -31,6 +31,7 @@ AS_GOOD = 6.0
 _NEAR = 40.0  # of the criterion: candidates that far behind the best are fitted again
 _DOUBTFUL = 0.05  # probability of a fit below which pairs without the best effect are fitted
 _REFUTED = 1e-3  # probability of a pair below which a third effect is looked for
+_HOPELESS = 5.0  # times χ² of the best fit so far, or of noise: others are given up on the way
 _PAIRS = 8  # that are fitted from their own starts
 _ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
@@ -97,11 +98,12 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     considered = [nothing, *singles]
     if _gain(misfit, nothing, best) <= DETECTED:
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
-    pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
-    if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
-        pairs += _pairs(misfit, every, most=len(best.values))
-    if _is_below(misfit, best, _DOUBTFUL):
-        pairs += _pairs(misfit, every)
+    jobs = [(c, best) for c in _promising(misfit, every, best)]
+    unexplained = _is_below(misfit, best, _DOUBTFUL)
+    # Two simple effects may do what one with many parameters does.
+    if unexplained or len(best.values) > _ONE:
+        jobs += _pairs(misfit, every, best, unexplained=unexplained)
+    pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best(misfit, [best, *pairs])
     considered += pairs
     if pair is best or _gain(misfit, best, pair) <= DETECTED:
@@ -111,14 +113,15 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     nothing = baseline_fit(misfit)
     alone = [fit_effect(misfit, _also_from(every[kind], pair)) for kind in pair.kinds]
     others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
-    considered = [nothing, *alone]
-    considered += fit_effects(misfit, [(_from(every, fit), nothing) for fit in others])
+    one, two = pair.kinds
+    together = fit_effect(misfit, _where(every, pair, two), started(_where(every, pair, one)))
+    considered = [nothing, *alone, together]
+    again = [(_from(every, fit), nothing) for fit in others]
+    considered += fit_effects(misfit, again, _hopeless(together))
     for kind, other in zip(pair.kinds, reversed(alone), strict=True):
         rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
-        begun = unfitted(misfit, _where(every, pair, other.kinds[0]))
-        jobs = [(_where(every, pair, kind), start) for start in (begun, other)]
-        fits = fit_effects(misfit, [*((c, other) for c in rivals), *jobs])
-        table.append(_table(misfit, other, fits))
+        fits = fit_effects(misfit, [(c, other) for c in rivals], _hopeless(together))
+        table.append(_table(misfit, other, [*fits, together]))
         considered += fits
     best = _best(misfit, considered)
     if _is_below(misfit, best, _REFUTED) and len(best.kinds) < _MOST:
@@ -168,7 +171,8 @@ def _compared_with(
         jobs.append((close, _only(misfit, every, fit, others)))
     if refuted and len(fit.kinds) < _MOST:
         jobs.append((close, fit))
-    fits = [one for one in fit_effects(misfit, jobs) if np.isfinite(one.chi_square)]
+    fits = fit_effects(misfit, jobs, _hopeless(fit))
+    fits = [one for one in fits if np.isfinite(one.chi_square)]
     if not fits:
         return found
     best = _best(misfit, [fit, *fits])
@@ -187,20 +191,24 @@ def _only(
 
 
 def _pairs(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], most: int | None = None
-) -> list[EffectFit]:
-    """Fits of the pairs of effects with the largest expected gain, from their own starts.
+    misfit: WeightedMisfit, every: dict[str, EffectCandidate], best: EffectFit, *, unexplained: bool
+) -> list[tuple[EffectCandidate, EffectFit]]:
+    """Fits, to be done, of the pairs with the largest expected gain, from their own starts.
 
-    Of pairs with at most `most` parameters.
+    Those with no more parameters than the best effect alone; and, where that leaves something
+    `unexplained`, those with any number.
     """
-    screened_ones = [
-        (one, two)
-        for _, one, two in screened_pairs(misfit, list(every.values()))
-        if most is None or len(one.unit) + len(two.unit) <= most
-    ]
-    return fit_effects(
-        misfit, [(two, unfitted(misfit, one)) for one, two in screened_ones[:_PAIRS]]
-    )
+    pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(every.values()))]
+    most = len(best.values)
+    simple = [(one, two) for one, two in pairs if len(one.unit) + len(two.unit) <= most]
+    chosen = simple[:_PAIRS] if most > _ONE else []
+    chosen += [pair for pair in pairs[:_PAIRS] if pair not in chosen] if unexplained else []
+    return [(two, started(one)) for one, two in chosen]
+
+
+def _hopeless(best: EffectFit) -> float:
+    """χ² that a fit must fall below, or promise to, to be continued beside the best one so far."""
+    return _HOPELESS * max(best.chi_square, float(len(best.rows)))
 
 
 def _is_below(misfit: WeightedMisfit, fit: EffectFit, probability: float) -> bool:
@@ -282,7 +290,7 @@ def _table(
 ) -> tuple[TriedEffect, ...]:
     rows = [
         TriedEffect(
-            fit.kinds[-1],
+            next(kind for kind in fit.kinds if kind not in before.kinds),
             _gain(misfit, before, fit),
             fit.chi_square,
             dict(zip(fit.labels, fit.values.tolist(), strict=True)),
