@@ -19,8 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from snrmjax.diagnose.evidence import marginal_of
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, parameter_labels
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import (
+    EffectCandidate,
+    candidate,
+    coordinates,
+    parameter_labels,
+)
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     baseline_fit,

@@ -7,7 +7,7 @@ import numpy as np
 
 from snrmjax.diagnose import evidence, priors
 from snrmjax.diagnose.checks.cross_validation import rms_misfit
-from snrmjax.diagnose.checks.neighbours import neighbour_noise
+from snrmjax.diagnose.checks.patterns import neighbour_noise
 from snrmjax.diagnose.decide import most_probable
 from snrmjax.diagnose.misfit.corrected_records import (
     already_added,

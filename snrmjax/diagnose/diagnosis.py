@@ -19,17 +19,25 @@ from snrmjax.diagnose.checks.level_forces import (
     suspected_level_forces,
     with_forces_that_acted,
 )
-from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
+from snrmjax.diagnose.checks.patterns import neighbour_noise, tolerated
 from snrmjax.diagnose.checks.shared_gains import (
     gain_found,
     notes_on_found_mass,
     notes_on_stated_parameters,
 )
 from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, completed_model
-from snrmjax.diagnose.decide import decide, imitations_of
+from snrmjax.diagnose.decide import Verdict, decide, imitations_of
 from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
-from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
-from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
+from snrmjax.diagnose.diagnosis_result import (
+    Answer,
+    Checks,
+    Diagnosis,
+    Estimate,
+    ForceMisfit,
+    FormerAnswer,
+    Gap,
+    what_changed,
+)
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.corrected_records import at_reference
@@ -41,7 +49,6 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_mis
 from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
 from snrmjax.diagnose.search.model_search import FoundEffects
-from snrmjax.diagnose.verdict import Verdict
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates

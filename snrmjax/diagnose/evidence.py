@@ -17,8 +17,7 @@ from jaxtyping import Float, Int
 from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import candidate, coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of

@@ -16,8 +16,13 @@ from snrmjax.diagnose.checks.cross_validation import (
     held_out_places,
     rows_of_level,
 )
-from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
-from snrmjax.diagnose.checks.patterns import UNLIKELY, left_curve, pattern
+from snrmjax.diagnose.checks.patterns import (
+    UNLIKELY,
+    left_curve,
+    neighbour_noise,
+    pattern,
+    tolerated,
+)
 from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
 from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
 from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, coordinates, parameter_labels
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.numerics.blocks import over_cores

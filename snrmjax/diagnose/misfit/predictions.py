@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
 from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
-from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -27,7 +27,6 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.modes import LinearModes
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
@@ -168,7 +167,12 @@ class Predictions:
         if self.sizes.alone.any():
             own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
             chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
-        return whitened_states(chosen, by_error)
+        parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
+        *columns, errors = jax.device_put(parts)
+        found = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
+        whiten = np.asarray(found)[: len(by_error)]
+        used = np.any(whiten != 0, axis=(1, 2))
+        return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
 
     def of(
         self,
@@ -414,18 +418,6 @@ def _filled(directions: np.ndarray) -> np.ndarray:
     return room
 
 
-def whitened_states(
-    chosen: ComparedColumns, by_error: Float[np.ndarray, "state column input"]
-) -> Measured:
-    """The states with the whitening that follows from their errors."""
-    parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
-    arrays = jax.device_put(parts)
-    states = CalibrationStates(*arrays[:-1])
-    whiten = np.asarray(state_whitener(states, arrays[-1], jnp.zeros(())))[: len(by_error)]
-    used = np.any(whiten != 0, axis=(1, 2))
-    return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
-
-
 def scales_of(predictions: Predictions) -> MotionScales:
     """Typical sizes of the measured motions."""
     return _scales(predictions.model, predictions.chosen)
@@ -437,24 +429,3 @@ def _scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
         np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
     )
     return motion_scales(model.modes, chosen.sensors[0], *columns)
-
-
-def motion_scales(
-    modes: LinearModes,
-    sensor: int,
-    speed: Float[np.ndarray, " state"],
-    omega: Float[np.ndarray, " state"],
-    force: Float[np.ndarray, " state"],
-) -> MotionScales:
-    """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
-    j = modes.mode_of_interest
-    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
-    return MotionScales(
-        amplitude=float(np.median(amplitude)),
-        largest=float(np.max(amplitude)),
-        frequency=float(modes.natural_frequency[j]),
-        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
-        receptance=float(np.median(speed / omega / force)),
-        smallest_force=float(np.min(force)),
-        damping_ratio=float(modes.damping_ratio[j]),
-    )

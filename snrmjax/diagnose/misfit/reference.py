@@ -61,7 +61,8 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     columns = [np.asarray(a)[rows] for a in chosen.states]
     states = type(chosen.states)(*columns)
     # Of few sizes: operations of JAX compile for every one.
-    beside: Array = residual_velocity(modes, padded(states.frequency), padded(states.force))
+    load: list[Any] = [padded(np.asarray(a)) for a in (states.frequency, states.force)]
+    beside: Array = residual_velocity(modes, *load)
     constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
     n_sensors = states.velocity.shape[1]
     stated = np.asarray(states.error)[:, [0, 1, 1 + n_sensors]]
