@@ -48,7 +48,7 @@ from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -62,7 +62,6 @@ _LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is co
 _LEAST_STATES = 6
 _OTHER_MODE = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _FEW = 2  # effects of an answer beside which no law is drawn
-_NEAR_BEST = 6.0  # of Schwarz's criterion
 
 
 @on_one_core
@@ -409,7 +408,7 @@ def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     notes, rows = [], [row for step in found.table for row in step]
     lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
     behind = [one for one in behind if np.isfinite(one)]
-    near = sum(one < _NEAR_BEST for one in behind)
+    near = sum(one < AS_GOOD for one in behind)
     if behind:
         effect = "all were clearly worse than the best, so the answer does not depend on them."
         if near:

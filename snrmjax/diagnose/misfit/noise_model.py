@@ -6,10 +6,10 @@ Numbers that share a few errors are decorrelated at a cost in proportion to the 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import chdtrc
 
-from snrmjax.diagnose.misfit.predictions import Measured
+from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.identify.calibrate.calibration_states import whitened_columns
 
 
@@ -150,31 +150,32 @@ class NoiseModel(NamedTuple):
 
 
 def noise_model(
-    measured: Measured,
+    predictions: Predictions,
+    by_error: Float[np.ndarray, "state column input"],
+    phasors: Complex[np.ndarray, "state part"],
     baseline: Float[np.ndarray, "state column prior"],
     by_linear: Float[np.ndarray, "state column two"],
-    level_std: Float[np.ndarray, " four"],
 ) -> NoiseModel:
     """The noise of states with errors of the baseline model and of whole levels.
 
-    Arguments: `baseline` are slopes by the baseline's own parameters, times their 1σ;
-    `by_linear` are slopes by natural frequency and damping ratio; `level_std` has the 1σ of a
-    level's gain, phase, natural frequency and damping ratio.
+    Arguments: slopes `by_error` of the states and `phasors`, of the model that passes errors on;
+    `baseline` are slopes by the baseline's own parameters, times their 1σ; `by_linear` are slopes
+    by natural frequency and damping ratio.
     """
-    states, levels = measured.states, measured.chosen.n_levels
-    known = measured.known
+    states, levels = predictions.chosen.states, predictions.chosen.n_levels
+    whiten, known = predictions.whitened_for(by_error, phasors)
     n_sensors = np.asarray(states.velocity).shape[1]
-    gain = measured.by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
-    phase = measured.by_error[:, :, n_sensors + 1 :].sum(axis=2)
+    gain = by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
+    phase = by_error[:, :, n_sensors + 1 :].sum(axis=2)
     member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
-    slopes = (gain, phase, *np.moveaxis(by_linear, 2, 0))
+    slopes, level_std = (gain, phase, *np.moveaxis(by_linear, 2, 0)), predictions.model.level_stds
     kinds = [k for k, std in enumerate(level_std) if std > 0]
     parts = [level_std[k] * slopes[k][:, :, None] * member[:, None, :] for k in kinds]
     every = np.concatenate([baseline, *parts], axis=2)
     shared_kind = np.append(np.full(baseline.shape[2], -1), np.repeat(kinds, levels)).astype(int)
-    own = np.asarray(whitened_columns(measured.whiten, every))[known]
+    own = np.asarray(whitened_columns(whiten, every))[known]
     state, column = np.nonzero(known)
-    return NoiseModel(measured.whiten, known, shared_covariance(own), shared_kind, state, column)
+    return NoiseModel(whiten, known, shared_covariance(own), shared_kind, state, column)
 
 
 def chi_square_p_value(chi_square: float, freedom: int) -> float:

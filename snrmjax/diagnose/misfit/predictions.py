@@ -78,20 +78,6 @@ class Predicted(NamedTuple):
     force_slopes: Complex[np.ndarray, "trial state direction"]
 
 
-class Measured(NamedTuple):
-    """The states, their whitening and what of them was measured."""
-
-    chosen: ComparedColumns
-    by_error: Float[np.ndarray, "state column input"]
-    whiten: Float[np.ndarray, "state column column"]
-    known: Bool[np.ndarray, "state column"]
-
-    @property
-    def states(self) -> CalibrationStates:
-        """The states themselves."""
-        return self.chosen.states
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predictions:
     """Predictions of one model for one set of data; `predictions_of` makes them."""
@@ -161,8 +147,11 @@ class Predictions:
         self,
         by_error: Float[np.ndarray, "state column input"],
         phasors: Complex[np.ndarray, "state part"],
-    ) -> Measured:
-        """The states with the whitening of a model with these phasors that passes on errors so."""
+    ) -> tuple[Float[np.ndarray, "state column column"], Bool[np.ndarray, "state column"]]:
+        """The whitening of the states by a model with these phasors that passes on errors so.
+
+        And which columns count.
+        """
         chosen = self.chosen
         if self.sizes.alone.any():
             own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
@@ -172,7 +161,7 @@ class Predictions:
         found = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
         whiten = np.asarray(found)[: len(by_error)]
         used = np.any(whiten != 0, axis=(1, 2))
-        return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
+        return whiten, np.asarray(chosen.states.known) & used[:, None]
 
     def of(
         self,

@@ -263,7 +263,6 @@ def _weighted(
     starts: StartChanges,
 ) -> WeightedMisfit:
     """Weighted as errors are `passed_on`."""
-    measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
     parts = [own, gain] if np.any(gain) else [own]
@@ -271,7 +270,8 @@ def _weighted(
     levels = of_level == np.array(predictions.free_level_forces, dtype=int)
     parts.append(FREE_LEVEL_FORCE_STD * passed_on.by_error[:, :, :1] * levels)
     shared = np.concatenate(parts, axis=2)
-    noise = noise_model(measured, shared, by_linear, np.array(predictions.model.level_stds))
+    of_errors = passed_on.by_error, passed_on.phasors
+    noise = noise_model(predictions, *of_errors, shared, by_linear)
     base = noise.noise_units(baseline.columns[None])[0]
     linear = noise.noise_units(np.moveaxis(by_linear, 2, 0)).T
     return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear, starts)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
@@ -32,7 +33,6 @@ AS_GOOD = 6.0
 
 _NEAR = 40.0  # of the criterion: candidates that far behind the best are fitted again
 _DOUBTFUL = 0.05  # probability of a fit below which pairs without the best effect are fitted
-_REFUTED = 1e-3  # probability of a pair below which a third effect is looked for
 _HOPELESS = 5.0  # times χ² of the best fit so far, or of noise: others are given up on the way
 _PAIRS = 8  # that are fitted from their own starts
 _ONE = 2  # parameters of one effect; one with more is compared with two simple effects
@@ -130,7 +130,7 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         table.append(_table(misfit, other, [*fits, together]))
         considered += fits
     best = _best(misfit, considered)
-    if _is_below(misfit, best, _REFUTED) and len(best.kinds) < _MOST:
+    if _is_below(misfit, best, priors.REJECTED) and len(best.kinds) < _MOST:
         thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
         table.append(_table(misfit, best, thirds))
         considered += thirds
@@ -168,7 +168,7 @@ def _compared_with(
     misfit, fit = found.misfit, found.fit
     alike = [kind for kind in fit.kinds if EFFECTS[kind].is_linear]
     others = [kind for kind in fit.kinds if not EFFECTS[kind].is_linear]
-    refuted = _is_below(misfit, fit, _REFUTED)
+    refuted = _is_below(misfit, fit, priors.REJECTED)
     fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
     if not fit.kinds or fits_by_itself or misfit.predictions.sizes.alone.any():
         return found
