@@ -34,12 +34,10 @@ from snrmjax.model.effects import EFFECTS
 
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
-_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
+_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that is as much
 _CORRECTIONS = 6  # of the records, at most
 _STRAIGHT = 0.003  # relative or rad, within which the misfit is straight
 _BETTER = 0.9  # share of χ² that is left with many harmonics
-_BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
-_LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
 
 
 class Answered(NamedTuple):
@@ -95,7 +93,7 @@ class Search(NamedTuple):
             size = least
             if reference is not None:
                 size = reference.posterior.hyper.noise / ASSUMED_ERROR
-            size, least = max(size, _LEAST_NOISE), max(min(least, size), _LEAST_NOISE)
+            least = min(least, size)
             misfit = weighted_misfit(predictions.with_errors_scaled(size / predictions.error_scale))
         found, winner = self.found(misfit), None
         for _ in range(0 if stated else _ROUNDS):
@@ -198,7 +196,7 @@ def leaves_more_than_noise(answered: Answered) -> bool:
     if predictions.chosen.noise_stated or predictions.reference is None:
         return answered.found.p_value < priors.REJECTED
     size = ASSUMED_ERROR * predictions.error_scale
-    return bool(size > _BEYOND_CURVES * predictions.reference.posterior.hyper.noise)
+    return bool(_NEAR * size > predictions.reference.posterior.hyper.noise)
 
 
 def levels_may_differ(predictions: Predictions) -> bool:

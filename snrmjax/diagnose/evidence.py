@@ -36,7 +36,6 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
-_AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
 _REFINED = 8  # answers that are made straight at their own errors
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
@@ -206,8 +205,7 @@ def marginal_of(
         step = np.linalg.lstsq(own, left, rcond=1e-10)[0]
         promised = float(np.sum((own @ step) ** 2))
     # The most likely parameters are the fit's; what more a linear step promises is not believed.
-    penalty = 0.5 * promised if promised > _AGAIN else 0.0
-    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), group, penalty)
+    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), group, 0.5 * promised)
 
 
 class Evidence(NamedTuple):
