@@ -98,6 +98,8 @@ def law_columns(
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     phasors = p.sizes.phasors(columns[None])[0]
     by_baseline = by_value[:, :, [names.index(name) for name in (*stated, *linear)]]
+    own_mode = [float(values[names.index(name)]) for name in linear]
+    by_baseline[..., -2] -= own_mode[1] / own_mode[0] * by_baseline[..., -1]  # as a stiffness does
     passed_on = ErrorPropagation(by_error, phasors, by_baseline * std)
     shape = (*columns.shape, *secants.shape)
     return LawColumns(columns, by_secant.reshape(shape), passed_on, *found[4:])

@@ -1,7 +1,7 @@
 """Fits of effects to a weighted misfit."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,9 +62,6 @@ class _Evaluated(NamedTuple):
     jacobian: Float[np.ndarray, "row parameter"]
 
 
-_Evaluation = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
 def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
     """The baseline without any effect."""
     empty, none = np.zeros((misfit.n_rows, 0)), np.zeros(0)
@@ -104,7 +101,6 @@ def fit_effect(
     given up. The `status` says whether a minimum was found.
     """
     before = beside or baseline_fit(misfit)
-    together = _together(misfit, candidate, before)
     labels = (*parameter_labels(candidate.kind), *before.labels)
     law = coordinates(labels, scales_of(misfit.predictions).amplitude)
     n, m = len(candidate.unit), len(before.values)
@@ -116,7 +112,8 @@ def fit_effect(
 
     def evaluated(values: np.ndarray) -> list[_Evaluated]:
         found = []
-        for own, rows, slopes in zip(values, *together(values), strict=True):
+        together = misfit.evaluated(misfit.predictions.group, labels, values)
+        for own, rows, slopes in zip(values, *together, strict=True):
             by = law.slopes(own, slopes) * unit
             left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
             found.append(_Evaluated(own, rows, slopes, by, left, arms))
@@ -195,9 +192,3 @@ def values_of(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " par
     values = group.values.copy()
     values[[group.place(label) for label in fit.labels]] = fit.values
     return values
-
-
-def _together(misfit: WeightedMisfit, candidate: EffectCandidate, before: EffectFit) -> _Evaluation:
-    """Rows and slopes by a candidate's parameters and those of what was fitted before."""
-    labels = (*parameter_labels(candidate.kind), *before.labels)
-    return lambda values: misfit.evaluated(misfit.predictions.group, labels, values)

@@ -40,25 +40,6 @@ class ErrorPropagation(NamedTuple):
     slopes: Float[np.ndarray, "state column direction"]
 
 
-class StartChanges:
-    """What the starting points of candidates change of the misfit: each is predicted once.
-
-    A memory that all weightings of one set of data share: changes do not depend on the noise.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[tuple, Float[np.ndarray, "trial state column"]] = {}
-
-    def of(
-        self, misfit: "WeightedMisfit", candidate: EffectCandidate
-    ) -> Float[np.ndarray, "trial state column"]:
-        """Columns of every starting point less those of the baseline."""
-        key = (candidate.kind, candidate.starts)
-        if key not in self._known:
-            self._known[key] = _start_changes(misfit, candidate)
-        return self._known[key]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class WeightedMisfit:
     """Misfit of the baseline model to measured states, and the noise that weights it.
@@ -74,7 +55,8 @@ class WeightedMisfit:
     noise: NoiseModel
     base: Float[np.ndarray, " row"]
     by_linear: Float[np.ndarray, "row two"]  # by natural frequency and damping ratio
-    starts: StartChanges
+    # What starting points of candidates change: of all weightings, for it does not depend on them.
+    starts: dict[tuple, Float[np.ndarray, "trial state column"]]
 
     @property
     def model(self) -> Structure:
@@ -101,8 +83,11 @@ class WeightedMisfit:
         return float(np.sum(self.noise.decorrelated(rows) ** 2))
 
     def start_changes(self, candidate: EffectCandidate) -> Float[np.ndarray, "trial state column"]:
-        """What the starting points of a candidate change."""
-        return self.starts.of(self, candidate)
+        """Columns of every starting point of a candidate less those of the baseline."""
+        key = (candidate.kind, candidate.starts)
+        if key not in self.starts:
+            self.starts[key] = _start_changes(self, candidate)
+        return self.starts[key]
 
     def first_change(self, candidate: EffectCandidate) -> Float[np.ndarray, " row"]:
         """What the first starting point of a candidate changes, in units of noise."""
@@ -169,7 +154,7 @@ class WeightedMisfit:
         own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
         passed_on = ErrorPropagation(by_error, phasors, own)
-        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+        return _weighted(predictions, baseline, errors, passed_on, {})
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -195,7 +180,7 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     if plain.added is not None:
         plain = plain.carried_back(passed_on.by_error)
         baseline, _ = _baseline_of(plain)
-    return _weighted(plain, baseline, errors, passed_on, StartChanges())
+    return _weighted(plain, baseline, errors, passed_on, {})
 
 
 def _baseline_of(
@@ -260,7 +245,7 @@ def _weighted(
     baseline: BaselinePrediction,
     errors: ErrorPropagation,
     passed_on: ErrorPropagation,
-    starts: StartChanges,
+    starts: dict[tuple, Float[np.ndarray, "trial state column"]],
 ) -> WeightedMisfit:
     """Weighted as errors are `passed_on`."""
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]

@@ -105,8 +105,8 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
     jobs = [(c, best) for c in _promising(misfit, every, best)]
     if _is_below(misfit, best, _DOUBTFUL):
-        pairs = screened_pairs(misfit, list(every.values()))[:_PAIRS]
-        jobs += [(two, started(one)) for _, one, two in pairs]
+        promising = screened_pairs(misfit, list(every.values()))[:_PAIRS]
+        jobs += [(two, started(one)) for _, one, two in promising]
     pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best(misfit, [best, *pairs])
     considered += pairs
