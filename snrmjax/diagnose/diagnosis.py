@@ -100,9 +100,9 @@ def diagnose_model(
     notes: list[str] = []
     gain = None
     if driven_by_voltage(data):
-        data, gain, note = with_first_gain(model, data)
+        data, gain, of_gain = with_first_gain(model, data)
         force_gain_std = force_gain_std or FREE_GAIN_STD
-        notes.append(note)
+        notes += of_gain
     predictions = predictions_of(model, data, force_gain_std)
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)

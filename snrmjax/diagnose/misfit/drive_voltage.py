@@ -8,6 +8,7 @@ import numpy as np
 from snrmjax.diagnose.misfit.predictions import predictions_of
 from snrmjax.diagnose.misfit.reference import reference_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
@@ -23,7 +24,7 @@ class FirstGain(NamedTuple):
 
     data: SteadyStates
     gain: float  # N/V
-    note: str
+    notes: tuple[str, ...]
 
 
 def driven_by_voltage(data: SteadyStates) -> bool:
@@ -55,13 +56,16 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
     if not np.any(np.isfinite(gains)):
         raise ValueError("the model has no motion of the measured amplitude for any state.")
     gain, by = float(np.median(gains[np.isfinite(gains)])), "the model as given"
+    doubt = ""
     for _ in range(0 if unknown.any() else _ROUNDS):
         reference = reference_of(predictions_of(model, driven(gain), FREE_GAIN_STD))
         if reference is None:
             break
-        gain, by = gain / reference.posterior.modal_mass[0], "smooth curves of amplitude"
+        mass, std = reference.posterior.modal_mass
+        gain, by = gain / mass, "smooth curves of amplitude"
+        doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
     note = (
         f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
         "is fitted too: a 1 % error of the gain looks like 1 % of damping."
     )
-    return FirstGain(driven(gain), gain, note)
+    return FirstGain(driven(gain), gain, (note, doubt) if doubt else (note,))

@@ -38,6 +38,7 @@ _PAIRS = 8  # that are fitted from their own starts
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
+_ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 _MOST = 3  # effects of an answer
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
 _KEPT = 2  # starts of a candidate
@@ -104,9 +105,10 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     if _gain(misfit, nothing, best) <= DETECTED:
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
     jobs = [(c, best) for c in _promising(misfit, every, best)]
-    if _is_below(misfit, best, _DOUBTFUL):
-        promising = screened_pairs(misfit, list(every.values()))[:_PAIRS]
-        jobs += [(two, started(one)) for _, one, two in promising]
+    unexplained = _is_below(misfit, best, _DOUBTFUL)
+    # Two simple effects may do what one with many parameters does.
+    if unexplained or len(best.values) > _ONE:
+        jobs += _pairs(misfit, every, best, unexplained=unexplained)
     pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best(misfit, [best, *pairs])
     considered += pairs
@@ -192,6 +194,22 @@ def _only(
     for kind in kinds:
         found = fit_effect(misfit, _where(every, fit, kind), found)
     return found
+
+
+def _pairs(
+    misfit: WeightedMisfit, every: dict[str, EffectCandidate], best: EffectFit, *, unexplained: bool
+) -> list[tuple[EffectCandidate, EffectFit]]:
+    """Fits, to be done, of the pairs with the largest expected gain, from their own starts.
+
+    Those with no more parameters than the best effect alone; and, where that leaves something
+    `unexplained`, those with any number.
+    """
+    pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(every.values()))]
+    most = len(best.values)
+    simple = [(one, two) for one, two in pairs if len(one.unit) + len(two.unit) <= most]
+    chosen = simple[:_PAIRS] if most > _ONE else []
+    chosen += [pair for pair in pairs[:_PAIRS] if pair not in chosen] if unexplained else []
+    return [(two, started(one)) for one, two in chosen]
 
 
 def _hopeless(best: EffectFit) -> float:
