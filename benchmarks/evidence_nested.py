@@ -19,8 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from snrmjax.diagnose.evidence import marginal_of
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, parameter_labels
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import (
+    EffectCandidate,
+    candidate,
+    coordinates,
+    parameter_labels,
+)
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     baseline_fit,
@@ -93,7 +97,7 @@ def compared(folder: Path, name: str, kinds: list[str], live: int) -> dict:
         marginal = marginal_of(misfit, one)
         if marginal is None:
             return -np.inf
-        return marginal.rows.log_likelihood(1.0, marginal.variance)[0] - marginal.penalty
+        return marginal.rows.log_likelihood(1.0, np.ones(len(marginal.group)))[0] - marginal.penalty
 
     laplace, none = log_evidence(fit), log_evidence(baseline_fit(misfit))
     # Of rows made independent, which have the ln determinant and the units of all answers alike.

@@ -71,7 +71,7 @@ SUB_ROOMS = {
     "methods.bench": {"methods.result", "methods.one_sensor"},
     "identify.test_model": {"identify.checks", "identify.curves"},
     "diagnose.misfit": set(),
-    "diagnose.search": {"diagnose.misfit"},
+    "diagnose.search": {"diagnose.misfit", "diagnose.priors"},
     "diagnose.checks": {
         *("diagnose.misfit", "diagnose.search", "diagnose.priors", "diagnose.evidence"),
     },

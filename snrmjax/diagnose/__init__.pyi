@@ -1,9 +1,9 @@
 from .completed_model import CompletedStatus
+from .decide import Verdict
 from .design.discriminating_test import DiscriminatingTest
 from .diagnosis import diagnose_model
 from .diagnosis_result import Answer, Diagnosis, Estimate
 from .response_prediction import LevelPredictions, LevelResponse, predict_levels
-from .verdict import Verdict
 
 __all__ = [
     "Answer",

@@ -1,13 +1,13 @@
 """Answers under some errors: what a search finds, weighed, and found again where it misfits."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from snrmjax.diagnose import evidence, priors
 from snrmjax.diagnose.checks.cross_validation import rms_misfit
-from snrmjax.diagnose.checks.neighbours import neighbour_noise
+from snrmjax.diagnose.checks.patterns import neighbour_noise
 from snrmjax.diagnose.decide import most_probable
 from snrmjax.diagnose.misfit.corrected_records import (
     already_added,
@@ -34,12 +34,10 @@ from snrmjax.model.effects import EFFECTS
 
 _NEAR_ANSWERS, _NEAREST_ANSWERS = 12, 4  # whose effects are looked for again
 _WITHOUT_LAST_HARMONIC = (AbstractKinked, AbstractHysteresis)
-_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that ends them
+_ROUNDS, _NEAR = 3, 0.8  # in search of unstated noise: at most, and share of it that is as much
 _CORRECTIONS = 6  # of the records, at most
 _STRAIGHT = 0.003  # relative or rad, within which the misfit is straight
 _BETTER = 0.9  # share of χ² that is left with many harmonics
-_BEYOND_CURVES = 1.2  # times the noise that smooth curves leave
-_LEAST_NOISE = 0.03  # of the assumed error: no balance of a few harmonics is more exact
 
 
 class Answered(NamedTuple):
@@ -65,8 +63,16 @@ class Search(NamedTuple):
 
     def among(self, answered: Answered, n: int) -> "Search":
         """A search among the effects of the `n` best answers so far."""
-        answers = answered.weights.answers[:n]
-        near = {kind for one in answers for kind in one.kinds}
+        return self._among(one.kinds for one in answered.weights.answers[:n])
+
+    def near(self, found: FoundEffects) -> "Search":
+        """A search among the effects of the answers that fit best so far."""
+        n = found.misfit.n_rows
+        ranked = sorted(found.considered, key=lambda fit: fit.criterion(n))
+        return self._among(fit.kinds for fit in ranked[:_NEAR_ANSWERS])
+
+    def _among(self, answers: Iterable[Iterable[str]]) -> "Search":
+        near = {kind for kinds in answers for kind in kinds}
         return self._replace(kinds=tuple(kind for kind in self.kinds if kind in near))
 
     def found(self, misfit: WeightedMisfit) -> FoundEffects:
@@ -87,17 +93,24 @@ class Search(NamedTuple):
             size = least
             if reference is not None:
                 size = reference.posterior.hyper.noise / ASSUMED_ERROR
-            size, least = max(size, _LEAST_NOISE), max(min(least, size), _LEAST_NOISE)
+            least = min(least, size)
             misfit = weighted_misfit(predictions.with_errors_scaled(size / predictions.error_scale))
-        found = self.found(misfit)
+        found, winner = self.found(misfit), None
         for _ in range(0 if stated else _ROUNDS):
-            size = misfit.predictions.error_scale
-            factor = max(rms_misfit(*self.refined(found.misfit, found.fit)), least / size)
+            winner = self.refined(found.misfit, found.fit)
+            factor = max(rms_misfit(*winner), least / misfit.predictions.error_scale)
             if _NEAR < factor < 1 / _NEAR:
                 break
             misfit = weighted_misfit(misfit.predictions.with_errors_scaled(factor))
-            found = self.found(misfit)
-        weights = evidence.weights_of(found, self.refined)
+            # Smaller noise may need effects that larger noise hid; larger noise needs no others.
+            search = self.near(found) if factor > 1 else self
+            found, winner = search.found(misfit), None
+        best = found.fit
+
+        def refined(misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
+            return winner if winner is not None and fit is best else self.refined(misfit, fit)
+
+        weights = evidence.weights_of(found, refined)
         return Answered(most_probable(found, weights), weights)
 
     def refined(self, misfit: WeightedMisfit, fit: EffectFit) -> tuple[WeightedMisfit, EffectFit]:
@@ -183,7 +196,7 @@ def leaves_more_than_noise(answered: Answered) -> bool:
     if predictions.chosen.noise_stated or predictions.reference is None:
         return answered.found.p_value < priors.REJECTED
     size = ASSUMED_ERROR * predictions.error_scale
-    return bool(size > _BEYOND_CURVES * predictions.reference.posterior.hyper.noise)
+    return bool(_NEAR * size > predictions.reference.posterior.hyper.noise)
 
 
 def levels_may_differ(predictions: Predictions) -> bool:

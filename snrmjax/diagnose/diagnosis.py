@@ -19,17 +19,25 @@ from snrmjax.diagnose.checks.level_forces import (
     suspected_level_forces,
     with_forces_that_acted,
 )
-from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
+from snrmjax.diagnose.checks.patterns import neighbour_noise, tolerated
 from snrmjax.diagnose.checks.shared_gains import (
     gain_found,
     notes_on_found_mass,
     notes_on_stated_parameters,
 )
 from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, completed_model
-from snrmjax.diagnose.decide import decide, imitations_of
+from snrmjax.diagnose.decide import Verdict, decide, imitations_of
 from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
-from snrmjax.diagnose.diagnosis_result import Answer, Checks, Diagnosis, Estimate, ForceMisfit, Gap
-from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
+from snrmjax.diagnose.diagnosis_result import (
+    Answer,
+    Checks,
+    Diagnosis,
+    Estimate,
+    ForceMisfit,
+    FormerAnswer,
+    Gap,
+    what_changed,
+)
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.corrected_records import at_reference
@@ -40,8 +48,7 @@ from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import FoundEffects
-from snrmjax.diagnose.verdict import Verdict
+from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -55,7 +62,6 @@ _LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is co
 _LEAST_STATES = 6
 _OTHER_MODE = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _FEW = 2  # effects of an answer beside which no law is drawn
-_NEAR_BEST = 6.0  # of Schwarz's criterion
 
 
 @on_one_core
@@ -101,7 +107,7 @@ def diagnose_model(
     unknown = predictions.chosen.phase_unknown[:, 0]
     _check_number_of_states(unknown)
     # Beside an unknown gain nothing says which level's force is off.
-    estimable = force_gain_std == 0 and not np.any(np.asarray(data.phase_unknown))
+    estimable = force_gain_std == 0 and not predictions.chosen.phase_unknown.any()
     predictions = with_reference(predictions)
     misfit = weighted_misfit(predictions)
     if not np.isfinite(misfit.base).all():
@@ -402,7 +408,7 @@ def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
     notes, rows = [], [row for step in found.table for row in step]
     lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
     behind = [one for one in behind if np.isfinite(one)]
-    near = sum(one < _NEAR_BEST for one in behind)
+    near = sum(one < AS_GOOD for one in behind)
     if behind:
         effect = "all were clearly worse than the best, so the answer does not depend on them."
         if near:

@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 from snrmjax.diagnose.checks.cross_validation import HeldOut
 from snrmjax.diagnose.checks.level_forces import LevelGain, level_forces_sentence
 from snrmjax.diagnose.completed_model import CompletedStatus
+from snrmjax.diagnose.decide import Verdict, verdict_sentence
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
 from snrmjax.diagnose.laws.law_table import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
-from snrmjax.diagnose.verdict import Verdict, verdict_sentence
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effects import EFFECTS
 from snrmjax.model.structures import Structure
@@ -27,6 +27,7 @@ AS_NOISE = 1.3
 
 _WIDTH = 98  # of the notes, columns
 _LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
+_LIKELY = 0.05  # probability from which on an answer is mentioned
 
 
 class Estimate(NamedTuple):
@@ -273,3 +274,33 @@ def _texts(texts: Iterable[str]) -> np.ndarray:
 
 def _words(status: MinimisationStatus | CompletedStatus) -> str:
     return status.value.replace("_", " ")
+
+
+class FormerAnswer(NamedTuple):
+    """What a diagnosis of fewer states said."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    probabilities: Mapping[str, float]  # of the answers considered
+    starts: Mapping[str, tuple[float, ...]]  # parameters of every effect that was compared
+
+
+def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> str:
+    """What further states did to the answers that were likely before, in one sentence."""
+    likely = [name for name, p in former.probabilities.items() if p >= _LIKELY]
+    both = [
+        f"{name} {100 * former.probabilities[name]:.0f} % → "
+        f"{100 * probabilities.get(name, 0):.0f} %"
+        for name in dict.fromkeys([*likely, *list(probabilities)[:1]])
+        if name in former.probabilities
+    ]
+    new = [
+        f"{name} now {100 * p:.0f} %"
+        for name, p in probabilities.items()
+        if p >= _LIKELY and name not in former.probabilities
+    ]
+    before = " and ".join(former.effects) or "no effect"
+    return (
+        f"before the further states the verdict was {former.verdict} ({before}). Probabilities: "
+        f"{', '.join([*both, *new])}."
+    )

@@ -17,8 +17,7 @@ from jaxtyping import Float, Int
 from scipy.special import logsumexp
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.misfit.candidates import candidate
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import candidate, coordinates
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import scales_of
@@ -37,7 +36,6 @@ from snrmjax.model.effects import EFFECTS, effect_parameters
 
 NONE, UNKNOWN, NOISE_REJECTED = "none", "unknown", "noise_rejected"
 
-_AGAIN = 1.0  # of χ², by which an answer's linear step may lower it: a fit that ended before
 _REFINED = 8  # answers that are made straight at their own errors
 _BESIDE = 6  # answers that are compared with themselves beside a discrepancy
 _NOISES = 57  # of the noise's logarithm, that are summed over
@@ -49,7 +47,8 @@ class Weighed(NamedTuple):
     kinds: frozenset[str]
     misfit: WeightedMisfit  # made straight at its own most likely errors, where it was refined
     fit: EffectFit
-    log_weight: float
+    log_weight: float  # for noise as stated
+    if_noise_is_wrong: float = -np.inf  # and for noise stated wrong
 
 
 class Weights(NamedTuple):
@@ -83,13 +82,12 @@ def answer_name(kinds: Iterable[str]) -> str:
 
 
 class Marginal(NamedTuple):
-    """An answer, linear about its best fit: all that is unknown, with prior variances.
+    """An answer, linear about its best fit, by all that is unknown in units of its prior's 1σ.
 
     Rows are those of `WeightedMisfit`, each in units of its own state's noise.
     """
 
     rows: LinearRows
-    variance: Float[np.ndarray, " unknown"]  # at the sizes that the misfit's noise has
     group: Int[np.ndarray, " unknown"]  # whose size counts: of `_Sizes`, −1 where it is known
     penalty: float  # of a fit that had not ended
 
@@ -132,100 +130,82 @@ def weights_of(found: FoundEffects, refined: Refined | None = None) -> Weights:
     stated. The likeliest answers, and nothing at all, are `refined` before they are compared.
     """
     sizes = _sizes_of(found.misfit)
-    every = (found.baseline, found.fit, *found.considered)
-    best: dict[frozenset[str], _Compared] = {}
-    for fit in every:
-        one = _compared(found.misfit, fit, sizes)
-        if one is not None and (one.kinds not in best or one.right > best[one.kinds].right):
-            best[one.kinds] = one
-    done: list[_Compared] = []
+    fits = {id(fit): fit for fit in (found.baseline, found.fit, *found.considered)}
+    every = [_weighed(found.misfit, fit, sizes) for fit in fits.values()]
+    weighed = sorted((one for one in every if one is not None), key=lambda one: one.log_weight)
+    best = {one.kinds: one for one in weighed}
+    done: list[Weighed] = []
     for kinds in _worth_refining(best):
         if refined is None or _is_far_behind(best[kinds], done):
             continue
         misfit, fit = refined(best[kinds].misfit, best[kinds].fit)
-        again = _compared(misfit, fit, sizes)
+        again = _weighed(misfit, fit, sizes)
         if again is not None:
             best[kinds] = again
             done.append(again)
-    ranked = sorted(best.values(), key=lambda one: -one.right)
-    unknown = [np.log(priors.UNNAMED) + one.right for one in ranked if one.kinds]
+    ranked = sorted(best.values(), key=lambda one: -one.log_weight)
+    unknown = [np.log(priors.UNNAMED) + one.log_weight for one in ranked if one.kinds]
     for one in ranked[:_BESIDE]:
         directions = list(discrepancies(one.misfit))
         prior = np.log(priors.DISCREPANCY / len(directions)) + _log_prior(len(one.kinds))
         for columns in directions:
-            beside = with_discrepancy(one.misfit, one.fit, one.marginal, columns)
-            unknown.append(prior + log_evidence(beside, sizes).right)
-    rejected = np.log(priors.WRONG_NOISE) + logsumexp([one.wrong for one in ranked])
-    answers = tuple(Weighed(one.kinds, one.misfit, one.fit, one.right) for one in ranked)
-    return Weights(answers, float(logsumexp(unknown)), float(rejected))
+            beside = marginal_of(one.misfit, one.fit, columns)
+            if beside is not None:
+                unknown.append(prior + log_evidence(beside, sizes).right)
+    rejected = np.log(priors.WRONG_NOISE) + logsumexp([one.if_noise_is_wrong for one in ranked])
+    return Weights(tuple(ranked), float(logsumexp(unknown)), float(rejected))
 
 
-class _Compared(NamedTuple):
-    kinds: frozenset[str]
-    misfit: WeightedMisfit
-    fit: EffectFit
-    marginal: "Marginal"
-    right: float  # ln of prior odds times evidence, for noise as stated
-    wrong: float  # and for noise stated wrong
-
-
-def _compared(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> _Compared | None:
+def _weighed(misfit: WeightedMisfit, fit: EffectFit, sizes: "_Sizes") -> Weighed | None:
+    """A fit with its weight; None where it has no motion."""
     marginal = marginal_of(misfit, fit)
     if marginal is None:
         return None
     evidence, prior = log_evidence(marginal, sizes), _log_prior(len(fit.kinds))
     pair = prior + evidence.right, prior + evidence.wrong
-    return _Compared(frozenset(fit.kinds), misfit, fit, marginal, *pair)
+    return Weighed(frozenset(fit.kinds), misfit, fit, *pair)
 
 
-def _is_far_behind(one: _Compared, done: Sequence[_Compared]) -> bool:
-    """Whether a refined answer fits and makes this one, as it is, improbable."""
+def _is_far_behind(one: Weighed, done: Sequence[Weighed]) -> bool:
+    """Whether a refined answer makes this one, as it is, improbable."""
     if not done:
         return False
-    best = max(done, key=lambda each: each.right)
+    best = max(done, key=lambda each: each.log_weight)
     freedom = best.misfit.n_rows - len(best.fit.values)
     fits = chi_square_p_value(best.fit.chi_square, freedom) > priors.REJECTED
-    return fits and one.right < best.right - priors.FAR_BEHIND
+    # Where even the best one leaves more than noise, corrections move others so much further.
+    left = 1.0 if fits else best.fit.chi_square / max(freedom, 1)
+    return one.log_weight < best.log_weight - priors.FAR_BEHIND * left
 
 
-def _worth_refining(best: dict[frozenset[str], _Compared]) -> list[frozenset[str]]:
+def _worth_refining(best: dict[frozenset[str], Weighed]) -> list[frozenset[str]]:
     """Nothing, the likeliest effects alone, and then the likeliest answers of any size."""
-    ranked = sorted(best, key=lambda kinds: -best[kinds].right)
+    ranked = sorted(best, key=lambda kinds: -best[kinds].log_weight)
     alone = [kinds for kinds in ranked if len(kinds) <= 1][:_REFINED]
     return list(dict.fromkeys([*alone, frozenset[str](), *ranked[:_REFINED]]))
 
 
-def marginal_of(misfit: WeightedMisfit, fit: EffectFit) -> Marginal | None:
-    """A fit with the priors of its parameters; None where it has no motion."""
-    noise = misfit.noise
-    arms = _arms(misfit, fit)
+def marginal_of(
+    misfit: WeightedMisfit, fit: EffectFit, beside: Float[np.ndarray, "row any"] | None = None
+) -> Marginal | None:
+    """A fit with the priors of its parameters; None where it has no motion.
+
+    `beside` are directions of a discrepancy, of the size of noise for unit values.
+    """
+    noise, arms = misfit.noise, _arms(misfit, fit)
     if not (np.all(np.isfinite(fit.rows)) and np.all(np.isfinite(arms))):
         return None
-    design = np.concatenate([arms, noise.shared], axis=1)
-    group = np.concatenate([np.full(arms.shape[1], -1), noise.shared_kind])
-    variance = np.ones(design.shape[1])
+    columns = np.zeros((misfit.n_rows, 0)) if beside is None else beside
+    design = np.concatenate([arms, noise.shared, columns], axis=1)
+    known, unknown = np.full(arms.shape[1], -1), np.full(columns.shape[1], len(LEVELS))
+    group = np.concatenate([known, noise.shared_kind, unknown])
     left, own = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
     promised = 0.0
     if own.shape[1]:
         step = np.linalg.lstsq(own, left, rcond=1e-10)[0]
         promised = float(np.sum((own @ step) ** 2))
     # The most likely parameters are the fit's; what more a linear step promises is not believed.
-    penalty = 0.5 * promised if promised > _AGAIN else 0.0
-    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), variance, group, penalty)
-
-
-def with_discrepancy(
-    misfit: WeightedMisfit, fit: EffectFit, alone: Marginal, columns: Float[np.ndarray, "row any"]
-) -> Marginal:
-    """An answer beside a discrepancy in some directions, of the size of noise for unit values."""
-    design = np.concatenate([_arms(misfit, fit), misfit.noise.shared, columns], axis=1)
-    n = columns.shape[1]
-    return Marginal(
-        LinearRows.of(design, fit.rows, _units(misfit)),
-        np.append(alone.variance, np.ones(n)),
-        np.append(alone.group, np.full(n, 4)),
-        alone.penalty,
-    )
+    return Marginal(LinearRows.of(design, fit.rows, _units(misfit)), group, 0.5 * promised)
 
 
 class Evidence(NamedTuple):
@@ -255,7 +235,7 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
     densities = [sizes.densities[place] for place in used]
 
     def likelihood(point: np.ndarray) -> tuple[float, np.ndarray]:
-        variance = model.variance * np.exp(2 * (member @ point[1:]))
+        variance = np.exp(2 * (member @ point[1:]))
         value, by_scale, by_variance = model.rows.log_likelihood(np.exp(point[0]), variance)
         return value, np.append(by_scale, 2 * (by_variance @ member))
 
@@ -273,9 +253,21 @@ def log_evidence(model: Marginal, sizes: _Sizes) -> Evidence:
     volume = 0.5 * (len(others) * np.log(2 * np.pi) - np.linalg.slogdet(others)[1])
     top = with_priors(found)[0] - likelihood(found)[0]
     grid = np.linspace(*sizes.noise_bounds, _NOISES)
-    logs = np.array([likelihood(np.append(one, found[1:]))[0] for one in grid])
-    logs += volume + top - model.penalty
+    variance = np.exp(2 * (member @ found[1:]))
+    logs = _over_noise(model.rows, np.exp(grid), variance) + volume + top - model.penalty
     return Evidence(*(float(logsumexp(logs + prior(grid))) for prior in sizes.noise))
+
+
+def _over_noise(
+    rows: LinearRows, scale: Float[np.ndarray, " noise"], variance: Float[np.ndarray, " unknown"]
+) -> Float[np.ndarray, " noise"]:
+    """ln p of rows for several sizes of noise: in the principal directions of what is unknown."""
+    directions, size, _ = np.linalg.svd(rows.triangle * np.sqrt(variance), full_matrices=False)
+    noise, others = scale[:, None] ** 2, rows.n_rows - len(size)
+    square = np.sum((rows.along @ directions) ** 2 / (noise + size**2), axis=1)
+    square += rows.across / noise[:, 0]
+    log_det = np.sum(np.log(noise + size**2), axis=1) + others * np.log(noise[:, 0])
+    return rows.offset - 0.5 * (rows.n_rows * np.log(2 * np.pi) + log_det + square)
 
 
 def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any"]]:

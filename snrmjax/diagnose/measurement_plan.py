@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.verdict import Verdict
 from snrmjax.measure.states import PHASE_UNKNOWN, SteadyStates, relative_errors, steady_states
 
 _MOST = 24  # states of a level that is measured again

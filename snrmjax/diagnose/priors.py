@@ -70,4 +70,5 @@ SETTLED_ERROR = 0.02
 
 FAR_BEHIND = 25.0
 """Of ln p behind an answer that fits, from which on others are not corrected for their errors: that
-moves the ln p of answers near it by ten or so."""
+moves the ln p of answers near it by ten or so. Behind one that leaves more than noise, as many
+times more as its χ² is over what noise leaves."""

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from snrmjax.diagnose.former_answer import FormerAnswer
+from snrmjax.diagnose.diagnosis_result import FormerAnswer
 from snrmjax.diagnose.measurement_plan import MeasurementPlan
 from snrmjax.io.columns import PHASOR, harmonic_columns, read_header
 from snrmjax.io.files import FilePath, file_name, read_text, shown

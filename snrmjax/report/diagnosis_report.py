@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from snrmjax.diagnose.decide import Verdict
 from snrmjax.diagnose.diagnosis import diagnose_model
-from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis
+from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, FormerAnswer
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
-from snrmjax.diagnose.former_answer import FormerAnswer
 from snrmjax.diagnose.held_velocity import held_curves, holds_response
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
@@ -22,7 +22,6 @@ from snrmjax.diagnose.response_prediction import (
 from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
-from snrmjax.diagnose.verdict import Verdict
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model

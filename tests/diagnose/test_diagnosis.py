@@ -22,7 +22,7 @@ from truths.balanced_sets import (
 
 import snrmjax as sj
 from snrmjax.diagnose.checks.cross_validation import held_out
-from snrmjax.diagnose.checks.damping_asymmetry import acts_both_ways, even_share
+from snrmjax.diagnose.checks.doubts import acts_both_ways, even_share
 from snrmjax.diagnose.misfit.candidates import candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,

@@ -10,10 +10,10 @@ from truths.balanced_sets import balanced, linear_model, quadratic
 
 import snrmjax as sj
 from snrmjax.diagnose.completed_model import CompletedStatus
+from snrmjax.diagnose.decide import Verdict, verdict_sentence
 from snrmjax.diagnose.diagnosis import _notes_on_fits, _unconverged
 from snrmjax.diagnose.diagnosis_result import unit_of
 from snrmjax.diagnose.search.model_search import TriedEffect
-from snrmjax.diagnose.verdict import Verdict, verdict_sentence
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
 

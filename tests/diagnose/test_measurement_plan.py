@@ -28,7 +28,7 @@ from typer.testing import CliRunner
 
 import snrmjax as sj
 from snrmjax.cli import app
-from snrmjax.diagnose.former_answer import FormerAnswer, what_changed
+from snrmjax.diagnose.diagnosis_result import FormerAnswer, what_changed
 from snrmjax.diagnose.measurement_plan import measurement_plan
 from snrmjax.io.measurement_plans import read_further_states, write_plan
 

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
-from snrmjax.diagnose.misfit.noise_model import NoiseModel
-from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
+from snrmjax.diagnose.misfit.noise_model import NoiseModel, shared_covariance
 
 LEVELS, PER_LEVEL = 4, 15
 N_STATES = LEVELS * PER_LEVEL

@@ -16,8 +16,6 @@ from snrmjax.diagnose.misfit.weighted_misfit import FREE_LEVEL_FORCE_STD, Weight
 from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED, FoundEffects
 from snrmjax.measure.states import SteadyStates
 
-_LEAST_LEVELS = 3  # of two that disagree nothing says which is wrong
-
 
 class LevelGain(NamedTuple):
     """The force that acted at a level over the recorded one."""
@@ -90,8 +88,6 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
     Validity: three levels or more, whose phases and forces were measured.
     """
     misfit = found.misfit
-    if misfit.predictions.chosen.n_levels < _LEAST_LEVELS:
-        return None
     arms = misfit.noise.decorrelated(_of_forces(misfit)).T
     own = found.fit.criterion(misfit.n_rows)
     every = [_beside(misfit, fit, arms) for fit in _distinct(found)]
@@ -192,7 +188,7 @@ def _beside(
 
     places: tuple[int, ...] = ()
     least, levels = square(()), range(arms.shape[1])
-    while len(places) < (len(levels) - 1) // 2:
+    while len(places) < (len(levels) - 1) // 2:  # of two that disagree nothing says which is wrong
         others = [(square((*places, k)), (*places, k)) for k in levels if k not in places]
         best, chosen = min(others)
         if least - best - cost <= DETECTED:

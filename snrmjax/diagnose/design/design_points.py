@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, with_errors_passed_on
+from snrmjax.diagnose.misfit.noise_model import SharedCovariance, shared_covariance
 from snrmjax.diagnose.misfit.predictions import Predicted, Predictions, predictions_of
 from snrmjax.diagnose.misfit.programs import COMPARED
-from snrmjax.diagnose.misfit.shared_covariance import SharedCovariance, shared_covariance
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.measure.states import SteadyStates, steady_states
 

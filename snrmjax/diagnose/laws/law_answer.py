@@ -16,8 +16,13 @@ from snrmjax.diagnose.checks.cross_validation import (
     held_out_places,
     rows_of_level,
 )
-from snrmjax.diagnose.checks.neighbours import neighbour_noise, tolerated
-from snrmjax.diagnose.checks.patterns import UNLIKELY, left_curve, pattern
+from snrmjax.diagnose.checks.patterns import (
+    UNLIKELY,
+    left_curve,
+    neighbour_noise,
+    pattern,
+    tolerated,
+)
 from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
 from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
 from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind
@@ -57,8 +62,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
 
     It must do so as an effect must: what is left is noise without a pattern, and a level between
     others that was left out of the fit is predicted; and where the effects do not fit, its evidence
-    must be better than theirs. And one law must do: a free stiffness beside a free damping could
-    follow errors of the instruments, and Masing's rule ties the damping of slip to its stiffness.
+    must be better than theirs.
     """
     misfit = found.misfit
     try:
@@ -71,8 +75,6 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
     rejected = found.p_value < UNLIKELY
     if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - DETECTED:
-        return None
-    if len({part.split()[-1] for part in parts}) > 1:
         return None
     as_effect = _as_effect_fit(fit)
     neighbours = neighbour_noise(fit.misfit, as_effect)

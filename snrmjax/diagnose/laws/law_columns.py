@@ -56,7 +56,6 @@ class LawColumns(NamedTuple):
     passed_on: ErrorPropagation
     point: Float[np.ndarray, "state entry"]
     inverse: Float[np.ndarray, "state entry entry"]
-    largest: Float[np.ndarray, "state two"]  # |q| and |q̇| of the motion
 
 
 def law_columns(
@@ -99,6 +98,8 @@ def law_columns(
     std = np.array([*(std for _, std in stated.values()), 1.0, 1.0])
     phasors = p.sizes.phasors(columns[None])[0]
     by_baseline = by_value[:, :, [names.index(name) for name in (*stated, *linear)]]
+    own_mode = [float(values[names.index(name)]) for name in linear]
+    by_baseline[..., -2] -= own_mode[1] / own_mode[0] * by_baseline[..., -1]  # as a stiffness does
     passed_on = ErrorPropagation(by_error, phasors, by_baseline * std)
     shape = (*columns.shape, *secants.shape)
     return LawColumns(columns, by_secant.reshape(shape), passed_on, *found[4:])
@@ -247,17 +248,6 @@ def _law_columns(
         of_secant = balance.by_secant(at)
         by_secant = -jnp.tensordot(of_point[:, : of_secant.shape[0]], of_secant, axes=1)
         by_secant = by_secant.reshape(measured.known.shape[0], -1)
-        return (both(point, here)[1], by_secant, *slopes, point, exact, _largest(own, point))
+        return (both(point, here)[1], by_secant, *slopes, point, exact)
 
     return jax.vmap(one)(states, near, inverse)
-
-
-def _largest(motion: PrescribedMotion, point: Array) -> Float[Array, " two"]:
-    """Largest |q| and |q̇| of the mode of interest over the motion."""
-    balance = motion.balance
-    basis = harmonic_basis((balance.n_coefficients - 1) // 2, _SAMPLES)
-    j = balance.model.modes.mode_of_interest
-    x = point[:-2].reshape(balance.n_coefficients, -1)[:, j] * balance.displacement_scale
-    q = jnp.asarray(basis.synthesis) @ x
-    v = motion.frequency * (jnp.asarray(basis.synthesis @ basis.derivative) @ x)
-    return jnp.stack([jnp.max(jnp.abs(q)), jnp.max(jnp.abs(v))])

@@ -59,7 +59,9 @@ class LawFit(NamedTuple):
 def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     """The law that explains a misfit best, whatever it explains; None where none has a motion.
 
-    A second and a third part are added while the evidence gains as much as an effect must.
+    A second and a third part are added while the evidence gains as much as an effect must. None
+    where they are not those of one law: a free stiffness beside a free damping could follow errors
+    of the instruments, and Masing's rule ties the damping of slip to its stiffness.
     """
     predictions, scales = misfit.predictions, scales_of(misfit.predictions)
     knots = knots_of(predictions)
@@ -101,9 +103,18 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
         misfit = misfit.reweighted(columns.passed_on)
         if settled and number > 0:
             break
+        if number + 1 >= _SEARCHED and not _is_one(parts):
+            return None
+    if not _is_one(parts):
+        return None
     problem = law_problem(misfit, columns, secants, knots, units)
     final = posterior(problem, parts)._replace(mean=found.mean)
     return LawFit(misfit, knots, units, columns, problem, final, rivals, settled)
+
+
+def _is_one(parts: Sequence[str]) -> bool:
+    """Whether parts are those of one law: a spring, a damper, a film or slip."""
+    return len({part.split()[-1] for part in parts}) == 1
 
 
 def knots_of(predictions: Predictions) -> LawKnots:

@@ -1,12 +1,16 @@
-"""Every effect as a candidate: where its fit starts, and what separates it from others."""
+"""Every effect as a candidate: its starts, its steps, and what separates it from others."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from snrmjax.model.effect_metadata import Confusion, MotionScales
 from snrmjax.model.effect_shape import shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
 from snrmjax.model.library.confusions import CONFUSIONS
+from snrmjax.model.modes import LinearModes
 
 
 class EffectCandidate(NamedTuple):
@@ -70,3 +74,73 @@ def _confusions(kinds: Iterable[str]) -> list[Confusion]:
 def _confused(confusion: Confusion, kinds: Iterable[str]) -> set[str]:
     """Those of some kinds that a confusion names."""
     return {kind for kind in kinds if confusion in EFFECTS[kind].confusions}
+
+
+class Coordinates(NamedTuple):
+    """A law c x^p by its stiffness c R^(p − 1) at a typical amplitude R, and by p.
+
+    Data determine the force at the measured amplitudes. The coefficient c is that at unit
+    amplitude and changes by powers of ten with the exponent: a fit in c and p would follow a
+    narrow, bent valley.
+    """
+
+    pairs: tuple[tuple[int, int], ...]  # places of a coefficient and its exponent
+    reference: float  # R, kg^1/2 m
+
+    def inward(self, values: Float[np.ndarray, "*trial parameter"]) -> np.ndarray:
+        """Parameters as the fit sees them."""
+        return self._scaled(values, 1.0)
+
+    def outward(self, inner: Float[np.ndarray, "*trial parameter"]) -> np.ndarray:
+        """Parameters of the effects."""
+        return self._scaled(inner, -1.0)
+
+    def slopes(
+        self,
+        values: Float[np.ndarray, " parameter"],
+        slopes: Float[np.ndarray, "row parameter"],
+    ) -> Float[np.ndarray, "row parameter"]:
+        """Slopes by the fit's coordinates, of those by the effects' parameters at `values`."""
+        turned = slopes.copy()
+        for c, p in self.pairs:
+            turned[:, p] -= values[c] * np.log(self.reference) * slopes[:, c]
+            turned[:, c] *= self.reference ** (1 - values[p])
+        return turned
+
+    def _scaled(self, values: Float[np.ndarray, "*trial parameter"], sign: float) -> np.ndarray:
+        scaled = np.array(values, dtype=float)
+        for c, p in self.pairs:
+            scaled[..., c] *= self.reference ** (sign * (scaled[..., p] - 1))
+        return scaled
+
+
+def coordinates(labels: Sequence[str], reference: float) -> Coordinates:
+    """Coordinates for parameters of these names; `reference` is a typical amplitude."""
+    pairs = []
+    for place, label in enumerate(labels):
+        kind, _, name = label.partition(".")
+        exponent = EFFECTS[kind].parameters()[name].exponent
+        if exponent is not None:
+            pairs.append((place, labels.index(f"{kind}.{exponent}")))
+    return Coordinates(tuple(pairs), reference)
+
+
+def motion_scales(
+    modes: LinearModes,
+    sensor: int,
+    speed: Float[np.ndarray, " state"],
+    omega: Float[np.ndarray, " state"],
+    force: Float[np.ndarray, " state"],
+) -> MotionScales:
+    """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
+    j = modes.mode_of_interest
+    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
+    return MotionScales(
+        amplitude=float(np.median(amplitude)),
+        largest=float(np.max(amplitude)),
+        frequency=float(modes.natural_frequency[j]),
+        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
+        receptance=float(np.median(speed / omega / force)),
+        smallest_force=float(np.min(force)),
+        damping_ratio=float(modes.damping_ratio[j]),
+    )

@@ -7,13 +7,14 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 """
 
 import dataclasses
+from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, values_of
-from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of
-from snrmjax.diagnose.misfit.reference import as_weighed
+from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.measure.states import SteadyStates
 
@@ -59,19 +60,6 @@ def already_added(predictions: Predictions) -> Float[np.ndarray, "state input"]:
     return np.zeros_like(np.asarray(predictions.chosen.states.error)) if added is None else added
 
 
-def _at(
-    old: Predictions,
-    data: SteadyStates,
-    added: Float[np.ndarray, "state input"],
-    harmonics: int | None = None,
-) -> Predictions:
-    """Predictions of records with something added to them; it counts once they are weighted."""
-    corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
-    order = old.compared.harmonic_order if harmonics is None else harmonics
-    new = predictions_of(old.given, corrected, old.force_gain_std, harmonics=order)
-    return dataclasses.replace(as_weighed(new, old), added=added)
-
-
 def likely_errors(
     misfit: WeightedMisfit, rows: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "state input"]:
@@ -96,6 +84,17 @@ def likely_errors(
     return np.where(np.isfinite(added), added, 0.0)
 
 
+def _at(
+    old: Predictions,
+    data: SteadyStates,
+    added: Float[np.ndarray, "state input"],
+    harmonics: int | None = None,
+) -> Predictions:
+    """Predictions of records with something added to them; it counts once they are weighted."""
+    corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
+    return old.of_records(corrected, added, harmonics)
+
+
 def with_corrected_records(
     data: SteadyStates,
     rows: Int[np.ndarray, " state"],
@@ -103,16 +102,18 @@ def with_corrected_records(
     added: Float[np.ndarray, "state input"],
 ) -> SteadyStates:
     """The data with errors of velocities and phases taken away, of the states in `rows`."""
+    told: Any = jax.tree.map(np.asarray, data)
     n = len(sensors)
     size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
     size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
     back = np.argsort(sensors)
     size, turn = size[:, back], turn[:, back]
     orders = np.array(data.harmonic_order, dtype=int)
-    return dataclasses.replace(
-        data,
-        velocity=data.velocity * (size * np.exp(1j * turn)),
-        velocity_std=data.velocity_std * size,
-        harmonics=data.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
-        harmonic_std=data.harmonic_std * size,
+    found: SteadyStates = dataclasses.replace(
+        told,
+        velocity=told.velocity * (size * np.exp(1j * turn)),
+        velocity_std=told.velocity_std * size,
+        harmonics=told.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
+        harmonic_std=told.harmonic_std * size,
     )
+    return found

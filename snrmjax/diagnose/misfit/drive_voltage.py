@@ -6,12 +6,17 @@ import equinox as eqx
 import numpy as np
 
 from snrmjax.diagnose.misfit.predictions import predictions_of
+from snrmjax.diagnose.misfit.reference import reference_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
+from snrmjax.identify.checks.instruments import force_gain_undetermined
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.structures import Structure
 
 FREE_GAIN_STD = 1.0
 """Relative 1σ of a force gain that is unknown."""
+
+_BESIDE = 0.5  # cosine of the phase of states from which on the damping is seen well
+_ROUNDS = 2  # of smooth curves: the first one's prior lies about what the model as given needs
 
 
 class FirstGain(NamedTuple):
@@ -31,34 +36,36 @@ def driven_by_voltage(data: SteadyStates) -> bool:
 def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
     """The states with a force by a first value of the unknown gain, which must stay free.
 
-    It is that of a joint fit of smooth curves. A joint fit needs phases: where some are unknown,
-    the gain is the median, over the states, of the force that the model needs for the measured
-    motion over the drive voltage.
+    It is the median, over the states, of the force that the model needs for the measured motion
+    over the drive voltage; and, where phases are known, what smooth curves of amplitude make of
+    that: with a gain of the force all of the dynamic stiffness grows, but not the part of the known
+    modal mass.
 
-    Raises `ValueError` where the model has no such motions, and what `fit_jointly` raises, as for
-    a gain that the states do not determine.
+    Raises `ValueError` where the model has no such motions.
     """
-    doubts: tuple[str, ...] = ()
-    if np.any(np.asarray(data.phase_unknown)):
-        in_volts = eqx.tree_at(lambda d: d.force, data, data.drive)
-        needed = weighted_misfit(predictions_of(model, in_volts, FREE_GAIN_STD)).baseline.force
-        if not np.any(np.isfinite(needed)):
-            raise ValueError("the model has no motion of the measured amplitude for any state.")
-        gain = float(np.median(np.abs(needed)[np.isfinite(needed)]))
-        found, by = eqx.tree_at(lambda d: d.force, data, gain * data.drive), "the model as given"
-    else:
-        # Few need it, and it takes as long to import as half the others.
-        from snrmjax.identify.checks.instruments import notes_on_instruments
-        from snrmjax.identify.inference.corrected_states import corrected_states
-        from snrmjax.identify.joint.joint_fit import fit_jointly
-        from snrmjax.identify.test_model.states import LEVEL_ERRORS
 
-        fit = fit_jointly(data, model.modes, free=("force_gain",))
-        gain = float(np.exp(fit.unknowns.log_force_gain))
-        found, by = corrected_states(data, fit), "a joint fit of smooth curves"
-        doubts = notes_on_instruments(fit, LEVEL_ERRORS)
+    def driven(gain: float) -> SteadyStates:
+        return eqx.tree_at(lambda d: d.force, data, gain * data.drive)
+
+    predictions = predictions_of(model, driven(1.0), FREE_GAIN_STD)
+    needed, unknown = weighted_misfit(predictions).baseline.force, predictions.chosen.phase_unknown
+    phase = np.angle(np.asarray(predictions.chosen.states.velocity)[:, 0])
+    # With known phases the part against damping, which no error of the stiffness changes.
+    part = np.real(needed * np.exp(-1j * phase)) / np.maximum(np.cos(phase), _BESIDE)
+    gains = np.abs(needed if unknown.any() else part)
+    if not np.any(np.isfinite(gains)):
+        raise ValueError("the model has no motion of the measured amplitude for any state.")
+    gain, by = float(np.median(gains[np.isfinite(gains)])), "the model as given"
+    doubt = ""
+    for _ in range(0 if unknown.any() else _ROUNDS):
+        reference = reference_of(predictions_of(model, driven(gain), FREE_GAIN_STD))
+        if reference is None:
+            break
+        mass, std = reference.posterior.modal_mass
+        gain, by = gain / mass, "smooth curves of amplitude"
+        doubt = force_gain_undetermined(std / mass, float(np.max(np.abs(phase))))
     note = (
         f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
         "is fitted too: a 1 % error of the gain looks like 1 % of damping."
     )
-    return FirstGain(found, gain, (note, *doubts))
+    return FirstGain(driven(gain), gain, (note, doubt) if doubt else (note,))

@@ -1,13 +1,13 @@
 """Fits of effects to a weighted misfit."""
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, parameter_labels
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, coordinates, parameter_labels
 from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import ErrorPropagation, WeightedMisfit, by_baseline
 from snrmjax.numerics.blocks import over_cores
@@ -62,14 +62,19 @@ class _Evaluated(NamedTuple):
     jacobian: Float[np.ndarray, "row parameter"]
 
 
-_Evaluation = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
 def baseline_fit(misfit: WeightedMisfit) -> EffectFit:
     """The baseline without any effect."""
     empty, none = np.zeros((misfit.n_rows, 0)), np.zeros(0)
     square = misfit.chi_square(misfit.base)
     return EffectFit((), (), none, square, misfit.base, empty, none, none)
+
+
+def started(candidate: EffectCandidate) -> EffectFit:
+    """A candidate at its first starting point, where its misfit is not known yet."""
+    values, none = np.array(candidate.starts[0]), np.zeros(0)
+    bounds = np.array(candidate.lower), np.array(candidate.upper)
+    labels = parameter_labels(candidate.kind)
+    return EffectFit((candidate.kind,), labels, values, np.inf, none, none[:, None], *bounds)
 
 
 def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
@@ -85,14 +90,17 @@ def unfitted(misfit: WeightedMisfit, candidate: EffectCandidate) -> EffectFit:
 
 
 def fit_effect(
-    misfit: WeightedMisfit, candidate: EffectCandidate, beside: EffectFit | None = None
+    misfit: WeightedMisfit,
+    candidate: EffectCandidate,
+    beside: EffectFit | None = None,
+    hopeless: float = np.inf,
 ) -> EffectFit:
     """The best fit of a candidate from all its starting points, beside what was fitted before.
 
-    All parameters are free, those of `beside` too. The `status` says whether a minimum was found.
+    All parameters are free, those of `beside` too. A fit that promises no χ² below `hopeless` is
+    given up. The `status` says whether a minimum was found.
     """
     before = beside or baseline_fit(misfit)
-    together = _together(misfit, candidate, before)
     labels = (*parameter_labels(candidate.kind), *before.labels)
     law = coordinates(labels, scales_of(misfit.predictions).amplitude)
     n, m = len(candidate.unit), len(before.values)
@@ -104,7 +112,8 @@ def fit_effect(
 
     def evaluated(values: np.ndarray) -> list[_Evaluated]:
         found = []
-        for own, rows, slopes in zip(values, *together(values), strict=True):
+        together = misfit.evaluated(misfit.predictions.group, labels, values)
+        for own, rows, slopes in zip(values, *together, strict=True):
             by = law.slopes(own, slopes) * unit
             left, arms = misfit.noise.decorrelated(rows), misfit.noise.decorrelated(by.T).T
             found.append(_Evaluated(own, rows, slopes, by, left, arms))
@@ -123,7 +132,8 @@ def fit_effect(
         points[lost, 0] *= 0.3  # too strong to have a motion
         for t, one in zip(lost, linearised(points[lost]), strict=True):
             at_points[t] = one
-    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), _RULE)
+    rule = dataclasses.replace(_RULE, hopeless=hopeless)
+    ends = minimise(linearised, points, at_points, (lower / unit, upper / unit), rule)
     best = min(ends, key=lambda end: end.sum_of_squares)
     at, values = best.linearised, best.linearised.values
     if np.any(best.last_step):
@@ -143,10 +153,12 @@ def fit_effect(
 
 
 def fit_effects(
-    misfit: WeightedMisfit, jobs: Sequence[tuple[EffectCandidate, EffectFit]]
+    misfit: WeightedMisfit,
+    jobs: Sequence[tuple[EffectCandidate, EffectFit]],
+    hopeless: float = np.inf,
 ) -> list[EffectFit]:
     """The best fit of every candidate beside what was fitted before, over the cores."""
-    return over_cores(lambda job: fit_effect(misfit, *job), jobs)
+    return over_cores(lambda job: fit_effect(misfit, *job, hopeless), jobs)
 
 
 def with_errors_passed_on(misfit: WeightedMisfit, fit: EffectFit) -> WeightedMisfit:
@@ -180,9 +192,3 @@ def values_of(misfit: WeightedMisfit, fit: EffectFit) -> Float[np.ndarray, " par
     values = group.values.copy()
     values[[group.place(label) for label in fit.labels]] = fit.values
     return values
-
-
-def _together(misfit: WeightedMisfit, candidate: EffectCandidate, before: EffectFit) -> _Evaluation:
-    """Rows and slopes by a candidate's parameters and those of what was fitted before."""
-    labels = (*parameter_labels(candidate.kind), *before.labels)
-    return lambda values: misfit.evaluated(misfit.predictions.group, labels, values)

@@ -1,14 +1,91 @@
-"""The noise of measured states: each by itself, and all that they have in common."""
+"""The noise of measured states: each by itself, and all that they have in common.
+
+Numbers that share a few errors are decorrelated at a cost in proportion to the numbers.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import chdtrc
 
-from snrmjax.diagnose.misfit.predictions import Measured
-from snrmjax.diagnose.misfit.shared_covariance import SharedCovariance, shared_covariance
+from snrmjax.diagnose.misfit.predictions import Predictions
 from snrmjax.identify.calibrate.calibration_states import whitened_columns
+
+
+class SharedCovariance(NamedTuple):
+    """The covariance C = I + S Sᵀ of rows: errors of their own, of unit variance, and shared ones.
+
+    S has one column for every shared error: what its 1σ adds to each row. By the singular values
+    S = U D Vᵀ the inverse and its symmetric root are I and a correction of low rank,
+    C⁻¹ = I − U D²(1 + D²)⁻¹ Uᵀ and C^(−½) = I − U (1 − (1 + D²)^(−½)) Uᵀ: no matrix of rows by
+    rows is formed.
+    """
+
+    shared: Float[np.ndarray, "row shared"]  # S
+    directions: Float[np.ndarray, "row shared"]  # U, zero where there are fewer rows than errors
+    size: Float[np.ndarray, " shared"]  # D
+    errors: Float[np.ndarray, "shared shared"]  # Vᵀ, whole
+
+    def decorrelated(
+        self, rows: Float[np.ndarray, "*entry row"]
+    ) -> Float[np.ndarray, "*entry row"]:
+        """C^(−½) times rows: independent and of unit variance."""
+        return self._less(rows, 1 - 1 / np.hypot(1.0, self.size))
+
+    def solved(self, rows: Float[np.ndarray, "*entry row"]) -> Float[np.ndarray, "*entry row"]:
+        """C⁻¹ times rows: rows less the most likely part of the shared errors."""
+        return self._less(rows, self.size**2 / (1 + self.size**2))
+
+    def most_likely_errors(self, rows: Float[np.ndarray, " row"]) -> Float[np.ndarray, " shared"]:
+        """SᵀC⁻¹ times rows: the shared errors, in units of their 1σ, that are in rows."""
+        return (self.size / (1 + self.size**2) * (rows @ self.directions)) @ self.errors
+
+    def of_rows(self, keep: Bool[np.ndarray, " row"]) -> "SharedCovariance":
+        """The covariance of some of the rows."""
+        return shared_covariance(self.shared[keep])
+
+    def given_rows(self, known: Bool[np.ndarray, " row"]) -> "ConditionalCovariance":
+        """The covariance of the rows that are not known, given those that are."""
+        others = self.of_rows(known)
+        root = others.errors.T / np.hypot(1.0, others.size)  # of what is open of the errors
+        own = self.shared[~known]
+        return ConditionalCovariance(known, own, others, shared_covariance(own @ root))
+
+    def _less(
+        self, rows: Float[np.ndarray, "*entry row"], part: Float[np.ndarray, " shared"]
+    ) -> Float[np.ndarray, "*entry row"]:
+        return rows - (rows @ self.directions * part) @ self.directions.T
+
+
+class ConditionalCovariance(NamedTuple):
+    """The covariance of some rows given all others, which determine a part of the shared errors."""
+
+    known: Bool[np.ndarray, " row"]
+    shared: Float[np.ndarray, "other shared"]  # of the rows that are not known
+    others: SharedCovariance  # of the known rows
+    left: SharedCovariance  # of the other rows, with what is open of the shared errors
+
+    def decorrelated(
+        self, rows: Float[np.ndarray, "*entry row"]
+    ) -> Float[np.ndarray, "*entry other"]:
+        """Rows less what the known ones let expect, independent and of unit variance."""
+        expected = self.others.most_likely_errors(rows[..., self.known]) @ self.shared.T
+        return self.left.decorrelated(rows[..., ~self.known] - expected)
+
+
+def shared_covariance(shared: Float[np.ndarray, "row shared"]) -> SharedCovariance:
+    """The covariance I + S Sᵀ for the shared errors S.
+
+    >>> one = shared_covariance(np.ones((3, 1)))
+    >>> one.solved(np.ones(3))  # of a mean of three and a shared error, all of unit variance
+    array([0.25, 0.25, 0.25])
+    """
+    n, errors = shared.shape
+    # With fewer rows than errors the rest of the errors is in none: zeros complete V.
+    filled = np.concatenate([shared, np.zeros((max(errors - n, 0), errors))])
+    directions, size, own = np.linalg.svd(filled, full_matrices=False)
+    return SharedCovariance(shared, directions[:n], size, own)
 
 
 class NoiseModel(NamedTuple):
@@ -73,31 +150,32 @@ class NoiseModel(NamedTuple):
 
 
 def noise_model(
-    measured: Measured,
+    predictions: Predictions,
+    by_error: Float[np.ndarray, "state column input"],
+    phasors: Complex[np.ndarray, "state part"],
     baseline: Float[np.ndarray, "state column prior"],
     by_linear: Float[np.ndarray, "state column two"],
-    level_std: Float[np.ndarray, " four"],
 ) -> NoiseModel:
     """The noise of states with errors of the baseline model and of whole levels.
 
-    Arguments: `baseline` are slopes by the baseline's own parameters, times their 1σ;
-    `by_linear` are slopes by natural frequency and damping ratio; `level_std` has the 1σ of a
-    level's gain, phase, natural frequency and damping ratio.
+    Arguments: slopes `by_error` of the states and `phasors`, of the model that passes errors on;
+    `baseline` are slopes by the baseline's own parameters, times their 1σ; `by_linear` are slopes
+    by natural frequency and damping ratio.
     """
-    states, levels = measured.states, measured.chosen.n_levels
-    known = measured.known
+    states, levels = predictions.chosen.states, predictions.chosen.n_levels
+    whiten, known = predictions.whitened_for(by_error, phasors)
     n_sensors = np.asarray(states.velocity).shape[1]
-    gain = measured.by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
-    phase = measured.by_error[:, :, n_sensors + 1 :].sum(axis=2)
+    gain = by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
+    phase = by_error[:, :, n_sensors + 1 :].sum(axis=2)
     member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
-    slopes = (gain, phase, *np.moveaxis(by_linear, 2, 0))
+    slopes, level_std = (gain, phase, *np.moveaxis(by_linear, 2, 0)), predictions.model.level_stds
     kinds = [k for k, std in enumerate(level_std) if std > 0]
     parts = [level_std[k] * slopes[k][:, :, None] * member[:, None, :] for k in kinds]
     every = np.concatenate([baseline, *parts], axis=2)
     shared_kind = np.append(np.full(baseline.shape[2], -1), np.repeat(kinds, levels)).astype(int)
-    own = np.asarray(whitened_columns(measured.whiten, every))[known]
+    own = np.asarray(whitened_columns(whiten, every))[known]
     state, column = np.nonzero(known)
-    return NoiseModel(measured.whiten, known, shared_covariance(own), shared_kind, state, column)
+    return NoiseModel(whiten, known, shared_covariance(own), shared_kind, state, column)
 
 
 def chi_square_p_value(chi_square: float, freedom: int) -> float:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
 from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
-from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
+from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -27,12 +27,12 @@ from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractForce
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
-from snrmjax.model.modes import LinearModes
 from snrmjax.model.parameters import parameter_values, stated_stds
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import by_blocks, over_cores, padded
 
 _BLOCK = 64  # rows of a program: a state under one vector of parameters each
+_ROOM = 256  # states that programs have room for: few tests have more, which compile anew
 _GROWN = 16  # of those that are grown, one after the other
 _DIRECTIONS = 8  # derivatives that a call gives, at most
 _LEAST = 1e-6  # of its unit, that a shape counts for at least
@@ -78,20 +78,6 @@ class Predicted(NamedTuple):
     force_slopes: Complex[np.ndarray, "trial state direction"]
 
 
-class Measured(NamedTuple):
-    """The states, their whitening and what of them was measured."""
-
-    chosen: ComparedColumns
-    by_error: Float[np.ndarray, "state column input"]
-    whiten: Float[np.ndarray, "state column column"]
-    known: Bool[np.ndarray, "state column"]
-
-    @property
-    def states(self) -> CalibrationStates:
-        """The states themselves."""
-        return self.chosen.states
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predictions:
     """Predictions of one model for one set of data; `predictions_of` makes them."""
@@ -130,6 +116,20 @@ class Predictions:
         offset = -np.einsum("sci,si->sc", by_error, self.added)
         return dataclasses.replace(self, offset=offset)
 
+    def of_records(
+        self,
+        data: SteadyStates,
+        added: Float[np.ndarray, "state input"],
+        harmonics: int | None = None,
+    ) -> "Predictions":
+        """The same of other records of the same states, to which something was added.
+
+        `harmonics` are those of the motions: as before if None.
+        """
+        order = self.compared.harmonic_order if harmonics is None else harmonics
+        own = _records(self.given, data, order, self.error_scale)
+        return dataclasses.replace(self, **own._asdict(), added=added)
+
     def with_errors_scaled(self, factor: float) -> "Predictions":
         """The same with all errors of force, velocities and phases so many times larger."""
         states = self.chosen.states
@@ -147,13 +147,21 @@ class Predictions:
         self,
         by_error: Float[np.ndarray, "state column input"],
         phasors: Complex[np.ndarray, "state part"],
-    ) -> Measured:
-        """The states with the whitening of a model with these phasors that passes on errors so."""
+    ) -> tuple[Float[np.ndarray, "state column column"], Bool[np.ndarray, "state column"]]:
+        """The whitening of the states by a model with these phasors that passes on errors so.
+
+        And which columns count.
+        """
         chosen = self.chosen
         if self.sizes.alone.any():
             own = self.sizes.own_std(np.asarray(chosen.states.own_std), phasors)
             chosen = chosen._replace(states=chosen.states._replace(own_std=jnp.asarray(own)))
-        return whitened_states(chosen, by_error)
+        parts = [padded(np.asarray(part), _ROOM) for part in (*chosen.states, by_error)]
+        *columns, errors = jax.device_put(parts)
+        found = state_whitener(CalibrationStates(*columns), errors, jnp.zeros(()))
+        whiten = np.asarray(found)[: len(by_error)]
+        used = np.any(whiten != 0, axis=(1, 2))
+        return whiten, np.asarray(chosen.states.known) & used[:, None]
 
     def of(
         self,
@@ -263,7 +271,46 @@ def predictions_of(
     forces share; `harmonics` are those of the motions.
     """
     model = dataclasses.replace(model, name="")  # its name would be a part of the programs
-    chosen = _with_errors_of_force(calibration_states(model, data, programs.HARMONICS))
+    records = _records(model, data, harmonics)
+    numbers = parameter_values(model)
+    return Predictions(
+        model=model,
+        given=model,
+        **records._asdict(),
+        level_numbers=np.asarray(data.level)[records.chosen.rows],
+        force_gain_std=force_gain_std,
+        stated={
+            name: (numbers[name], std)
+            for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
+        },
+        group=_all_effects(model, _scales(model, records.chosen)),
+    )
+
+
+class _Records(NamedTuple):
+    """What of `Predictions` depends on the records: see there."""
+
+    chosen: ComparedColumns
+    sizes: Sizes
+    states: CalibrationStates
+    compared: programs.ComparedMotion
+    own_columns: Int[np.ndarray, " column"]
+    motions: programs.Stored
+
+
+def _records(
+    model: Structure, data: SteadyStates, harmonics: int, error_scale: float = 1.0
+) -> _Records:
+    """Records with the baseline's motions at them."""
+    chosen = calibration_states(model, data, programs.HARMONICS)
+    # Operations of JAX compile for every number of states.
+    on_host: Any = jax.tree.map(np.asarray, chosen.states)
+    error = on_host.error
+    # A force errs by a share of the velocity's error where none is stated: beside a steep curve an
+    # error of amplitude shows itself in the frequency, and the damping would be exact.
+    force = np.where(error[:, :1] > 0, error[:, :1], FORCE_TO_VELOCITY * error[:, 1:2])
+    error = error_scale * np.concatenate([force, error[:, 1:]], axis=1)
+    chosen = chosen._replace(states=on_host._replace(error=error))
     columns, orders, own_columns = _widened(chosen)
     compared = programs.ComparedMotion(chosen.sensors, orders, harmonics)
 
@@ -271,38 +318,16 @@ def predictions_of(
         return programs.grown(model, CalibrationStates(*rows), compared)
 
     found = by_blocks(motions, _GROWN, *columns)
-    # Room for a power of two of states: few sizes compile.
-    arrays = jax.device_put([padded(rows) for rows in (*columns, *found)])
-    numbers = parameter_values(model)
+    arrays = jax.device_put([padded(rows, _ROOM) for rows in (*columns, *found)])
     every: list[Any] = columns
-    return Predictions(
-        model=model,
-        given=model,
+    return _Records(
         chosen=chosen,
         sizes=sizes_of(chosen),
         states=CalibrationStates(*every),
         compared=compared,
         own_columns=own_columns,
-        level_numbers=np.asarray(data.level)[chosen.rows],
-        force_gain_std=force_gain_std,
-        stated={
-            name: (numbers[name], std)
-            for name, std in (stated_stds(model) | _of_modal_mass(model, force_gain_std)).items()
-        },
-        group=_all_effects(model, _scales(model, chosen)),
         motions=programs.Stored(CalibrationStates(*arrays[:-2]), *arrays[-2:]),
     )
-
-
-def _with_errors_of_force(chosen: ComparedColumns) -> ComparedColumns:
-    """States whose force errs by a share of the velocity's error where none is stated.
-
-    Beside a steep curve an error of amplitude shows itself in the frequency: without any error of
-    the force the damping of such a state would be exact.
-    """
-    error = np.array(chosen.states.error)
-    error[:, 0] = np.where(error[:, 0] > 0, error[:, 0], FORCE_TO_VELOCITY * error[:, 1])
-    return chosen._replace(states=chosen.states._replace(error=jnp.asarray(error)))
 
 
 def _of_modal_mass(model: Structure, force_gain_std: float) -> dict[str, float]:
@@ -382,18 +407,6 @@ def _filled(directions: np.ndarray) -> np.ndarray:
     return room
 
 
-def whitened_states(
-    chosen: ComparedColumns, by_error: Float[np.ndarray, "state column input"]
-) -> Measured:
-    """The states with the whitening that follows from their errors."""
-    parts = [padded(np.asarray(part)) for part in (*chosen.states, by_error)]
-    arrays = jax.device_put(parts)
-    states = CalibrationStates(*arrays[:-1])
-    whiten = np.asarray(state_whitener(states, arrays[-1], jnp.zeros(())))[: len(by_error)]
-    used = np.any(whiten != 0, axis=(1, 2))
-    return Measured(chosen, by_error, whiten, np.asarray(chosen.states.known) & used[:, None])
-
-
 def scales_of(predictions: Predictions) -> MotionScales:
     """Typical sizes of the measured motions."""
     return _scales(predictions.model, predictions.chosen)
@@ -405,24 +418,3 @@ def _scales(model: Structure, chosen: ComparedColumns) -> MotionScales:
         np.asarray(part) for part in (np.abs(states.velocity[:, 0]), states.frequency, states.force)
     )
     return motion_scales(model.modes, chosen.sensors[0], *columns)
-
-
-def motion_scales(
-    modes: LinearModes,
-    sensor: int,
-    speed: Float[np.ndarray, " state"],
-    omega: Float[np.ndarray, " state"],
-    force: Float[np.ndarray, " state"],
-) -> MotionScales:
-    """Typical sizes of motions, by velocity amplitudes at a sensor, frequencies and forces."""
-    j = modes.mode_of_interest
-    amplitude = speed / omega / abs(float(modes.mode_shape[sensor, j]))
-    return MotionScales(
-        amplitude=float(np.median(amplitude)),
-        largest=float(np.max(amplitude)),
-        frequency=float(modes.natural_frequency[j]),
-        stiffness=float(np.median(abs(float(modes.participation[j])) * force / amplitude)),
-        receptance=float(np.median(speed / omega / force)),
-        smallest_force=float(np.min(force)),
-        damping_ratio=float(modes.damping_ratio[j]),
-    )

@@ -18,6 +18,7 @@ from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import INSTRUMENT_PHASE, LEVELS
 from snrmjax.identify.test_model.states import TestStates, state_errors
 from snrmjax.model.modes import residual_velocity
+from snrmjax.numerics.blocks import padded
 
 _FEWEST = 6  # states with a phase
 
@@ -59,7 +60,9 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
     j = modes.mode_of_interest
     columns = [np.asarray(a)[rows] for a in chosen.states]
     states = type(chosen.states)(*columns)
-    beside: Array = residual_velocity(modes, states.frequency, states.force)
+    # Of few sizes: operations of JAX compile for every one.
+    load: list[Any] = [padded(np.asarray(a)) for a in (states.frequency, states.force)]
+    beside: Array = residual_velocity(modes, *load)
     constant = float(modes.mode_shape[sensor, j] * modes.participation[j])
     n_sensors = states.velocity.shape[1]
     stated = np.asarray(states.error)[:, [0, 1, 1 + n_sensors]]
@@ -75,7 +78,7 @@ def test_states_of(predictions: Predictions, rows: np.ndarray) -> TestStates:
         frequency=np.asarray(states.frequency),
         force=np.asarray(states.force),
         velocity=np.sign(constant)
-        * (np.asarray(states.velocity)[:, 0] - np.asarray(beside)[:, sensor]),
+        * (np.asarray(states.velocity)[:, 0] - np.asarray(beside)[: len(rows), sensor]),
         errors=errors,
         stated=chosen.noise_stated,
         constant=abs(constant),
@@ -101,19 +104,6 @@ def with_reference(predictions: Predictions) -> Predictions:
         for size, differs in zip(found.hyper.level_std, found.differing, strict=True)
     ]
     return _with_levels(dataclasses.replace(predictions, reference=reference), sizes)
-
-
-def as_weighed(predictions: Predictions, other: Predictions) -> Predictions:
-    """Predictions of the same states weighed as others of them are."""
-    predictions = predictions.with_errors_scaled(other.error_scale)
-    return dataclasses.replace(
-        predictions,
-        model=other.model,
-        free_level_forces=other.free_level_forces,
-        reference=other.reference,
-        level_sizes=other.level_sizes,
-        unstated_levels=other.unstated_levels,
-    )
 
 
 def with_unstated_level_errors(predictions: Predictions) -> Predictions:

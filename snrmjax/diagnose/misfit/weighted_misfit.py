@@ -40,25 +40,6 @@ class ErrorPropagation(NamedTuple):
     slopes: Float[np.ndarray, "state column direction"]
 
 
-class StartChanges:
-    """What the starting points of candidates change of the misfit: each is predicted once.
-
-    A memory that all weightings of one set of data share: changes do not depend on the noise.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[tuple, Float[np.ndarray, "trial state column"]] = {}
-
-    def of(
-        self, misfit: "WeightedMisfit", candidate: EffectCandidate
-    ) -> Float[np.ndarray, "trial state column"]:
-        """Columns of every starting point less those of the baseline."""
-        key = (candidate.kind, candidate.starts)
-        if key not in self._known:
-            self._known[key] = _start_changes(misfit, candidate)
-        return self._known[key]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class WeightedMisfit:
     """Misfit of the baseline model to measured states, and the noise that weights it.
@@ -74,7 +55,8 @@ class WeightedMisfit:
     noise: NoiseModel
     base: Float[np.ndarray, " row"]
     by_linear: Float[np.ndarray, "row two"]  # by natural frequency and damping ratio
-    starts: StartChanges
+    # What starting points of candidates change: of all weightings, for it does not depend on them.
+    starts: dict[tuple, Float[np.ndarray, "trial state column"]]
 
     @property
     def model(self) -> Structure:
@@ -101,8 +83,11 @@ class WeightedMisfit:
         return float(np.sum(self.noise.decorrelated(rows) ** 2))
 
     def start_changes(self, candidate: EffectCandidate) -> Float[np.ndarray, "trial state column"]:
-        """What the starting points of a candidate change."""
-        return self.starts.of(self, candidate)
+        """Columns of every starting point of a candidate less those of the baseline."""
+        key = (candidate.kind, candidate.starts)
+        if key not in self.starts:
+            self.starts[key] = _start_changes(self, candidate)
+        return self.starts[key]
 
     def first_change(self, candidate: EffectCandidate) -> Float[np.ndarray, " row"]:
         """What the first starting point of a candidate changes, in units of noise."""
@@ -169,7 +154,7 @@ class WeightedMisfit:
         own = np.where(np.isfinite(there.slopes[0]), there.slopes[0], slopes)
         errors = self.errors._replace(slopes=slopes)
         passed_on = ErrorPropagation(by_error, phasors, own)
-        return _weighted(predictions, baseline, errors, passed_on, StartChanges())
+        return _weighted(predictions, baseline, errors, passed_on, {})
 
     def with_phases(self, phase: Float[np.ndarray, " state"]) -> "WeightedMisfit":
         """The same with velocities of unknown phase at these phases, rad."""
@@ -195,7 +180,7 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     if plain.added is not None:
         plain = plain.carried_back(passed_on.by_error)
         baseline, _ = _baseline_of(plain)
-    return _weighted(plain, baseline, errors, passed_on, StartChanges())
+    return _weighted(plain, baseline, errors, passed_on, {})
 
 
 def _baseline_of(
@@ -260,10 +245,9 @@ def _weighted(
     baseline: BaselinePrediction,
     errors: ErrorPropagation,
     passed_on: ErrorPropagation,
-    starts: StartChanges,
+    starts: dict[tuple, Float[np.ndarray, "trial state column"]],
 ) -> WeightedMisfit:
     """Weighted as errors are `passed_on`."""
-    measured = predictions.whitened_for(passed_on.by_error, passed_on.phasors)
     own, by_linear = passed_on.slopes[:, :, :-2], passed_on.slopes[:, :, -2:]
     gain = predictions.force_gain_std * passed_on.by_error[:, :, :1]
     parts = [own, gain] if np.any(gain) else [own]
@@ -271,7 +255,8 @@ def _weighted(
     levels = of_level == np.array(predictions.free_level_forces, dtype=int)
     parts.append(FREE_LEVEL_FORCE_STD * passed_on.by_error[:, :, :1] * levels)
     shared = np.concatenate(parts, axis=2)
-    noise = noise_model(measured, shared, by_linear, np.array(predictions.model.level_stds))
+    of_errors = passed_on.by_error, passed_on.phasors
+    noise = noise_model(predictions, *of_errors, shared, by_linear)
     base = noise.noise_units(baseline.columns[None])[0]
     linear = noise.noise_units(np.moveaxis(by_linear, 2, 0)).T
     return WeightedMisfit(predictions, baseline, errors, passed_on, noise, base, linear, starts)

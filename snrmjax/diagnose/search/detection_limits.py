@@ -5,9 +5,8 @@ from collections.abc import Collection
 import numpy as np
 from jaxtyping import Int
 
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, motion_scales
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, unfitted
-from snrmjax.diagnose.misfit.predictions import motion_scales
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import DETECTED
 from snrmjax.measure.states import SteadyStates

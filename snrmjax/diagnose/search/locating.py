@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
@@ -12,7 +13,6 @@ from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
 _SEEN = 2.0  # 1σ beyond which a free curve counts as changed at an amplitude
-_P_VALUE = 1e-3
 _STEP = 0.01
 _POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
 _TELLING = 16.0  # of χ², that a power must explain to be reported
@@ -71,7 +71,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     parts = []
     for k, name in enumerate(("stiffness", "damping")):
         p_value = chi_square_p_value(alone[1 - k][0] - free, _FREE)
-        if p_value < _P_VALUE:
+        if p_value < priors.REJECTED:
             own = slice(k * _FREE, (k + 1) * _FREE)
             parts.append(
                 Located(
@@ -84,7 +84,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
     n_force = int(of_force.sum())
     left = chi_square_p_value(free, n_force - 2 * _FREE)
     everywhere = (float(speed.min()), float(speed.max()))
-    if left < _P_VALUE and nothing > n_force:
+    if left < priors.REJECTED and nothing > n_force:
         parts.append(Located("not_a_function_of_amplitude", everywhere, left))
     n_sensors = states.velocity.shape[1]
     orders = misfit.predictions.chosen.orders
@@ -99,7 +99,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
             np.where(mine, base.rows, 0.0), np.zeros((len(rows), 0))
         )[0]
         p_value = chi_square_p_value(square, int(mine.sum()))
-        if p_value < _P_VALUE:
+        if p_value < priors.REJECTED:
             large = np.abs(base.rows[mine]) > 2.5
             where = speed[noise.state[mine][large]] if large.any() else speed
             parts.append(
@@ -239,7 +239,7 @@ def power_of_amplitude(
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < _TELLING or chi_square_p_value(left, _FREE - 2) < _P_VALUE:
+    if explained[best] < _TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
     if below[0] == 0 or below[-1] == len(_POWERS) - 1:

@@ -1,22 +1,25 @@
-"""Stepwise search for the effects that explain a misfit, and for those that fit equally well."""
+"""Stepwise search for the effects that explain a misfit, and for those that fit equally well.
+
+What is worth a fit is seen from the gain that is expected if its starts are scaled to fit best.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
     baseline_fit,
     fit_effect,
     fit_effects,
-    unfitted,
+    started,
     with_errors_passed_on,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.screening import screened, screened_pairs
 from snrmjax.model.effect_metadata import MotionScales
 from snrmjax.model.effects import EFFECTS
 from snrmjax.numerics.blocks import over_cores
@@ -30,14 +33,18 @@ AS_GOOD = 6.0
 
 _NEAR = 40.0  # of the criterion: candidates that far behind the best are fitted again
 _DOUBTFUL = 0.05  # probability of a fit below which pairs without the best effect are fitted
-_REFUTED = 1e-3  # probability of a pair below which a third effect is looked for
+_HOPELESS = 5.0  # times χ² of the best fit so far, or of noise: others are given up on the way
 _PAIRS = 8  # that are fitted from their own starts
-_ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 # Candidates are fitted when a start of theirs would lower χ² by so much, beyond the first few by
 # such a share of what the best would.
 _TRIED, _WORTH, _SHARE = 8, 4.0, 0.25
+_ONE = 2  # parameters of one effect; one with more is compared with two simple effects
 _MOST = 3  # effects of an answer
 _SHARE_OF_SIZES = 0.02  # where sizes alone are compared, which are not linear in an effect
+_KEPT = 2  # starts of a candidate
+_SCALED = (0.1, 10.0)  # times its own strength, that a start is taken
+_TIMES = 3  # that a kind may be in pairs
+_ALIKE = 1e-3  # 1 − cos² between changes, less than which is not relied upon
 
 
 class TriedEffect(NamedTuple):
@@ -97,11 +104,12 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     considered = [nothing, *singles]
     if _gain(misfit, nothing, best) <= DETECTED:
         return FoundEffects(misfit, nothing, nothing, tuple(table), tuple(considered))
-    pairs = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
-    if len(best.values) > _ONE:  # two simple effects may do what one with many parameters does
-        pairs += _pairs(misfit, every, most=len(best.values))
-    if _is_below(misfit, best, _DOUBTFUL):
-        pairs += _pairs(misfit, every)
+    jobs = [(c, best) for c in _promising(misfit, every, best)]
+    unexplained = _is_below(misfit, best, _DOUBTFUL)
+    # Two simple effects may do what one with many parameters does.
+    if unexplained or len(best.values) > _ONE:
+        jobs += _pairs(misfit, every, best, unexplained=unexplained)
+    pairs = fit_effects(misfit, jobs, _hopeless(best))
     pair = _best(misfit, [best, *pairs])
     considered += pairs
     if pair is best or _gain(misfit, best, pair) <= DETECTED:
@@ -111,17 +119,18 @@ def _searched(misfit: WeightedMisfit, every: dict[str, EffectCandidate]) -> Foun
     nothing = baseline_fit(misfit)
     alone = [fit_effect(misfit, _also_from(every[kind], pair)) for kind in pair.kinds]
     others = [fit for fit in singles if fit.kinds[0] not in pair.kinds]
-    considered = [nothing, *alone]
-    considered += fit_effects(misfit, [(_from(every, fit), nothing) for fit in others])
+    one, two = pair.kinds
+    together = fit_effect(misfit, _where(every, pair, two), started(_where(every, pair, one)))
+    considered = [nothing, *alone, together]
+    again = [(_from(every, fit), nothing) for fit in others]
+    considered += fit_effects(misfit, again, _hopeless(together))
     for kind, other in zip(pair.kinds, reversed(alone), strict=True):
         rivals = [c for c in _promising(misfit, every, other) if c.kind != kind]
-        begun = unfitted(misfit, _where(every, pair, other.kinds[0]))
-        jobs = [(_where(every, pair, kind), start) for start in (begun, other)]
-        fits = fit_effects(misfit, [*((c, other) for c in rivals), *jobs])
-        table.append(_table(misfit, other, fits))
+        fits = fit_effects(misfit, [(c, other) for c in rivals], _hopeless(together))
+        table.append(_table(misfit, other, [*fits, together]))
         considered += fits
     best = _best(misfit, considered)
-    if _is_below(misfit, best, _REFUTED) and len(best.kinds) < _MOST:
+    if _is_below(misfit, best, priors.REJECTED) and len(best.kinds) < _MOST:
         thirds = fit_effects(misfit, [(c, best) for c in _promising(misfit, every, best)])
         table.append(_table(misfit, best, thirds))
         considered += thirds
@@ -159,7 +168,7 @@ def _compared_with(
     misfit, fit = found.misfit, found.fit
     alike = [kind for kind in fit.kinds if EFFECTS[kind].is_linear]
     others = [kind for kind in fit.kinds if not EFFECTS[kind].is_linear]
-    refuted = _is_below(misfit, fit, _REFUTED)
+    refuted = _is_below(misfit, fit, priors.REJECTED)
     fits_by_itself = len(others) == len(fit.kinds) == 1 and not refuted
     if not fit.kinds or fits_by_itself or misfit.predictions.sizes.alone.any():
         return found
@@ -168,7 +177,8 @@ def _compared_with(
         jobs.append((close, _only(misfit, every, fit, others)))
     if refuted and len(fit.kinds) < _MOST:
         jobs.append((close, fit))
-    fits = [one for one in fit_effects(misfit, jobs) if np.isfinite(one.chi_square)]
+    fits = fit_effects(misfit, jobs, _hopeless(fit))
+    fits = [one for one in fits if np.isfinite(one.chi_square)]
     if not fits:
         return found
     best = _best(misfit, [fit, *fits])
@@ -187,20 +197,24 @@ def _only(
 
 
 def _pairs(
-    misfit: WeightedMisfit, every: dict[str, EffectCandidate], most: int | None = None
-) -> list[EffectFit]:
-    """Fits of the pairs of effects with the largest expected gain, from their own starts.
+    misfit: WeightedMisfit, every: dict[str, EffectCandidate], best: EffectFit, *, unexplained: bool
+) -> list[tuple[EffectCandidate, EffectFit]]:
+    """Fits, to be done, of the pairs with the largest expected gain, from their own starts.
 
-    Of pairs with at most `most` parameters.
+    Those with no more parameters than the best effect alone; and, where that leaves something
+    `unexplained`, those with any number.
     """
-    screened_ones = [
-        (one, two)
-        for _, one, two in screened_pairs(misfit, list(every.values()))
-        if most is None or len(one.unit) + len(two.unit) <= most
-    ]
-    return fit_effects(
-        misfit, [(two, unfitted(misfit, one)) for one, two in screened_ones[:_PAIRS]]
-    )
+    pairs = [(one, two) for _, one, two in screened_pairs(misfit, list(every.values()))]
+    most = len(best.values)
+    simple = [(one, two) for one, two in pairs if len(one.unit) + len(two.unit) <= most]
+    chosen = simple[:_PAIRS] if most > _ONE else []
+    chosen += [pair for pair in pairs[:_PAIRS] if pair not in chosen] if unexplained else []
+    return [(two, started(one)) for one, two in chosen]
+
+
+def _hopeless(best: EffectFit) -> float:
+    """χ² that a fit must fall below, or promise to, to be continued beside the best one so far."""
+    return _HOPELESS * max(best.chi_square, float(len(best.rows)))
 
 
 def _is_below(misfit: WeightedMisfit, fit: EffectFit, probability: float) -> bool:
@@ -282,7 +296,7 @@ def _table(
 ) -> tuple[TriedEffect, ...]:
     rows = [
         TriedEffect(
-            fit.kinds[-1],
+            next(kind for kind in fit.kinds if kind not in before.kinds),
             _gain(misfit, before, fit),
             fit.chi_square,
             dict(zip(fit.labels, fit.values.tolist(), strict=True)),
@@ -291,3 +305,80 @@ def _table(
         for fit in fits
     ]
     return tuple(sorted(rows, key=lambda row: -row.gain))
+
+
+def screened(
+    misfit: WeightedMisfit, candidate: EffectCandidate, beside: EffectFit
+) -> tuple[float, EffectCandidate]:
+    """The expected fall of χ² if the best start is scaled to fit best, and the best starts.
+
+    Returns the fall and the candidate with its best starts so scaled.
+    """
+    changes = misfit.noise.noise_units(misfit.start_changes(candidate))
+    if beside.slopes.shape[1]:
+        basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
+    else:
+        basis = np.zeros((misfit.n_rows, 0))
+    left = misfit.noise.decorrelated(beside.rows)
+    moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
+    if not moves.size:
+        return 0.0, candidate  # no start has a motion
+    arms = misfit.noise.decorrelated(changes[moves])
+    arms = arms - (arms @ basis) @ basis.T
+    size = np.sum(arms**2, axis=1)
+    factor = -(arms @ left) / np.where(size > 0, size, np.inf)
+    factor = np.where((factor < 0) & (candidate.lower[0] >= 0), 0.0, factor)
+    gains = factor**2 * size
+    best = np.argsort(gains)[::-1][:_KEPT]
+    starts = tuple(_scaled(candidate, int(moves[k]), float(factor[k])) for k in best)
+    return float(np.max(gains)), candidate._replace(starts=starts)
+
+
+def screened_pairs(
+    misfit: WeightedMisfit, candidates: Sequence[EffectCandidate]
+) -> list[tuple[float, EffectCandidate, EffectCandidate]]:
+    """The expected fall of Schwarz's criterion if starts of two effects are scaled to fit best.
+
+    Of every two effects the best starts, so scaled; the best pair first. No effect is in more
+    than a few pairs: a strong one would be in all of them.
+    """
+    rows = [misfit.noise.noise_units(misfit.start_changes(c)) for c in candidates]
+    whose = np.repeat(np.arange(len(candidates)), [len(some) for some in rows])
+    which = np.concatenate([np.arange(len(some)) for some in rows])
+    arms = misfit.noise.decorrelated(np.concatenate(rows))
+    size = np.linalg.norm(arms, axis=1)
+    moves = np.isfinite(size) & (size > 0)
+    whose, which, arms, size = whose[moves], which[moves], arms[moves], size[moves]
+    arms = arms / size[:, None]
+    along, across = -arms @ misfit.noise.decorrelated(misfit.base), arms @ arms.T
+    left = np.maximum(1 - across**2, _ALIKE)
+    factor = (along[:, None] - across * along) / left / size[:, None]  # of one beside another
+    least = [-np.inf if c.strength_order == 1 and c.lower[0] < 0 else 0.0 for c in candidates]
+    good = factor > np.array(least)[whose][:, None]
+    good = good & good.T & (whose[:, None] < whose)
+    gain = (along[:, None] ** 2 + along**2 - 2 * across * np.outer(along, along)) / left
+    cost = np.array([len(c.unit) for c in candidates])[whose] * np.log(misfit.n_rows)
+    gain = np.where(good, gain - cost[:, None] - cost, -np.inf)
+    found, seen, times = [], set(), np.zeros(len(candidates), dtype=int)
+    for place in np.argsort(-gain, axis=None)[: int(np.isfinite(gain).sum())]:
+        i, j = divmod(int(place), len(whose))
+        kinds = (int(whose[i]), int(whose[j]))
+        if kinds in seen or times[list(kinds)].max() >= _TIMES:
+            continue
+        seen.add(kinds)
+        times[list(kinds)] += 1
+        one, two = (
+            mine._replace(starts=(_scaled(mine, int(which[k]), float(factor[k, other])),))
+            for mine, k, other in ((candidates[kinds[0]], i, j), (candidates[kinds[1]], j, i))
+        )
+        found.append((float(gain[i, j]), one, two))
+    return found
+
+
+def _scaled(candidate: EffectCandidate, start: int, factor: float) -> tuple[float, ...]:
+    """A start scaled so that its change has a factor."""
+    strength, *shape = candidate.starts[start]
+    # Those of second order change as the square of their strength, whatever its sign.
+    times = float(np.sqrt(abs(factor))) if candidate.strength_order > 1 else factor
+    times = float(np.clip(abs(times), *_SCALED)) * (-1.0 if times < 0 else 1.0)
+    return (strength * times, *shape)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from truths.balanced_sets import (
@@ -18,7 +19,6 @@ from truths.balanced_sets import (
 import snrmjax as sj
 from snrmjax.diagnose.misfit.predictions import predictions_of
 from snrmjax.diagnose.misfit.reference import (
-    as_weighed,
     reference_of,
     with_reference,
     with_unstated_level_errors,
@@ -135,13 +135,19 @@ def test_a_sensor_without_phases_is_no_hindrance():
     assert found.reference.posterior.differing == (False, False, True, False)
 
 
-def test_other_predictions_of_the_same_states_are_weighed_alike():
-    one, again = referred(predicted()), predicted()
-    same = as_weighed(again, one)
-    assert same.reference is one.reference
-    assert same.level_sizes == one.level_sizes
-    assert same.model.level_stds == one.model.level_stds
-    assert same.motions is again.motions
+def test_other_records_of_the_same_states_are_weighed_alike():
+    one = referred(predicted())
+    none = np.zeros_like(np.asarray(one.chosen.states.error))
+    data = silent(balanced(quadratic, seed=SEED, levels=N_LEVELS, shift=SHIFT))
+    faster = dataclasses.replace(data, velocity=1.1 * data.velocity)
+    other = one.of_records(faster, none)
+    assert other.reference is one.reference
+    assert other.level_sizes == one.level_sizes
+    assert other.model.level_stds == one.model.level_stds
+    fresh = predictions_of(linear_model(), faster)
+    for own, there in zip(other.motions, fresh.motions, strict=True):
+        for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(there), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_a_force_without_a_stated_error_has_a_share_of_the_velocitys():

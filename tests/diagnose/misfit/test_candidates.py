@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import snrmjax as sj
-from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
-from snrmjax.diagnose.misfit.coordinates import coordinates
+from snrmjax.diagnose.misfit.candidates import candidate, coordinates, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import fit_effect
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit

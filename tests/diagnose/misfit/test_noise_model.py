@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from snrmjax.diagnose.misfit.shared_covariance import shared_covariance
+from snrmjax.diagnose.misfit.noise_model import shared_covariance
 
 N = 40
 

@@ -7,7 +7,7 @@ import pytest
 from truths.made_up_misfits import noise_of
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate
-from snrmjax.diagnose.search.screening import screened_pairs
+from snrmjax.diagnose.search.model_search import screened_pairs
 
 N = 60
 
