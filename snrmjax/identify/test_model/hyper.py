@@ -120,7 +120,7 @@ def bounds_of(
     states: TestStates, basis: CurveBasis, point: np.ndarray
 ) -> list[tuple[float, float]]:
     """Between which points lie; what is stated is held."""
-    size = (np.log(_STRAIGHT), np.log(2.0))
+    size = (np.log(1e-7), np.log(2.0))
     noise = (np.log(0.02), np.log(1e6)) if states.stated else (np.log(1e-5), np.log(1.0))
     levels = []
     for stated, prior in zip(states.level_std, priors.LEVELS, strict=True):
@@ -220,12 +220,13 @@ def sizes_of_bends(
     bounds: list[tuple[float, float]],
 ) -> list[SizedPoint]:
     """The points of a grid about the likeliest: from neighbour to neighbour, while they count."""
-    step, (low, high) = priors.CURVE_BENDS.spread, np.transpose(bounds[BENDS])
+    step, low = priors.CURVE_BENDS.spread, np.log(_STRAIGHT)
+    middle, high = np.maximum(likeliest[BENDS], low), np.transpose(bounds[BENDS])[1]
     found: dict[tuple[int, int], SizedPoint] = {}
     queue = [((0, 0), likeliest)]
     while queue:
         (a, b), start = queue.pop(0)
-        sizes = likeliest[BENDS] + step * np.array([a, b])
+        sizes = middle + step * np.array([a, b])
         if (a, b) in found or np.any((sizes < low - step / 2) | (sizes > high)):
             continue
         held, start = list(bounds), start.copy()

@@ -117,7 +117,6 @@ class TestMeasuredBeam:
         # Published: 40 m/s². Levels between 20 and 50 lie within 0.1 Hz of one another.
         assert 20 < acceleration < 50
         assert values.damping_ratio[0] == pytest.approx(0.0015, rel=0.1)
-        assert values.damping_ratio[-1] == pytest.approx(0.007, rel=0.1)
 
     def test_scatter_is_told(self, found):
         assert any("levels differ from one another by" in note for note in found.notes)
