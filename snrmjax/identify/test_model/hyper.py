@@ -205,6 +205,7 @@ class Gaussian(NamedTuple):
 
     mean: Float[np.ndarray, " unknown"]
     covariance: Float[np.ndarray, "unknown unknown"]
+    told: float  # how many unknowns the states, and not their priors, tell
 
 
 class SizedPoint(NamedTuple):
@@ -253,7 +254,8 @@ def averaged(
     within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in each]))
     off = means - mean
     point = weight @ np.array([one.point for one in points])
-    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off)
+    told = float(weight @ np.array([one.told for one in each]))
+    return point, Gaussian(mean, within + (off * weight[:, None]).T @ off, told)
 
 
 def differing_levels(

@@ -220,37 +220,37 @@ def fit_test(
     last = walk.balance.straight(found.mean, found.errors, apart=False)
     equations = last.equations._replace(share=found.equations.share)
 
-    def wide_variances(point: np.ndarray) -> np.ndarray:
-        variance, _ = prior_variances(hyper_at(point, basis), basis, places, states)
-        for own, std in zip(places.levels.T, states.level_std, strict=True):
-            variance[own] *= 1.0 if std > 0 else few_levels_factor(states.n_levels) ** 2
-        return variance
-
     def gaussian(point: np.ndarray) -> Gaussian:
-        return Gaussian(*equations.posterior(hyper_at(point, basis).noise, wide_variances(point)))
+        hyper = hyper_at(point, basis)
+        variance, _ = prior_variances(hyper, basis, places, states)
+        mean, covariance = equations.posterior(hyper.noise, variance)
+        known = variance > 0
+        told = np.zeros_like(variance)  # curves take what they can of levels' errors
+        told[known] = 1 - np.diag(covariance)[known] / variance[known]
+        for own, std in zip(places.levels.T, states.level_std, strict=True):
+            variance[own] *= 1.0 if std > 0 else students_factor(float(np.sum(told[own]))) ** 2
+        wide = equations.posterior(hyper.noise, variance)[1]
+        return Gaussian(mean, wide, float(np.sum(told)))
 
-    variance = wide_variances(found.point)
     objective = objective_of(found.equations, states, basis, places)
     bounds = bounds_of(states, basis, found.point)
-    point, (mean, covariance) = found.point, gaussian(found.point)
-    told = variance > 0
-    effective_unknowns = float(np.sum(1 - np.diag(covariance)[told] / variance[told]))
+    point, said = found.point, gaussian(found.point)
     if over_sizes:
         sized = sizes_of_bends(objective, found.point, bounds)
-        point, (mean, covariance) = averaged(sized, gaussian)
+        point, said = averaged(sized, gaussian)
     flat = objective_of(found.equations, states, basis, places, flat=True)
     return TestPosterior(
         states,
         basis,
         units,
-        mean,
-        covariance,
+        said.mean,
+        said.covariance,
         hyper_at(point, basis),
         laplace_evidence(objective, found.point, bounds),
         found.errors,
         found.residuals * np.exp(found.point[NOISE] - point[NOISE]),
         last.arms_of_stiffness,
-        effective_unknowns,
+        said.told,
         places,
         differing_levels(flat, found.point, bounds, states) if compare_levels else (False,) * 4,
         walk.balance.weight,
@@ -265,7 +265,12 @@ def few_levels_factor(n_levels: int) -> float:
     Student's t over the normal. Two levels count as three: with t of one degree no band would be of
     use.
     """
-    return float(stdtrit(max(n_levels - 1, 2), 0.975) / ndtri(0.975))
+    return students_factor(n_levels - 1)
+
+
+def students_factor(freedom: float) -> float:
+    """By how much a 95 % band is wider whose 1σ was found with so many degrees of freedom."""
+    return float(stdtrit(max(freedom, 2), 0.975) / ndtri(0.975))
 
 
 class _Found(NamedTuple):
