@@ -1,8 +1,11 @@
 """Curves averaged over how much they bend, where levels differ by what nobody stated."""
 
 import numpy as np
+import pytest
 
+from snrmjax.identify.test_model import posterior
 from snrmjax.identify.test_model import states as measured
+from snrmjax.identify.test_model.hyper import averaged, sizes_of_bends
 from snrmjax.identify.test_model.posterior import fit_test
 from snrmjax.numerics.blocks import on_one_core
 
@@ -43,11 +46,70 @@ def test_bands_know_that_levels_may_differ_for_what_curves_may_bend():
     inside = {True: [], False: []}
     for seed in range(10):
         states = response_controlled(seed, 5e-4)
-        for averaged, shares in inside.items():
-            curves = fit_test(states, over_sizes=averaged).curves(at)
+        for over_sizes, shares in inside.items():
+            curves = fit_test(states, over_sizes=over_sizes).curves(at)
             std = np.sqrt(curves.covariance[:, 0, 0])
             shares.append(np.abs(curves.squared_frequency - stiffness(at)) < 1.96 * std)
     # 95 % are meant. Ten tests of eight levels know it to some 5 %.
     assert np.mean(inside[True]) > 0.9
     # The likeliest sizes alone mostly miss the lowest level, which is far from its neighbours.
     assert np.mean(inside[True], axis=0)[0] > np.mean(inside[False], axis=0)[0] + 0.3
+
+
+def sampled(objective, point, bounds, draws, rng):
+    """Hyperparameters by differential evolution Monte Carlo (ter Braak 2006), about a point."""
+    low, high = np.transpose(bounds)
+    free = high > low
+    n = int(np.sum(free))
+    crowd = np.clip(point + 0.3 * rng.normal(size=(3 * n, len(point))) * free, low, high)
+    value = np.array([objective(one)[0] for one in crowd])
+    kept = []
+    for turn in range(draws):
+        for k in range(len(crowd)):
+            one, other = crowd[rng.choice(len(crowd), 2, replace=False)]
+            reach = 1.0 if turn % 10 == 0 else 2.38 / np.sqrt(2 * n)
+            step = reach * (one - other) + 1e-3 * rng.normal(size=len(point))
+            moved = crowd[k] + step * free
+            if np.any((moved < low) | (moved > high)):
+                continue
+            new = objective(moved)[0]
+            if np.log(rng.random()) < new - value[k]:
+                crowd[k], value[k] = moved, new
+        if turn >= draws // 3:
+            kept.append(crowd.copy())
+    return np.concatenate(kept)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("seed", "scatter"), [(0, 5e-4), (1, 1.5e-3), (2, 5e-4)])
+@on_one_core
+def test_bands_are_those_of_sampled_hyperparameters(monkeypatch, seed, scatter):
+    given = {}
+
+    def sizes(objective, point, bounds):
+        given["problem"] = objective, point, bounds
+        return sizes_of_bends(objective, point, bounds)
+
+    def average(points, gaussian):
+        given["gaussian"] = gaussian
+        return averaged(points, gaussian)
+
+    monkeypatch.setattr(posterior, "sizes_of_bends", sizes)
+    monkeypatch.setattr(posterior, "averaged", average)
+    found = fit_test(response_controlled(seed, scatter), over_sizes=True)
+    at = np.linspace(AMPLITUDES[0], AMPLITUDES[-1], 12)
+    rng = np.random.default_rng(0)
+    points = sampled(*given["problem"], 600, rng)
+    means, variances = [], []
+    for point in points[rng.choice(len(points), 400)]:
+        said = given["gaussian"](point)
+        curves = found._replace(mean=said.mean, covariance=said.covariance).curves(at)
+        means.append(curves.squared_frequency)
+        variances.append(curves.covariance[:, 0, 0])
+    std = np.sqrt(np.mean(variances, axis=0) + np.var(means, axis=0))
+    curves = found.curves(at)
+    assert np.max(np.abs(curves.squared_frequency - np.mean(means, axis=0)) / std) < 0.3
+    # Sizes of levels' errors are taken at their likeliest for each size of the bends.
+    ratio = np.sqrt(curves.covariance[:, 0, 0]) / std
+    assert ratio.min() > 0.75
+    assert ratio.max() < 1.3
