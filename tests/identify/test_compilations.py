@@ -17,8 +17,9 @@ def states(seed, levels):
 def test_points_and_curves_of_as_many_states(compilations):
     found = sj.identify_backbone(states(0, 5), modes())
     found.backbone.values(np.linspace(*(float(x) for x in ends(found)), 50))
-    # Most of a first identification's time is compilation: all curves are the host's.
-    assert len(compilations) <= 16
+    # Points are three programs; the fit is the host's but for what its modes and unknowns are put
+    # together by, an operation each.
+    assert len(compilations) <= 40
     del compilations[:]
     for seed, levels in ((1, 5), (2, 9), (3, 15)):
         again = sj.identify_backbone(states(seed, levels), modes())

@@ -80,9 +80,11 @@ class TestMeasuredBeam:
         backbone = found.backbone
         frequency, speed, damping = crossings
         values = backbone.values(np.clip(speed / frequency, backbone.smallest, backbone.largest))
-        # Runs repeat to 0.1 to 0.15 Hz, as those who measured them say.
-        assert found.level_frequency_std / HERTZ < 0.12
-        std = np.hypot(values.natural_frequency_std, found.level_frequency_std)
+        # What levels may differ by, if curves do not bend for it: runs repeat to 0.1 to 0.15 Hz, as
+        # those who measured them say.
+        apart = 0.5 * float(found.fit.prior.level[2]) * frequency
+        assert apart.max() / HERTZ < 0.15
+        std = np.hypot(values.natural_frequency_std, apart)
         assert np.abs((values.natural_frequency - frequency) / std).max() < 1.96
         # Damping of the levels repeats to about 10 %, as those who measured it say.
         np.testing.assert_allclose(values.damping_ratio, damping, rtol=0.1)
@@ -119,7 +121,6 @@ class TestMeasuredBeam:
         assert values.damping_ratio[0] == pytest.approx(0.0015, rel=0.1)
 
     def test_scatter_is_told(self, found):
-        assert any("levels differ from one another by" in note for note in found.notes)
         # From 0.54 to 0.97 % inside the highest level, least where the velocity lags most.
         assert any("higher from points 45° below resonance" in note for note in found.notes)
 
