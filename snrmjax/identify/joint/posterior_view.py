@@ -70,21 +70,21 @@ def view_of(
     gain = abs(guess) if "force_gain" in free else 1.0
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
     states = _test_states(problem, free, stated, guess)
-    fit = functools.partial(
-        fit_test, robust=robust, most_knots=knots, tempered=True, over_sizes=True
-    )
-    found = fit(states)
+    fit = functools.partial(fit_test, robust=robust, most_knots=knots, tempered=True)
+    quick = functools.partial(fit, compare_levels=False)
+    found = quick(states)
     mass, std = found.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:
         known = dataclasses.replace(problem.prior, linear=problem.prior.linear.at[-1].set(0.0))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
-        found = fit(states)
+        found = quick(states)
     wandering = wandering_stiffness(found)
     if wandering > 0:
         own = np.full(len(states.level), wandering / found.hyper.noise)
-        found = fit(states._replace(errors=np.column_stack([states.errors, own])))
+        states = states._replace(errors=np.column_stack([states.errors, own]))
+    found = fit(states, over_sizes=True)
     if "force_gain" in free:
         found = _with_common_gain_in_the_force(found)
     noise = noise_and_levels(found)
