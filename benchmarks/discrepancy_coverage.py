@@ -157,13 +157,13 @@ def scores(
     the model's modal mass. The 1σ are relative to the truth. Rows: frequency, damping.
     """
     joint = sj.identify.fitted_values(fit, speed)
-    # Damping is relative to the modal mass that a fit found: compared by the force that it is.
+    # Damping of both is relative to the modal mass that a fit found: compared by its force.
     found = float(fit.problem.modal_mass_of(fit.unknowns) * abs(fit.problem.modal_constant))
     curve = points.backbone.values(speed / natural)
     errors, bands = {}, {}
-    for way, values, mass in (("joint", joint, found), ("pointwise", curve, 1.0)):
-        std = np.array([values.natural_frequency_std, mass * values.damping_ratio_std])
-        given = np.array([values.natural_frequency, mass * values.damping_ratio])
+    for way, values in (("joint", joint), ("pointwise", curve)):
+        std = np.array([values.natural_frequency_std, found * values.damping_ratio_std])
+        given = np.array([values.natural_frequency, found * values.damping_ratio])
         errors[way] = (given - [natural, ratio]) / std
         bands[way] = std / [natural, ratio]
     return errors, bands
