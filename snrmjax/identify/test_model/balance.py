@@ -59,8 +59,9 @@ class Balance(NamedTuple):
         damping = 1j * omega * d * (values @ unknowns[places.damping])
         at_rest, _ = self.basis.values(np.zeros(1))
         added = k * ((values - at_rest) @ unknowns[places.stiffness])
-        with_frequency = np.stack([added, damping], axis=1) * self.away[:, None]
-        softer, faster = self.away * unknowns[WITH_FREQUENCY, None]
+        away = self.away
+        with_frequency = np.stack([added, damping], axis=1) * away[:, None]
+        softer, faster = away * unknowns[WITH_FREQUENCY, None]
         slope = (1 + stiffer + softer) * k * (by_log @ unknowns[places.stiffness])
         rate = (1 + lossier + faster) * d * (by_log @ unknowns[places.damping])
         slope = slope + 1j * omega * rate
@@ -167,9 +168,10 @@ class Balance(NamedTuple):
         design[:, WITH_FREQUENCY] = now.with_frequency
         (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
         at_rest, _ = self.basis.values(np.zeros(1))
-        added = softer * self.away[:, None] * (now.values - at_rest)
+        away = self.away
+        added = softer * away[:, None] * (now.values - at_rest)
         design[:, places.stiffness] = k * ((1 + stiffer)[:, None] * now.values + added)
-        design[:, places.damping] = (1j * omega * d * (1 + lossier + faster * self.away))[
+        design[:, places.damping] = (1j * omega * d * (1 + lossier + faster * away))[
             :, None
         ] * now.values
         if states.beside is not None:
