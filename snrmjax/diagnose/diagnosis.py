@@ -1,6 +1,7 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -233,6 +234,7 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         completed=law.completed,
         completed_status=CompletedStatus.COMPLETED,
         laws=law.laws,
+        probabilities=_with_probability_of_law(diagnosis.probabilities, law),
     )
     checks = diagnosis.checks._replace(
         p_value=law.p_value,
@@ -252,6 +254,19 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         notes=(*law.notes, *misfit.predictions.chosen.notes),
         force_misfit=_force_misfit(misfit, nothing, law.fit),
     )
+
+
+def _with_probability_of_law(probabilities: Mapping[str, float], law: LawAnswer) -> dict[str, float]:
+    """A law's share of what is outside the library, and of the effects in whose place it stands."""
+    apart = {
+        name: p
+        for name, p in probabilities.items()
+        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
+    }
+    outside = 1 - sum(apart.values())
+    own = "+".join(law.kinds)
+    found = {**apart, own: law.share * outside, Verdict.UNKNOWN.value: (1 - law.share) * outside}
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 
 def _check_number_of_states(phase_unknown: np.ndarray) -> None:

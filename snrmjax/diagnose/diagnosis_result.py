@@ -128,8 +128,6 @@ class Diagnosis(AbstractResult):
     def probability(self) -> float:
         """That the answer given is right: its verdict, or an answer of effects in its classes."""
         verdict = Verdict(self.verdict)
-        if verdict is Verdict.DRAWN:  # what no effect of the library explains
-            return self.probabilities.get(Verdict.UNKNOWN.value, 0.0)
         if not verdict.is_answer:
             return self.probabilities.get(verdict.value, 0.0)
         given = {kind for group in self.candidates for kind in group}

@@ -20,6 +20,10 @@ IMITATION = 0.4
 UNNAMED = 0.004
 """The same where no such law is known."""
 
+NO_CURVE = 0.15
+"""Of laws outside the library that follow a drawn curve within noise, those that are none of one
+quantity: friction with rates, contact that bounces, damping with a memory."""
+
 LEVELS_APART = 0.4
 """Of levels that differ by more than was stated, to levels that do not: temperature and clamps."""
 
@@ -50,8 +54,9 @@ times as much as an open question."""
 NO_DOUBT = 0.1
 """The same up to which an answer is named without a word."""
 
-AS_GOOD = 0.05
-"""Odds to the best answer down to which another one belongs to the class: 95 % of the posterior."""
+AS_GOOD = 0.01
+"""Odds to the best answer down to which another one belongs to the class: of a hundred names that
+stand alone one may be wrong."""
 
 REJECTED = 1e-3
 """Probability by chance below which a check refutes: some thirty checks are made of a test."""

@@ -51,6 +51,17 @@ class LawFit(NamedTuple):
         return self.problem.square + self.posterior.cost
 
     @property
+    def share(self) -> float:
+        """The probability of its class among laws of one quantity, all as likely before."""
+        own = self.posterior.cost
+        alone: dict[str, float] = {}
+        for part in PARTS:
+            cost = best_processes(self.problem, (part,))[1]
+            alone[_class_of(part)] = min(cost, alone.get(_class_of(part), np.inf))
+        alone.pop(_class_of(self.posterior.parts[0]))
+        return 1 / (1 + float(np.sum(np.exp(-0.5 * (np.array(list(alone.values())) - own)))))
+
+    @property
     def secants(self) -> Float[np.ndarray, "table knot"]:
         """The mean of the secants, table by table."""
         return secants_of(self.posterior.parts, self.posterior.mean, self.units)
@@ -114,7 +125,12 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
 
 def _is_one(parts: Sequence[str]) -> bool:
     """Whether parts are those of one law: a spring, a damper, a film or slip."""
-    return len({part.split()[-1] for part in parts}) == 1
+    return len({_class_of(part) for part in parts}) == 1
+
+
+def _class_of(part: str) -> str:
+    """Of a part, what it is a function of: "odd spring" and "even spring" are of one law."""
+    return part.split()[-1]
 
 
 def knots_of(predictions: Predictions) -> LawKnots:

@@ -191,14 +191,34 @@ class Predictions:
     ) -> tuple[Float[np.ndarray, "state column input"], Complex[np.ndarray, "state part"]]:
         """Derivatives by the states' errors, as a model with these parameters passes them on.
 
+        A gain or a phase acts on what the model has there and not on what was measured, whose noise
+        levels of free gain would else explain (D'Agostini, doi:10.1016/0168-9002(94)90719-6).
         Returns the model's phasors too.
         """
         inputs = self.states.error.shape[1]
         none = (np.full(inputs, -1), np.zeros((1, inputs)))
         steps = _Steps(*none, _ERROR * np.eye(inputs))
         columns, slopes = self._in_turn(group, values[None], steps)
-        found = self.sizes.compared(columns, slopes / _ERROR, of_errors=True)[1]
+        slopes = slopes / _ERROR - self._by_error_of_missed(columns)
+        found = self.sizes.compared(columns, slopes, of_errors=True)[1]
         return found[0], self.sizes.phasors(columns)[0]
+
+    def _by_error_of_missed(
+        self, columns: Float[np.ndarray, "trial state column"]
+    ) -> Float[np.ndarray, "trial state column input"]:
+        """What gains and phases do to the difference of the model from other sensors and harmonics.
+
+        Both act on a sensor's motion; a phase turns harmonic h by h times as much.
+        """
+        orders, n = self.chosen.orders, len(self.chosen.sensors)
+        sensor = [*range(1, n), *np.repeat(np.arange(n), len(orders))]
+        order = [*[1] * (n - 1), *orders * n]
+        found = np.zeros((*columns.shape, 1 + 2 * n))
+        for k, (s, h) in enumerate(zip(sensor, order, strict=True), 1):
+            missed = columns[..., 2 * k] + 1j * columns[..., 2 * k + 1]
+            for place, by in ((1 + s, missed), (1 + n + s, 1j * h * missed)):
+                found[..., 2 * k, place], found[..., 2 * k + 1, place] = by.real, by.imag
+        return found
 
     def _in_turn(
         self, group: Group, values: Float[np.ndarray, "trial parameter"], steps: "_Steps"

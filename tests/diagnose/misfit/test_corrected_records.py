@@ -184,3 +184,37 @@ def test_corrections_turn_harmonics_as_errors_of_time():
     for k, order in enumerate((2, 3)):
         turned = harmonics[..., k] * np.exp(0.1 + 0.02j * order)
         np.testing.assert_allclose(new.harmonics[..., k], turned, rtol=1e-12)
+
+
+def with_noise_as_harmonics(data, seed=5):
+    """Harmonics 2 and 3 of a linear structure: nothing but noise of the stated size."""
+    rng = np.random.default_rng(seed)
+    n = data.n_states
+    std = 0.005 * np.max(np.abs(data.velocity))
+    noise = rng.normal(size=(n, 1, 2, 2)) @ [1.0, 1j] * std / np.sqrt(2)
+    return dataclasses.replace(
+        data, harmonics=noise, harmonic_order=(2, 3), harmonic_std=np.full((n, 1), std)
+    )
+
+
+def test_errors_of_levels_pass_on_harmonics_and_not_their_noise():
+    """A linear structure has no harmonics, so that no gain and no phase can change them."""
+    predictions = predictions_of(
+        linear_model(damping=RATIO), with_noise_as_harmonics(hardening(0.0))
+    )
+    by_error, _ = predictions.by_error(predictions.group, predictions.group.values)
+    assert by_error.shape[1:] == (6, 3)
+    assert np.max(np.abs(by_error[:, :2])) > 0.5
+    # Slopes are differences, whose second order is of the noise: 0.2 at most, times a small step.
+    np.testing.assert_allclose(by_error[:, 2:], 0.0, atol=2e-5)
+
+
+def test_a_gain_beside_levels_that_may_differ_does_not_explain_the_noise_of_harmonics():
+    """Errors of levels as large as −100 % would, and noise far below the stated beside them."""
+    data = hardening(0.0, gain=0 * GAIN + np.log(0.88), phase=0 * PHASE, noise=NOISE)
+    found = sj.diagnose_model(
+        linear_model(damping=RATIO, damping_std=0.05 * RATIO), with_noise_as_harmonics(data)
+    )
+    assert found.verdict in ("named", "ambiguous")
+    assert {"sensor_gain_error", "force_gain_error"} & set(found.candidates[0])
+    assert found.probabilities["noise_rejected"] < 0.01
