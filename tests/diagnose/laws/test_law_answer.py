@@ -64,6 +64,11 @@ def test_the_law_stands_in_the_summary_and_the_model_returns_from_its_file(tmp_p
     assert {"class", "displacement_m", "force_n", "force_std_n"} <= set(law)
     assert len(law["displacement_m"]) == len(law["force_n"]) == len(law["force_std_n"])
     assert "drawn from the data" in found.verdict_sentence
+    # Outside the library 15 % are no curve of one quantity, whatever the data are.
+    own = entry["probabilities"]["+".join(found.effects)]
+    assert sum(entry["probabilities"].values()) == pytest.approx(1.0)
+    assert own <= 0.85 * (own + entry["probabilities"]["unknown"]) * (1 + 1e-9)
+    assert own <= entry["probability"] <= 0.85
     write_model(tmp_path / "model.toml", found.completed)
     back = read_model(tmp_path / "model.toml").effects[0]
     # φ f at x = φ q is the modal force: the table of the sensor is that of the model.
