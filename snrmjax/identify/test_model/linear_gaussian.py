@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.optimize import minimize
 
 _STEP = 1e-4  # of a logarithm, for second derivatives
@@ -66,19 +66,32 @@ class LinearRows(NamedTuple):
         by_root = self.triangle * np.sqrt(variance)
         n, m = self.share * self.n_rows, len(by_root)
         constant = n * np.log(2 * np.pi * scale**2)
+        if not m:  # which lapack refuses
+            square = self.across * self.share / scale**2
+            return -0.5 * (constant + square) + self.offset, square - n, np.zeros(len(variance))
         scale = scale / np.sqrt(self.share)
-        inverse, log_det = _inverse(by_root @ by_root.T + scale**2 * np.eye(m))
-        weighed = inverse @ self.along
-        square = float(self.along @ weighed) + self.across / scale**2
+        covariance = by_root @ by_root.T
+        covariance[np.diag_indices(m)] += scale**2
+        # In units that make it even.
+        unit = 1 / np.sqrt(np.diagonal(covariance))
+        covariance *= unit[:, None] * unit
+        covariance[np.diag_indices(m)] += _ROUNDING
+        factor, failed = dpotrf(covariance.T, lower=True, clean=False, overwrite_a=True)
+        if failed:
+            raise np.linalg.LinAlgError("the matrix is not positive definite.")
+        both = np.empty((m, by_root.shape[1] + 1), order="F")
+        both[:, :-1], both[:, -1] = by_root, self.along
+        both *= unit[:, None]
+        both, _ = dtrtrs(factor, both, lower=True, overwrite_b=True)
+        arms, along = both[:, :-1], both[:, -1]
+        told = np.einsum("ij,ij->j", arms, arms)  # of every unknown by the rows: m less noise's
+        weighed = dtrtrs(factor, along, lower=True, trans=1)[0] * unit
+        log_det = 2 * float(np.sum(np.log(np.diagonal(factor) / unit)))
+        square = float(along @ along) + self.across / scale**2
         value = -0.5 * (constant - m * np.log(scale**2) + log_det + square)
-        pull = by_root.T @ weighed
-        by_variance = 0.5 * (pull**2 - np.sum(by_root * (inverse @ by_root), axis=0))
-        by_scale = (
-            scale**2 * (float(weighed @ weighed) - float(np.trace(inverse)))
-            + self.across / scale**2
-            - (n - m)
-        )
-        return value + self.offset, by_scale, by_variance
+        by_scale = scale**2 * float(weighed @ weighed) + self.across / scale**2
+        by_scale += float(told.sum()) - n
+        return value + self.offset, by_scale, 0.5 * ((along @ arms) ** 2 - told)
 
 
 Objective = Callable[[Float[np.ndarray, " hyper"]], tuple[float, Float[np.ndarray, " hyper"]]]
@@ -122,21 +135,6 @@ def maximised(
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
-        options={"maxiter": _STEPS, "ftol": 1e-9, "gtol": 1e-3},
+        options={"maxiter": _STEPS, "ftol": 1e-7, "gtol": 1e-2},
     )
     return np.asarray(found.x)
-
-
-def _inverse(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Inverse and ln determinant of a positive definite matrix, in units that make it even."""
-    if not len(matrix):  # which lapack refuses
-        return matrix, 0.0
-    size = np.sqrt(np.diagonal(matrix))
-    even = matrix / np.outer(size, size) + _ROUNDING * np.eye(len(matrix))
-    factor, failed = dpotrf(even, lower=True)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix is not positive definite.")
-    half = np.tril(dpotri(factor, lower=True)[0])
-    inverse = half + np.tril(half, -1).T
-    log_det = 2 * float(np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(size)))
-    return inverse / np.outer(size, size), log_det
