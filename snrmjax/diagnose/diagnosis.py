@@ -256,7 +256,9 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
     )
 
 
-def _with_probability_of_law(probabilities: Mapping[str, float], law: LawAnswer) -> dict[str, float]:
+def _with_probability_of_law(
+    probabilities: Mapping[str, float], law: LawAnswer
+) -> dict[str, float]:
     """A law's share of what is outside the library, and of the effects in whose place it stands."""
     apart = {
         name: p

@@ -26,6 +26,7 @@ from snrmjax.identify.test_model.linear_gaussian import LinearRows
 from snrmjax.identify.test_model.states import TestStates
 
 _STEPS = 4  # towards every state's most likely errors
+_NOTHING = 1e-8  # relative or rad, by which the last step moves
 _FARTHEST = 0.3  # relative or rad, of a state's error
 _SOFTEST = 1e-3  # of the squared frequencies, that a stiffness is for its logarithm
 _LOST = 1e100  # slopes that no mode has
@@ -53,24 +54,21 @@ class Balance(NamedTuple):
         force = states.force * np.exp(errors[:, 0] - (gain if states.force_is_free else 0.0))
         force = force + unknowns[OFFSET] * np.min(states.force)
         z = 1j * omega * states.constant * force / velocity
-        values, by_log = self.basis.values(np.abs(velocity) / omega)
-        mass, (k, d) = 1 + unknowns[MASS], self.units
-        stiffness = k * (values @ unknowns[places.stiffness]) + mass * places.reference
-        damping = 1j * omega * d * (values @ unknowns[places.damping])
-        at_rest, _ = self.basis.values(np.zeros(1))
-        added = k * ((values - at_rest) @ unknowns[places.stiffness])
+        mass, units = 1 + unknowns[MASS], np.array(self.units)
+        pair = units * np.stack([unknowns[places.stiffness], unknowns[places.damping]], axis=1)
+        (curve, lost), (slope, rate) = self.basis.curves(np.abs(velocity) / omega, pair)
+        stiffness, damping = curve + mass * places.reference, 1j * omega * lost
+        added = curve - self.basis.at_rest @ pair[:, 0]
         away = self.away
         with_frequency = np.stack([added, damping], axis=1) * away[:, None]
         softer, faster = away * unknowns[WITH_FREQUENCY, None]
-        slope = (1 + stiffer + softer) * k * (by_log @ unknowns[places.stiffness])
-        rate = (1 + lossier + faster) * d * (by_log @ unknowns[places.damping])
-        slope = slope + 1j * omega * rate
+        slope = (1 + stiffer + softer) * slope + 1j * omega * (1 + lossier + faster) * rate
         model = (1 + stiffer) * stiffness - mass * omega**2 + (1 + lossier) * damping
         model = model + self.beside @ unknowns[places.beside]
         model = model + with_frequency @ unknowns[WITH_FREQUENCY]
         inputs = errors.shape[1]
         return BalancedStates(
-            force, z, model, slope, values, stiffness, damping, with_frequency, inputs
+            force, z, model, slope, velocity, stiffness, damping, with_frequency, inputs
         )
 
     @property
@@ -122,7 +120,7 @@ class Balance(NamedTuple):
         NaN where curves are so steep that no number holds their squares.
         """
         for _ in range(_STEPS):
-            now = self.at(unknowns, errors)
+            last, now = errors, self.at(unknowns, errors)
             slopes = now.by_error
             if not np.all(np.abs(slopes) < _LOST):
                 return np.full_like(errors, np.nan)
@@ -133,6 +131,8 @@ class Balance(NamedTuple):
             parts = np.stack([slopes.real, slopes.imag], axis=1)
             errors = -np.einsum("nie,ni->ne", parts, pull) * self.states.errors**2
             errors = np.clip(errors, -_FARTHEST, _FARTHEST)
+            if np.max(np.abs(errors - last)) < _NOTHING:
+                break
         return errors
 
     def misfit(self, unknowns: np.ndarray, errors: np.ndarray) -> float:
@@ -167,13 +167,11 @@ class Balance(NamedTuple):
         design[:, TREND] = states.trend * now.stiffness
         design[:, WITH_FREQUENCY] = now.with_frequency
         (softer, faster), (k, d) = unknowns[WITH_FREQUENCY], self.units
-        at_rest, _ = self.basis.values(np.zeros(1))
-        away = self.away
-        added = softer * away[:, None] * (now.values - at_rest)
-        design[:, places.stiffness] = k * ((1 + stiffer)[:, None] * now.values + added)
-        design[:, places.damping] = (1j * omega * d * (1 + lossier + faster * away))[
-            :, None
-        ] * now.values
+        away, (values, _) = self.away, self.basis.values(np.abs(now.velocity) / omega)
+        added = softer * away[:, None] * (values - self.basis.at_rest)
+        design[:, places.stiffness] = k * ((1 + stiffer)[:, None] * values + added)
+        lossier = 1 + lossier + faster * away
+        design[:, places.damping] = (1j * omega * d * lossier)[:, None] * values
         if states.beside is not None:
             moved = -states.beside / self.own_velocity(unknowns)[:, None]
             design[:, places.others] = own[:, None] * moved + slope[:, None] * moved.real
@@ -211,7 +209,7 @@ class BalancedStates(NamedTuple):
     z: Complex[np.ndarray, " state"]  # FA/X
     model: Complex[np.ndarray, " state"]
     slope: Complex[np.ndarray, " state"]  # of the model by the logarithm of amplitude
-    values: Float[np.ndarray, "state function"]
+    velocity: Complex[np.ndarray, " state"]  # of the mode, corrected
     stiffness: Float[np.ndarray, " state"]  # κK
     damping: Complex[np.ndarray, " state"]  # iΩκδ
     with_frequency: Complex[np.ndarray, "state curve"]  # what exponents of frequency add

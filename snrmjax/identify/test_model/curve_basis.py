@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 
-from snrmjax.identify.curves.splines import amplitudes_apart, bends_of, hats, spline_terms
+from snrmjax.identify.curves.splines import amplitudes_apart, bends_of
 from snrmjax.identify.test_model.priors import CURVE_CONSTANT, CURVE_SLOPES, SIZES_ALIKE
 
 MOST_KNOTS = 42
@@ -29,7 +30,7 @@ class CurveBasis(NamedTuple):
 
     largest: float  # m
     knots: Float[np.ndarray, " knot"]  # of (a/largest)²
-    mix: Float[np.ndarray, "term function"]  # of the spline's terms
+    pieces: Float[np.ndarray, "4 interval function"]  # of the cubics, from the third power on
     directions: Float[np.ndarray, "bend direction"]  # of the logarithms of the bends' sizes
 
     @classmethod
@@ -47,30 +48,49 @@ class CurveBasis(NamedTuple):
         values, vectors = np.linalg.eigh(np.exp(-0.5 * apart_by**2))
         keep = values > _NOTHING * np.max(values, initial=0.0)
         directions = vectors[:, keep] * np.sqrt(values[keep])
-        mix = np.linalg.solve(spline_terms(knots, knots), functions)
-        return cls(largest, knots, mix, directions)
+        pieces = CubicSpline(knots, functions, bc_type="natural").c
+        return cls(largest, knots, pieces, directions)
+
+    @property
+    def at_rest(self) -> Float[np.ndarray, " function"]:
+        """The functions at the first knot, zero."""
+        return self.pieces[-1, 0]
 
     @property
     def n_functions(self) -> int:
         """How many functions there are."""
-        return self.mix.shape[1]
+        return self.pieces.shape[2]
 
     def values(
         self, amplitude: Float[np.ndarray, " point"]
     ) -> tuple[Float[np.ndarray, "point function"], Float[np.ndarray, "point function"]]:
         """The functions, and their derivatives by the logarithm of amplitude."""
-        u = (np.asarray(amplitude, dtype=float) / self.largest) ** 2
-        bent, slopes = hats(u, self.knots)
-        by_u = np.column_stack([np.zeros_like(u), np.ones_like(u), slopes])
-        terms = np.column_stack([np.ones_like(u), u, bent])
-        return terms @ self.mix, 2 * u[:, None] * by_u @ self.mix
+        values, slopes = self.curves(amplitude, np.eye(self.n_functions))
+        return values.T, slopes.T
+
+    def curves(
+        self,
+        amplitude: Float[np.ndarray, " point"],
+        coefficients: Float[np.ndarray, "function curve"],
+    ) -> tuple[Float[np.ndarray, "curve point"], Float[np.ndarray, "curve point"]]:
+        """Sums of the functions, and their derivatives by the logarithm of amplitude."""
+        u = (amplitude / self.largest) ** 2
+        k = np.clip(np.searchsorted(self.knots, u, side="right") - 1, 0, len(self.knots) - 2)
+        inside = np.minimum(u, self.knots[-1])
+        t = (inside - self.knots[k])[:, None]
+        third, second, first, value = (self.pieces @ coefficients)[:, k]
+        slope = first + t * (2 * second + 3 * t * third)
+        value = value + t * (first + t * (second + t * third))
+        return (value + slope * (u - inside)[:, None]).T, (2 * u[:, None] * slope).T
 
     def log_variances(
-        self, log_size: float, along: Float[np.ndarray, " direction"]
+        self,
     ) -> tuple[Float[np.ndarray, " function"], Float[np.ndarray, "function hyper"]]:
-        """ln of the prior variances by the bends' size and how it changes; their slopes by both."""
+        """ln of the prior variances of straight functions, and for bends of size one that does not
+        change; what they gain by ln of the size, and by how it changes.
+        """
         powers = 2 * np.log([CURVE_CONSTANT, CURVE_SLOPES])
-        slopes = np.zeros((self.n_functions, 1 + len(along)))
+        slopes = np.zeros((self.n_functions, 1 + self.directions.shape[1]))
         slopes[N_POWERS:, 0] = 2.0
         slopes[N_POWERS:, 1:] = 2 * self.directions
-        return np.concatenate([powers, 2 * (log_size + self.directions @ along)]), slopes
+        return np.concatenate([powers, np.zeros(len(self.directions))]), slopes

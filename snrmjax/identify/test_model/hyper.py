@@ -133,33 +133,36 @@ def bounds_of(
     return [noise, size, size, *levels, *[(-_FARTHEST, _FARTHEST)] * n, *more]
 
 
-def prior_variances(
-    hyper: Hyper, basis: CurveBasis, places: Places, states: TestStates
-) -> tuple[np.ndarray, np.ndarray]:
-    """Prior variances of all unknowns, and slopes of their logarithms by the hyperparameters."""
-    n = places.others.stop
-    end = FIRST_ALONG + basis.directions.shape[1]
-    along = slice(FIRST_ALONG, end)
+class PriorVariances(NamedTuple):
+    """Prior variances of all unknowns: their logarithms are linear in a point of hyperparameters.
+
+    What is held at zero has −∞.
+    """
+
+    constant: Float[np.ndarray, " unknown"]
+    slopes: Float[np.ndarray, "unknown hyper"]
+
+    def __call__(self, point: Float[np.ndarray, " hyper"]) -> Float[np.ndarray, " unknown"]:
+        """The variances at a point."""
+        return np.exp(self.constant + self.slopes @ point)
+
+
+def prior_variances(basis: CurveBasis, places: Places, states: TestStates) -> PriorVariances:
+    """Those of a test's unknowns."""
+    n, end = places.others.stop, FIRST_ALONG + basis.directions.shape[1]
     with_more = places.discrepancy[0].stop > places.discrepancy[0].start
-    variance, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
-    variance[places.others] = 1.0
-    variance[: WITH_FREQUENCY.stop] = np.square(
-        [
-            *(states.mass_std, states.phase_std, states.offset_std, states.trend_std),
-            *states.off_resonance_std,
-        ]
-    )
+    constant, slopes = np.zeros(n), np.zeros((n, end + 2 * with_more))
+    held = (states.mass_std, states.phase_std, states.offset_std, states.trend_std)
+    with np.errstate(divide="ignore"):
+        constant[: WITH_FREQUENCY.stop] = 2 * np.log([*held, *states.off_resonance_std])
     for k, own in enumerate((places.stiffness, places.damping)):
-        log_variance, by = basis.log_variances(np.log(hyper.bends[k]), hyper.along)
-        variance[own] = np.exp(log_variance)
-        slopes[own, BENDS.start + k], slopes[own, along] = by[:, 0], by[:, 1:]
-    for k, std in enumerate(hyper.level_std):
-        variance[places.levels[:, k]] = std**2
+        constant[own], by = basis.log_variances()
+        slopes[own, BENDS.start + k], slopes[own, FIRST_ALONG:end] = by[:, 0], by[:, 1:]
+    for k in range(4):
         slopes[places.levels[:, k], LEVELS.start + k] = 2.0
-    if with_more:
-        for k, (part, std) in enumerate(zip(places.discrepancy, hyper.discrepancy, strict=True)):
-            variance[part], slopes[part, end + k] = std**2, 2.0
-    return variance, slopes
+    for k in range(2 * with_more):
+        slopes[places.discrepancy[k], end + k] = 2.0
+    return PriorVariances(constant, slopes)
 
 
 def objective_of(
@@ -172,30 +175,24 @@ def objective_of(
 ) -> Objective:
     """Likelihood times prior; with `flat` that of levels' errors alone is left out."""
     noise = priors.STATED_NOISE if states.stated else priors.UNSTATED_NOISE
-    densities: list[priors.Density | None] = [
-        noise,
-        priors.CURVE_BENDS,
-        priors.CURVE_BENDS,
-        *(
-            None if stated > 0 or flat else prior
-            for stated, prior in zip(states.level_std, priors.LEVELS, strict=True)
-        ),
-        *[priors.BENDS_VARY] * basis.directions.shape[1],
-        priors.DISCREPANCY,
-        priors.DISCREPANCY,
+    variances = prior_variances(basis, places, states)
+    n = variances.slopes.shape[1]
+    of_levels = [
+        None if stated > 0 or flat else prior
+        for stated, prior in zip(states.level_std, priors.LEVELS, strict=True)
     ]
+    along = [priors.BENDS_VARY] * basis.directions.shape[1]
+    densities = [noise, *[priors.CURVE_BENDS] * 2, *of_levels, *along, *[priors.DISCREPANCY] * 2]
+    prior = priors.JointDensity.of(densities[:n])
 
     def value(point: np.ndarray) -> tuple[float, np.ndarray]:
-        hyper = hyper_at(point, basis)
-        variance, by_hyper = prior_variances(hyper, basis, places, states)
-        likelihood, by_noise, by_variance = equations.log_likelihood(hyper.noise, variance)
-        slopes = by_variance @ by_hyper
+        likelihood, by_noise, by_variance = equations.log_likelihood(
+            np.exp(point[NOISE]), variances(point)
+        )
+        density, slopes = prior.log_density(point)
+        slopes += by_variance @ variances.slopes
         slopes[NOISE] += by_noise
-        for k, (density, at) in enumerate(zip(densities, point, strict=False)):
-            if density is not None:
-                own, slope = density.log_density(at)
-                likelihood, slopes[k] = likelihood + own, slopes[k] + slope
-        return likelihood, slopes
+        return likelihood + density, slopes
 
     return value
 

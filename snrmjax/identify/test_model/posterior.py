@@ -220,16 +220,17 @@ def fit_test(
     last = walk.balance.straight(found.mean, found.errors, apart=False)
     equations = last.equations._replace(share=found.equations.share)
 
+    variances = prior_variances(basis, places, states)
+
     def gaussian(point: np.ndarray) -> Gaussian:
-        hyper = hyper_at(point, basis)
-        variance, _ = prior_variances(hyper, basis, places, states)
-        mean, covariance = equations.posterior(hyper.noise, variance)
+        noise, variance = np.exp(point[NOISE]), variances(point)
+        mean, covariance = equations.posterior(noise, variance)
         known = variance > 0
         told = np.zeros_like(variance)  # curves take what they can of levels' errors
         told[known] = 1 - np.diag(covariance)[known] / variance[known]
         for own, std in zip(places.levels.T, states.level_std, strict=True):
             variance[own] *= 1.0 if std > 0 else students_factor(float(np.sum(told[own]))) ** 2
-        wide = equations.posterior(hyper.noise, variance)[1]
+        wide = equations.posterior(noise, variance)[1]
         return Gaussian(mean, wide, float(np.sum(told)))
 
     objective = objective_of(found.equations, states, basis, places)
@@ -366,22 +367,20 @@ class _Walk:
         begin = self.point if k > (_SETTLED if self.straight else 1) else start
         for _ in range(2):
             point = maximised(objective, begin, bounds)
-            hyper = hyper_at(point, basis)
-            variance = prior_variances(hyper, basis, places, held)[0]
-            goal, covariance = this.equations.posterior(hyper.noise, variance)
+            noise = float(np.exp(point[NOISE]))
+            variance = prior_variances(basis, places, held)(point)
+            goal, covariance = this.equations.posterior(noise, variance)
             if np.all(np.abs(goal[places.levels]) < _FARTHEST):
                 break
             # Levels that differ by more are no levels of one structure: not this way.
             bounds[LEVELS] = [(low, low) for low, _ in bounds[LEVELS]]
         moved = _step(
-            self.balance, self.mean, goal, self.errors, hyper.noise, variance, free=k < _SETTLED
+            self.balance, self.mean, goal, self.errors, noise, variance, free=k < _SETTLED
         )
         left = (this.rows - this.design @ goal).reshape(-1, 2)
         value = objective(point)[0]
         if k <= _SETTLED or self.tempered or value > self.likelihood:
-            self.found = _Found(
-                point, value, this.equations, goal, left / hyper.noise, moved.errors
-            )
+            self.found = _Found(point, value, this.equations, goal, left / noise, moved.errors)
         size = np.sqrt(np.diag(covariance) + 1e-300)
         self.still = k > _SETTLED and np.max(np.abs(moved.unknowns - self.mean) / size) < _STILL
         self.point, self.mean, self.errors = point, moved.unknowns, moved.errors
@@ -390,7 +389,7 @@ class _Walk:
             told = share_told_by(left, states.level, states.frequency)
             self.share = max(told, priors.LEAST_SHARE)
         if self.robust:
-            square = np.sum(left**2, axis=1) / hyper.noise**2
+            square = np.sum(left**2, axis=1) / noise**2
             weight = (priors.STUDENT_FREEDOM + 2) / (priors.STUDENT_FREEDOM + square)
             self.balance = self.balance._replace(weight=weight)
 

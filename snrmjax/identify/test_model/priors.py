@@ -4,9 +4,11 @@ Sizes are 1σ. Those of levels and of the discrepancy are the scale of a half-no
 of the size itself; those of curves and noise are medians of lognormal ones.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 _LOG_ROOT = 0.5 * np.log(2 * np.pi)
 
@@ -57,6 +59,53 @@ class FlatSize(NamedTuple):
 
 
 Density = LogNormalSize | HalfNormalSize | NormalNumber
+
+
+class JointDensity(NamedTuple):
+    """Independent densities of the numbers of a point, all at once."""
+
+    normal: Int[np.ndarray, " normal"]  # places of logarithms and numbers that are normal
+    mean: Float[np.ndarray, " normal"]
+    std: Float[np.ndarray, " normal"]
+    half: Int[np.ndarray, " half"]  # places of logarithms of half-normal sizes
+    scale: Float[np.ndarray, " half"]  # their logarithms
+    constant: float
+
+    @classmethod
+    def of(cls, densities: Sequence[Density | None]) -> "JointDensity":
+        """Of one density a number; None says nothing."""
+        normal, half = [], []
+        constant = 0.0
+        for place, one in enumerate(densities):
+            if isinstance(one, HalfNormalSize):
+                half.append((place, np.log(one.scale)))
+                constant += np.log(2) - _LOG_ROOT
+            elif one is not None:
+                pair = (
+                    (np.log(one.median), one.spread)
+                    if isinstance(one, LogNormalSize)
+                    else (0.0, one.std)
+                )
+                normal.append((place, *pair))
+                constant -= np.log(pair[1]) + _LOG_ROOT
+        first, second = (np.array(rows).reshape(-1, k) for rows, k in ((normal, 3), (half, 2)))
+        return cls(
+            *(first[:, 0].astype(int), first[:, 1], first[:, 2]),
+            *(second[:, 0].astype(int), second[:, 1], float(constant)),
+        )
+
+    def log_density(
+        self, point: Float[np.ndarray, " number"]
+    ) -> tuple[float, Float[np.ndarray, " number"]]:
+        """ln p, and its slopes."""
+        slopes = np.zeros(len(point))
+        step = (point[self.normal] - self.mean) / self.std
+        off = point[self.half] - self.scale
+        square = np.exp(2 * off)
+        slopes[self.normal], slopes[self.half] = -step / self.std, 1 - square
+        value = -0.5 * float(step @ step) + float(np.sum(off) - 0.5 * np.sum(square))
+        return value + self.constant, slopes
+
 
 STATED_NOISE = LogNormalSize(1.0, 0.1)
 """Noise over the stated one: standard deviations from ten readings are good to some 20 %, and a

@@ -22,7 +22,7 @@ def test_any_values_at_the_knots_are_followed_by_the_natural_spline(basis):
     spline = CubicSpline(basis.knots, at_knots, bc_type="natural")
     inside = np.sqrt(np.linspace(0.0, basis.knots[-1], 301))
     found = basis.values(2e-3 * inside)[0] @ unknowns
-    np.testing.assert_allclose(found, spline(inside**2), atol=1e-6 * np.abs(at_knots).max())
+    np.testing.assert_allclose(found, spline(inside**2), atol=1e-9 * np.abs(at_knots).max())
     assert 0.7 * MOST_KNOTS < np.sum(basis.knots <= 1.0) <= MOST_KNOTS
     assert basis.n_functions == len(basis.knots)
 
@@ -61,16 +61,14 @@ def test_sizes_of_bends_are_alike_over_two_of_them(basis):
     np.testing.assert_allclose(covariance, np.exp(-0.5 * (apart / SIZES_ALIKE) ** 2), atol=1e-4)
 
 
-def test_variances_and_their_slopes(basis):
+def test_logarithms_of_variances_are_linear_in_those_of_sizes(basis):
     rng = np.random.default_rng(2)
     along = rng.normal(size=basis.directions.shape[1])
-    log_variance, slopes = basis.log_variances(np.log(0.02), along)
+    constant, slopes = basis.log_variances()
+    log_variance = constant + slopes @ [np.log(0.02), *along]
     assert np.exp(0.5 * log_variance[:N_POWERS]) == pytest.approx([CURVE_CONSTANT, CURVE_SLOPES])
     expected = 2 * (np.log(0.02) + basis.directions @ along)
     assert log_variance[N_POWERS:] == pytest.approx(expected)
-    step = 1e-6 * rng.normal(size=1 + len(along))
-    moved, _ = basis.log_variances(np.log(0.02) + step[0], along + step[1:])
-    assert moved - log_variance == pytest.approx(slopes @ step, abs=1e-12)
 
 
 @pytest.mark.parametrize("amplitude", [[1.0, 1.0], [0.5, 0.51, 1.0], [1e-6, 1.0]])
