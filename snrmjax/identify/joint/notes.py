@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from snrmjax.identify.joint.force_balance import (
     BalanceProblem,
@@ -125,14 +125,14 @@ def notes_on_stated_errors(
     notes, n_levels = [], len(deviation)
     for kind, name in enumerate(LEVEL_ERRORS):
         own = deviation[:, kind]
-        if stated[kind] == 0 or float(own @ own) <= chi2.isf(_CHANCE, n_levels):
+        if stated[kind] == 0 or float(own @ own) <= chdtri(n_levels, _CHANCE):
             continue
         size = in_words(np.where(np.arange(len(stated)) == kind, stated, 0.0))
         needed = float(np.sqrt(np.mean(own**2)))
         wanted = in_words(np.where(np.arange(len(stated)) == kind, needed * stated, 0.0))
         shift = float(np.mean(own)) * np.sqrt(n_levels)
         alike = ""
-        if abs(shift) > norm.isf(_CHANCE / 2) and n_levels > 1 and name in _COMMON:
+        if abs(shift) > -ndtri(_CHANCE / 2) and n_levels > 1 and name in _COMMON:
             alike = f"; their mean is {float(np.mean(own)):+.2g} of it: {_COMMON[name]}"
         notes.append(
             f"levels deviate by {needed:.2g} times the stated 1σ of {size} (root mean square; "

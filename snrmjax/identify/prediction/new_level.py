@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import linregress
 
 from snrmjax.identify.joint.joint_fit import JointFit
 from snrmjax.identify.test_model.states import LEVEL_ERRORS
@@ -80,6 +79,8 @@ def _trends(fit: JointFit, force: float) -> tuple[LevelTrend, ...]:
     size = np.array([np.median(known[level == k]) for k in range(fit.data.n_levels)])
     if not np.ptp(size) > 0:
         return ()
+    from scipy.stats import linregress  # slow to import, and rarely needed
+
     deviation = np.asarray(fit.unknowns.level * fit.prior.level)
     for kind, own in zip(LEVEL_ERRORS, deviation.T, strict=True):
         line = linregress(size, own) if np.any(own != 0) else None

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from snrmjax.identify.joint.notes import in_words
 from snrmjax.identify.pointwise.backbone import BackboneValues
@@ -66,7 +66,7 @@ def notes_on_negative_damping(values: BackboneValues) -> list[str]:
     """Where a curve of damping, or its band, is below zero."""
     ratio, std = np.asarray(values.damping_ratio), np.asarray(values.damping_ratio_std)
     known = np.isfinite(ratio) & np.isfinite(std) & (std > 0)
-    below = np.where(known, norm.cdf(-ratio / np.where(known, std, 1.0)), ratio < 0)
+    below = np.where(known, ndtr(-ratio / np.where(known, std, 1.0)), ratio < 0)
     k = int(np.argmax(below))
     if not below[k] > _WORTH:
         return []
