@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.answers import Search, best_answer
 from snrmjax.diagnose.checks.cross_validation import (
     held_out_levels,
@@ -266,8 +267,8 @@ def _with_probability_of_law(
         if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
     }
     outside = 1 - sum(apart.values())
-    own = "+".join(law.kinds)
-    found = {**apart, own: law.share * outside, Verdict.UNKNOWN.value: (1 - law.share) * outside}
+    own, share = "+".join(law.kinds), (1 - priors.NO_CURVE) * law.share
+    found = {**apart, own: share * outside, Verdict.UNKNOWN.value: (1 - share) * outside}
     return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 

@@ -15,12 +15,13 @@ from snrmjax.identify.checks.residual_autocorrelation import share_told_by
 from snrmjax.identify.test_model.posterior import TestPosterior, fit_test
 from snrmjax.identify.test_model.priors import LEAST_SHARE
 from snrmjax.identify.test_model.states import TestStates
+from snrmjax.identify.test_model.walk import Rounds
 
 _ROUNDS, _FINE = 6, 16  # of a fit: for most; for what is to be said
 _KNOTS = 24  # of its curves, at most
 _NEARLY = 1.0  # relative, of amplitudes for which fits may go on from one another
 _STAYS = 0.3  # of ln κ, from which on forces are scaled anew: what is linear reaches as far
-_SEARCHED = 3  # fits of a modal mass from one start, at most
+_ALLED = 3  # fits of a modal mass from one start, at most
 _MAGNITUDES = (8.0, 1 / 8, 64.0, 1 / 64)  # over the model's
 _GUESSED = 1e3  # its 1σ in the first of them
 
@@ -160,14 +161,11 @@ def judge(
     """
     for fewer in (rounds, 2, 1):
         try:
+            rounds = Rounds(
+                *(fewer, _KNOTS, states.n_levels > 1, None if start is None else start.posterior)
+            )
             posterior = fit_test(
-                states,
-                rounds=fewer,
-                most_knots=_KNOTS,
-                levels_apart=states.n_levels > 1,
-                compare_levels=False,
-                discrepancy=discrepancy,
-                start=None if start is None else start.posterior,
+                states, discrepancy=discrepancy, compare_levels=False, rounds=rounds
             )
             break
         except np.linalg.LinAlgError:  # of phasors that are no mode's
@@ -192,7 +190,7 @@ def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False
     return best if best is found else _about(states, best.mass, log_jacobian)
 
 
-def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _SEARCHED) -> Scale:
+def _about(states: TestStates, start: float, log_jacobian: float, steps: int = _ALLED) -> Scale:
     """The likeliest modal mass from some on: forces are divided by it until it stays."""
     mass, std = start, np.inf
     for _ in range(steps):

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.cross_validation import (
     HeldOut,
     HeldOutLevels,
@@ -46,7 +45,7 @@ class LawAnswer(NamedTuple):
 
     laws: tuple[DrawnLaw, ...]
     kinds: tuple[str, ...]  # of the effects of the completed model
-    share: float  # its probability, where no effect of the library explains the data
+    share: float  # probability of its class, where the data follow one curve that the library lacks
     rivals: tuple[str, ...]  # kinds that would do about as well as the first
     fit: EffectFit
     misfit: WeightedMisfit
@@ -112,7 +111,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
     return LawAnswer(
         laws=laws,
         kinds=tuple(effect.kind for effect in effects),
-        share=(1 - priors.NO_CURVE) * fit.share,
+        share=fit.share,
         rivals=tuple(law_kind(part) for part in fit.rivals),
         fit=as_effect,
         misfit=fit.misfit,

@@ -21,10 +21,12 @@ from snrmjax.identify.joint.force_balance import (
     with_deviations,
 )
 from snrmjax.identify.joint.notes import NoiseAndLevels
+from snrmjax.identify.test_model.curve_basis import MOST_KNOTS
 from snrmjax.identify.test_model.hyper import MASS, OFFSET, PHASE
 from snrmjax.identify.test_model.posterior import TestPosterior, few_levels_factor, fit_test
 from snrmjax.identify.test_model.priors import OFF_RESONANCE
 from snrmjax.identify.test_model.states import TestStates
+from snrmjax.identify.test_model.walk import Rounds
 
 _FREE = 3.0  # 1σ of what nobody knows of the instruments, once its size is guessed
 _CLEARLY = 20.0  # of −2 ln p, to believe in a frequency that wanders though nobody stated it
@@ -70,21 +72,21 @@ def view_of(
     gain = abs(guess) if "force_gain" in free else 1.0
     guess = gain * np.exp(1j * np.angle(guess)) if "instrument_phase" in free else gain + 0j
     states = _test_states(problem, free, stated, guess)
-    fit = functools.partial(fit_test, robust=robust, most_knots=knots, tempered=True)
-    quick = functools.partial(fit, compare_levels=False)
-    found = quick(states)
+    rounds = Rounds(most_knots=MOST_KNOTS if knots is None else knots)
+    fit = functools.partial(fit_test, robust=robust, tempered=True)
+    found = fit(states, compare_levels=False, rounds=rounds)
     mass, std = found.modal_mass
     assumed = "force_gain" not in free and problem.modes.modal_mass_std is None
     if assumed and abs(mass - 1) < _ASKED * std:
         known = dataclasses.replace(problem.prior, linear=problem.prior.linear.at[-1].set(0.0))
         problem = dataclasses.replace(problem, prior=known)
         states = states._replace(mass_std=0.0)
-        found = quick(states)
+        found = fit(states, compare_levels=False, rounds=rounds._replace(start=found))
     wandering = wandering_stiffness(found)
     if wandering > 0:
         own = np.full(len(states.level), wandering / found.hyper.noise)
         states = states._replace(errors=np.column_stack([states.errors, own]))
-    found = fit(states, over_sizes=True)
+    found = fit(states, over_sizes=True, rounds=rounds._replace(start=found))
     if "force_gain" in free:
         found = _with_common_gain_in_the_force(found)
     noise = noise_and_levels(found)

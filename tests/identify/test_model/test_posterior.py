@@ -8,6 +8,7 @@ from truths.exact_states import CONSTANT, damping, squared
 
 from snrmjax.identify.test_model import states as measured
 from snrmjax.identify.test_model.posterior import few_levels_factor, fit_test
+from snrmjax.identify.test_model.walk import Rounds
 from snrmjax.numerics.blocks import on_one_core
 
 LEVELS, PER_LEVEL, NOISE, SPREAD = 6, 15, 0.005, 0.005
@@ -246,7 +247,8 @@ def test_a_natural_frequency_that_moves_along_the_test_is_a_trend():
 def test_levels_bandwidths_apart_are_found_by_the_start_that_has_them_apart():
     """Natural frequencies 2 % apart, where 2ζ is 1 %: the noise that is left is what was put in."""
     states = made(0, spread=0.02).states
-    found = fitted(states, rounds=4, levels_apart=True, compare_levels=False)
+    four = Rounds(most=4)
+    found = fitted(states, rounds=four._replace(levels_apart=True), compare_levels=False)
     assert found.hyper.noise == pytest.approx(1.0, abs=0.15)  # 180 rows say it to 5 %
-    assert found.log_evidence >= fitted(states, rounds=4).log_evidence - 0.1
+    assert found.log_evidence >= fitted(states, rounds=four).log_evidence - 0.1
     assert found.differing == (False,) * 4
