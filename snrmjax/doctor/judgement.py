@@ -160,12 +160,11 @@ def judge(
     with `discrepancy` beside what one mode leaves off resonance.
     """
     for fewer in (rounds, 2, 1):
+        first = None if start is None else start.posterior
+        walked = Rounds(fewer, _KNOTS, states.n_levels > 1, first)
         try:
-            rounds = Rounds(
-                *(fewer, _KNOTS, states.n_levels > 1, None if start is None else start.posterior)
-            )
             posterior = fit_test(
-                states, discrepancy=discrepancy, compare_levels=False, rounds=rounds
+                states, discrepancy=discrepancy, compare_levels=False, rounds=walked
             )
             break
         except np.linalg.LinAlgError:  # of phasors that are no mode's

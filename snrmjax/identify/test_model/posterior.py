@@ -171,7 +171,7 @@ def fit_test(
     places = places_of(basis, states.n_levels, discrepancy, reference, n_others)
     beside = np.zeros((n, 2 * ALONG * discrepancy), dtype=complex)
     balance = Balance(states, basis, places, units, np.ones(n), beside)
-    walk = likeliest_walk(balance, search, robust=robust, tempered=tempered)
+    walk = likeliest_walk(balance, rounds, robust=robust, tempered=tempered)
     found = walk.found
     if found is None:
         raise ValueError(f"`rounds.most` must be at least one, not {rounds.most}.")
