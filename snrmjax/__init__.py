@@ -45,5 +45,7 @@ from snrmjax.numerics.result import draw_with  # noqa: E402 - after the setting 
 
 draw_with("snrmjax.report.plots")
 
+__version__ = "0.1.0"
+
 # The names are in `__init__.pyi`. Who simulates does not wait for the imports of who identifies.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -48,3 +48,5 @@ __all__ = [
     "study",
     "use_compilation_cache",
 ]
+
+__version__: str
