@@ -196,11 +196,13 @@ def in_noise_units(misfit: WeightedMisfit, found: Predicted) -> Rows:
 def shared_by_both(
     old: WeightedMisfit, new: WeightedMisfit, kept: Bool[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row shared"]:
-    """Errors shared by measured states and a further test: the baseline's, not the levels'."""
+    """Errors shared by measured states and a further test: the baseline's, not the levels'.
+
+    A force of a level that is free is one of the levels'.
+    """
     parts = old.noise.shared, new.noise.shared[kept]
-    of_levels = [misfit.noise.shared_kind >= 0 for misfit in (old, new)]
-    common = [part[:, ~mine] for part, mine in zip(parts, of_levels, strict=True)]
-    apart = [part[:, mine] for part, mine in zip(parts, of_levels, strict=True)]
+    common = [part[:, : old.first_level_force] for part in parts]
+    apart = [part[:, old.first_level_force :] for part in parts]
     own = [part.shape[1] for part in apart]
     blank = np.zeros((len(parts[0]), own[1])), np.zeros((len(parts[1]), own[0]))
     return np.concatenate(

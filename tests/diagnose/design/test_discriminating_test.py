@@ -22,6 +22,7 @@ from snrmjax.diagnose.design.design_points import (
     Rows,
     predicted_test,
     refitted_chi_square,
+    shared_by_both,
 )
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, discriminating_test
 from snrmjax.diagnose.design.recommendation import recommendation
@@ -48,6 +49,21 @@ def test_a_sum_of_squares_is_refitted_with_all_that_is_free():
     assert refitted_chi_square(rows, shared) == pytest.approx(left[0], rel=1e-9)
     # What a parameter can do by itself costs nothing.
     assert refitted_chi_square(Rows(rows.slopes[:, 0], rows.slopes), shared) < 1e-9
+
+
+def test_a_free_force_of_a_measured_level_says_nothing_of_a_further_test():
+    predictions = predictions_of(linear_model(), measured(), force_gain_std=0.2)
+    freed = weighted_misfit(predictions.with_level_forces_free((1,)))
+    further = weighted_misfit(predictions)
+    kept = np.arange(further.n_rows) < 6
+    shared = shared_by_both(freed, further, kept)
+    by_force = shared[:, freed.first_level_force]
+    assert np.max(np.abs(by_force[: freed.n_rows])) > 1.0
+    np.testing.assert_array_equal(by_force[freed.n_rows :], 0.0)
+    # The gain that all forces share is that of both.
+    np.testing.assert_array_equal(
+        shared[freed.n_rows :, freed.first_level_force - 1], further.noise.shared[kept][:, -1]
+    )
 
 
 def test_design_points_obey_the_law_that_predicts_them():
