@@ -9,10 +9,10 @@ each, force 1 %. At a small scatter (scale 0.5) and a large one (scale 5): mean,
 and 95 % range of the frequency (Hz) and velocity (m/s) of the highest peak, every fold and the
 phase resonance by first order, second order, Monte Carlo and quasi-Monte Carlo (8 scramblings),
 1σ of the latter two, members at which the motion ceases to exist, and members whose whole response
-curve, traced by continuation, has another event in its place. Then the scale from which first
-order errs by 10 % (its mean in standard deviations, its standard deviation, the ends of its 95 %
-range in half widths), from members at nine scales and as second order predicts it. Last total
-Sobol' indices and the bounds on them by derivatives, at the small scatter. One JSON line each.
+curve, traced by continuation, has another event in its place; and the factor on the scatter from
+which first order errs by 10 % (its mean in standard deviations, its standard deviation, the ends of
+its 95 % range in half widths), as second order predicts it. Last total Sobol' indices at the small
+scatter. One JSON line each.
 """
 
 import argparse
@@ -30,7 +30,6 @@ from snrmjax.study.uncertainty.quantities import MemberStatus
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
-STUDIED = np.geomspace(0.25, 8.0, 9)
 
 
 class Case(NamedTuple):
@@ -112,6 +111,7 @@ def propagated(name: str, case: Case, members: int) -> dict[str, sj.study.Propag
                 nominal=float(result.expansion.value[q]),
                 **rows,
                 first_order_error=result.first_order_error[:, q].tolist(),
+                scatter_of_10_percent_error=result.scatter_limit[:, q].tolist(),
                 members=int(counts.sum()),
                 replaced=int(counts[MemberStatus.REPLACED]),
                 ceased=int(counts[MemberStatus.CEASED]),
@@ -123,33 +123,12 @@ def propagated(name: str, case: Case, members: int) -> dict[str, sj.study.Propag
     return found
 
 
-def limits(name: str, case: Case, members: int) -> sj.study.ScatterStudy:
-    """From which scale on first order errs by 10 %, printed."""
-    settings = sj.study.PropagationSettings(members=members)
-    study = sj.study.scatter_study(quantities(case, 1.0), STUDIED, settings)
-    for q, quantity in enumerate(study.names):
-        tell(
-            case=name,
-            quantity=quantity,
-            scale_of_10_percent_error=dict(
-                zip(("mean", "std", "range"), study.limit[:, q].tolist(), strict=True)
-            ),
-            predicted_by_second_order=study.predicted_limit[:, q].tolist(),
-            share_found_at_scales=study.share_found[:, q].tolist(),
-            error_of_first_order=np.nanmax(study.first_order_error[:, :, q], axis=1).tolist(),
-            error_of_second_order=np.nanmax(study.second_order_error[:, :, q], axis=1).tolist(),
-        )
-    return study
-
-
 def indices(name: str, case: Case, members: int) -> None:
-    """Total Sobol' indices and their bounds by derivatives at the small scatter, printed."""
+    """Total Sobol' indices at the small scatter, printed."""
     some = quantities(case, SCALES["small"])
     begin = time.perf_counter()
     shares = sj.study.sobol_indices(some, base_rows=max(members // 8, 64))
-    middle = time.perf_counter()
-    bounds = sj.study.derivative_bounds(some, members=max(members // 8, 64))
-    end = time.perf_counter()
+    seconds = time.perf_counter() - begin
     for q, quantity in enumerate(some.names):
         tell(
             case=name,
@@ -157,9 +136,8 @@ def indices(name: str, case: Case, members: int) -> None:
             inputs=list(shares.input_names),
             total=shares.total[q].tolist(),
             total_half_width=shares.total_half_width[q].tolist(),
-            bound=bounds.bound[q].tolist(),
         )
-    tell(case=name, sobol_seconds=middle - begin, derivative_seconds=end - middle)
+    tell(case=name, sobol_seconds=seconds)
 
 
 def main() -> None:
@@ -171,13 +149,11 @@ def main() -> None:
     asked = parser.parse_args()
     for name in asked.case or CASES:
         results = propagated(name, CASES[name], asked.members)
-        study = limits(name, CASES[name], asked.members // 2)
         indices(name, CASES[name], asked.members)
         if asked.figures is not None:
             asked.figures.mkdir(parents=True, exist_ok=True)
             stem = name.replace(",", "").replace(" ", "_")
             sj.plot.save_figure(asked.figures / f"{stem}_members.png", results["large"].plot())
-            sj.plot.save_figure(asked.figures / f"{stem}_errors.png", study.plot())
 
 
 if __name__ == "__main__":

@@ -13,13 +13,7 @@ from .uncertainty.propagation import (
     propagate_uncertainty,
 )
 from .uncertainty.quantities import FunctionQuantities, MemberStatus
-from .uncertainty.scatter_study import ScatterStudy, scatter_study
-from .uncertainty.sensitivity import (
-    DerivativeBounds,
-    SobolIndices,
-    derivative_bounds,
-    sobol_indices,
-)
+from .uncertainty.sensitivity import SobolIndices, sobol_indices
 from .uncertainty.uncertain_inputs import (
     UncertainInputs,
     correlated_inputs,
@@ -31,7 +25,6 @@ from .variations import joint_normal, listed, lognormal, normal, ranged, uniform
 __all__ = [
     "Curves",
     "DampedModes",
-    "DerivativeBounds",
     "Diagnoses",
     "FunctionQuantities",
     "Identifications",
@@ -45,7 +38,6 @@ __all__ = [
     "ResponseRange",
     "RunSettings",
     "Sampling",
-    "ScatterStudy",
     "Shard",
     "SobolIndices",
     "Study",
@@ -53,7 +45,6 @@ __all__ = [
     "UncertainInputs",
     "VirtualTests",
     "correlated_inputs",
-    "derivative_bounds",
     "discard_chunks",
     "joint_normal",
     "listed",
@@ -67,7 +58,6 @@ __all__ = [
     "read_study",
     "response_quantities",
     "run_study",
-    "scatter_study",
     "sobol_indices",
     "uncertain_inputs",
     "uniform",

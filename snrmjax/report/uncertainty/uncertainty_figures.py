@@ -1,4 +1,4 @@
-"""Figures of propagated uncertainty, of where derivatives fail, and of sensitivity indices."""
+"""Figures of propagated uncertainty and of sensitivity indices."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,8 +9,6 @@ from snrmjax.report.style import (
     BACKGROUND,
     COLUMN,
     CURVE,
-    EXCLUDED,
-    LINE,
     PAGE,
     SERIES,
     SIMULATED,
@@ -20,7 +18,6 @@ from snrmjax.report.style import (
     panels,
 )
 from snrmjax.study.uncertainty.propagation import METHOD_NAMES, Propagation
-from snrmjax.study.uncertainty.scatter_study import ScatterStudy
 from snrmjax.study.uncertainty.sensitivity import SobolIndices
 
 _COLOURS = (SERIES[0], SERIES[1], SERIES[2], SIMULATED)  # of the methods
@@ -66,40 +63,6 @@ def _distribution(axes: Axes, result: Propagation, q: int) -> None:
     axes.set_ylim(-top * 0.4, top * 1.08)
     axes.set_yticks([])
     name_axes(axes, "", _label(result.names[q]), "Density")
-
-
-def scatter_figure(study: ScatterStudy) -> Figure:
-    """The largest error of first order against the scale of the inputs' scatter.
-
-    Frequencies above, velocities below; dashed what second order errs by; a line at 10 %. Returns
-    the figure.
-    """
-    places: dict[str, list[int]] = {}
-    for q, name in enumerate(study.names):
-        kind = "Frequencies" if name.endswith("_hz") else "Velocities"
-        kind = kind if name.endswith(("_hz", "_m_s")) else "Quantities"
-        places.setdefault(kind, []).append(q)
-    figure, grid = panels(COLUMN, 0.8 + 2.3 * len(places), len(places), 1)
-    for axes, (kind, own) in zip(grid.flat, places.items(), strict=True):
-        for k, q in enumerate(own):
-            colour = SERIES[k % len(SERIES)]
-            first = np.nanmax(study.first_order_error[:, :, q], axis=1)
-            second = np.nanmax(study.second_order_error[:, :, q], axis=1)
-            name = study.names[q].removesuffix("_frequency_hz").removesuffix("_velocity_m_s")
-            # Peak and resonance often err alike: the later ones are thinner, so that both are seen.
-            width = LINE * max(2.0 - 0.4 * k, 0.6)
-            label = name.replace("_", " ")
-            axes.loglog(study.scale, first, color=colour, linewidth=width, label=label)
-            axes.loglog(study.scale, second, "--", color=colour, linewidth=0.8)
-        axes.axhline(0.1, color=EXCLUDED, linewidth=0.8)
-        axes.set_ylim(1e-3, max(2.0, axes.get_ylim()[1]))
-        low, high = np.ceil(np.log2(study.scale[0])), np.floor(np.log2(study.scale[-1]))
-        ticks = 2.0 ** np.arange(low, high + 1)
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.set_xticks([], minor=True)
-        name_axes(axes, kind, "Scatter over the stated one", "Error (dashed: second order)")
-    legend(figure)
-    return figure
 
 
 def sensitivity_figure(indices: SobolIndices) -> Figure:

@@ -82,7 +82,7 @@ class ResponseQuantities(AbstractQuantities):
 
     def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """See `AbstractQuantities`; what cannot be followed is looked for on the whole curve."""
-        followed = self._followed(z, slopes=False)[0]
+        followed = self._followed(z)
         ceased = followed.status == int(MemberStatus.CEASED)
         rows = np.flatnonzero(ceased.any(axis=1))
         if not rows.size:
@@ -94,10 +94,6 @@ class ResponseQuantities(AbstractQuantities):
         status[rows] = np.where(instead, int(MemberStatus.REPLACED), status[rows])
         return SolvedMembers(values, status)
 
-    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
-        """See `AbstractQuantities`."""
-        return self._followed(z, slopes=True)
-
     def traced(
         self, z: Float[np.ndarray, "member input"]
     ) -> tuple[Float[np.ndarray, "member quantity"], Bool[np.ndarray, " member"]]:
@@ -108,7 +104,7 @@ class ResponseQuantities(AbstractQuantities):
         """
         rows = np.asarray(z, dtype=np.float64)
         models, forces = [], []
-        numbers = _none(rows) if self.made is None else self.made.numbers(rows)
+        numbers = np.zeros((len(rows), 0)) if self.made is None else self.made.numbers(rows)
         for row, own in zip(rows, numbers, strict=True):
             model, force = self.base.at(self.inputs, jnp.asarray(row))
             models.append(model if self.made is None else with_numbers(model, own))
@@ -127,37 +123,27 @@ class ResponseQuantities(AbstractQuantities):
                         row[place : place + 2] = curve.frequency[k] / HERTZ, speed
         return found, batch.n_points > 0
 
-    def _followed(self, z: np.ndarray, *, slopes: bool) -> tuple[SolvedMembers, np.ndarray]:
+    def _followed(self, z: np.ndarray) -> SolvedMembers:
         rows = np.asarray(z, dtype=np.float64)
         possible = self.inputs.possible(rows)
         safe = np.where(possible[:, None], rows, 0.0)
-        values, by_z, made = [], [], self.made
-        rest = _none(safe) if made is None else made.rest(safe)
-        own = [_none(safe)] * 2
-        if made is not None and slopes:
-            own = [made.numbers(safe), made.slopes(safe)]
+        rest = np.zeros((len(safe), 0)) if self.made is None else self.made.rest(safe)
+        values = []
         for kind, motion in zip(self.kinds, self.motions, strict=True):
 
             def block(
                 some: np.ndarray,
                 rest: np.ndarray,
-                *own: np.ndarray,
                 kind: EventKind = kind,
                 motion: NominalMotion = motion,
             ) -> tuple:
-                found = _follow(self.base, self.inputs, kind, motion, some, rest)
-                if not slopes:
-                    return found[0], np.zeros((len(some), 2, some.shape[1]))
-                return found[0], _slopes(self.base, self.inputs, kind, found[1:], some, *own)
+                return (_follow(self.base, self.inputs, kind, motion, some, rest),)
 
-            found, gradient = by_blocks(block, _BLOCK, safe, rest, *own)
-            values.append(found)
-            by_z.append(gradient)
+            values += by_blocks(block, _BLOCK, safe, rest)
         table = np.where(possible[:, None], np.concatenate(values, axis=1), np.nan)
         ceased = np.where(np.isnan(table), int(MemberStatus.CEASED), int(MemberStatus.FOUND))
         status = np.where(possible[:, None], ceased, int(MemberStatus.IMPOSSIBLE))
-        gradients = np.where(np.isnan(table)[:, :, None], np.nan, np.concatenate(by_z, axis=1))
-        return SolvedMembers(table, status), gradients
+        return SolvedMembers(table, status)
 
 
 def response_quantities(
@@ -254,11 +240,6 @@ def response_quantities(
     )
 
 
-def _none(rows: np.ndarray) -> Float[np.ndarray, "member zero"]:
-    """Nothing of every member."""
-    return np.zeros((len(rows), 0))
-
-
 def _name(kind: EventKind, number: int) -> str:
     return {"peak": "peak", "phase_resonance": "resonance", "fold": f"fold_{number + 1}"}[kind]
 
@@ -330,14 +311,14 @@ def _follow(
     near: NominalMotion,
     z: Array,
     rests: Array,
-) -> tuple[Array, Array, Array]:
-    """Frequency (Hz) and velocity of every member, and its coefficients and frequency (rad/s).
+) -> Array:
+    """Frequency (Hz) and velocity of every member.
 
     `rests` are the numbers of every member's model less those of the series.
     """
     size, speed = jnp.max(jnp.abs(near.coefficients)), near.frequency
 
-    def member(row: Array, rest: Array) -> tuple[Array, Array, Array]:
+    def member(row: Array, rest: Array) -> Array:
         def apart(one: tuple, other: tuple) -> Array:
             moved = jnp.max(jnp.abs(one[0] - other[0])) / size
             return jnp.maximum(moved, jnp.abs(one[1] - other[1]) / speed)
@@ -401,25 +382,6 @@ def _follow(
         arrived = end.share >= 1
         start = (jnp.where(arrived, end.point[0], jnp.nan), end.point[1])
         arrived_at = base.toward(rest, jnp.ones(()))
-        return _pair(_motion(arrived_at, inputs, kind, start, row)), *start
+        return _pair(_motion(arrived_at, inputs, kind, start, row))
 
     return mapped(member, z, rests)
-
-
-@compiled
-def _slopes(
-    base: Base,
-    inputs: UncertainInputs,
-    kind: EventKind,
-    starts: tuple[Array, Array],
-    z: Array,
-    numbers: Array,
-    by_z: Array,
-) -> Array:
-    """Derivatives of frequency and velocity by z, of members whose motion is known."""
-
-    def member(row: Array, numbers: Array, by_z: Array, *start: Array) -> Array:
-        own = base.about(row, numbers, by_z)
-        return jax.jacfwd(lambda z: _pair(_motion(own, inputs, kind, start, z)))(row)
-
-    return mapped(member, z, numbers, by_z, *starts)

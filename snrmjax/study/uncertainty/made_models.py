@@ -63,14 +63,6 @@ class Base(NamedTuple):
             return self
         return self._replace(series=self.series.toward(rest, share))
 
-    def about(self, z: Array, numbers: Array, slopes: Array) -> "Base":
-        """The same with a model that has these numbers and slopes at z."""
-        if self.series is None:
-            return self
-        curvature = jnp.zeros_like(self.series.curvature)
-        own = ModelSeries(self.series.template, numbers - slopes @ z, slopes, curvature)
-        return self._replace(series=own)
-
     def at(
         self, inputs: UncertainInputs, z: Float[Array, " input"]
     ) -> tuple[Structure, Float[Array, ""]]:
@@ -97,13 +89,6 @@ class MadeModels(eqx.Module):
     def numbers(self, z: Float[np.ndarray, "member input"]) -> Float[np.ndarray, "member number"]:
         """The numbers of every member's own model; NaN where there is none."""
         (found,) = by_blocks(lambda rows: (_numbers(self.model_of, self.inputs, rows),), _BLOCK, z)
-        return found
-
-    def slopes(
-        self, z: Float[np.ndarray, "member input"]
-    ) -> Float[np.ndarray, "member number input"]:
-        """Derivatives of the numbers by z at every member."""
-        (found,) = by_blocks(lambda rows: (_slopes(self.model_of, self.inputs, rows),), _BLOCK, z)
         return found
 
     def rest(self, z: Float[np.ndarray, "member input"]) -> Float[np.ndarray, "member number"]:
@@ -156,8 +141,3 @@ def _expanded(model_of: ModelOf, inputs: UncertainInputs) -> tuple[Array, Array,
 @compiled
 def _numbers(model_of: ModelOf, inputs: UncertainInputs, z: Array) -> Array:
     return mapped(lambda row: _numbers_at(model_of, inputs, row), z)
-
-
-@compiled
-def _slopes(model_of: ModelOf, inputs: UncertainInputs, z: Array) -> Array:
-    return mapped(jax.jacfwd(lambda row: _numbers_at(model_of, inputs, row)), z)

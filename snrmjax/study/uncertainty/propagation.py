@@ -11,7 +11,6 @@ from snrmjax.study.uncertainty.followed_motions import ResponseQuantities
 from snrmjax.study.uncertainty.moments import (
     ERRORS,
     STATISTICS,
-    Sampled,
     expanded_members,
     first_order,
     first_order_error,
@@ -51,14 +50,6 @@ class PropagationSettings(eqx.Module):
 DEFAULT_PROPAGATION = PropagationSettings()
 
 
-class Convergence(eqx.Module):
-    """Statistics from the first members of each sampling, and 1σ of each."""
-
-    members: Int[np.ndarray, " size"]
-    statistics: Float[np.ndarray, "size sampling statistic quantity"]
-    standard_error: Float[np.ndarray, "size sampling statistic quantity"]
-
-
 class TracedCheck(eqx.Module):
     """Members whose whole response curve was traced, against the motions that were followed."""
 
@@ -83,7 +74,6 @@ class Propagation(AbstractResult):
     expansion: Expansion  # by standard normal numbers
     statistics: Float[np.ndarray, "method statistic quantity"]
     standard_error: Float[np.ndarray, "sampling statistic quantity"]
-    convergence: Convergence
     status_counts: Int[np.ndarray, "status quantity"]  # both samplings together, by `MemberStatus`
     first_order_error: Float[np.ndarray, "error quantity"]
     scatter_limit: Float[np.ndarray, "error quantity"]
@@ -110,9 +100,8 @@ class Propagation(AbstractResult):
         return (*lines, *(f"note: {note}" for note in self.notes))
 
     def variables(self) -> dict[str, Variable]:
-        """Statistics by method, their standard errors and convergence, counts and limits."""
+        """Statistics by method, their standard errors, counts and limits."""
         both = ("statistic", "quantity")
-        size, sampled = self.convergence, ("size", "sampling", *both)
         kinds = np.array([kind.name.lower() for kind in MemberStatus])
         named = {
             "quantity": Variable(("quantity",), np.array(self.names), "", "quantity"),
@@ -123,11 +112,6 @@ class Propagation(AbstractResult):
             "value": Variable(("approach", *both), self.statistics, "SI", "statistic"),
             "standard_error": Variable(
                 ("sampling", *both), self.standard_error, "SI", "1σ of the statistic"
-            ),
-            "size": Variable(("size",), size.members, "1", "members used"),
-            "value_of_size": Variable(sampled, size.statistics, "SI", "from the first members"),
-            "standard_error_of_size": Variable(
-                sampled, size.standard_error, "SI", "1σ, from the first members"
             ),
             "status": Variable(("status",), kinds, "", "what became of members"),
             "n_members": Variable(("status", "quantity"), self.status_counts, "1", "members"),
@@ -174,7 +158,7 @@ def propagate_uncertainty(
     >>> found.statistics[:2, 0, 0].round(6).tolist()
     [1.0, 1.04]
     """
-    per_scrambling = members_per_scrambling(settings)
+    per_scrambling = _members_per_scrambling(settings)
     n_inputs = len(quantities.inputs.names)
     expansion = quantities.expansion()
     random_z = normal_members(settings.members, n_inputs, settings.seed)
@@ -182,8 +166,8 @@ def propagate_uncertainty(
     sampled = quantities.members(random_z)
     spread = quantities.members(sobol_z.reshape(-1, n_inputs))
     by_scrambling = spread.values.reshape(settings.scramblings, per_scrambling, -1)
-    convergence = _convergence(sampled.values, by_scrambling)
-    final = convergence.statistics[-1]
+    solved = [monte_carlo(sampled.values), quasi_monte_carlo(by_scrambling)]
+    final = [one.statistics for one in solved]
     first, second = first_order(expansion), second_order(expansion)
     # Of the same members, so that the sequence's own error does not count.
     linear, quadratic = (
@@ -207,8 +191,7 @@ def propagate_uncertainty(
         inputs=quantities.inputs,
         expansion=expansion,
         statistics=np.stack([first, second, *final]),
-        standard_error=convergence.standard_error[-1],
-        convergence=convergence,
+        standard_error=np.stack([one.standard_error for one in solved]),
         status_counts=counts,
         first_order_error=error,
         scatter_limit=limit,
@@ -219,7 +202,7 @@ def propagate_uncertainty(
     )
 
 
-def members_per_scrambling(settings: PropagationSettings) -> int:
+def _members_per_scrambling(settings: PropagationSettings) -> int:
     """How many members each scrambling has. Raises `ValueError` where it is no power of two."""
     each, rest = divmod(settings.members, settings.scramblings)
     if settings.members < 64 or settings.scramblings < 2 or rest or each & (each - 1):
@@ -228,21 +211,6 @@ def members_per_scrambling(settings: PropagationSettings) -> int:
             f" scramblings, but there are {settings.members} members in {settings.scramblings}."
         )
     return each
-
-
-def _convergence(sampled: np.ndarray, by_scrambling: np.ndarray) -> Convergence:
-    """Statistics of the first 2^k members, of every scrambling equally many."""
-    n_scramblings, each, _ = by_scrambling.shape
-    sizes = [k for k in (2**p for p in range(3, 31)) if k <= each] or [each]
-    rows: list[list[Sampled]] = [
-        [monte_carlo(sampled[: k * n_scramblings]), quasi_monte_carlo(by_scrambling[:, :k])]
-        for k in sizes
-    ]
-    return Convergence(
-        members=np.array(sizes) * n_scramblings,
-        statistics=np.array([[one.statistics for one in row] for row in rows]),
-        standard_error=np.array([[one.standard_error for one in row] for row in rows]),
-    )
 
 
 def _traced(

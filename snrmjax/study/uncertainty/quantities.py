@@ -69,12 +69,6 @@ class AbstractQuantities(eqx.Module):
     def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """The quantities of every member."""
 
-    @abc.abstractmethod
-    def gradients(
-        self, z: Float[np.ndarray, "member input"]
-    ) -> tuple[SolvedMembers, Float[np.ndarray, "member quantity input"]]:
-        """The quantities of every member and their derivatives by z."""
-
 
 class FunctionQuantities(AbstractQuantities):
     """The results of a differentiable JAX function of the inputs' values.
@@ -102,22 +96,13 @@ class FunctionQuantities(AbstractQuantities):
     def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
         """See `AbstractQuantities`."""
         (values,) = by_blocks(lambda rows: (_values(self, rows),), _BLOCK, np.asarray(z))
-        return _finite_members(values)
-
-    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
-        """See `AbstractQuantities`."""
-        values, slopes = by_blocks(lambda rows: _with_slopes(self, rows), _BLOCK, np.asarray(z))
-        return _finite_members(values), slopes
+        finite = np.isfinite(values)
+        status = np.where(finite, int(MemberStatus.FOUND), int(MemberStatus.NOT_FINITE))
+        return SolvedMembers(np.where(finite, values, np.nan), status)
 
     def at(self, z: Float[Array, " input"]) -> Float[Array, " quantity"]:
         """The quantities at standard normal numbers."""
         return self.function(self.inputs.values(z))
-
-
-def _finite_members(values: np.ndarray) -> SolvedMembers:
-    finite = np.isfinite(values)
-    status = np.where(finite, int(MemberStatus.FOUND), int(MemberStatus.NOT_FINITE))
-    return SolvedMembers(np.where(finite, values, np.nan), status)
 
 
 @jitted
@@ -129,8 +114,3 @@ def _expanded(quantities: FunctionQuantities, z: Array) -> tuple[Array, Array, A
 @jitted
 def _values(quantities: FunctionQuantities, z: Array) -> Array:
     return mapped(quantities.at, z)
-
-
-@jitted
-def _with_slopes(quantities: FunctionQuantities, z: Array) -> tuple[Array, Array]:
-    return mapped(lambda row: (quantities.at(row), jax.jacfwd(quantities.at)(row)), z)

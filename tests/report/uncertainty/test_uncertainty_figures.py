@@ -33,19 +33,6 @@ def test_every_range_of_a_propagation_is_drawn_where_it_is():
         sj.study.propagate_uncertainty(nothing, SETTINGS).plot()
 
 
-def test_errors_are_drawn_against_the_scatter():
-    study = sj.study.scatter_study(quantities(), np.array([0.5, 1.0, 2.0]), SETTINGS)
-    frequencies, velocities = study.plot().axes
-    for q, axes in enumerate((frequencies, velocities)):
-        assert axes.lines[0].get_xdata() == pytest.approx(study.scale)
-        worst = study.first_order_error[:, :, q].max(axis=1)
-        assert axes.lines[0].get_ydata() == pytest.approx(worst)
-    assert (frequencies.get_title(loc="left"), velocities.get_title(loc="left")) == (
-        "Frequencies",
-        "Velocities",
-    )
-
-
 def test_indices_are_drawn_as_bars():
     indices = sj.study.sobol_indices(quantities(), base_rows=64)
     for q, axes in enumerate(indices.plot().axes):
