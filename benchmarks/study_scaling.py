@@ -19,7 +19,7 @@ import numpy as np
 import snrmjax as sj
 from snrmjax.report.figures import save_figure
 from snrmjax.study.computations.base import OfForces
-from snrmjax.study.engine import Progress
+from snrmjax.study.compute import Progress
 from snrmjax.study.run import RunSettings
 
 HERTZ = 2 * np.pi

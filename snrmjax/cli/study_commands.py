@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray
 
     from snrmjax.report.study.summary import ScalarSummary
-    from snrmjax.study.engine import Progress, ProgressReport
+    from snrmjax.study.compute import Progress, ProgressReport
     from snrmjax.study.run import Expected, Shard, StudyRun
     from snrmjax.study.study import Study
 

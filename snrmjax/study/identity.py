@@ -47,16 +47,11 @@ def description(study: Study) -> dict[str, Any]:
     }
 
 
-def fingerprint(described: Mapping[str, Any]) -> str:
-    """A hash of a description: the same for the same study, and only for it."""
-    text = json.dumps(described, sort_keys=True, allow_nan=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def model_hash(study: Study) -> str:
     """A hash of the base model alone."""
     beam = isinstance(study.model_of, BeamModels)
-    return fingerprint({"model": _plain(study.model_of if beam else study.model)})
+    text = json.dumps({"model": _plain(study.model_of if beam else study.model)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def differences(here: Any, there: Any, place: str = "") -> list[Difference]:
