@@ -6,13 +6,8 @@ from .run import RunSettings, Shard, StudyRun, discard_chunks, open_study, run_s
 from .sampling import Sampling
 from .study import Study, planned
 from .study_file import read_study
-from .uncertainty.followed_motions import ResponseQuantities, response_quantities
-from .uncertainty.propagation import (
-    Propagation,
-    PropagationSettings,
-    propagate_uncertainty,
-)
-from .uncertainty.quantities import FunctionQuantities, MemberStatus
+from .uncertainty.propagation import Propagation, propagate_uncertainty
+from .uncertainty.quantities import Quantities, function_quantities, response_quantities
 from .uncertainty.sensitivity import SobolIndices, sobol_indices
 from .uncertainty.uncertain_inputs import (
     UncertainInputs,
@@ -26,15 +21,12 @@ __all__ = [
     "Curves",
     "DampedModes",
     "Diagnoses",
-    "FunctionQuantities",
     "Identifications",
-    "MemberStatus",
     "NormalModes",
     "OfForces",
     "Peaks",
     "Propagation",
-    "PropagationSettings",
-    "ResponseQuantities",
+    "Quantities",
     "ResponseRange",
     "RunSettings",
     "Sampling",
@@ -46,6 +38,7 @@ __all__ = [
     "VirtualTests",
     "correlated_inputs",
     "discard_chunks",
+    "function_quantities",
     "joint_normal",
     "listed",
     "lognormal",

@@ -18,7 +18,6 @@ from snrmjax.study.variations import AbstractVariation, standard_normal
 
 FORCE = "force_n"
 Marginal = Literal["normal", "lognormal", "uniform"]
-_POSITIVE = ("natural_frequency", "damping_ratio", FORCE)  # ends of names of what must be positive
 
 
 class UncertainInputs(AbstractResult):
@@ -62,15 +61,6 @@ class UncertainInputs(AbstractResult):
     def variation(self) -> "InputVariation":
         """The same numbers as what varies between the members of a `Study`."""
         return InputVariation(self.names, self)
-
-    def possible(self, z: Float[np.ndarray, "member input"]) -> np.ndarray:
-        """Whether every number of a member that must be positive is so, one truth a member.
-
-        Natural frequencies, damping ratios and the force must be.
-        """
-        rows = np.asarray(jax.vmap(self.values)(jnp.asarray(z)))
-        needed = [name.rsplit(".", 1)[-1] in _POSITIVE for name in self.names]
-        return np.all(rows[:, needed] > 0, axis=1)
 
     def summary(self) -> tuple[str, ...]:
         """Every input with its mean and 1σ."""
