@@ -62,7 +62,7 @@ def tell(**fields: object) -> None:
     print(json.dumps({"benchmark": "uncertainty_propagation", **rounded}), flush=True)
 
 
-def inputs_of(case: Case, scale: float) -> sj.study.UncertainInputs:
+def varied_of(case: Case, scale: float) -> tuple:
     """What is uncertain, with its scatter times a scale."""
     own = sj.model.parameters.parameter_values(case.model)
     relative = {
@@ -70,12 +70,13 @@ def inputs_of(case: Case, scale: float) -> sj.study.UncertainInputs:
         "mode_1.damping_ratio": 0.05,
         **dict.fromkeys(case.coefficients, 0.025),
     }
-    std = {name: scale * share * abs(own[name]) for name, share in relative.items()}
-    return sj.study.uncertain_inputs(
-        case.model,
-        {**std, "force_n": scale * 0.01 * case.force},
-        force=case.force,
-        marginals={"mode_1.damping_ratio": "lognormal"},
+    numbers = {
+        name: (own[name], scale * share * abs(own[name])) for name, share in relative.items()
+    }
+    numbers["force_n"] = case.force, scale * 0.01 * case.force
+    return tuple(
+        (sj.study.lognormal if name.endswith("damping_ratio") else sj.study.normal)(name, *number)
+        for name, number in numbers.items()
     )
 
 
@@ -89,17 +90,17 @@ def study_of(case: Case, varied: tuple, sampling: sj.study.Sampling) -> sj.study
 def propagated(name: str, case: Case, members: int) -> None:
     """Both scatters of a case, printed."""
     for scatter, scale in SCALES.items():
-        inputs = inputs_of(case, scale)
+        varied = varied_of(case, scale)
         low, high = (HERTZ * end for end in case.ends_hz)
         begin = time.perf_counter()
         found = sj.study.propagate_uncertainty(
             sj.study.response_quantities(
-                case.model, inputs, low, high, harmonic_order=case.harmonic_order
+                case.model, varied, low, high, harmonic_order=case.harmonic_order
             )
         )
         middle = time.perf_counter()
         sampling = sj.study.Sampling("sobol", members)
-        study = study_of(case, (inputs.variation(),), sampling)
+        study = study_of(case, varied, sampling)
         rows = sj.study.planned(study).rows(range(members))
         end = time.perf_counter()
         for q, quantity in enumerate(found.quantities.names):

@@ -254,14 +254,8 @@ show(plot.sensitivity_figure(indices), "beam_batch_indices")
 # `model_of` their derivatives reach the dimensions.
 
 # %%
-inputs = sj.study.correlated_inputs(
-    tuple(MEAN),
-    list(MEAN.values()),
-    np.diag([value**2 for value in std.values()]),
-    ("normal", "normal", "lognormal"),
-)
 quantities = sj.study.response_quantities(
-    *(nominal, inputs, *ENDS),
+    *(nominal, study.variations, *ENDS),
     **{"force": FORCE, "kinds": ("peak", "fold"), "harmonic_order": 7, "model_of": beam_of},
 )
 propagated = sj.study.propagate_uncertainty(quantities)
@@ -309,7 +303,7 @@ headline["highest peaks scatter more than twice as much as first order says"] = 
 # ## The headline, checked
 
 # %%
-rise = list(inputs.names).index("rise_m")
+rise = list(indices.input_names).index("rise_m")
 first = propagated.first_order_error[:, at]
 print("error of first order for the peak's frequency:", first)
 headline["the rise makes most of the peak frequency's variance"] = (

@@ -9,13 +9,16 @@ from .study_file import read_study
 from .uncertainty.propagation import Propagation, propagate_uncertainty
 from .uncertainty.quantities import Quantities, function_quantities, response_quantities
 from .uncertainty.sensitivity import SobolIndices, sobol_indices
-from .uncertainty.uncertain_inputs import (
-    UncertainInputs,
-    correlated_inputs,
-    posterior_inputs,
-    uncertain_inputs,
+from .variations import (
+    joint_normal,
+    listed,
+    lognormal,
+    normal,
+    posterior_variation,
+    ranged,
+    stated_variations,
+    uniform,
 )
-from .variations import joint_normal, listed, lognormal, normal, ranged, uniform
 
 __all__ = [
     "Curves",
@@ -34,9 +37,7 @@ __all__ = [
     "SobolIndices",
     "Study",
     "StudyRun",
-    "UncertainInputs",
     "VirtualTests",
-    "correlated_inputs",
     "discard_chunks",
     "function_quantities",
     "joint_normal",
@@ -45,13 +46,13 @@ __all__ = [
     "normal",
     "open_study",
     "planned",
-    "posterior_inputs",
+    "posterior_variation",
     "propagate_uncertainty",
     "ranged",
     "read_study",
     "response_quantities",
     "run_study",
     "sobol_indices",
-    "uncertain_inputs",
+    "stated_variations",
     "uniform",
 ]

@@ -42,10 +42,10 @@ class Propagation(AbstractResult):
         """A line a quantity and method, then what is wrong."""
         about = self.quantities
         lines = [
-            f"uncertainty of {len(about.names)} quantities from {len(about.inputs.names)} inputs"
+            f"uncertainty of {len(about.names)} quantities by {about.gradient.shape[1]} numbers"
         ]
         for q, name in enumerate(about.names):
-            lines.append(f"{name}: {about.value[q]:.6g} at the nominal inputs")
+            lines.append(f"{name}: {about.value[q]:.6g} at the medians")
             for m, method in enumerate(METHOD_NAMES):
                 mean, std, lower, upper = self.statistics[m, :, q]
                 lines.append(
@@ -62,7 +62,7 @@ class Propagation(AbstractResult):
             "approach": Variable(("approach",), methods, "", "method"),
             "statistic": Variable(("statistic",), np.array(STATISTICS), "", "statistic"),
             "error": Variable(("error",), np.array(ERRORS), "", "in which first order errs"),
-            "nominal": Variable(("quantity",), self.quantities.value, "SI", "at nominal inputs"),
+            "nominal": Variable(("quantity",), self.quantities.value, "SI", "at the medians"),
             "value": Variable(
                 ("approach", "statistic", "quantity"), self.statistics, "SI", "statistic"
             ),
@@ -76,7 +76,7 @@ class Propagation(AbstractResult):
 
 
 def propagate_uncertainty(quantities: Quantities) -> Propagation:
-    """Uncertainty of quantities from that of their inputs, by derivatives at the nominal inputs.
+    """Uncertainty of quantities from that of their inputs, by derivatives at the medians.
 
     With f(z) the quantity by independent standard normal numbers, g its gradient and H its Hessian
     at z = 0 (automatic differentiation): first order is f(0) with variance gᵀg; second order
@@ -84,15 +84,15 @@ def propagate_uncertainty(quantities: Quantities) -> Propagation:
     name the quantities of which first order is wrong by more than a tenth.
 
     Arguments: `quantities` by `response_quantities`, or `function_quantities` of your own function.
-    Validity: the derivatives know nothing of what happens away from the nominal inputs. To solve
-    members instead, vary `inputs.variation()` in a `Study`.
+    Validity: the derivatives know nothing of what happens away from the medians. To solve members
+    instead, make a `Study` of the same variations.
     Reference: Anderson, J. Aircraft 36 (1999) and Putko et al., J. Fluids Eng. 124 (2002) 60,
     doi:10.1115/1.1446068.
 
     >>> from snrmjax.study.uncertainty.quantities import function_quantities
-    >>> from snrmjax.study.uncertainty.uncertain_inputs import correlated_inputs
-    >>> inputs = correlated_inputs(["x"], [1.0], [[0.04]])
-    >>> found = propagate_uncertainty(function_quantities(lambda x: x**2, inputs, ["y"]))
+    >>> from snrmjax.study.variations import normal
+    >>> square = function_quantities(lambda x: x**2, [normal("x", 1.0, 0.2)], ["y"])
+    >>> found = propagate_uncertainty(square)
     >>> found.statistics[:, 0, 0].round(6).tolist()
     [1.0, 1.04]
     """

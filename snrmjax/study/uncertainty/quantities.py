@@ -1,4 +1,4 @@
-"""Quantities of uncertain inputs with both derivatives: events of a response, or any function."""
+"""Quantities of uncertain numbers with both derivatives: events of a response, or any function."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
@@ -17,16 +17,19 @@ from snrmjax.simulate.balance.labelled import HERTZ
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.solutions.periodic_motion import periodic_motion
-from snrmjax.study.uncertainty.uncertain_inputs import FORCE, UncertainInputs
+from snrmjax.study.variations import AbstractVariation
 
+FORCE = "force_n"
 EventKind = Literal["peak", "fold", "phase_resonance"]
 ModelOf = Callable[[dict[str, Array]], Structure]
 
 
 class Quantities(eqx.Module):
-    """Named quantities about z = 0, the nominal inputs, by the standard normal numbers z."""
+    """Named quantities about z = 0, by the standard normal numbers z of what is uncertain.
 
-    inputs: UncertainInputs
+    Every uncertain number has its median at z = 0, which for a lognormal one is below its mean.
+    """
+
     value: Float[np.ndarray, " quantity"] = eqx.field(converter=np.asarray)
     gradient: Float[np.ndarray, "quantity input"] = eqx.field(converter=np.asarray)
     hessian: Float[np.ndarray, "quantity input input"] = eqx.field(converter=np.asarray)
@@ -36,23 +39,23 @@ class Quantities(eqx.Module):
 
 def function_quantities(
     function: Callable[[Float[Array, " input"]], Float[Array, " quantity"]],
-    inputs: UncertainInputs,
+    varied: Sequence[AbstractVariation],
     names: Sequence[str],
 ) -> Quantities:
-    """The results of a JAX function of a vector of the inputs' values.
+    """The results of a JAX function of a vector of the uncertain numbers.
 
-    >>> from snrmjax.study.uncertainty.uncertain_inputs import correlated_inputs
-    >>> inputs = correlated_inputs(["a", "b"], [1.0, 2.0], [[0.01, 0.0], [0.0, 0.04]])
-    >>> area = function_quantities(lambda x: x[:1] * x[1], inputs, ["area_m2"])
+    >>> from snrmjax.study.variations import normal
+    >>> varied = normal("a", 1.0, 0.1), normal("b", 2.0, 0.2)
+    >>> area = function_quantities(lambda x: x[:1] * x[1], varied, ["area_m2"])
     >>> area.gradient.round(12).tolist()
     [[0.2, 0.2]]
     """
-    return Quantities(inputs, *_of_function(function, inputs), tuple(names))
+    return Quantities(*_of_function(function, tuple(varied)), tuple(names))
 
 
 def response_quantities(
     model: Structure,
-    inputs: UncertainInputs,
+    varied: Sequence[AbstractVariation],
     from_frequency: float,
     to_frequency: float,
     *,
@@ -61,39 +64,43 @@ def response_quantities(
     harmonic_order: int = 9,
     model_of: ModelOf | None = None,
 ) -> Quantities:
-    """Frequency (Hz) and velocity (m/s) of a response's events, differentiated by uncertain inputs.
+    """Frequency (Hz) and velocity (m/s) of a response's events, by uncertain numbers.
 
-    The response at the nominal inputs is traced once. Of it are taken the highest peak of the
+    The response at their medians is traced once. Of it are taken the highest peak of the
     velocity fundamental at the first sensor, every fold in order along the curve and the strongest
     phase resonance. Each solves the harmonic balance with its condition (see `periodic_motion`),
     whose first and second derivatives follow from the implicit function theorem.
 
-    Arguments: frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
-    among `inputs`; `model_of`, a differentiable JAX function that makes the model of the inputs'
-    values by name, where inputs are no parameters of `model` (dimensions, say).
+    Arguments: `varied` as in a `Study`, by the names of `snrmjax.model.parameter_names` and
+    "force_n"; frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
+    uncertain; `model_of`, a differentiable JAX function that makes the model of the numbers by
+    name, where they are no parameters of `model` (dimensions, say).
     Returns `Quantities`; kinds of which the nominal curve has none are in its `notes`.
     Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
     where the nominal curve has none of the events.
-    Validity: derivatives know nothing of what happens away from the nominal inputs (folds that
-    merge, another peak that becomes the highest): a `Study` of `inputs.variation()` does.
+    Validity: derivatives know nothing of what happens away from the medians (folds that merge,
+    another peak that becomes the highest): a `Study` of the same `varied` does.
 
     >>> from snrmjax.model import flat_beam
-    >>> from snrmjax.study.uncertainty.uncertain_inputs import uncertain_inputs
-    >>> beam = flat_beam()
-    >>> inputs = uncertain_inputs(beam, {"mode_1.damping_ratio": 0.005})
-    >>> found = response_quantities(beam, inputs, 480.0, 520.0, force=2e-4, harmonic_order=1)
+    >>> from snrmjax.study.variations import normal
+    >>> beam, varied = flat_beam(), [normal("mode_1.damping_ratio", 0.05, 0.005)]
+    >>> found = response_quantities(beam, varied, 480.0, 520.0, force=2e-4, harmonic_order=1)
     >>> found.names[:2]
     ('peak_frequency_hz', 'peak_velocity_m_s')
     """
     for kind in kinds:
         if kind not in get_args(EventKind):
             raise ValueError(f"`kinds` must be out of {get_args(EventKind)}, but has {kind!r}.")
+    inputs = _Inputs(tuple(varied))
+    for name in inputs.names:
+        if inputs.names.count(name) > 1:
+            raise ValueError(f"{name} varies twice.")
     checked = [name for name in inputs.names if name != FORCE]
     if checked and model_of is None:
         checked_names(model, checked)
     if (force is None) != (FORCE in inputs.names):
-        verb = "are given none of" if force is None else "have"
-        raise ValueError(f"`force` must be given once, but it is {force!r} and inputs {verb} it.")
+        verb = "do not have" if force is None else "have"
+        raise ValueError(f"`force` must be given once, but it is {force!r} and `varied` {verb} it.")
     load = np.asarray(1.0 if force is None else force, dtype=np.float64)
     nominal = _Nominal(model, load, None if model_of is None else _series(model_of, inputs))
     settings = ResponseSettings(harmonic_order=harmonic_order, stability=False)
@@ -120,7 +127,7 @@ def response_quantities(
     if not parts:
         raise ValueError(f"nothing to propagate to: {'; '.join(notes) or 'no kinds'}.")
     together = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Quantities(inputs, *together, tuple(names), tuple(notes))
+    return Quantities(*together, tuple(names), tuple(notes))
 
 
 def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[ResponseCurve, int]]:
@@ -129,6 +136,24 @@ def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[Resp
     if kind == "fold" or not every:
         return every
     return [max(every, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
+
+
+class _Inputs(NamedTuple):
+    """What is uncertain, as a function of standard normal numbers."""
+
+    varied: tuple[AbstractVariation, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for one in self.varied for name in one.names)
+
+    def values(self, z: Float[Array, " input"]) -> Float[Array, " input"]:
+        parts = jnp.split(z, np.cumsum([len(one.names) for one in self.varied])[:-1])
+        each = zip(self.varied, parts, strict=True)
+        return jnp.concatenate([one.at(part) for one, part in each])
+
+    def by_name(self, z: Float[Array, " input"]) -> dict[str, Array]:
+        return dict(zip(self.names, self.values(z), strict=True))
 
 
 class _Series(NamedTuple):
@@ -155,12 +180,10 @@ class _Nominal(NamedTuple):
     """Model and force as functions of z."""
 
     own: Structure
-    force: Float[np.ndarray, ""]  # N, where it is not among the inputs
-    series: _Series | None  # where the inputs are no numbers of the model
+    force: Float[np.ndarray, ""]  # N, where it is not uncertain
+    series: _Series | None  # where what is uncertain are no numbers of the model
 
-    def at(
-        self, inputs: UncertainInputs, z: Float[Array, " input"]
-    ) -> tuple[Structure, Float[Array, ""]]:
+    def at(self, inputs: _Inputs, z: Float[Array, " input"]) -> tuple[Structure, Float[Array, ""]]:
         """Model and force at standard normal numbers."""
         values, model = inputs.values(z), self.own
         own = [k for k, name in enumerate(inputs.names) if name != FORCE]
@@ -173,10 +196,9 @@ class _Nominal(NamedTuple):
         return model, jnp.asarray(self.force)
 
 
-def _series(model_of: ModelOf, inputs: UncertainInputs) -> _Series:
+def _series(model_of: ModelOf, inputs: _Inputs) -> _Series:
     zero = jnp.zeros(len(inputs.names))
-    template = model_of(dict(zip(inputs.names, inputs.values(zero), strict=True)))
-    return _Series(template, *_of_model(model_of, inputs))
+    return _Series(model_of(inputs.by_name(zero)), *_of_model(model_of, inputs))
 
 
 def _is_number(leaf: object) -> bool:
@@ -184,7 +206,7 @@ def _is_number(leaf: object) -> bool:
 
 
 def _derivatives(
-    function: Callable[[Array], tuple[Array, Any]], inputs: UncertainInputs
+    function: Callable[[Array], tuple[Array, Any]], inputs: _Inputs
 ) -> tuple[Any, ...]:
     """Value, gradient and Hessian at z = 0 of the first result, then the second as it is."""
 
@@ -202,22 +224,24 @@ def _derivatives(
 
 
 @compiled
-def _of_function(function: Callable[[Array], Array], inputs: UncertainInputs) -> tuple[Array, ...]:
+def _of_function(
+    function: Callable[[Array], Array], varied: tuple[AbstractVariation, ...]
+) -> tuple[Array, ...]:
+    inputs = _Inputs(varied)
     return _derivatives(lambda z: (function(inputs.values(z)), None), inputs)[:3]
 
 
 @compiled
-def _of_model(model_of: ModelOf, inputs: UncertainInputs) -> tuple[Array, ...]:
+def _of_model(model_of: ModelOf, inputs: _Inputs) -> tuple[Array, ...]:
     def numbers(z: Array) -> tuple[Array, None]:
-        model = model_of(dict(zip(inputs.names, inputs.values(z), strict=True)))
-        return ravel_pytree(eqx.filter(model, _is_number))[0], None
+        return ravel_pytree(eqx.filter(model_of(inputs.by_name(z)), _is_number))[0], None
 
     return _derivatives(numbers, inputs)[:3]
 
 
 @compiled
 def _of_event(
-    nominal: _Nominal, inputs: UncertainInputs, kind: EventKind, start: tuple
+    nominal: _Nominal, inputs: _Inputs, kind: EventKind, start: tuple
 ) -> tuple[Array, ...]:
     """Frequency (Hz) and velocity with derivatives, and whether the motion was found."""
 

@@ -22,7 +22,7 @@ from snrmjax.study.uncertainty.quantities import (
     function_quantities,
     response_quantities,
 )
-from snrmjax.study.uncertainty.uncertain_inputs import correlated_inputs, uncertain_inputs
+from snrmjax.study.variations import joint_normal, listed, lognormal, normal
 
 OMEGA, RATIO, SHAPE, LOAD, FORCE, CUBIC = 2.0, 0.02, 1.2, 1.5, 0.12, 1.2
 HERTZ = 2 * np.pi
@@ -35,31 +35,22 @@ def oscillator(cubic=0.0):
     return structure(modes, polynomial_potential({"1111": cubic / 4} if cubic else {}, 1))
 
 
-def lognormal_inputs(stds, correlation=0.0):
-    """ω, ζ and force with relative standard deviations, the first two correlated."""
-    mean = np.array([OMEGA, RATIO, FORCE])
-    spread = np.diag((mean * stds) ** 2)
-    spread[0, 1] = spread[1, 0] = correlation * np.sqrt(spread[0, 0] * spread[1, 1])
-    return correlated_inputs(PEAK_INPUTS, mean, spread, ["lognormal"] * 3)
-
-
 def quadratic(linear, curved):
-    inputs = correlated_inputs(["x"], [0.0], [[1.0]])
-    return Quantities(inputs, np.zeros(1), [[linear]], [[[curved]]], ("y",))
+    return Quantities(np.zeros(1), [[linear]], [[[curved]]], ("y",))
 
 
 @pytest.mark.long
 def test_a_linear_peak_is_that_of_a_lognormal_number():
     # |V| is largest at Ω = ω, exactly, and there F φ b/(2ζω): a product of lognormal numbers.
-    inputs = lognormal_inputs(np.array([0.02, 0.2, 0.1]), correlation=-0.5)
-    peak = response_quantities(oscillator(), inputs, 1.0, 4.0, kinds=("peak",), harmonic_order=1)
-    relative = inputs.covariance / np.outer(inputs.mean, inputs.mean)
-    of_logs = np.log1p(relative)
-    power = np.array([-1.0, -1.0, 1.0])
-    std = np.sqrt(power @ of_logs @ power)
-    median = np.exp(np.log(inputs.mean) - 0.5 * np.diag(of_logs))
+    mean, relative = np.array([OMEGA, RATIO, FORCE]), np.array([0.02, 0.2, 0.1])
+    each = zip(PEAK_INPUTS, mean.tolist(), (relative * mean).tolist(), strict=True)
+    varied = [lognormal(*one) for one in each]
+    peak = response_quantities(oscillator(), varied, 1.0, 4.0, kinds=("peak",), harmonic_order=1)
+    of_logs = np.log1p(relative**2)
+    std = np.sqrt(of_logs.sum())
+    median = mean * np.exp(-0.5 * of_logs)
     nominal = SHAPE * LOAD * median[2] / (2 * median[0] * median[1])
-    slope = power @ np.linalg.cholesky(of_logs)
+    slope = np.array([-1.0, -1.0, 1.0]) * np.sqrt(of_logs)
     assert peak.names == ("peak_frequency_hz", "peak_velocity_m_s")
     # Newton's method to 1e-12, and the derivatives of a peak, whose |V| is flat: 1e-8.
     assert peak.value[1] == pytest.approx(nominal, rel=1e-10)
@@ -74,7 +65,7 @@ def test_a_linear_peak_is_that_of_a_lognormal_number():
     data = found.to_xarray()["value"]
     own = data.sel(approach="first_order", statistic="std", quantity="peak_velocity_m_s")
     assert own == pytest.approx(nominal * std, rel=1e-8)
-    assert "uncertainty of 2 quantities from 3 inputs" in repr(found)
+    assert "uncertainty of 2 quantities by 3 numbers" in repr(found)
 
 
 def backbone(values):
@@ -85,25 +76,24 @@ def backbone(values):
     return jnp.stack([jnp.sqrt(square) / HERTZ, SHAPE * speed])
 
 
-def duffing_inputs(relative):
-    """All four numbers of the oscillator, normally distributed; `potential.1111` is γ/4."""
-    model = oscillator(CUBIC)
-    own = parameter_values(model)
-    names = ["mode_1.natural_frequency", "mode_1.damping_ratio", "potential.1111"]
-    std = {name: relative * own[name] for name in names} | {"force_n": relative * FORCE}
-    return model, uncertain_inputs(model, std, force=FORCE)
-
-
 @pytest.mark.long
 def test_gradient_and_hessian_of_a_duffing_resonance_are_those_of_its_backbone():
-    model, inputs = duffing_inputs(0.03)
+    model = oscillator(CUBIC)
+    own = parameter_values(model)
+    names = ["mode_1.natural_frequency", "mode_1.damping_ratio", "potential.1111", "force_n"]
+    mean = np.array([*(own[name] for name in names[:3]), FORCE])
+    # The first two vary together; `potential.1111` is γ/4.
+    correlation = np.eye(4)
+    correlation[0, 1] = correlation[1, 0] = 0.6
+    pair = joint_normal(names[:2], mean[:2], (0.03**2 * np.outer(mean, mean) * correlation)[:2, :2])
+    varied = [pair, *(normal(n, m, 0.03 * m) for n, m in zip(names[2:], mean[2:], strict=True))]
     found = response_quantities(
-        model, inputs, 1.0, 8.0, kinds=("phase_resonance",), harmonic_order=1
+        model, varied, 1.0, 8.0, kinds=("phase_resonance",), harmonic_order=1
     )
 
     def truth(z):
-        own = inputs.values(z)
-        return backbone(own * jnp.array([1.0, 1.0, 4.0, 1.0]))
+        values = jnp.concatenate([pair.at(z[:2]), mean[2:] * (1 + 0.03 * z[2:])])
+        return backbone(values * jnp.array([1.0, 1.0, 4.0, 1.0]))
 
     zero = jnp.zeros(4)
     # Newton's method to 1e-12, scaled; each derivative of a well-posed root keeps 1e-9 of it.
@@ -144,8 +134,8 @@ def test_the_scatter_of_a_ten_per_cent_error_is_that_of_the_noncentral_chi_squar
 
 
 def test_a_function_is_propagated_by_its_own_derivatives():
-    inputs = correlated_inputs(["x", "y"], [1.0, 2.0], np.diag([0.04, 0.01]))
-    found = function_quantities(lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]), inputs, ["a", "b"])
+    varied = [normal("x", 1.0, 0.2), normal("y", 2.0, 0.1)]
+    found = function_quantities(lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]), varied, ["a", "b"])
     # By z with 1σ of 0.2 and 0.1.
     np.testing.assert_allclose(found.value, [2.0, 1.0], rtol=1e-15)
     np.testing.assert_allclose(found.gradient, [[0.4, 0.1], [0.4, 0.0]], atol=1e-15)
@@ -161,10 +151,10 @@ def of_loss_factor(values):
 @pytest.mark.long
 def test_inputs_may_be_other_numbers_than_the_model_has():
     # |V| is largest at Ω = ω, there F φ b/(2ζω) = F φ b/(ηω): by 1/η, whose derivatives are known.
-    inputs = correlated_inputs(["loss_factor"], [2 * RATIO], [[(0.1 * RATIO) ** 2]])
+    varied = [normal("loss_factor", 2 * RATIO, 0.1 * RATIO)]
     model, ends = oscillator(), (1.0, 4.0)
     own = {"force": FORCE, "kinds": ("peak",), "harmonic_order": 1}
-    found = response_quantities(model, inputs, *ends, **own, model_of=of_loss_factor)
+    found = response_quantities(model, varied, *ends, **own, model_of=of_loss_factor)
     relative = np.array([found.gradient[1, 0], found.hessian[1, 0, 0]]) / found.value[1]
     # Relative 1σ of 0.05: −0.05 and 2 · 0.05². Rounding of a solved motion's second derivative.
     np.testing.assert_allclose(relative, [-0.05, 2 * 0.05**2], rtol=1e-7)
@@ -172,15 +162,17 @@ def test_inputs_may_be_other_numbers_than_the_model_has():
 
 
 def test_what_cannot_be_followed_is_refused():
-    model = oscillator()
-    inputs = uncertain_inputs(model, {"mode_1.damping_ratio": 0.002})
-    ends = (1.0, 4.0)
+    model, ends = oscillator(), (1.0, 4.0)
+    varied = [normal("mode_1.damping_ratio", RATIO, 0.002)]
     with pytest.raises(ValueError, match="`force` must be given once"):
-        response_quantities(model, inputs, *ends)
+        response_quantities(model, varied, *ends)
     with pytest.raises(ValueError, match="must be out of"):
-        response_quantities(model, inputs, *ends, force=FORCE, kinds=("summit",))
+        response_quantities(model, varied, *ends, force=FORCE, kinds=("summit",))
     with pytest.raises(ValueError, match="the nominal response has no fold from"):
-        response_quantities(model, inputs, *ends, force=FORCE, kinds=("fold",), harmonic_order=1)
-    strange = correlated_inputs(["mode_9.damping_ratio"], [0.1], [[1e-4]])
+        response_quantities(model, varied, *ends, force=FORCE, kinds=("fold",), harmonic_order=1)
     with pytest.raises(ValueError, match="mode_9"):
-        response_quantities(model, strange, *ends, force=FORCE)
+        response_quantities(model, [normal("mode_9.damping_ratio", 0.1, 0.01)], *ends, force=FORCE)
+    with pytest.raises(ValueError, match="varies twice"):
+        response_quantities(model, varied * 2, *ends, force=FORCE)
+    with pytest.raises(ValueError, match="derivatives need a distribution"):
+        response_quantities(model, [listed("mode_1.damping_ratio", [0.1])], *ends, force=FORCE)
