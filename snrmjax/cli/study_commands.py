@@ -1,4 +1,4 @@
-"""The commands `study run`, `study report` and `study discard-chunks`."""
+"""The commands `study run` and `study report`."""
 
 import sys
 import time
@@ -134,22 +134,6 @@ def report(
         found = write_study_report(folder, data)
     _say_summary(found.headline, found.summaries)
     say(f"written to {out}")
-
-
-@study_app.command("discard-chunks")
-def discard(
-    store: Annotated[
-        Path,
-        typer.Argument(
-            help="The data set of a complete study.", metavar="STORE", show_default=False
-        ),
-    ],
-) -> None:
-    """Remove what a complete data set was made of, to save disk; it cannot be mended then."""
-    from snrmjax.study.run import discard_chunks
-
-    discard_chunks(store)
-    say(f"{store} stands alone now.")
 
 
 def _shard(text: str) -> "Shard":

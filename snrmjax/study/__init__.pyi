@@ -2,7 +2,7 @@ from .computations.base import OfForces
 from .computations.modes import DampedModes, NormalModes
 from .computations.responses import Curves, Peaks, ResponseRange
 from .computations.tests import Diagnoses, Identifications, VirtualTests
-from .run import RunSettings, Shard, StudyRun, discard_chunks, open_study, run_study
+from .run import RunSettings, Shard, StudyRun, open_study, run_study
 from .sampling import Sampling
 from .study import Study, planned
 from .study_file import read_study
@@ -38,7 +38,6 @@ __all__ = [
     "Study",
     "StudyRun",
     "VirtualTests",
-    "discard_chunks",
     "function_quantities",
     "joint_normal",
     "listed",

@@ -140,18 +140,6 @@ def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings =
     )
 
 
-def discard_chunks(out: str | os.PathLike[str]) -> None:
-    """Remove the chunks of a study whose data set is complete. Raises `ValueError` where it is not.
-
-    The data set stands alone then: it cannot be mended from its chunks any more.
-    """
-    folder = StudyFolder(Path(os.path.abspath(out)))
-    plan = read_study_plan(folder)
-    if plan is None or not is_collected(folder, plan):
-        raise ValueError(f"{out} is not complete: its chunks are still needed.")
-    shutil.rmtree(folder.work)
-
-
 def _computed(
     plan: PlannedStudy,
     folder: StudyFolder,
