@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from snrmjax.report.study.summary import ScalarSummary
     from snrmjax.study.compute import Progress, ProgressReport
-    from snrmjax.study.run import Expected, Shard, StudyRun
+    from snrmjax.study.run import Shard, StudyRun
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
@@ -36,7 +36,7 @@ StudyOut = Annotated[
     typer.Option(
         "--out",
         help="The data set: a Zarr store that xarray opens. While it is not complete, and to mend "
-        "it, its parts are kept beside it in OUT.parts.",
+        "it, its parts are kept beside it in OUT.parts; remove them to save disk.",
         metavar="OUT",
         rich_help_panel=FILES,
         show_default=False,
@@ -98,9 +98,7 @@ def run(
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = RunSettings(
-                *(processes, scheduler, part, progress), None if quiet else _say_expected
-            )
+            settings = RunSettings(processes, scheduler, part, progress)
             done = run_study(study, out, settings)
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
@@ -150,13 +148,6 @@ def _say_study(study: "Study") -> None:
     say(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
         f"chunks; {names} varies" + ("" if len(study.names) < 2 else " together")
-    )
-
-
-def _say_expected(expected: "Expected") -> None:
-    say(
-        f"after the first chunk: about {_duration(expected.seconds)} to go, {_bytes(expected.size)}"
-        f" on disk in the end, {_bytes(expected.memory)} of memory"
     )
 
 
@@ -257,7 +248,3 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _bytes(size: int) -> str:
-    return f"{size / 1e9:.2g} GB" if size > 1e9 else f"{size / 1e6:.2g} MB"

@@ -1,8 +1,6 @@
 """Computes the chunks of a study in processes that may die, and counts what was done."""
 
 import os
-import sys
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -26,9 +24,6 @@ class Receipt(NamedTuple):
 
     members: int
     failed: int
-    seconds: float  # of computing and writing
-    size: int  # bytes on disk
-    memory: int  # bytes, most that the worker has held
 
 
 def computed_rows(planned: PlannedStudy, numbers: range) -> dict[str, np.ndarray]:
@@ -40,26 +35,15 @@ def computed_rows(planned: PlannedStudy, numbers: range) -> dict[str, np.ndarray
 
 def compute_chunk(planned: PlannedStudy, folder: StudyFolder, number: int) -> Receipt:
     """Compute a chunk and write it; returns its receipt. Raises `OSError` on a full disk."""
-    begin = time.perf_counter()
-    return _stored(folder, number, computed_rows(planned, planned.rows_of(number)), begin)
+    return _stored(folder, number, computed_rows(planned, planned.rows_of(number)))
 
 
-def _stored(folder: StudyFolder, number: int, rows: dict[str, np.ndarray], begin: float) -> Receipt:
+def _stored(folder: StudyFolder, number: int, rows: dict[str, np.ndarray]) -> Receipt:
     """Write the rows of a chunk and count them."""
-    size = write_chunk(folder, number, rows)
+    write_chunk(folder, number, rows)
     status = np.asarray(rows["status"])
     whole = np.isin(status, COMPLETE).reshape(len(status), -1).all(axis=1)
-    seconds = time.perf_counter() - begin
-    return Receipt(len(status), int(np.sum(~whole)), seconds, size, _memory())
-
-
-def _memory() -> int:
-    if sys.platform == "win32":
-        return 0
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return Receipt(len(status), int(np.sum(~whole)))
 
 
 def receipts(
@@ -95,12 +79,10 @@ def _singly(
     planned: PlannedStudy, folder: StudyFolder, workers: AbstractWorkers, number: int
 ) -> Receipt:
     """A chunk alone in the workers, and where its process dies its members."""
-    begin = time.perf_counter()
     try:
         return workers.result(workers.submit(compute_chunk, planned, folder, number))
     except WorkerDied:
-        rows = _rescued(planned, workers, planned.rows_of(number))
-        return _stored(folder, number, rows, begin)
+        return _stored(folder, number, _rescued(planned, workers, planned.rows_of(number)))
 
 
 def _rescued(
@@ -127,8 +109,6 @@ class Progress(NamedTuple):
     failed: int
     seconds: float  # since this run began
     done_before: int  # members that were there when it began
-    size: int  # bytes of the chunks of this run
-    memory: int  # bytes, most that one worker has held
 
     @property
     def per_second(self) -> float:
@@ -146,8 +126,6 @@ class Progress(NamedTuple):
             done=self.done + receipt.members,
             failed=self.failed + receipt.failed,
             seconds=seconds,
-            size=self.size + receipt.size,
-            memory=max(self.memory, receipt.memory),
         )
 
 

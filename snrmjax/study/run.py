@@ -6,7 +6,7 @@ An immutable plan, files that appear whole, and a data set made of them at the e
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     import xarray
 
 _SHOWN = 3  # differences that a refusal lists
-_SPARE = 1.2  # times the expected size that must be free
 
 
 class Shard(NamedTuple):
@@ -42,14 +41,6 @@ class Shard(NamedTuple):
 
     part: int  # from 1
     parts: int
-
-
-class Expected(NamedTuple):
-    """What a run will take, from its first chunk."""
-
-    seconds: float
-    size: int  # bytes: chunks and data set
-    memory: int  # bytes in all workers together
 
 
 class StudyRun(NamedTuple):
@@ -80,7 +71,6 @@ class RunSettings(NamedTuple):
     scheduler: str | None = None  # address of a running Dask scheduler
     shard: Shard | None = None
     progress: ProgressReport | None = None  # called after each chunk
-    expected: Callable[[Expected], None] | None = None  # called after the first chunk
     workers: AbstractWorkers | None = None  # your own, in place of processes or a scheduler
 
 
@@ -150,35 +140,13 @@ def _computed(
     part, parts = settings.shard or (1, 1)
     before = sum(len(plan.rows_of(k)) for k in whole)
     missing = sorted({*range(part - 1, plan.study.n_chunks, parts)} - {*whole})
-    state = Progress(len(plan.table), before, 0, 0.0, before, 0, 0)
+    state = Progress(len(plan.table), before, 0, 0.0, before)
     begin = time.perf_counter()
-    for number, receipt in enumerate(receipts(plan, folder, workers, missing)):
+    for receipt in receipts(plan, folder, workers, missing):
         state = state.with_receipt(receipt, time.perf_counter() - begin)
-        if number == 0:
-            _announce(folder, settings, state, receipt.seconds, workers.width)
         if settings.progress is not None:
             settings.progress(state)
     return state
-
-
-def _announce(
-    folder: StudyFolder, settings: RunSettings, state: Progress, seconds: float, width: int
-) -> None:
-    """Say what the run will take; refuse one for which the disk has no room."""
-    mine = state.done - state.done_before
-    left = (state.members - state.done) / mine
-    share = 1 if settings.shard is None else 1 / settings.shard.parts
-    # Chunks, and the data set that is made of them.
-    size = int(2 * state.size * state.members / mine)
-    expected = Expected(seconds * left * share / width, size, state.memory * width)
-    if settings.expected is not None:
-        settings.expected(expected)
-    free = shutil.disk_usage(folder.work).free
-    if free < _SPARE * 2 * state.size * left:
-        raise ValueError(
-            f"the study needs about {size / 1e6:.3g} MB, but {folder.out.parent} has "
-            f"{free / 1e6:.3g} MB left; the chunks that are done stay."
-        )
 
 
 def _workers(settings: RunSettings, n_chunks: int) -> AbstractWorkers:

@@ -5,7 +5,6 @@ is, and a file a chunk. Every file takes its name when it is whole.
 """
 
 import hashlib
-import io
 import json
 import os
 import shutil
@@ -76,20 +75,18 @@ def read_study_plan(folder: StudyFolder) -> dict[str, Any] | None:
         ) from error
 
 
-def write_chunk(folder: StudyFolder, number: int, rows: Mapping[str, np.ndarray]) -> int:
-    """Write the rows of a chunk; returns its size in bytes.
+def write_chunk(folder: StudyFolder, number: int, rows: Mapping[str, np.ndarray]) -> None:
+    """Write the rows of a chunk.
 
     Raises `OSError` where it cannot be written; nothing is left behind then.
     """
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **rows)
     temporary = folder.chunks / f".{uuid.uuid4().hex}.tmp"
     try:
-        temporary.write_bytes(buffer.getvalue())
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **rows)
         os.replace(temporary, folder.chunk(number))
     finally:
         temporary.unlink(missing_ok=True)
-    return buffer.getbuffer().nbytes
 
 
 def whole_chunks(folder: StudyFolder, n_chunks: int) -> tuple[list[int], list[Path]]:
