@@ -79,7 +79,8 @@ def _leaves(described: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, BeamModels):
-        return {"kind": "beam", **_plain(value.stated)}
+        stated = value.stated
+        return {"kind": "beam", **_plain({**stated._asdict(), "numbers": dict(stated.numbers)})}
     if isinstance(value, eqx.Module):
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": getattr(value, "kind", type(value).__name__), **fields}
