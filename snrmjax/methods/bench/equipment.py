@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 
 class Shaker(NamedTuple):
@@ -40,6 +40,14 @@ class Instruments(NamedTuple):
     filter_corner_hz: float = np.inf  # of the anti-alias filter; infinite for none
     filter_order: int = 4
     delay: int = 0  # samples, of both channels
+
+
+def positive(name: str, values: ArrayLike) -> Float[np.ndarray, " value"]:
+    """Numbers in a row. Raises `ValueError` unless all are positive and finite, at least one."""
+    each = np.asarray(values, dtype=float).ravel()
+    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
+        raise ValueError(f"`{name}` must be positive and finite, but is {values}.")
+    return each
 
 
 def check_shaker(shaker: Shaker) -> None:

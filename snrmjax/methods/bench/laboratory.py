@@ -151,6 +151,22 @@ class Laboratory(eqx.Module):
                 f"{int(np.ceil(_FEWEST_STEPS * fastest / self.sampling_rate))} substeps would do."
             )
 
+    @property
+    def frequency(self) -> float:
+        """Natural frequency of the mode of interest, rad/s."""
+        modes = self.structure.modes
+        return float(modes.natural_frequency[modes.mode_of_interest])
+
+    @property
+    def decay(self) -> float:
+        """ζω of the mode of interest, 1/s."""
+        modes = self.structure.modes
+        return float(modes.damping_ratio[modes.mode_of_interest]) * self.frequency
+
+    def samples(self, cycles: float) -> int:
+        """How many samples so many cycles of the mode of interest have."""
+        return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
+
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state before anything moves."""
         n = simulated_structure(self.structure).n_modes
@@ -177,9 +193,8 @@ class Laboratory(eqx.Module):
         """The effects with a memory, set for motions up to `largest_displacement`."""
         if not self.structure.hysteretic:
             return ()
-        modes = self.structure.modes
-        omega = float(modes.natural_frequency[modes.mode_of_interest])
-        return scaled_friction(self.structure, self.reach(), self.reach() * omega / np.sqrt(2))
+        speed = self.reach() * self.frequency / np.sqrt(2)
+        return scaled_friction(self.structure, self.reach(), speed)
 
 
 def detached(laboratory: Laboratory) -> Laboratory:
