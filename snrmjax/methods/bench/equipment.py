@@ -1,9 +1,9 @@
 """Shaker, amplifier and instruments of the virtual laboratory, by their numbers."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
 
 class Shaker(NamedTuple):
@@ -42,7 +42,7 @@ class Instruments(NamedTuple):
     delay: int = 0  # samples, of both channels
 
 
-def positive(name: str, values: ArrayLike) -> Float[np.ndarray, " value"]:
+def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
     """Numbers in a row. Raises `ValueError` unless all are positive and finite, at least one."""
     each = np.asarray(values, dtype=float).ravel()
     if not each.size or not np.all(np.isfinite(each) & (each > 0)):

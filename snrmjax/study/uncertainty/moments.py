@@ -22,16 +22,15 @@ def first_order(about: Quantities, scale: float = 1.0) -> Statistics:
     return np.stack([about.value, spread, about.value - reach, about.value + reach])
 
 
-def second_order(about: Quantities, scale: float = 1.0) -> Statistics:
-    """Statistics of f₀ + gᵀz + ½ zᵀHz, z standard normal numbers times `scale`.
+def second_order(about: Quantities) -> Statistics:
+    """Statistics of f₀ + gᵀz + ½ zᵀHz, z standard normal numbers.
 
     The mean f₀ + ½ tr H and the variance gᵀg + ½ tr H² are exact; the percentage points are
     those of 2^14 members of a Sobol' sequence.
     """
     linear, quadratic = _members(about)
-    members = scale * linear + scale**2 * quadratic
-    ends = about.value + np.quantile(members, _TAILS, axis=0)
-    return np.stack([*_exact(about, scale), *ends])
+    ends = about.value + np.quantile(linear + quadratic, _TAILS, axis=0)
+    return np.stack([*_exact(about, 1.0), *ends])
 
 
 def first_order_error(first: Statistics, reference: Statistics) -> Float[np.ndarray, "error q"]:

@@ -50,7 +50,8 @@ def function_quantities(
     >>> area.gradient.round(12).tolist()
     [[0.2, 0.2]]
     """
-    return Quantities(*_of_function(function, tuple(varied)), tuple(names))
+    value, gradient, hessian = map(np.asarray, _of_function(function, tuple(varied)))
+    return Quantities(value, gradient, hessian, tuple(names))
 
 
 def response_quantities(
@@ -126,8 +127,8 @@ def response_quantities(
             names += [f"{name}_frequency_hz", f"{name}_velocity_m_s"]
     if not parts:
         raise ValueError(f"nothing to propagate to: {'; '.join(notes) or 'no kinds'}.")
-    together = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Quantities(*together, tuple(names), tuple(notes))
+    value, gradient, hessian = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Quantities(value, gradient, hessian, tuple(names), tuple(notes))
 
 
 def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[ResponseCurve, int]]:

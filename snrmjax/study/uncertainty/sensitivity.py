@@ -102,8 +102,12 @@ def sobol_indices(data: "xarray.Dataset", *, seed: int = 0) -> SobolIndices:
         known = len(kept) >= _FEWEST_ROWS and variance[-1] > 0
         every.append(_indices(kept, seed) if known else np.full((4, len(inputs)), np.nan))
     missing = 1 - a_row * np.array(rows) / data.sizes["member"]
+    first, first_half_width, total, total_half_width = np.stack(every, axis=1)
     return SobolIndices(
-        *np.stack(every, axis=1),
+        first=first,
+        first_half_width=first_half_width,
+        total=total,
+        total_half_width=total_half_width,
         variance=np.array(variance),
         rows=np.array(rows),
         names=tuple(columns),
