@@ -260,6 +260,7 @@ quantities = sj.study.response_quantities(
 )
 propagated = sj.study.propagate_uncertainty(quantities)
 print(propagated)
+show(propagated.plot(), "beam_batch_propagation")
 
 # %% [markdown]
 # From which scatter on is first order off by 10 % (of its standard deviation or of its 95 % range)?

@@ -35,7 +35,10 @@ from snrmjax.report.simulation_figures import (
     normal_mode_figure,
     simulated_response_figure,
 )
-from snrmjax.report.uncertainty.uncertainty_figures import sensitivity_figure
+from snrmjax.report.uncertainty.uncertainty_figures import (
+    propagation_figure,
+    sensitivity_figure,
+)
 
 __all__ = [
     "DampingSeries",
@@ -57,6 +60,7 @@ __all__ = [
     "next_measurements_figure",
     "normal_mode_figure",
     "profile_figure",
+    "propagation_figure",
     "residuals_figure",
     "response_figure",
     "save_figure",

@@ -41,6 +41,7 @@ from snrmjax.simulate.solutions.normal_modes import NormalModeBranch
 from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion
 from snrmjax.simulate.solutions.time_integration import IntegratedMotion
 from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
+from snrmjax.study.uncertainty.propagation import Propagation
 from snrmjax.study.uncertainty.sensitivity import SobolIndices
 
 
@@ -216,6 +217,11 @@ def _(result: ForceCalibration, *, largest_drive: float = 1.0) -> Figure:
     drive = jnp.asarray(np.linspace(0.0, largest_drive, 50))
     given = map(np.asarray, (drive, result.force(drive), result.force_std(drive)))
     return simulation_figures.line_figure(*given, joined=True)
+
+
+@plot_result.register
+def _(result: Propagation) -> Figure:
+    return uncertainty_figures.propagation_figure(result)
 
 
 @plot_result.register

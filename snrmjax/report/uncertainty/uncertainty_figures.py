@@ -1,4 +1,4 @@
-"""Figures of sensitivity indices."""
+"""Figures of propagated uncertainty and of sensitivity indices."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,7 +12,28 @@ from snrmjax.report.style import (
     name_axes,
     panels,
 )
+from snrmjax.study.uncertainty.propagation import METHOD_NAMES, Propagation
 from snrmjax.study.uncertainty.sensitivity import SobolIndices
+
+
+def propagation_figure(result: Propagation) -> Figure:
+    """Mean and 95 % range of every quantity by first and by second order. Returns the figure."""
+    names = result.quantities.names
+    columns = min(len(names), 2)
+    rows = -(-len(names) // columns)
+    figure, grid = panels(PAGE if columns > 1 else COLUMN, 0.6 + 1.1 * rows, rows, columns)
+    for q, axes in enumerate(grid.flat[: len(names)]):
+        for m, (method, colour) in enumerate(zip(METHOD_NAMES, SERIES, strict=False)):
+            mean, _, lower, upper = result.statistics[m, :, q]
+            axes.plot([lower, upper], [-m, -m], color=colour, linewidth=2.0, label=method)
+            axes.plot(mean, -m, "o", color=colour, markersize=4.0)
+        axes.set_ylim(-1.6, 0.6)
+        axes.set_yticks([])
+        name_axes(axes, "", _label(names[q]), "")
+    for axes in grid.flat[len(names) :]:
+        axes.set_visible(False)
+    legend(figure)
+    return figure
 
 
 def sensitivity_figure(indices: SobolIndices) -> Figure:

@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
@@ -25,6 +26,25 @@ def indices(output):
     return sj.study.sobol_indices(
         xr.Dataset(data, attrs={"study": json.dumps({"study": described})})
     )
+
+
+def test_every_range_of_a_propagation_is_drawn_where_it_is():
+    varied = [sj.study.normal("a", 1.0, 0.2), sj.study.normal("b", 2.0, 0.1)]
+    found = sj.study.propagate_uncertainty(
+        sj.study.function_quantities(
+            lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]),
+            varied,
+            ["fold_1_frequency_hz", "peak_velocity_m_s"],
+        )
+    )
+    figure = found.plot()
+    for q, axes in enumerate(figure.axes):
+        drawn = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2]
+        assert np.array(drawn) == pytest.approx(found.statistics[:, 2:, q])
+    assert [axes.get_xlabel() for axes in figure.axes] == [
+        "Fold 1 frequency (Hz)",
+        "Peak velocity (m/s)",
+    ]
 
 
 def test_indices_are_drawn_as_bars():
