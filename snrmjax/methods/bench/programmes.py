@@ -1,4 +1,4 @@
-"""Programmes of a test: stepped and swept sines, multisines and decays, as records in time.
+"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time.
 
 A stepped sine may hold the voltage (open loop: force and response find themselves, and jump where
 a branch ends), or by its voltage the amplitude of force, velocity or displacement. The law is
@@ -54,7 +54,6 @@ class LaboratoryTest(NamedTuple):
     record: TestRecord
     seconds: float
     steps: TestSteps | None = None  # of a stepped sine
-    frequency: Float[np.ndarray, " sample"] | None = None  # rad/s, of a sweep
 
 
 class DecayTest(NamedTuple):
@@ -197,39 +196,6 @@ def stepped_sine_test(
     record, _ = run_test(laboratory, programme, count, seed=seed)
     first = approach + settle + np.arange(len(steps)) * (settle + keep)
     return LaboratoryTest(record, count / laboratory.sampling_rate, TestSteps(steps, first, keep))
-
-
-def sine_sweep_test(
-    laboratory: Laboratory,
-    voltage: float,
-    from_frequency: float,
-    to_frequency: float,
-    seconds: float,
-    *,
-    law: Literal["linear", "logarithmic"] = "linear",
-    seed: int = 0,
-) -> LaboratoryTest:
-    """Sweep a sine of constant voltage, up or down.
-
-    Arguments: `voltage` in V; frequencies in rad/s; `law` of the frequency over time. Returns a
-    `LaboratoryTest` with the frequency of the drive at each sample.
-    Raises `ValueError` for numbers that are not positive.
-    """
-    for name, value in (
-        *(("voltage", voltage), ("seconds", seconds)),
-        *(("from_frequency", from_frequency), ("to_frequency", to_frequency)),
-    ):
-        positive(name, value)
-    if law not in ("linear", "logarithmic"):
-        raise ValueError(f"`law` must be linear or logarithmic, but is {law!r}.")
-    count = round(seconds * laboratory.sampling_rate)
-    spaced = np.linspace if law == "linear" else np.geomspace
-    frequency = spaced(from_frequency, to_frequency, count)
-    angle = np.cumsum(frequency) / laboratory.sampling_rate
-    record, _ = run_test(
-        laboratory, Playback(jnp.asarray(voltage * np.sin(angle))), count, seed=seed
-    )
-    return LaboratoryTest(record, seconds, frequency=frequency)
 
 
 def multisine_test(
