@@ -1,15 +1,16 @@
 """Time, memory and disk of large studies on one and two processes and on a Dask cluster.
 
-    python benchmarks/study_scaling.py --one-mode 100000 --flat 10000 --figure memory.png
+    python benchmarks/study_scaling.py --one-mode 100000 --flat 10000
 
 Peaks of a one-mode structure with a cubic stiffness (three harmonics) and of the flat beam (nine),
 damping and cubic coefficient drawn from a Sobol' sequence, with folds but without stability.
-Prints one JSON line a study and one that compares the digits of the data sets. The figure has the
-memory of the largest worker against the members done. Run it on an idle machine.
+Prints one JSON line a study, with the memory of the largest process so far, and one that compares
+the digits of the data sets. Run it on an idle machine.
 """
 
 import argparse
 import json
+import resource
 import tempfile
 import time
 from pathlib import Path
@@ -17,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import snrmjax as sj
-from snrmjax.report.figures import save_figure
 from snrmjax.study.computations.base import OfForces
-from snrmjax.study.engine import Progress
+from snrmjax.study.compute import Progress
 from snrmjax.study.run import RunSettings
 
 HERTZ = 2 * np.pi
@@ -68,14 +68,14 @@ def contents(path: Path) -> dict[str, bytes]:
     }
 
 
-def timed(study: sj.study.Study, out: Path, **settings: object) -> tuple[dict, list[Progress]]:
-    """One run, and where it stood after each chunk."""
+def timed(study: sj.study.Study, out: Path, **settings: object) -> dict:
+    """One run."""
     steps: list[Progress] = []
     begin = time.perf_counter()
     run = sj.study.run_study(study, out, RunSettings(progress=steps.append, **settings))
     seconds = time.perf_counter() - begin
     first = steps[0].done
-    line = {
+    return {
         "members": run.members,
         "failed": run.failed,
         "seconds": round(seconds, 1),
@@ -83,12 +83,12 @@ def timed(study: sj.study.Study, out: Path, **settings: object) -> tuple[dict, l
         "ms_a_curve": round(
             1e3 * (steps[-1].seconds - steps[0].seconds) / max(run.members - first, 1), 3
         ),
-        "worker_mb_first_chunk": round(steps[0].memory / 1e6, 1),
-        "worker_mb_last_chunk": round(steps[-1].memory / 1e6, 1),
+        "largest_process_mb": round(
+            resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3, 1
+        ),
         "data_set_mb": round(folder_size(out) / 1e6, 3),
         "parts_mb": round(folder_size(out.with_name(f"{out.name}.parts")) / 1e6, 3),
     }
-    return line, steps
 
 
 def main() -> None:
@@ -98,9 +98,7 @@ def main() -> None:
     options.add_argument("--flat", type=int, default=400)
     options.add_argument("--chunk", type=int, default=128)
     options.add_argument("--without", nargs="*", default=[], help="of 1, 2, dask")
-    options.add_argument("--figure", type=Path)
     chosen = options.parse_args()
-    memory: dict[str, list[Progress]] = {}
     for name, members in (("one_mode", chosen.one_mode), ("flat_beam", chosen.flat)):
         study, stores = study_of(name, members, chosen.chunk), {}
         with tempfile.TemporaryDirectory() as folder:
@@ -114,31 +112,16 @@ def main() -> None:
                     with LocalCluster(
                         n_workers=2, threads_per_worker=1, dashboard_address=None
                     ) as cluster:
-                        line, steps = timed(study, out, scheduler=cluster.scheduler_address)
+                        line = timed(study, out, scheduler=cluster.scheduler_address)
                 else:
-                    line, steps = timed(study, out, processes=int(how))
-                stores[how], memory[f"{name}, {how}"] = contents(out), steps
+                    line = timed(study, out, processes=int(how))
+                stores[how] = contents(out)
                 report = {"benchmark": "study_scaling", "model": name, "processes": how, **line}
                 print(json.dumps(report), flush=True)
             if stores:
                 first = next(iter(stores.values()))
                 equal = all(one == first for one in stores.values())
                 print(json.dumps({"benchmark": "study_scaling", "model": name, "equal": equal}))
-    if chosen.figure is not None:
-        _draw(chosen.figure, memory)
-
-
-def _draw(path: Path, memory: dict[str, list[Progress]]) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 3.5), layout="constrained")
-    axes = figure.subplots()
-    for name, steps in memory.items():
-        share = [100 * step.done / step.members for step in steps]
-        axes.plot(share, [step.memory / 1e6 for step in steps], label=name)
-    axes.set(xlabel="Members done (%)", ylabel="Memory of the largest worker (MB)", ylim=(0, None))
-    axes.legend(frameon=False, title="model, processes")
-    save_figure(path, figure)
 
 
 if __name__ == "__main__":

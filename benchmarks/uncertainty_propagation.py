@@ -1,36 +1,30 @@
-"""Uncertainty of peak, folds and resonance: derivatives against members, and where they part.
+"""Uncertainty of peak, folds and resonance: derivatives against the members of a study.
 
-Run: python benchmarks/uncertainty_propagation.py [--members 2048] [--case NAME] [--figures DIR]
+Run: python benchmarks/uncertainty_propagation.py [--members 2048] [--case NAME]
 
 Both numerical beams of the method paper, each at a force where its folds are far apart and at one
 where they are near to merging. Uncertain and independent, 1σ at scale 1: natural frequency of
 the mode of interest 0.5 %, damping ratio 5 % (lognormal), two coefficients of the potential 2.5 %
 each, force 1 %. At a small scatter (scale 0.5) and a large one (scale 5): mean, standard deviation
-and 95 % range of the frequency (Hz) and velocity (m/s) of the highest peak, every fold and the
-phase resonance by first order, second order, Monte Carlo and quasi-Monte Carlo (8 scramblings),
-1σ of the latter two, members at which the motion ceases to exist, and members whose whole response
-curve, traced by continuation, has another event in its place. Then the scale from which first
-order errs by 10 % (its mean in standard deviations, its standard deviation, the ends of its 95 %
-range in half widths), from members at nine scales and as second order predicts it. Last total
-Sobol' indices and the bounds on them by derivatives, at the small scatter. One JSON line each.
+and 95 % range of the frequency (Hz) and velocity (m/s) of the highest peak and the phase resonance
+by first order, by second order and by the members of a study (a Sobol' sequence), members that
+have another number of folds, and the factor on the scatter from which first order errs by 10 % (its
+mean in standard deviations, its standard deviation, the ends of its 95 % range in half widths), as
+second order predicts it. One JSON line each.
 """
 
 import argparse
 import json
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 import snrmjax as sj
 from snrmjax.study.uncertainty.moments import STATISTICS
-from snrmjax.study.uncertainty.propagation import METHODS
-from snrmjax.study.uncertainty.quantities import MemberStatus
 
 HERTZ = 2 * np.pi
 SCALES = {"small": 0.5, "large": 5.0}
-STUDIED = np.geomspace(0.25, 8.0, 9)
 
 
 class Case(NamedTuple):
@@ -68,116 +62,83 @@ def tell(**fields: object) -> None:
     print(json.dumps({"benchmark": "uncertainty_propagation", **rounded}), flush=True)
 
 
-def quantities(case: Case, scale: float) -> sj.study.ResponseQuantities:
-    """Peak, folds and resonance of a case with its scatter times a scale."""
+def varied_of(case: Case, scale: float) -> tuple:
+    """What is uncertain, with its scatter times a scale."""
     own = sj.model.parameters.parameter_values(case.model)
     relative = {
         "mode_1.natural_frequency": 0.005,
         "mode_1.damping_ratio": 0.05,
         **dict.fromkeys(case.coefficients, 0.025),
     }
-    std = {name: scale * share * abs(own[name]) for name, share in relative.items()}
-    inputs = sj.study.uncertain_inputs(
-        case.model,
-        {**std, "force_n": scale * 0.01 * case.force},
-        force=case.force,
-        marginals={"mode_1.damping_ratio": "lognormal"},
+    numbers = {
+        name: (own[name], scale * share * abs(own[name])) for name, share in relative.items()
+    }
+    numbers["force_n"] = case.force, scale * 0.01 * case.force
+    return tuple(
+        (sj.study.lognormal if name.endswith("damping_ratio") else sj.study.normal)(name, *number)
+        for name, number in numbers.items()
     )
+
+
+def study_of(case: Case, varied: tuple, sampling: sj.study.Sampling) -> sj.study.Study:
+    """The peaks of a case's members."""
     low, high = (HERTZ * end for end in case.ends_hz)
-    return sj.study.response_quantities(
-        case.model, inputs, low, high, harmonic_order=case.harmonic_order
-    )
+    within = sj.study.ResponseRange(low, high, harmonic_order=case.harmonic_order, stability=False)
+    return sj.study.Study("members", case.model, sj.study.Peaks(within), varied, sampling)
 
 
-def propagated(name: str, case: Case, members: int) -> dict[str, sj.study.Propagation]:
+def propagated(name: str, case: Case, members: int) -> None:
     """Both scatters of a case, printed."""
-    found = {}
-    settings = sj.study.PropagationSettings(members=members)
     for scatter, scale in SCALES.items():
+        varied = varied_of(case, scale)
+        low, high = (HERTZ * end for end in case.ends_hz)
         begin = time.perf_counter()
-        result = sj.study.propagate_uncertainty(quantities(case, scale), settings)
-        seconds = time.perf_counter() - begin
-        for q, quantity in enumerate(result.names):
-            rows = {
-                method: dict(zip(STATISTICS, result.statistics[m, :, q].tolist(), strict=True))
-                for m, method in enumerate(METHODS)
-            }
-            for m, method in enumerate(METHODS[2:]):
-                rows[method]["1σ of each"] = result.standard_error[m, :, q].tolist()
-            counts = result.status_counts[:, q]
+        found = sj.study.propagate_uncertainty(
+            sj.study.response_quantities(
+                case.model, varied, low, high, harmonic_order=case.harmonic_order
+            )
+        )
+        middle = time.perf_counter()
+        sampling = sj.study.Sampling("sobol", members)
+        study = study_of(case, varied, sampling)
+        rows = sj.study.planned(study).rows(range(members))
+        end = time.perf_counter()
+        for q, quantity in enumerate(found.quantities.names):
+            by = dict(zip(("first order", "second order"), found.statistics[:, :, q], strict=True))
+            if quantity in rows:
+                values = rows[quantity][np.isfinite(rows[quantity])]
+                ends = np.quantile(values, [0.025, 0.975])
+                by["members"] = np.array([values.mean(), values.std(ddof=1), *ends])
             tell(
                 case=name,
                 scatter=scatter,
                 quantity=quantity,
-                nominal=float(result.expansion.value[q]),
-                **rows,
-                first_order_error=result.first_order_error[:, q].tolist(),
-                members=int(counts.sum()),
-                replaced=int(counts[MemberStatus.REPLACED]),
-                ceased=int(counts[MemberStatus.CEASED]),
-                impossible=int(counts[MemberStatus.IMPOSSIBLE]),
-                traced_differ=f"{result.traced.differ[q]} of {result.traced.members}",
+                **{
+                    method: dict(zip(STATISTICS, row.tolist(), strict=True))
+                    for method, row in by.items()
+                },
+                first_order_error=found.first_order_error[:, q].tolist(),
+                scatter_of_10_percent_error=found.scatter_limit[:, q].tolist(),
             )
-        tell(case=name, scatter=scatter, seconds=seconds, notes=list(result.notes))
-        found[scatter] = result
-    return found
-
-
-def limits(name: str, case: Case, members: int) -> sj.study.ScatterStudy:
-    """From which scale on first order errs by 10 %, printed."""
-    settings = sj.study.PropagationSettings(members=members)
-    study = sj.study.scatter_study(quantities(case, 1.0), STUDIED, settings)
-    for q, quantity in enumerate(study.names):
+        folds = sum(one.startswith("fold") for one in found.quantities.names) // 2
         tell(
             case=name,
-            quantity=quantity,
-            scale_of_10_percent_error=dict(
-                zip(("mean", "std", "range"), study.limit[:, q].tolist(), strict=True)
-            ),
-            predicted_by_second_order=study.predicted_limit[:, q].tolist(),
-            share_found_at_scales=study.share_found[:, q].tolist(),
-            error_of_first_order=np.nanmax(study.first_order_error[:, :, q], axis=1).tolist(),
-            error_of_second_order=np.nanmax(study.second_order_error[:, :, q], axis=1).tolist(),
+            scatter=scatter,
+            other_number_of_folds=f"{int(np.sum(rows['n_folds'] != folds))} of {members}",
+            derivative_seconds=middle - begin,
+            members_seconds=end - middle,
+            notes=list(found.notes),
         )
-    return study
-
-
-def indices(name: str, case: Case, members: int) -> None:
-    """Total Sobol' indices and their bounds by derivatives at the small scatter, printed."""
-    some = quantities(case, SCALES["small"])
-    begin = time.perf_counter()
-    shares = sj.study.sobol_indices(some, base_rows=max(members // 8, 64))
-    middle = time.perf_counter()
-    bounds = sj.study.derivative_bounds(some, members=max(members // 8, 64))
-    end = time.perf_counter()
-    for q, quantity in enumerate(some.names):
-        tell(
-            case=name,
-            quantity=quantity,
-            inputs=list(shares.input_names),
-            total=shares.total[q].tolist(),
-            total_half_width=shares.total_half_width[q].tolist(),
-            bound=bounds.bound[q].tolist(),
-        )
-    tell(case=name, sobol_seconds=middle - begin, derivative_seconds=end - middle)
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--members", type=int, default=2048, help="of each sampling")
+    parser.add_argument("--members", type=int, default=2048, help="of each study")
     parser.add_argument("--case", choices=CASES, action="append", help="all by default")
-    parser.add_argument("--figures", type=Path, help="folder to draw into")
     asked = parser.parse_args()
     for name in asked.case or CASES:
-        results = propagated(name, CASES[name], asked.members)
-        study = limits(name, CASES[name], asked.members // 2)
-        indices(name, CASES[name], asked.members)
-        if asked.figures is not None:
-            asked.figures.mkdir(parents=True, exist_ok=True)
-            stem = name.replace(",", "").replace(" ", "_")
-            sj.plot.save_figure(asked.figures / f"{stem}_members.png", results["large"].plot())
-            sj.plot.save_figure(asked.figures / f"{stem}_errors.png", study.plot())
+        propagated(name, CASES[name], asked.members)
 
 
 if __name__ == "__main__":

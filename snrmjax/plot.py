@@ -37,7 +37,6 @@ from snrmjax.report.simulation_figures import (
 )
 from snrmjax.report.uncertainty.uncertainty_figures import (
     propagation_figure,
-    scatter_figure,
     sensitivity_figure,
 )
 
@@ -65,7 +64,6 @@ __all__ = [
     "residuals_figure",
     "response_figure",
     "save_figure",
-    "scatter_figure",
     "sensitivity_figure",
     "simulated_response_figure",
     "stabilisation_figure",

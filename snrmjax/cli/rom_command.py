@@ -30,8 +30,7 @@ def rom(
     tables: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with cases.csv (or cases.npz) and modes.toml: load cases that another "
-            "code has run.",
+            help="Folder with cases.csv and modes.toml: load cases that another code has run.",
             metavar="DIR",
             rich_help_panel=FILES,
             show_default=False,

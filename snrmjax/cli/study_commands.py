@@ -1,4 +1,4 @@
-"""The commands `study run`, `study report` and `study discard-chunks`."""
+"""The commands `study run` and `study report`."""
 
 import sys
 import time
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import xarray
 
     from snrmjax.report.study.summary import ScalarSummary
-    from snrmjax.study.engine import Progress, ProgressReport
-    from snrmjax.study.run import Expected, Shard, StudyRun
+    from snrmjax.study.compute import Progress, ProgressReport
+    from snrmjax.study.run import Shard, StudyRun
     from snrmjax.study.study import Study
 
 _QUIET_SECONDS = 30.0  # between lines of progress in a log
@@ -36,7 +36,7 @@ StudyOut = Annotated[
     typer.Option(
         "--out",
         help="The data set: a Zarr store that xarray opens. While it is not complete, and to mend "
-        "it, its parts are kept beside it in OUT.parts.",
+        "it, its parts are kept beside it in OUT.parts; remove them to save disk.",
         metavar="OUT",
         rich_help_panel=FILES,
         show_default=False,
@@ -98,9 +98,7 @@ def run(
         _say_study(study)
     try:
         with _progress(quiet) as progress:
-            settings = RunSettings(
-                *(processes, scheduler, part, progress), None if quiet else _say_expected
-            )
+            settings = RunSettings(processes, scheduler, part, progress)
             done = run_study(study, out, settings)
     except KeyboardInterrupt:
         warn("stopped; the same command continues.")
@@ -136,22 +134,6 @@ def report(
     say(f"written to {out}")
 
 
-@study_app.command("discard-chunks")
-def discard(
-    store: Annotated[
-        Path,
-        typer.Argument(
-            help="The data set of a complete study.", metavar="STORE", show_default=False
-        ),
-    ],
-) -> None:
-    """Remove what a complete data set was made of, to save disk; it cannot be mended then."""
-    from snrmjax.study.run import discard_chunks
-
-    discard_chunks(store)
-    say(f"{store} stands alone now.")
-
-
 def _shard(text: str) -> "Shard":
     from snrmjax.study.run import Shard
 
@@ -166,13 +148,6 @@ def _say_study(study: "Study") -> None:
     say(
         f"{study.name}: {study.n_members} members ({study.computation.kind}) in {study.n_chunks} "
         f"chunks; {names} varies" + ("" if len(study.names) < 2 else " together")
-    )
-
-
-def _say_expected(expected: "Expected") -> None:
-    say(
-        f"after the first chunk: about {_duration(expected.seconds)} to go, {_bytes(expected.size)}"
-        f" on disk in the end, {_bytes(expected.memory)} of memory"
     )
 
 
@@ -273,7 +248,3 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _bytes(size: int) -> str:
-    return f"{size / 1e9:.2g} GB" if size > 1e9 else f"{size / 1e6:.2g} MB"

@@ -3,7 +3,6 @@ from .condensation import Condensation, FitQuality, condense
 from .elements.beam import Beam, PointMass, Support, rise_of_radius
 from .elements.beam_cases import static_cases
 from .elements.beam_modes import base_participation, beam_modes, participation, shape_at
-from .elements.static_path import PathStatus, StaticPath, static_path
 from .elements.statics import StaticSolutions, StaticStatus, static_solutions
 from .expansion import MembraneExpansion, fit_expansion
 from .load_cases import ReductionBasis, StaticCases
@@ -20,11 +19,9 @@ __all__ = [
     "LoadScaleStudy",
     "LoadSet",
     "MembraneExpansion",
-    "PathStatus",
     "PointMass",
     "ReductionBasis",
     "StaticCases",
-    "StaticPath",
     "StaticSolutions",
     "StaticStatus",
     "Support",
@@ -41,6 +38,5 @@ __all__ = [
     "shape_at",
     "static_cases",
     "static_displacement",
-    "static_path",
     "static_solutions",
 ]

@@ -124,7 +124,6 @@ class LeftOutCases(NamedTuple):
     residual: Float[np.ndarray, "case mode"]  # of the fit to all, scaled rows
     held_out: Float[np.ndarray, "case mode"]  # of each case, of the fit to the others
     std: Float[np.ndarray, " monomial"]  # jackknife 1σ of the scaled coefficients
-    squares_without: Float[np.ndarray, " case"]  # Σ residual² of the fit to the others
     condition: float
 
 
@@ -150,13 +149,11 @@ def leave_out(system: FitSystem) -> LeftOutCases:
     held_out = np.linalg.solve(rest, residual[..., None])[..., 0]
     shift = np.linalg.solve(triangle, np.einsum("cmk,cm->kc", blocks, held_out)).T
     std = np.sqrt((n_cases - 1) / n_cases * np.sum((shift - shift.mean(axis=0)) ** 2, axis=0))
-    squares = np.sum(residual**2) - np.sum(residual * held_out, axis=1)
     held_out[alone] = np.inf
     return LeftOutCases(
         residual,
         held_out,
         np.full(n_unknowns, np.nan) if alone.any() else std,
-        np.where(alone, np.inf, np.maximum(squares, 0.0)),
         float(np.linalg.cond(triangle)),
     )
 

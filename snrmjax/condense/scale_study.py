@@ -89,7 +89,6 @@ def load_scale_study(
     *,
     degree: int = 3,
     scales: tuple[float, ...] = SCALES,
-    most_modes: int | None = None,
     report: Callable[[int, int], None] | None = None,
 ) -> LoadScaleStudy:
     """Condense with loads of many sizes.
@@ -108,9 +107,7 @@ def load_scale_study(
     typical = np.ones(len(basis.numbers))
     nearest = int(np.argmin(np.abs(np.log(scale))))
     for k, one in enumerate(scale):
-        loads = modal_loads(
-            basis, one * np.asarray(displacement), degree=degree, most_modes=most_modes
-        )
+        loads = modal_loads(basis, one * np.asarray(displacement), degree=degree)
         cases = solve(np.asarray(loads.force))
         if k == nearest:
             typical = typical_displacement(cases) / one

@@ -98,8 +98,3 @@ def _drive_point(modes: LinearModes) -> float:
 def drive_point(modes: LinearModes) -> float:
     """Velocity of the reference sensor per modal velocity and force: |Φ_r Φᵀb|, 1/kg."""
     return abs(_drive_point(modes))
-
-
-def modal_damping_at_resonance(states: SensorStates, modes: LinearModes) -> np.ndarray:
-    """2ζ̃ω̃ (1/s) from the balance of power at resonance: force in over velocity out."""
-    return drive_point(modes) * states.force / np.abs(states.velocity)

@@ -42,7 +42,6 @@ from snrmjax.simulate.solutions.periodic_motion import PeriodicMotion
 from snrmjax.simulate.solutions.time_integration import IntegratedMotion
 from snrmjax.simulate.virtual_test.phase_resonance_test import VirtualTest
 from snrmjax.study.uncertainty.propagation import Propagation
-from snrmjax.study.uncertainty.scatter_study import ScatterStudy
 from snrmjax.study.uncertainty.sensitivity import SobolIndices
 
 
@@ -223,11 +222,6 @@ def _(result: ForceCalibration, *, largest_drive: float = 1.0) -> Figure:
 @plot_result.register
 def _(result: Propagation) -> Figure:
     return uncertainty_figures.propagation_figure(result)
-
-
-@plot_result.register
-def _(result: ScatterStudy) -> Figure:
-    return uncertainty_figures.scatter_figure(result)
 
 
 @plot_result.register

@@ -2,73 +2,56 @@ from .computations.base import OfForces
 from .computations.modes import DampedModes, NormalModes
 from .computations.responses import Curves, Peaks, ResponseRange
 from .computations.tests import Diagnoses, Identifications, VirtualTests
-from .run import RunSettings, Shard, StudyRun, discard_chunks, open_study, run_study
+from .run import RunSettings, Shard, StudyRun, open_study, run_study
 from .sampling import Sampling
 from .study import Study, planned
 from .study_file import read_study
-from .uncertainty.followed_motions import ResponseQuantities, response_quantities
-from .uncertainty.propagation import (
-    Propagation,
-    PropagationSettings,
-    propagate_uncertainty,
+from .uncertainty.propagation import Propagation, propagate_uncertainty
+from .uncertainty.quantities import Quantities, function_quantities, response_quantities
+from .uncertainty.sensitivity import SobolIndices, sobol_indices
+from .variations import (
+    joint_normal,
+    listed,
+    lognormal,
+    normal,
+    posterior_variation,
+    ranged,
+    stated_variations,
+    uniform,
 )
-from .uncertainty.quantities import FunctionQuantities, MemberStatus
-from .uncertainty.scatter_study import ScatterStudy, scatter_study
-from .uncertainty.sensitivity import (
-    DerivativeBounds,
-    SobolIndices,
-    derivative_bounds,
-    sobol_indices,
-)
-from .uncertainty.uncertain_inputs import (
-    UncertainInputs,
-    correlated_inputs,
-    posterior_inputs,
-    uncertain_inputs,
-)
-from .variations import joint_normal, listed, lognormal, normal, ranged, uniform
 
 __all__ = [
     "Curves",
     "DampedModes",
-    "DerivativeBounds",
     "Diagnoses",
-    "FunctionQuantities",
     "Identifications",
-    "MemberStatus",
     "NormalModes",
     "OfForces",
     "Peaks",
     "Propagation",
-    "PropagationSettings",
-    "ResponseQuantities",
+    "Quantities",
     "ResponseRange",
     "RunSettings",
     "Sampling",
-    "ScatterStudy",
     "Shard",
     "SobolIndices",
     "Study",
     "StudyRun",
-    "UncertainInputs",
     "VirtualTests",
-    "correlated_inputs",
-    "derivative_bounds",
-    "discard_chunks",
+    "function_quantities",
     "joint_normal",
     "listed",
     "lognormal",
     "normal",
     "open_study",
     "planned",
-    "posterior_inputs",
+    "posterior_variation",
     "propagate_uncertainty",
     "ranged",
     "read_study",
     "response_quantities",
     "run_study",
-    "scatter_study",
     "sobol_indices",
-    "uncertain_inputs",
+    "stated_variations",
     "uniform",
 ]

@@ -5,7 +5,7 @@ import hashlib
 import importlib.metadata
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -47,37 +47,40 @@ def description(study: Study) -> dict[str, Any]:
     }
 
 
-def fingerprint(described: Mapping[str, Any]) -> str:
-    """A hash of a description: the same for the same study, and only for it."""
-    text = json.dumps(described, sort_keys=True, allow_nan=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def model_hash(study: Study) -> str:
     """A hash of the base model alone."""
     beam = isinstance(study.model_of, BeamModels)
-    return fingerprint({"model": _plain(study.model_of if beam else study.model)})
+    text = json.dumps({"model": _plain(study.model_of if beam else study.model)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-def differences(here: Any, there: Any, place: str = "") -> list[Difference]:
+def differences(here: Any, there: Any) -> list[Difference]:
     """Where two descriptions differ, in the order of the first."""
-    if isinstance(here, dict) and isinstance(there, dict):
-        keys = [*here, *(key for key in there if key not in here)]
-        found = []
-        for key in keys:
-            inside = f"{place}.{key}" if place else str(key)
-            found += differences(here.get(key, "absent"), there.get(key, "absent"), inside)
-        return found
-    if isinstance(here, list) and isinstance(there, list) and len(here) == len(there):
-        numbered = enumerate(zip(here, there, strict=True))
-        return [d for k, (a, b) in numbered for d in differences(a, b, f"{place}[{k}]")]
-    same = here == there or (here != here and there != there)
-    return [] if same else [Difference(place.removeprefix("study."), here, there)]
+    own, other = dict(_leaves(here)), dict(_leaves(there))
+    found = []
+    for place in [*own, *(place for place in other if place not in own)]:
+        a, b = own.get(place, "absent"), other.get(place, "absent")
+        if not (a == b or (a != a and b != b)):
+            found.append(Difference(place.removeprefix("study."), a, b))
+    return found
+
+
+def _leaves(described: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Every number and text of a description, and its place."""
+    if isinstance(described, dict):
+        for key, value in described.items():
+            yield from _leaves(value, f"{place}.{key}" if place else str(key))
+    elif isinstance(described, list):
+        for k, value in enumerate(described):
+            yield from _leaves(value, f"{place}[{k}]")
+    else:
+        yield place, described
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, BeamModels):
-        return {"kind": "beam", **_plain(value.stated)}
+        stated = value.stated
+        return {"kind": "beam", **_plain({**stated._asdict(), "numbers": dict(stated.numbers)})}
     if isinstance(value, eqx.Module):
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": getattr(value, "kind", type(value).__name__), **fields}

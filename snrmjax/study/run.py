@@ -1,30 +1,28 @@
 """A study from its plan to its data set: run, continued after any stop, in shards or on a cluster.
 
-Reference for the pattern (an immutable plan, files named by their content, a data set made of
-them at the end): the formulation is this package's own.
+An immutable plan, files that appear whole, and a data set made of them at the end.
 """
 
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from snrmjax.study.chunks import (
-    PLAN,
-    FoundChunks,
+from snrmjax.study.compute import Progress, ProgressReport, receipts
+from snrmjax.study.identity import description, differences
+from snrmjax.study.store import (
     StudyFolder,
-    found_chunks,
+    collect_chunks,
+    is_collected,
     read_study_plan,
-    remove_leftovers,
+    stored_description,
+    whole_chunks,
     write_study_plan,
 )
-from snrmjax.study.collect import collect_chunks, is_collected, stored_description
-from snrmjax.study.engine import Job, Progress, ProgressReport, receipts
-from snrmjax.study.identity import description, differences, fingerprint
-from snrmjax.study.study import Study, planned
+from snrmjax.study.study import PlannedStudy, Study, planned
 from snrmjax.study.workers import (
     AbstractWorkers,
     DaskCluster,
@@ -36,7 +34,6 @@ if TYPE_CHECKING:
     import xarray
 
 _SHOWN = 3  # differences that a refusal lists
-_SPARE = 1.2  # times the expected size that must be free
 
 
 class Shard(NamedTuple):
@@ -44,14 +41,6 @@ class Shard(NamedTuple):
 
     part: int  # from 1
     parts: int
-
-
-class Expected(NamedTuple):
-    """What a run will take, from its first chunk."""
-
-    seconds: float
-    size: int  # bytes: chunks and data set
-    memory: int  # bytes in all workers together
 
 
 class StudyRun(NamedTuple):
@@ -82,7 +71,6 @@ class RunSettings(NamedTuple):
     scheduler: str | None = None  # address of a running Dask scheduler
     shard: Shard | None = None
     progress: ProgressReport | None = None  # called after each chunk
-    expected: Callable[[Expected], None] | None = None  # called after the first chunk
     workers: AbstractWorkers | None = None  # your own, in place of processes or a scheduler
 
 
@@ -126,74 +114,39 @@ def run_study(study: Study, out: str | os.PathLike[str], settings: RunSettings =
     if is_collected(folder, described):
         return StudyRun(folder.out, len(plan.table), 0, 0, 0, 0, 0.0)
     workers = _workers(settings, study.n_chunks)  # a cluster that is not there leaves nothing
-    with closing(workers), _locked(folder, settings.shard):
+    with closing(workers), _words_for_disk(folder), _locked(folder, settings.shard):
         _claim(folder, described)
-        job = Job(plan, folder, fingerprint(described))
-        found = found_chunks(folder, job.fingerprint, study.n_chunks)
-        remove_leftovers(folder, found)
-        done = _computed(job, found, settings, workers)
-        every = found_chunks(folder, job.fingerprint, study.n_chunks)
-        missing = study.n_chunks - len(every.whole)
+        whole, damaged = whole_chunks(folder, study.n_chunks)
+        for chunk in damaged:
+            chunk.unlink()
+        done = _computed(plan, folder, whole, settings, workers)
+        missing = study.n_chunks - len(whole_chunks(folder, study.n_chunks)[0])
         if not missing:
-            with _words_for_disk(folder):
-                collect_chunks(plan, folder, described, every.whole)
+            collect_chunks(plan, folder, described)
     return StudyRun(
         folder.out,
         *(len(plan.table), done.failed, done.done - done.done_before),
-        *(missing, len(found.damaged), time.perf_counter() - begin),
+        *(missing, len(damaged), time.perf_counter() - begin),
     )
 
 
-def discard_chunks(out: str | os.PathLike[str]) -> None:
-    """Remove the chunks of a study whose data set is complete. Raises `ValueError` where it is not.
-
-    The data set stands alone then: it cannot be mended from its chunks any more.
-    """
-    folder = StudyFolder(Path(os.path.abspath(out)))
-    plan = read_study_plan(folder)
-    if plan is None or not is_collected(folder, plan):
-        raise ValueError(f"{out} is not complete: its chunks are still needed.")
-    shutil.rmtree(folder.work)
-
-
 def _computed(
-    job: Job, found: FoundChunks, settings: RunSettings, workers: AbstractWorkers
+    plan: PlannedStudy,
+    folder: StudyFolder,
+    whole: list[int],
+    settings: RunSettings,
+    workers: AbstractWorkers,
 ) -> Progress:
-    study, n = job.planned.study, len(job.planned.table)
-    before = sum(len(job.planned.rows_of(k)) for k in found.whole)
-    missing = [k for k in range(study.n_chunks) if k not in found.whole]
-    if settings.shard is not None:
-        missing = [k for k in missing if k % settings.shard.parts == settings.shard.part - 1]
-    state = Progress(n, before, 0, 0.0, before, 0, 0)
-    if not missing:
-        return state
+    part, parts = settings.shard or (1, 1)
+    before = sum(len(plan.rows_of(k)) for k in whole)
+    missing = sorted({*range(part - 1, plan.study.n_chunks, parts)} - {*whole})
+    state = Progress(len(plan.table), before, 0, 0.0, before)
     begin = time.perf_counter()
-    with _words_for_disk(job.folder):
-        for number, receipt in enumerate(receipts(job, workers, missing)):
-            state = state.with_receipt(receipt, time.perf_counter() - begin)
-            if number == 0:
-                _announce(job, settings, state, receipt.seconds, workers.width)
-            if settings.progress is not None:
-                settings.progress(state)
+    for receipt in receipts(plan, folder, workers, missing):
+        state = state.with_receipt(receipt, time.perf_counter() - begin)
+        if settings.progress is not None:
+            settings.progress(state)
     return state
-
-
-def _announce(job: Job, settings: RunSettings, state: Progress, seconds: float, width: int) -> None:
-    """Say what the run will take; refuse one for which the disk has no room."""
-    mine = state.done - state.done_before
-    left = (state.members - state.done) / mine
-    share = 1 if settings.shard is None else 1 / settings.shard.parts
-    # Chunks, and the data set that is made of them.
-    size = int(2 * state.size * state.members / mine)
-    expected = Expected(seconds * left * share / width, size, state.memory * width)
-    if settings.expected is not None:
-        settings.expected(expected)
-    free = shutil.disk_usage(job.folder.work).free
-    if free < _SPARE * 2 * state.size * left:
-        raise ValueError(
-            f"the study needs about {size / 1e6:.3g} MB, but {job.folder.out.parent} has "
-            f"{free / 1e6:.3g} MB left; the chunks that are done stay."
-        )
 
 
 def _workers(settings: RunSettings, n_chunks: int) -> AbstractWorkers:
@@ -218,13 +171,7 @@ def _check_settings(settings: RunSettings) -> None:
 def _claim(folder: StudyFolder, described: dict) -> None:
     """Make the folder this study's, or see that it is."""
     known = read_study_plan(folder) or stored_description(folder)
-    if folder.out.exists() and not (folder.out / ".zgroup").exists():
-        raise ValueError(f"{folder.out} is there already and no data set of a study.")
-    if known is None:
-        with _words_for_disk(folder):
-            write_study_plan(folder, described)
-        return
-    found = differences(described, known)
+    found = [] if known is None else differences(described, known)
     if found:
         further = f" (and {len(found) - _SHOWN} more)" if len(found) > _SHOWN else ""
         listed = "; ".join(str(one) for one in found[:_SHOWN])
@@ -232,9 +179,8 @@ def _claim(folder: StudyFolder, described: dict) -> None:
             f"{folder.out} has another study: {listed}{further}. Take another --out, or go back to "
             "that study."
         )
-    if read_study_plan(folder) is None and not is_collected(folder, described):
-        with _words_for_disk(folder):
-            write_study_plan(folder, described)
+    if not folder.plan.exists():
+        write_study_plan(folder, described)
 
 
 @contextmanager
@@ -244,19 +190,18 @@ def _locked(folder: StudyFolder, shard: Shard | None) -> Iterator[None]:
 
     made = not folder.work.exists()
     name = ".lock" if shard is None else f".lock-{shard.part}-of-{shard.parts}"
-    with _words_for_disk(folder):
-        folder.work.mkdir(parents=True, exist_ok=True)
-        try:
-            lock = FileLock(folder.work / name, timeout=0).acquire()
-        except Timeout as error:  # before it is taken for an error of the disk, which it is too
-            raise ValueError(
-                f"another process is at work on {folder.out}: wait until it ends."
-            ) from error
+    folder.work.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = FileLock(folder.work / name, timeout=0).acquire()
+    except Timeout as error:
+        raise ValueError(
+            f"another process is at work on {folder.out}: wait until it ends."
+        ) from error
     with lock:
         try:
             yield
         finally:
-            if made and not (folder.work / PLAN).exists():
+            if made and not folder.plan.exists():
                 shutil.rmtree(folder.work, ignore_errors=True)
 
 

@@ -10,15 +10,18 @@ from jaxtyping import Float
 
 from snrmjax.study.variations import AbstractVariation
 
-Method = Literal["grid", "list", "latin_hypercube", "sobol", "random"]
+Method = Literal["grid", "list", "latin_hypercube", "sobol", "random", "saltelli"]
 MOST_MEMBERS = 100_000_000
+FEWEST_ROWS = 16  # of Saltelli's scheme
 
 
 class Sampling(eqx.Module):
     """How the members are chosen.
 
     "grid": every combination of the values; "list": the first value of each quantity, the second
-    of each, and so on; the others draw `members` of them from the distributions.
+    of each, and so on; the others draw `members` of them from the distributions. "saltelli" draws
+    rows of a Sobol' sequence in pairs and exchanges one quantity after the other between them:
+    what `sobol_indices` asks for.
     """
 
     method: Method = eqx.field(static=True)
@@ -49,6 +52,14 @@ def number_of_members(variations: Sequence[AbstractVariation], sampling: Samplin
         raise ValueError(f"the method {sampling.method} needs `members`, how many to draw.")
     else:
         n = sampling.members
+    if sampling.method == "saltelli":
+        a_row = len(variations) + 2
+        rows, rest = divmod(n, a_row)
+        if rest or rows < FEWEST_ROWS or rows & (rows - 1):
+            raise ValueError(
+                f"saltelli needs {a_row} times a power of two of members (the quantities and two "
+                f"more), {a_row * FEWEST_ROWS} at least, but has {n}."
+            )
     if n > MOST_MEMBERS:
         raise ValueError(f"a study has at most {MOST_MEMBERS:.0e} members, but this has {n:.3g}.")
     return n
@@ -80,18 +91,18 @@ def drawn_members(
     """The value of every varied quantity for every member, in the order of the variations.
 
     Draws by `scipy.stats.qmc`: Latin hypercube, scrambled Sobol' sequence (its first `members`
-    points), or independently.
+    points), or independently. Saltelli's scheme has for every row a, b of a sequence the members
+    a, a with each quantity of b in turn (of several that vary together all), and b.
     """
     n = number_of_members(variations, sampling)
-    width = sum(len(one.names) for one in variations)
     if sampling.method in ("grid", "list"):
         values = [np.asarray(one.grid()) for one in variations]
         if sampling.method == "list":
             return np.stack(values, axis=1)
         return np.stack([a.ravel() for a in np.meshgrid(*values, indexing="ij")], axis=1)
-    if width == 0:
+    if not variations:
         return np.zeros((n, 0))
-    unit = _unit_cube(sampling.method, n, width, seed)
+    unit = _unit_cube(sampling.method, n, [len(one.names) for one in variations], seed)
     columns, begin = [], 0
     for one in variations:
         end = begin + len(one.names)
@@ -100,10 +111,21 @@ def drawn_members(
     return np.concatenate(columns, axis=1)
 
 
-def _unit_cube(method: Method, n: int, width: int, seed: int) -> Float[np.ndarray, "member name"]:
+def _unit_cube(
+    method: Method, n: int, groups: Sequence[int], seed: int
+) -> Float[np.ndarray, "member name"]:
+    """Points of the unit cube; `groups` are how many quantities each variation has."""
     from scipy.stats import qmc
 
+    width = sum(groups)
+
     random = np.random.default_rng(seed)
+    if method == "saltelli":
+        pairs = qmc.Sobol(2 * width, rng=random).random(n // (len(groups) + 2))
+        one, other = pairs[:, None, :width], pairs[:, None, width:]
+        taken = np.repeat(np.eye(len(groups), dtype=bool), groups, axis=1)
+        mixed = np.where(taken, other, one)
+        return np.concatenate([one, mixed, other], axis=1).reshape(n, width)
     if method == "latin_hypercube":
         return qmc.LatinHypercube(width, rng=random).random(n)
     if method == "sobol":

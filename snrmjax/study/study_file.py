@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from snrmjax.study.computations.base import AbstractComputation, OfForces
 from snrmjax.study.computations.modes import DampedModes, NormalModes
 from snrmjax.study.computations.responses import Curves, Peaks, ResponseRange
 from snrmjax.study.computations.tests import Diagnoses, Identifications, VirtualTests
-from snrmjax.study.sampling import Sampling
+from snrmjax.study.sampling import Method, Sampling
 from snrmjax.study.study import FORCE, Study, planned
 from snrmjax.study.variations import (
     AbstractVariation,
@@ -31,7 +32,7 @@ from snrmjax.study.variations import (
     uniform,
 )
 
-_METHODS = ("grid", "list", "latin_hypercube", "sobol", "random")
+_METHODS = get_args(Method)
 _RANGE = ("from_hz", "to_hz")
 _ERRORS = ("amplitude", "phase_deg", "force", "level_gain", "level_phase_deg")
 # Keys that each kind of computation needs and may have, beside those of every study.

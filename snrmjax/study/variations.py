@@ -2,10 +2,19 @@
 
 import abc
 from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
+
+from snrmjax.identify.calibrate.backbone_calibration import BackboneCalibration
+from snrmjax.identify.calibrate.calibrated_model import CalibratedModel
+from snrmjax.model.parameters import parameter_values, stated_stds
+from snrmjax.model.structures import Structure
 
 _FEWEST, _MOST = 2, 10_000_000
 _NORMAL_LIMIT = 1e-12  # quantiles nearer to 0 or 1 than this have no place in a sample
@@ -20,9 +29,24 @@ class AbstractVariation(eqx.Module):
     def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
         """Values at points of the unit cube, every one of which is as likely."""
 
+    @abc.abstractmethod
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """Values at independent standard normal numbers, differentiable; the medians at zero.
+
+        Arguments: `z` with a last axis of names; `xp` is NumPy or JAX.
+        """
+
     def grid(self) -> Float[np.ndarray, " value"] | None:
         """The values that a grid goes through; None where there are none."""
         return None
+
+
+class AbstractNormal(AbstractVariation):
+    """Quantities that are functions of standard normal numbers."""
+
+    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
+        """See `AbstractVariation.quantiles`."""
+        return self.at(standard_normal(unit), np)
 
 
 class ListedValues(AbstractVariation):
@@ -35,6 +59,10 @@ class ListedValues(AbstractVariation):
         """See `AbstractVariation.quantiles`."""
         n = len(self.values)
         return self.values[np.minimum((unit * n).astype(int), n - 1)]
+
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """Raises `ValueError`: what is listed has no derivative."""
+        raise ValueError(f"{self.names[0]} takes listed values: derivatives need a distribution.")
 
     def grid(self) -> Float[np.ndarray, " value"]:
         """The values."""
@@ -53,49 +81,53 @@ class ValueRange(AbstractVariation):
         """See `AbstractVariation.quantiles`."""
         return self.low + (self.high - self.low) * unit
 
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """See `AbstractVariation.at`."""
+        return self.low + (self.high - self.low) * jax.scipy.stats.norm.cdf(z)
+
     def grid(self) -> Float[np.ndarray, " value"] | None:
         """The equally spaced values."""
         return None if self.points is None else np.linspace(self.low, self.high, self.points)
 
 
-class Normal(AbstractVariation):
+class Normal(AbstractNormal):
     """A normal distribution by mean and standard deviation."""
 
     names: tuple[str, ...]
     mean: float
     std: float
 
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        return self.mean + self.std * standard_normal(unit)
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """See `AbstractVariation.at`."""
+        return self.mean + self.std * z
 
 
-class LogNormal(AbstractVariation):
+class LogNormal(AbstractNormal):
     """A lognormal distribution by the mean and standard deviation of the quantity itself."""
 
     names: tuple[str, ...]
     mean: float
     std: float
 
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        variance = np.log1p((self.std / self.mean) ** 2)
-        return self.mean * np.exp(np.sqrt(variance) * standard_normal(unit) - variance / 2)
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """See `AbstractVariation.at`."""
+        variance = xp.log1p((self.std / self.mean) ** 2)
+        return self.mean * xp.exp(xp.sqrt(variance) * z - variance / 2)
 
 
-class JointNormal(AbstractVariation):
+class JointNormal(AbstractNormal):
     """Several quantities that are normal together, by mean and covariance."""
 
     names: tuple[str, ...]
     mean: Float[np.ndarray, " name"]
     covariance: Float[np.ndarray, "name name"]
 
-    def quantiles(self, unit: Float[np.ndarray, "member name"]) -> Float[np.ndarray, "member name"]:
-        """See `AbstractVariation.quantiles`."""
-        scale = _scale(self.covariance)
-        values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        return self.mean + standard_normal(unit) @ root.T
+    def at(self, z: Any, xp: ModuleType = jnp) -> Any:
+        """See `AbstractVariation.at`."""
+        scale = _scale(self.covariance, xp)
+        values, vectors = xp.linalg.eigh(self.covariance / xp.outer(scale, scale))
+        root = scale[:, None] * vectors * xp.sqrt(xp.maximum(values, 0.0))
+        return self.mean + z @ root.T
 
 
 def standard_normal(unit: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -176,10 +208,33 @@ def joint_normal(
     return JointNormal(tuple(names), center, (cov + cov.T) / 2)
 
 
-def _scale(covariance: np.ndarray) -> np.ndarray:
+def stated_variations(model: Structure) -> tuple[Normal, ...]:
+    """The numbers of a model that state a standard deviation, as normally distributed quantities.
+
+    Raises `ValueError` where none does.
+    """
+    own, stds = parameter_values(model), stated_stds(model)
+    if not stds:
+        raise ValueError("the model states no standard deviation of its parameters.")
+    return tuple(normal(name, own[name], std) for name, std in stds.items())
+
+
+def posterior_variation(calibrated: CalibratedModel | BackboneCalibration) -> JointNormal:
+    """The fitted parameters of a calibration with their covariance, normally distributed.
+
+    Raises `ValueError` for a calibration that did not converge.
+    """
+    if not calibrated.converged:
+        raise ValueError(
+            f"the calibration did not converge ({calibrated.status}): its covariance says nothing."
+        )
+    return joint_normal(calibrated.names, calibrated.values, calibrated.covariance)
+
+
+def _scale(covariance: Any, xp: ModuleType = np) -> Any:
     """Standard deviations, one for a quantity that does not vary."""
-    std = np.sqrt(np.diag(covariance))
-    return np.where(std > 0, std, 1.0)
+    std = xp.sqrt(xp.diag(covariance))
+    return xp.where(std > 0, std, 1.0)
 
 
 def _finite(name: str, **numbers: ArrayLike) -> None:

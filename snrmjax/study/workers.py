@@ -2,6 +2,8 @@
 
 import abc
 import os
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import contextmanager
@@ -10,8 +12,14 @@ from typing import Any, ClassVar
 import jax
 
 from snrmjax.io.compilation_cache import WORTH_KEEPING, default_cache_folder
-from snrmjax.study.tasks import ENVIRONMENT, settle
 
+ENVIRONMENT = {
+    # One thread each: workers share the cores, and digits must not depend on how many there are.
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+}
 INSTALL_CLUSTER = "a Dask cluster needs the package distributed: pip install 'snrmjax[cluster]'."
 
 
@@ -167,6 +175,24 @@ class DaskCluster(AbstractWorkers):
             yield
         except (*self._gone, OSError) as error:
             raise ClusterGone(self._left) from error
+
+
+def settle(parent: int, cores: Any) -> None:
+    """Before the first chunk: end with the process that started this one, and stay on one core.
+
+    Arguments: `parent` is that process's number, `cores` a queue with a core for every worker.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    # First of all: a parent that is killed now leaves nobody who would fill the queue.
+    threading.Thread(target=watch, daemon=True).start()
+    core = cores.get()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core})
 
 
 def available_cores() -> list[int]:

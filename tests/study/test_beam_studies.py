@@ -151,7 +151,7 @@ def test_a_study_of_a_beam_is_known_by_the_beam(folder):
     assert differences(one, description(read(folder, STUDY + THICKNESS))) == []
     (folder / "beam.toml").write_text(BEAM.replace("204.8e9", "200e9"))
     other = description(read(folder, STUDY + THICKNESS))
-    assert [d.place for d in differences(one, other)] == ["model_of.young"]
+    assert [d.place for d in differences(one, other)] == ["model_of.numbers.material.young_pa"]
 
 
 @pytest.mark.long

@@ -35,7 +35,7 @@ STATIC_MESSAGE = {
     StaticStatus.CONVERGED: "in equilibrium, on the stable path from rest",
     StaticStatus.DIVERGED: "Newton's method found no equilibrium: check the model, or load less",
     StaticStatus.SNAPPED_THROUGH: "the path from rest loses its stability before the load is "
-    "reached (limit point or buckling): load less, or trace it by `static_path`",
+    "reached (limit point or buckling): load less",
 }
 
 
@@ -78,7 +78,7 @@ def static_solutions(beam: Beam, load: Float[Array, "case dof"]) -> StaticSoluti
         # order of derivatives whole.
         factor = jax.scipy.linalg.lu_factor(k)
         for _ in range(2):
-            u = u - jax.scipy.linalg.lu_solve(factor, free_force(beam, u) - one)
+            u = u - jax.scipy.linalg.lu_solve(factor, _free_force(beam, u) - one)
         whole = jnp.where(good, jnp.zeros(beam.n_dof).at[free].set(u), jnp.nan)
         return whole, strain_energy(beam, whole)
 
@@ -100,12 +100,12 @@ class _Path(NamedTuple):
     iterations: Array  # in it
 
 
-def free_force(beam: Beam, u: Array) -> Array:
+def _free_force(beam: Beam, u: Array) -> Array:
     """Internal force on the degrees of freedom that are not held, at displacements of them."""
     return internal_force(beam, jnp.zeros(beam.n_dof).at[beam.free].set(u))[beam.free]
 
 
-def free_tangent(beam: Beam, u: Array) -> Array:
+def _free_tangent(beam: Beam, u: Array) -> Array:
     """Tangent stiffness of the degrees of freedom that are not held."""
     free = beam.free
     whole = tangent_stiffness(beam, jnp.zeros(beam.n_dof).at[free].set(u))
@@ -120,8 +120,8 @@ def _followed(beam: Beam, load: Array) -> tuple[Array, Array, Array, Array]:
 
     def step(path: _Path) -> _Path:
         target = jnp.minimum(path.reached + path.size, 1.0)
-        residual = target * load - free_force(beam, path.u)
-        stiffness = free_tangent(beam, path.u)
+        residual = target * load - _free_force(beam, path.u)
+        stiffness = _free_tangent(beam, path.u)
         change = jnp.linalg.solve(stiffness, residual)
         u, first = path.u + change, path.iterations == 0
         predicted = jnp.where(first, jnp.abs(load @ change), path.predicted)

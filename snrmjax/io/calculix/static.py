@@ -173,14 +173,7 @@ def _compute(calculix: Calculix, model: Path, step: str, place: Path, modes: Dec
     result = _judged(run_job(calculix, model, step), modes.deck)
     if result.status not in (KILLED, REFUSED):
         content = io.BytesIO()
-        np.savez(
-            content,
-            status=result.status,
-            displacement=result.displacement,
-            energy=result.energy,
-            seconds=result.seconds,
-            error=result.error,
-        )
+        np.savez(content, **result._asdict())
         write_atomically(place, content.getvalue())
     return result
 
@@ -188,27 +181,19 @@ def _compute(calculix: Calculix, model: Path, step: str, place: Path, modes: Dec
 def _judged(outcome: JobOutcome, deck: Deck) -> _Result:
     """What a job's end means: the displacement only where the whole load was reached."""
     nothing = np.full(3 * len(deck.nodes), np.nan)
+    failed = _Result(DIVERGED, nothing, np.nan, outcome.seconds, outcome.error)
     if not outcome.finished:
-        return _Result(KILLED, nothing, np.nan, outcome.seconds, outcome.error)
+        return failed._replace(status=KILLED)
     if not outcome.started:
-        return _Result(
-            REFUSED, nothing, np.nan, outcome.seconds, outcome.error or "it said nothing"
-        )
+        return failed._replace(status=REFUSED, error=outcome.error or "it said nothing")
     try:
         tables = list(printed_tables(outcome.dat, deck.nodes))
     except ValueError as error:
-        return _Result(DIVERGED, nothing, np.nan, outcome.seconds, str(error))
+        return failed._replace(error=str(error))
     if outcome.error or not tables or tables[-1].time < _END_OF_STEP:
-        said = outcome.error or "the whole load was not reached"
-        return _Result(DIVERGED, nothing, np.nan, outcome.seconds, said)
-    energy = last_energy(outcome.dat)
-    return _Result(
-        CONVERGED,
-        tables[-1].values.ravel(),
-        np.nan if energy is None else energy,
-        outcome.seconds,
-        "",
-    )
+        return failed._replace(error=outcome.error or "the whole load was not reached")
+    energy, moved = last_energy(outcome.dat), tables[-1].values.ravel()
+    return _Result(CONVERGED, moved, np.nan if energy is None else energy, outcome.seconds, "")
 
 
 def _stored(place: Path, deck: Deck) -> _Result | None:
@@ -217,13 +202,8 @@ def _stored(place: Path, deck: Deck) -> _Result | None:
         return None
     try:
         with np.load(place, allow_pickle=False) as file:
-            result = _Result(
-                str(file["status"]),
-                file["displacement"],
-                float(file["energy"]),
-                float(file["seconds"]),
-                str(file["error"]),
-            )
+            numbers = file["displacement"], float(file["energy"]), float(file["seconds"])
+            result = _Result(str(file["status"]), *numbers, str(file["error"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     return result if result.displacement.shape == (3 * len(deck.nodes),) else None

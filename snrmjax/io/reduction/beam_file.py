@@ -30,6 +30,7 @@ mass_kg = 1e-3
 inertia_kg_m2 = 2e-8                 # optional, about the axis of bending
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,7 @@ from snrmjax.numerics.rules import BELOW_ONE, FRACTION, NOT_NEGATIVE, POSITIVE, 
 
 MOST_ELEMENTS = 400
 SUPPORTS = ("clamped", "pinned", "free")
+SIDES = ("left", "right")
 STIFFNESSES = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
 
 _TABLES = ("material", "section", "geometry", "supports", "condense", "sensors", "force")
@@ -48,43 +50,28 @@ POISSON = Rule("above -1 and below 0.5", lambda value: -1 < value < 0.5)
 MOST_RISE = 0.95  # of the length over twice the radius: an arch below a half circle
 
 
-class SupportStiffness(NamedTuple):
-    """Springs at an end; infinite is held, zero free."""
-
-    axial: float  # N/m, along the chord
-    transverse: float  # N/m, across it
-    rotation: float  # N m/rad
-
-
-class PointMassEntry(NamedTuple):
-    """A mass fixed to the beam."""
-
-    at: float  # fraction of the length
-    mass: float  # kg
-    inertia: float  # kg m²
+RISE, RADIUS = "geometry.rise_m", "geometry.radius_m"
+LENGTH, THICKNESS = "geometry.length_m", "section.thickness_m"
 
 
 class BeamDescription(NamedTuple):
-    """A beam or arch as its file says."""
+    """A beam or arch as its file says.
+
+    `numbers` have the names of tables and keys ("section.thickness_m"), stiffnesses of a support
+    "supports.left.rotation_nm_rad" (infinite: held) and point masses "point_mass_1.mass_kg". Those
+    that the file does not state are missing.
+    """
 
     name: str
-    young: float  # Pa
-    density: float  # kg/m³
-    poisson: float | None  # None: no shear deformation
-    width: float  # m
-    thickness: float  # m
-    length: float  # m, of the chord
-    radius: float | None  # m; None: straight
+    numbers: tuple[tuple[str, float], ...]  # SI units
     elements: int
-    supports: tuple[SupportStiffness, SupportStiffness]  # left, right
     modes: tuple[int, ...]  # counted from one
     load_scale: float | None  # thicknesses
     degree: int
     damping_ratio: tuple[float, ...] | None  # one a mode; None: not stated
     sensors: tuple[tuple[str, float], ...]  # names and fractions of the length
     force_at: float | None  # fraction of the length; None: uniform
-    point_masses: tuple[PointMassEntry, ...] = ()
-    rise: float = 0.0  # m, of the arc over the chord, where no radius is stated
+    masses_at: tuple[float, ...] = ()  # fractions of the length
 
 
 def read_beam_description(path: FilePath) -> BeamDescription:
@@ -104,18 +91,27 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     geometry.check_keys(("length_m", "elements"), ("radius_m", "rise_m"))
     supports.check_keys(("left", "right"))
     of_modes.check_keys(("modes",), ("load_scale", "degree", "damping_ratio"))
-    length = geometry.number("length_m", POSITIVE)
-    radius = geometry.number("radius_m", POSITIVE) if "radius_m" in geometry.entries else None
-    if radius is not None and not length < 2 * MOST_RISE * radius:
-        raise geometry.refusal("radius_m", f"above {length / (2 * MOST_RISE):.4g}", radius)
-    rise = geometry.number("rise_m", NOT_NEGATIVE, default=0.0)
-    if radius is not None and "rise_m" in geometry.entries:
-        raise ValueError(f"{geometry.place} has both `radius_m` and `rise_m`: one is enough.")
-    if not 2 * rise < length:
-        raise geometry.refusal("rise_m", f"below half of the length ({length / 2:.4g})", rise)
-    thickness = section.number("thickness_m", POSITIVE)
-    if not thickness < length:
-        raise section.refusal("thickness_m", f"below the length ({length:g})", thickness)
+    numbers = {
+        "material.young_pa": material.number("young_pa", POSITIVE),
+        "material.density_kg_m3": material.number("density_kg_m3", POSITIVE),
+    }
+    if "poisson" in material.entries:
+        numbers["material.poisson"] = material.number("poisson", POISSON)
+    numbers["section.width_m"] = section.number("width_m", POSITIVE)
+    numbers |= _geometry(geometry, section)
+    for side in SIDES:
+        springs = zip(STIFFNESSES, _support(supports, side), strict=True)
+        numbers |= {f"supports.{side}.{key}": size for key, size in springs}
+    missing = what_is_loose(numbers)  # a mechanism has no static load cases
+    if missing is not None:
+        raise ValueError(f"{supports.place} leave a mechanism: {missing}.")
+    masses_at = []
+    for k, one in enumerate(top.tables(_POINT_MASS, file), 1):
+        one.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
+        masses_at.append(one.number("at", FRACTION))
+        numbers[f"point_mass_{k}.mass_kg"] = one.number("mass_kg", NOT_NEGATIVE)
+        inertia = one.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0)
+        numbers[f"point_mass_{k}.inertia_kg_m2"] = inertia
     elements = geometry.whole("elements", 2)
     if elements > MOST_ELEMENTS:
         raise geometry.refusal("elements", f"at most {MOST_ELEMENTS}", elements)
@@ -127,23 +123,15 @@ def read_beam_description(path: FilePath) -> BeamDescription:
     places = tuple((name, sensors.number(name, FRACTION)) for name in sensors.entries)
     return BeamDescription(
         name=top.text("name", file.removesuffix(".toml")),
-        young=material.number("young_pa", POSITIVE),
-        density=material.number("density_kg_m3", POSITIVE),
-        poisson=material.number("poisson", POISSON) if "poisson" in material.entries else None,
-        width=section.number("width_m", POSITIVE),
-        thickness=thickness,
-        length=length,
-        radius=radius,
+        numbers=tuple(numbers.items()),
         elements=elements,
-        supports=_held(_support(supports, "left"), _support(supports, "right"), supports),
         modes=modes,
         load_scale=of_modes.number("load_scale", POSITIVE) if scaled else None,
         degree=degree,
         damping_ratio=_damping(of_modes, len(modes)),
         sensors=places or (("midspan", 0.5),),
         force_at=_force(force),
-        point_masses=tuple(_point_mass(one) for one in top.tables(_POINT_MASS, file)),
-        rise=rise,
+        masses_at=tuple(masses_at),
     )
 
 
@@ -156,15 +144,38 @@ def is_beam_file(path: FilePath) -> bool:
     return "mode" not in top.entries and any(name in top.entries for name in _TABLES[:5])
 
 
-def what_is_loose(left: SupportStiffness, right: SupportStiffness) -> str | None:
-    """Which rigid-body motion two supports leave, in words, or nothing."""
-    if not (left.axial or right.axial):
+def what_is_loose(numbers: Mapping[str, float]) -> str | None:
+    """Which rigid-body motion the two supports leave, in words, or nothing."""
+    axial, transverse, rotation = (
+        [numbers[f"supports.{side}.{key}"] for side in SIDES] for key in STIFFNESSES
+    )
+    if not any(axial):
         return "nothing holds the beam along its axis"
-    if not (left.transverse or right.transverse):
+    if not any(transverse):
         return "nothing holds the beam across its axis"
-    if not ((left.transverse and right.transverse) or left.rotation or right.rotation):
+    if not (all(transverse) or any(rotation)):
         return "nothing keeps the beam from turning"
     return None
+
+
+def _geometry(geometry: TomlTable, section: TomlTable) -> dict[str, float]:
+    """Length, thickness and the curvature that is stated."""
+    length = geometry.number("length_m", POSITIVE)
+    thickness = section.number("thickness_m", POSITIVE)
+    if not thickness < length:
+        raise section.refusal("thickness_m", f"below the length ({length:g})", thickness)
+    rise = geometry.number("rise_m", NOT_NEGATIVE, default=0.0)
+    if not 2 * rise < length:
+        raise geometry.refusal("rise_m", f"below half of the length ({length / 2:.4g})", rise)
+    known = {THICKNESS: thickness, LENGTH: length}
+    if "radius_m" not in geometry.entries:
+        return {**known, RISE: rise}
+    if "rise_m" in geometry.entries:
+        raise ValueError(f"{geometry.place} has both `radius_m` and `rise_m`: one is enough.")
+    radius = geometry.number("radius_m", POSITIVE)
+    if not length < 2 * MOST_RISE * radius:
+        raise geometry.refusal("radius_m", f"above {length / (2 * MOST_RISE):.4g}", radius)
+    return {**known, RADIUS: radius}
 
 
 def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
@@ -185,42 +196,24 @@ def _modes(table: TomlTable, elements: int) -> tuple[int, ...]:
     return tuple(numbers)
 
 
-def _support(table: TomlTable, side: str) -> SupportStiffness:
+def _support(table: TomlTable, side: str) -> tuple[float, ...]:
+    """Stiffnesses along the chord, across it and in rotation; infinite is held, zero free."""
     value = table.entries[side]
     if isinstance(value, dict):
         springs = TomlTable(value, f"{side} of {table.place}")
         springs.check_keys((), STIFFNESSES)
         if not value:
             raise table.refusal(side, f"a support or stiffnesses ({', '.join(STIFFNESSES)})", value)
-        return SupportStiffness(*(_stiffness(springs, key) for key in STIFFNESSES))
+        return tuple(_stiffness(springs, key) for key in STIFFNESSES)
     kind = table.choice(side, SUPPORTS)
     held = np.inf if kind != "free" else 0.0
-    return SupportStiffness(held, held, np.inf if kind == "clamped" else 0.0)
+    return held, held, np.inf if kind == "clamped" else 0.0
 
 
 def _stiffness(springs: TomlTable, key: str) -> float:
     if springs.entries.get(key) == np.inf:
         return np.inf
     return springs.number(key, NOT_NEGATIVE, default=0.0)
-
-
-def _point_mass(table: TomlTable) -> PointMassEntry:
-    table.check_keys(("at", "mass_kg"), ("inertia_kg_m2",))
-    return PointMassEntry(
-        table.number("at", FRACTION),
-        table.number("mass_kg", NOT_NEGATIVE),
-        table.number("inertia_kg_m2", NOT_NEGATIVE, default=0.0),
-    )
-
-
-def _held(
-    left: SupportStiffness, right: SupportStiffness, table: TomlTable
-) -> tuple[SupportStiffness, SupportStiffness]:
-    """The supports, unless they leave a rigid-body motion: a mechanism has no static load cases."""
-    missing = what_is_loose(left, right)
-    if missing is not None:
-        raise ValueError(f"{table.place} leave a mechanism: {missing}.")
-    return left, right
 
 
 def _damping(table: TomlTable, n: int) -> tuple[float, ...] | None:

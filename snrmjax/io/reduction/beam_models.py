@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from snrmjax.condense.condensation import condense
 from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
+from snrmjax.io.reduction.beam_file import THICKNESS, BeamDescription, read_beam_description
 from snrmjax.io.reduction.beam_parameters import (
     beam_parameters,
     check_beam_name,
@@ -74,7 +74,8 @@ class BeamModels(eqx.Module):
 def _model(models: BeamModels, values: Mapping[str, Any]) -> Structure:
     beam = with_beam_parameters(models.stated, values)
     source = beam_source(beam, models.file)
-    _, cases = run_load_cases(source, beam.thickness * np.asarray(models.displacement))
+    thickness = dict(beam.numbers)[THICKNESS]
+    _, cases = run_load_cases(source, thickness * np.asarray(models.displacement))
     return source.structure(condense(source.basis, cases, degree=source.degree))
 
 
@@ -94,4 +95,5 @@ def read_beam_models(path: FilePath) -> BeamModels:
     stated, file = read_beam_description(path), file_name(path)
     source = beam_source(stated, file)
     displacement, _ = run_load_cases(source)
-    return BeamModels(stated, file, tuple((np.asarray(displacement) / stated.thickness).tolist()))
+    thickness = dict(stated.numbers)[THICKNESS]
+    return BeamModels(stated, file, tuple((np.asarray(displacement) / thickness).tolist()))

@@ -13,7 +13,14 @@ from snrmjax.condense.elements.beam_modes import beam_modes, participation, shap
 from snrmjax.condense.load_cases import ReductionBasis, StaticCases
 from snrmjax.condense.load_set import StaticSolver
 from snrmjax.io.files import FilePath, file_name
-from snrmjax.io.reduction.beam_file import BeamDescription, read_beam_description
+from snrmjax.io.reduction.beam_file import (
+    LENGTH,
+    SIDES,
+    STIFFNESSES,
+    THICKNESS,
+    BeamDescription,
+    read_beam_description,
+)
 from snrmjax.io.reduction.beam_parameters import rise_of
 from snrmjax.io.reduction.source import ASSUMED_DAMPING, ReductionSource, ShapeLines
 from snrmjax.model.modes import have_values
@@ -64,7 +71,7 @@ def beam_source(stated: BeamDescription, file: str) -> ReductionSource:
         sensors=seen.sensors,
         participation=seen.participation,
         solve=solve,
-        thickness=stated.thickness,
+        thickness=dict(stated.numbers)[THICKNESS],
         load_scale=stated.load_scale,
         degree=stated.degree,
         # Rows of the shapes are x, y and rotation of each node.
@@ -110,19 +117,22 @@ def seen_of(
 
 def beam_of(stated: BeamDescription) -> Beam:
     """The finite elements of a beam."""
-    left, right = (Support(*one) for one in stated.supports)
+    of = dict(stated.numbers)
+    left, right = (Support(*(of[f"supports.{s}.{key}"] for key in STIFFNESSES)) for s in SIDES)
+    masses = enumerate(stated.masses_at, 1)
     return Beam(
-        stated.length,
-        stated.width,
-        stated.thickness,
+        *(of[LENGTH], of["section.width_m"], of[THICKNESS]),
         rise=rise_of(stated),
-        young=stated.young,
-        density=stated.density,
-        poisson=stated.poisson,
+        young=of["material.young_pa"],
+        density=of["material.density_kg_m3"],
+        poisson=of.get("material.poisson"),
         elements=stated.elements,
         left=left,
         right=right,
-        point_masses=tuple(PointMass(*one) for one in stated.point_masses),
+        point_masses=tuple(
+            PointMass(at, of[f"point_mass_{k}.mass_kg"], of[f"point_mass_{k}.inertia_kg_m2"])
+            for k, at in masses
+        ),
     )
 
 

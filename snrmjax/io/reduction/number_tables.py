@@ -1,8 +1,6 @@
-"""CSV tables of numbers with numbered columns, and the same as arrays of an NPZ file."""
+"""CSV tables of numbers with numbered columns."""
 
 import re
-import zipfile
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -80,24 +78,3 @@ def read_number_table(
                 f"{len(names)}."
             )
     return NumberedColumns(Cells(rows[1:], Header(position, len(names), (), ()), file), groups)
-
-
-def read_arrays(path: FilePath, known: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ file, by name.
-
-    Raises `ValueError` for what is no NPZ file of plain arrays, and for unknown names.
-    """
-    file = file_name(path)
-    try:
-        with np.load(Path(path), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, AttributeError) as error:
-        raise ValueError(f"{file} is not an NPZ file of plain arrays.") from error
-    for name, values in arrays.items():
-        if name not in known:
-            raise ValueError(
-                f"{file} has the unknown array {shown(name)}{suggestion(name, known)}."
-            )
-        if name != "names" and values.dtype.kind not in "fiub":
-            raise ValueError(f"`{name}` of {file} must be numbers, but is {values.dtype}.")
-    return {k: v if k == "names" else v.astype(float) for k, v in arrays.items()}

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.methods.bench.equipment import positive
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.held_phasors import (
     HANN,
@@ -132,11 +133,8 @@ class _Bench:
         self.laboratory, self.settings, self.seed = laboratory, settings, seed
         self.samples, self.runs = 0, 0
         self.state: LabState | None = None
-        modes = laboratory.structure.modes
-        own = float(modes.natural_frequency[modes.mode_of_interest])
-        cycle = laboratory.sampling_rate * 2 * np.pi / own
-        self.settle = round(settings.settle_cycles * cycle)
-        self.keep = round(settings.record_cycles * cycle)
+        self.settle = laboratory.samples(settings.settle_cycles)
+        self.keep = laboratory.samples(settings.record_cycles)
         self.higher = np.zeros(len(_ORDERS) - 1, dtype=complex)
 
     @property
@@ -223,8 +221,8 @@ def s_curve(
     of its own, or that were not steady within 1 %, are NaN.
     Raises `ValueError` for numbers that are not positive.
     """
-    targets = _positive("amplitudes", amplitudes)
-    (omega,) = _positive("frequency", frequency)
+    targets = positive("amplitudes", amplitudes)
+    (omega,) = positive("frequency", frequency)
     bench = _Bench(laboratory, _checked(settings), seed)
     found = [bench.held(float(omega), float(size)) for size in targets]
     held = np.array([bench.holds(one) for one in found])
@@ -256,12 +254,9 @@ def control_based_continuation(
     everything.
     Raises `ValueError` for numbers that are not positive.
     """
-    targets = _positive("amplitudes", amplitudes)
+    targets = positive("amplitudes", amplitudes)
     bench = _Bench(laboratory, _checked(settings), seed)
-    modes = laboratory.structure.modes
-    own = modes.mode_of_interest
-    omega = float(modes.natural_frequency[own])
-    decay = float(modes.damping_ratio[own]) * omega
+    modes, omega, decay = laboratory.structure.modes, laboratory.frequency, laboratory.decay
     points, velocity_std = [], []
     for level, size in enumerate(targets, 1):
         found = _resonance(bench, omega, float(size), decay)
@@ -312,13 +307,6 @@ def _resonance(bench: _Bench, omega: float, size: float, decay: float) -> HeldMo
         largest = 10 * _FIRST_STEP * omega
         omega += float(np.clip(step, -largest, largest))
     return None
-
-
-def _positive(name: str, values: Float[np.ndarray, "..."] | float) -> np.ndarray:
-    each = np.asarray(values, dtype=float).ravel()
-    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
-        raise ValueError(f"`{name}` must be positive and finite, but are {values}.")
-    return each
 
 
 def _checked(settings: FeedbackSettings) -> FeedbackSettings:

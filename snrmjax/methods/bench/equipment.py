@@ -1,6 +1,6 @@
 """Shaker, amplifier and instruments of the virtual laboratory, by their numbers."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -9,9 +9,8 @@ from jaxtyping import Float
 class Shaker(NamedTuple):
     """An electrodynamic shaker on its amplifier: U = R i + G v_a, and G i moves the armature.
 
-    A stiff stinger (the default) moves the armature with the drive point; a flexible one, a spring
-    with a dashpot along its axis, gives the armature a degree of freedom of its own. The force
-    cell sits between stinger and structure. The amplifier clips voltage, then current.
+    A stiff stinger moves the armature with the drive point. The force cell sits between stinger
+    and structure. The amplifier clips voltage, then current.
     """
 
     resistance: float = 3.0  # ohm
@@ -19,14 +18,12 @@ class Shaker(NamedTuple):
     mass: float = 0.0  # kg, armature and force cell beyond its sensing element
     damping: float = 0.0  # N s/m
     stiffness: float = 0.0  # N/m, of the armature's suspension
-    stinger_stiffness: float = np.inf  # N/m, along its axis
-    stinger_damping: float = 0.0  # N s/m
     largest_voltage: float = np.inf  # V, of the amplifier
     largest_current: float = np.inf  # A, of the amplifier
 
 
 class Instruments(NamedTuple):
-    """What the channels of force and velocity add, and how late they are.
+    """What the channels of force and velocity add.
 
     An anti-alias filter, a Butterworth low-pass of `filter_order`, works before sampling and
     on both channels, so that their relative phase stays. Controllers see what is recorded.
@@ -34,12 +31,16 @@ class Instruments(NamedTuple):
 
     force_noise: float = 0.0  # N, 1σ of a sample
     velocity_noise: float = 0.0  # m/s, 1σ of a sample
-    force_range: float = np.inf  # N, beyond which the channel is clipped
-    velocity_range: float = np.inf  # m/s
-    bits: int = 0  # of the converter over both ranges; 0 for none
     filter_corner_hz: float = np.inf  # of the anti-alias filter; infinite for none
     filter_order: int = 4
-    delay: int = 0  # samples, of both channels
+
+
+def positive(name: str, values: Any) -> Float[np.ndarray, " value"]:
+    """Numbers in a row. Raises `ValueError` unless all are positive and finite, at least one."""
+    each = np.asarray(values, dtype=float).ravel()
+    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
+        raise ValueError(f"`{name}` must be positive and finite, but is {values}.")
+    return each
 
 
 def check_shaker(shaker: Shaker) -> None:
@@ -47,29 +48,23 @@ def check_shaker(shaker: Shaker) -> None:
     numbers = np.asarray(shaker, dtype=float)
     if not shaker.resistance > 0 or not numbers.min() >= 0:
         raise ValueError(f"a shaker's numbers must not be negative, but are {shaker}.")
-    if not np.isfinite(numbers[:5]).all() or not np.isfinite(shaker.stinger_damping):
+    if not np.isfinite(numbers[:5]).all():
+        raise ValueError(f"only the amplifier's limits may be infinite, but {shaker} has others.")
+    if min(shaker.largest_voltage, shaker.largest_current) == 0:
         raise ValueError(
-            f"only stinger stiffness and the amplifier's limits may be infinite, but {shaker} has "
-            "others."
+            f"`largest_voltage` and `largest_current` must be positive, but one is zero: {shaker}."
         )
-    if min(shaker.stinger_stiffness, shaker.largest_voltage, shaker.largest_current) == 0:
-        raise ValueError(
-            "`stinger_stiffness`, `largest_voltage` and `largest_current` must be positive, but "
-            f"one is zero: {shaker}."
-        )
-    if np.isfinite(shaker.stinger_stiffness) and not shaker.mass > 0:
-        raise ValueError("a flexible stinger needs an armature with mass, but `mass` is 0.")
 
 
 def check_instruments(instruments: Instruments, sampling_rate: float) -> None:
     """Raise `ValueError` where the instruments' numbers cannot be at this rate (Hz)."""
     one = instruments
-    if min(one.force_noise, one.velocity_noise, one.bits, one.delay) < 0:
-        raise ValueError(f"the instruments' numbers must not be negative, but are {one}.")
-    if not min(one.force_range, one.velocity_range, one.filter_corner_hz) > 0:
-        raise ValueError(f"the instruments' ranges and corner must be positive, but are {one}.")
-    if int(one.delay) != one.delay or int(one.filter_order) != one.filter_order:
-        raise ValueError(f"`delay` and `filter_order` must be whole numbers, but are {one}.")
+    if min(one.force_noise, one.velocity_noise) < 0:
+        raise ValueError(f"the instruments' noise must not be negative, but is {one}.")
+    if not one.filter_corner_hz > 0 or int(one.filter_order) != one.filter_order:
+        raise ValueError(
+            f"`filter_corner_hz` must be positive and `filter_order` a whole number, but are {one}."
+        )
     filtered = np.isfinite(one.filter_corner_hz)
     if filtered and not (one.filter_corner_hz <= sampling_rate / 2 and one.filter_order >= 1):
         raise ValueError(

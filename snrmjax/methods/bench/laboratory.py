@@ -9,9 +9,8 @@ images about the sampling rate, which alias into the sampled force. The equation
 integrated by the classical method of Runge and Kutta, of order 4, in substeps of equal length;
 sliders are moved exactly after each of them.
 
-References: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
-doi:10.1016/0022-460X(79)90681-9; for the flexible stinger, K. G. McConnell & P. S. Varoto,
-Vibration Testing (2008), chapter 7.
+Reference: for the shaker, G. R. Tomlinson, J. Sound Vib. 63 (1979) 337,
+doi:10.1016/0022-460X(79)90681-9.
 """
 
 import abc
@@ -85,7 +84,6 @@ class LabMotion(NamedTuple):
 
     displacement: Float[Array, " mode"]  # kg^1/2 m
     velocity: Float[Array, " mode"]  # kg^1/2 m/s
-    armature: Float[Array, "2"]  # displacement (m) and velocity (m/s); used with a flexible stinger
     memory: tuple[Float[Array, " state"], ...]  # of friction, one entry an effect
 
 
@@ -98,7 +96,6 @@ class LabState(NamedTuple):
     voltage: Float[Array, "3"]  # of the amplifier at the last three samples, V
     seen: Float[Array, " channel"]  # force (N) and velocity (m/s) behind the anti-alias filter
     filtered: Float[Array, "section 2 channel"]  # memory of the anti-alias filter
-    late: Float[Array, "delay channel"]  # samples on their way, the next one first
     largest: Float[Array, ""]  # |q| of the mode of interest so far, kg^1/2 m
 
 
@@ -106,8 +103,8 @@ class Laboratory(eqx.Module):
     """A structure on a shaker with its instruments.
 
     `sampling_rate` in Hz is that of the controller and of the records; each sample is integrated
-    in `substeps`, of which the fastest linear motion (a contact that is closed and the stinger
-    included) needs 20 a cycle. Effects with memory (friction) need `largest_displacement`, in m at
+    in `substeps`, of which the fastest linear motion (a contact that is closed included) needs 20 a
+    cycle. Effects with memory (friction) need `largest_displacement`, in m at
     the reference sensor: their sliders, and the width of a smoothed Coulomb force, are set for
     motions up to it. With `attached` False the shaker is away and nothing drives the structure.
     What is left of the voltage's images aliases into the force by about (ω period)⁴/38 of the
@@ -146,10 +143,26 @@ class Laboratory(eqx.Module):
         if self.sampling_rate * self.substeps < _FEWEST_STEPS * fastest:
             raise ValueError(
                 f"`sampling_rate` times `substeps` must be {_FEWEST_STEPS} times the highest "
-                f"frequency of structure, contacts and stinger, {fastest:.4g} Hz, or more, but is "
+                f"frequency of structure and contacts, {fastest:.4g} Hz, or more, but is "
                 f"{self.sampling_rate * self.substeps:g} Hz: "
                 f"{int(np.ceil(_FEWEST_STEPS * fastest / self.sampling_rate))} substeps would do."
             )
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency of the mode of interest, rad/s."""
+        modes = self.structure.modes
+        return float(modes.natural_frequency[modes.mode_of_interest])
+
+    @property
+    def decay(self) -> float:
+        """ζω of the mode of interest, 1/s."""
+        modes = self.structure.modes
+        return float(modes.damping_ratio[modes.mode_of_interest]) * self.frequency
+
+    def samples(self, cycles: float) -> int:
+        """How many samples so many cycles of the mode of interest have."""
+        return round(cycles * self.sampling_rate * 2 * np.pi / self.frequency)
 
     def at_rest(self, controller: AbstractController) -> LabState:
         """The state before anything moves."""
@@ -157,13 +170,12 @@ class Laboratory(eqx.Module):
         memory = tuple(memory_at_rest(e, jnp.zeros(())) for e in self.friction())
         sections = len(filter_sections(self.instruments, self.sampling_rate * self.substeps))
         return LabState(
-            LabMotion(jnp.zeros(n), jnp.zeros(n), jnp.zeros(2), memory),
+            LabMotion(jnp.zeros(n), jnp.zeros(n), memory),
             controller.initial(),
             jnp.zeros(()),
             jnp.zeros(3),
             jnp.zeros(2),
             jnp.zeros((sections, 2, 2)),
-            jnp.zeros((int(self.instruments.delay), 2)),
             jnp.zeros(()),
         )
 
@@ -177,9 +189,8 @@ class Laboratory(eqx.Module):
         """The effects with a memory, set for motions up to `largest_displacement`."""
         if not self.structure.hysteretic:
             return ()
-        modes = self.structure.modes
-        omega = float(modes.natural_frequency[modes.mode_of_interest])
-        return scaled_friction(self.structure, self.reach(), self.reach() * omega / np.sqrt(2))
+        speed = self.reach() * self.frequency / np.sqrt(2)
+        return scaled_friction(self.structure, self.reach(), speed)
 
 
 def detached(laboratory: Laboratory) -> Laboratory:
@@ -239,11 +250,8 @@ def _run(
         return jnp.stack([slope(motion, voltage)[1], turn * (shape @ motion.velocity)])
 
     def sample(state: LabState, drawn: Array) -> tuple[LabState, tuple]:
-        arriving = jnp.concatenate([state.late, state.seen[None]])
-        force = arriving[0, 0] + ins.force_noise * drawn[0]
-        speed = arriving[0, 1] + ins.velocity_noise * drawn[1]
-        force = _recorded(force, ins.force_range, ins.bits)
-        speed = _recorded(speed, ins.velocity_range, ins.bits)
+        force = state.seen[0] + ins.force_noise * drawn[0]
+        speed = state.seen[1] + ins.velocity_noise * drawn[1]
         control, command, report = controller.step(
             state.controller, Sample(state.time, force, speed), period
         )
@@ -266,7 +274,7 @@ def _run(
         largest = jnp.maximum(state.largest, jnp.abs(motion.displacement[j]))
         after = LabState(
             *(motion, control, state.time + period, known[1:], seen, filtered),
-            *(arriving[1:], largest),
+            largest,
         )
         return after, (state.time, voltage, force, speed, report)
 
@@ -305,23 +313,16 @@ def _equations(
         for effect, own in zip(friction, motion.memory, strict=True):
             inner = inner.at[j].add(effect.state_force(q[j], v[j], own))
         free = -inner / terms.mass
-        armature = jnp.zeros(2)
-        if not attached:
-            force = jnp.zeros(())
-        elif np.isinf(shaker.stinger_stiffness):
+        force = jnp.zeros(())
+        if attached:
             # The armature's inertia is part of the force: F = push − m (Γ·q̈), q̈ = free + Γ F.
             push = pushed(drive @ q, drive @ v, voltage)
             force = (push - shaker.mass * (drive @ free)) / inertia
-        else:
-            at, speed = motion.armature
-            force = shaker.stinger_stiffness * (at - drive @ q)
-            force = force + shaker.stinger_damping * (speed - drive @ v)
-            armature = jnp.stack([speed, (pushed(at, speed, voltage) - force) / shaker.mass])
         memory = tuple(
             memory_rate(effect, q[j], v[j], own)
             for effect, own in zip(friction, motion.memory, strict=True)
         )
-        return LabMotion(v, free + per_force * force, armature, memory), force
+        return LabMotion(v, free + per_force * force, memory), force
 
     return slope
 
@@ -383,17 +384,6 @@ def _filtered(
     return value, jnp.stack(kept)
 
 
-def _recorded(value: Array, limit: float, bits: int) -> Array:
-    """A value after clipping and the converter."""
-    if not np.isfinite(limit):
-        return value
-    clipped = jnp.clip(value, -limit, limit)
-    if not bits:
-        return clipped
-    step = 2 * limit / 2**bits
-    return step * jnp.round(clipped / step)
-
-
 def _fastest(structure: Structure, shaker: Shaker) -> float:
     """Largest |eigenvalue| (rad/s) of structure and shaker, closed contacts included."""
     model = simulated_structure(structure)
@@ -407,25 +397,13 @@ def _fastest(structure: Structure, shaker: Shaker) -> float:
             stiffness[j, j] += float(jnp.max(slope))
     drive = np.asarray(model.modes.participation)
     coil = shaker.damping + shaker.motor_constant**2 / shaker.resistance
-    rigid = np.isinf(shaker.stinger_stiffness)
-    own, link = (np.outer(drive, drive), None) if rigid else _with_armature(drive)
-    if link is not None:
-        mass, damping, stiffness = (np.pad(matrix, (0, 1)) for matrix in (mass, damping, stiffness))
-        stiffness += shaker.stinger_stiffness * link
-        damping += shaker.stinger_damping * link
+    own = np.outer(drive, drive)
     mass, damping = mass + shaker.mass * own, damping + coil * own
     stiffness = stiffness + shaker.stiffness * own
-    size = n + (not rigid)
     state = np.block(
         [
-            [np.zeros((size, size)), np.eye(size)],
+            [np.zeros((n, n)), np.eye(n)],
             [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)],
         ]
     )
     return float(np.abs(np.linalg.eigvals(state)).max())
-
-
-def _with_armature(drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The armature's own coordinate behind the modes, and the stinger's stretch, squared."""
-    armature, stretch = np.append(0 * drive, 1.0), np.append(-drive, 1.0)
-    return np.outer(armature, armature), np.outer(stretch, stretch)

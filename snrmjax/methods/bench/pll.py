@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from snrmjax.methods.bench.equipment import positive
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.held_phasors import (
     HANN,
@@ -104,9 +105,7 @@ class PhaseLockedLoop(AbstractController):
 
 def standard_gains(laboratory: Laboratory) -> LoopGains:
     """Gains from the linear mode of interest: a filter of ω/20 and a loop of a sixth of that."""
-    modes = laboratory.structure.modes
-    omega = float(modes.natural_frequency[modes.mode_of_interest])
-    return LoopGains(omega / 20, omega / 120)
+    return LoopGains(laboratory.frequency / 20, laboratory.frequency / 120)
 
 
 def phase_locked_loop(
@@ -137,9 +136,7 @@ def phase_locked_loop(
     A loop that has not come to rest is off by some times what it still drifts, which 1σ does not
     know: 0.005 % of the frequency after 300 cycles at a large step under v|v|, nothing after 900.
     """
-    levels = np.asarray(voltages, dtype=float).ravel()
-    if not levels.size or not np.all(np.isfinite(levels) & (levels > 0)):
-        raise ValueError(f"`voltages` must be positive and finite, but are {voltages}.")
+    levels = positive("voltages", voltages)
     if settle_cycles < 1 or record_cycles < 1:
         raise ValueError(
             f"`settle_cycles` and `record_cycles` must be 1 or more, but are {settle_cycles} and "
@@ -258,12 +255,9 @@ def lock_in(
     level before, by default rest; the others as there.
     """
     rates = standard_gains(laboratory) if gains is None else gains
-    modes = laboratory.structure.modes
-    j = modes.mode_of_interest
-    omega, ratio = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
-    cycle = laboratory.sampling_rate * 2 * np.pi / omega
-    settle, keep = round(settle_cycles * cycle), round(record_cycles * cycle)
-    numbers = (voltage, omega, ratio * omega, *rates, phase)
+    decay = laboratory.decay
+    settle, keep = laboratory.samples(settle_cycles), laboratory.samples(record_cycles)
+    numbers = (voltage, laboratory.frequency, decay, *rates, phase)
     loop = PhaseLockedLoop(*(jnp.asarray(value, dtype=float) for value in numbers))
     record, state = run_test(laboratory, loop, settle + keep, start=start, seed=seed)
     frequency, angle, force, velocity = (
@@ -275,7 +269,7 @@ def lock_in(
     period = 1 / laboratory.sampling_rate
     noise = [noise_of_sample(signal, angle) for signal in (force, velocity)]
     locked = _Locked(
-        *(frequency, force * turned, velocity * turned, ratio * omega, phase),
+        *(frequency, force * turned, velocity * turned, decay, phase),
         *(np.array(noise), period, rates),
     )
     seconds = (settle + keep) / laboratory.sampling_rate
@@ -284,7 +278,7 @@ def lock_in(
         return HeldPhase(lost, np.nan, np.nan, complex(np.nan), np.nan, state, seconds)
     push, speed = np.mean(locked.force), np.mean(locked.velocity)
     relative = complex(speed * np.conj(push) / np.abs(push))
-    point = locked.point(level, drive_point(modes))
+    point = locked.point(level, drive_point(laboratory.structure.modes))
     return HeldPhase(
         *(point, point.natural_frequency, float(np.abs(push)), relative, locked.velocity_std()),
         *(state, seconds),

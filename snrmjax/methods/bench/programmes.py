@@ -1,4 +1,4 @@
-"""Programmes of a test: stepped and swept sines, multisines and decays, as records in time.
+"""Programmes of a test: stepped sines, multisines, decays and tables of voltages, in time.
 
 A stepped sine may hold the voltage (open loop: force and response find themselves, and jump where
 a branch ends), or by its voltage the amplitude of force, velocity or displacement. The law is
@@ -10,7 +10,7 @@ References: for response control, T. Karaağaçlı & H. N. Özgüven, Mech. Syst
 Trans. Inf. Theory 16 (1970) 85, doi:10.1109/TIT.1970.1054411.
 """
 
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from snrmjax.identify.pointwise.snrm import reference_sensor
 from snrmjax.measure.records import steady_state_from_records
 from snrmjax.measure.states import SteadyStates, join_steady_states
+from snrmjax.methods.bench.equipment import positive
 from snrmjax.methods.bench.fourier_filter import FourierState, followed, nothing_followed
 from snrmjax.methods.bench.laboratory import (
     AbstractController,
@@ -53,7 +54,6 @@ class LaboratoryTest(NamedTuple):
     record: TestRecord
     seconds: float
     steps: TestSteps | None = None  # of a stepped sine
-    frequency: Float[np.ndarray, " sample"] | None = None  # rad/s, of a sweep
 
 
 class DecayTest(NamedTuple):
@@ -142,10 +142,7 @@ def standard_amplitude_gains(laboratory: Laboratory) -> AmplitudeGains:
     A branch that folds over at fixed frequency needs k > −d ln F/d ln X there; far from resonance
     a large k meets the filters' delay, and the loop rings.
     """
-    modes = laboratory.structure.modes
-    j = modes.mode_of_interest
-    omega = float(modes.natural_frequency[j])
-    return AmplitudeGains(omega / 3, 1.5, float(modes.damping_ratio[j]) * omega)
+    return AmplitudeGains(laboratory.frequency / 3, 1.5, laboratory.decay)
 
 
 def stepped_sine_test(
@@ -179,9 +176,8 @@ def stepped_sine_test(
         *(("target", target), ("frequencies", steps), ("first_voltage", first_voltage)),
         *(("settle_cycles", settle_cycles), ("record_cycles", record_cycles), ("gains", rates)),
     ):
-        _require_positive(name, values)
-    cycle = _samples_a_cycle(laboratory)
-    settle, keep = round(settle_cycles * cycle), round(record_cycles * cycle)
+        positive(name, values)
+    settle, keep = laboratory.samples(settle_cycles), laboratory.samples(record_cycles)
     approach = 0
     if held != "voltage":
         approach = round(_APPROACH / rates.integral_rate * laboratory.sampling_rate)
@@ -200,39 +196,6 @@ def stepped_sine_test(
     record, _ = run_test(laboratory, programme, count, seed=seed)
     first = approach + settle + np.arange(len(steps)) * (settle + keep)
     return LaboratoryTest(record, count / laboratory.sampling_rate, TestSteps(steps, first, keep))
-
-
-def sine_sweep_test(
-    laboratory: Laboratory,
-    voltage: float,
-    from_frequency: float,
-    to_frequency: float,
-    seconds: float,
-    *,
-    law: Literal["linear", "logarithmic"] = "linear",
-    seed: int = 0,
-) -> LaboratoryTest:
-    """Sweep a sine of constant voltage, up or down.
-
-    Arguments: `voltage` in V; frequencies in rad/s; `law` of the frequency over time. Returns a
-    `LaboratoryTest` with the frequency of the drive at each sample.
-    Raises `ValueError` for numbers that are not positive.
-    """
-    for name, value in (
-        *(("voltage", voltage), ("seconds", seconds)),
-        *(("from_frequency", from_frequency), ("to_frequency", to_frequency)),
-    ):
-        _require_positive(name, value)
-    if law not in ("linear", "logarithmic"):
-        raise ValueError(f"`law` must be linear or logarithmic, but is {law!r}.")
-    count = round(seconds * laboratory.sampling_rate)
-    spaced = np.linspace if law == "linear" else np.geomspace
-    frequency = spaced(from_frequency, to_frequency, count)
-    angle = np.cumsum(frequency) / laboratory.sampling_rate
-    record, _ = run_test(
-        laboratory, Playback(jnp.asarray(voltage * np.sin(angle))), count, seed=seed
-    )
-    return LaboratoryTest(record, seconds, frequency=frequency)
 
 
 def multisine_test(
@@ -258,7 +221,7 @@ def multisine_test(
         *(("rms_voltage", rms_voltage), ("periods", periods)),
         ("period_samples", period_samples),
     ):
-        _require_positive(name, value)
+        positive(name, value)
     if not every.size or every[0] < 1 or every[-1] >= period_samples / 2:
         raise ValueError(
             f"`lines` must lie between 1 and half of `period_samples`, {period_samples / 2:g}, but "
@@ -295,7 +258,7 @@ def decay_test(
     `phase_locked_loop`. Returns a `DecayTest`, whose velocity goes into `resonant_decay`.
     Raises `ValueError` for numbers that are not positive.
     """
-    _require_positive("decay_seconds", decay_seconds)
+    positive("decay_seconds", decay_seconds)
     held = lock_in(
         laboratory,
         voltage,
@@ -349,15 +312,3 @@ def steady_states_of(
             )
         )
     return join_steady_states(found)
-
-
-def _samples_a_cycle(laboratory: Laboratory) -> float:
-    modes = laboratory.structure.modes
-    omega = float(modes.natural_frequency[modes.mode_of_interest])
-    return laboratory.sampling_rate * 2 * np.pi / omega
-
-
-def _require_positive(name: str, values: Any) -> None:
-    each = np.asarray(values, dtype=float).ravel()
-    if not each.size or not np.all(np.isfinite(each) & (each > 0)):
-        raise ValueError(f"`{name}` must be positive and finite, but is {values}.")

@@ -41,11 +41,6 @@ class RestoringForce(NamedTuple):
     largest: float
     misfit: float  # rms of what the two forces leave, over the rms of the acceleration
 
-    def elastic_force(self, displacement: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """s(x) in m/s²."""
-        powers = np.arange(1, len(self.elastic) + 1)
-        return np.sum(self.elastic * displacement[..., None] ** powers, axis=-1)
-
     def damping_force(self, velocity: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """d(v) in m/s²."""
         return np.stack(_damping_terms(velocity), axis=-1) @ self.damping

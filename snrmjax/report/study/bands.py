@@ -1,13 +1,14 @@
 """Bands of curves over all members: where half of them lie, 95 % of them, and all of them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from snrmjax.report.study.scalars import force_texts, readable
 from snrmjax.study.computations.base import MEMBER
+from snrmjax.study.computations.responses import bounds_over
 
 if TYPE_CHECKING:
     import xarray
@@ -112,37 +113,9 @@ def band_panels(data: "xarray.Dataset") -> list[BandPanel]:
         if all(name in data for name in (kind.x, *kind.y)):
             found += _ragged(data, kind)
     if "natural_frequency_hz" in data and data["natural_frequency_hz"].dims == (MEMBER, _SHARE):
-        found += [_identified(data, name) for name in ("natural_frequency_hz", "damping_ratio")]
+        for name in ("natural_frequency_hz", "damping_ratio"):
+            found += _identified(data, name)
     return found
-
-
-def bounds_over(
-    curve: Int[np.ndarray, " row"],
-    x: Float[np.ndarray, " row"],
-    y: Float[np.ndarray, " row"],
-    at: Float[np.ndarray, " place"],
-    begins: Bool[np.ndarray, " row"],
-    n_curves: int,
-) -> tuple[Float[np.ndarray, "curve place"], Float[np.ndarray, "curve place"]]:
-    """Lowest and highest y of curves made of polylines at rising places x, NaN outside them.
-
-    Arguments: `curve` is the number of the curve of every point, `begins` whether a point begins a
-    polyline.
-    """
-    same = ~begins[1:]
-    x0, x1, y0, y1 = (part[same] for part in (x[:-1], x[1:], y[:-1], y[1:]))
-    first = np.searchsorted(at, np.minimum(x0, x1), side="left")
-    count = np.searchsorted(at, np.maximum(x0, x1), side="right") - first
-    segment = np.repeat(np.arange(len(x0)), count)
-    place = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count - first, count)
-    width = np.where(x1 == x0, 1.0, x1 - x0)
-    value = y0[segment] + (at[place] - x0[segment]) / width[segment] * (y1 - y0)[segment]
-    of_curve = curve[1:][same][segment]
-    low, high = np.full((n_curves, len(at)), np.inf), np.full((n_curves, len(at)), -np.inf)
-    np.minimum.at(low, (of_curve, place), value)
-    np.maximum.at(high, (of_curve, place), value)
-    none = ~np.isfinite(high)
-    return np.where(none, np.nan, low), np.where(none, np.nan, high)
 
 
 def _blocks(n: int) -> Iterator[tuple[int, int]]:
@@ -151,59 +124,64 @@ def _blocks(n: int) -> Iterator[tuple[int, int]]:
 
 
 def _gridded(data: "xarray.Dataset") -> list[BandPanel]:
-    at, titles = data[_GRID].values, force_texts(data)
-    n = data.sizes[MEMBER]
-    sets = [(_Collected(n, len(at)), _Collected(n, len(at))) for _ in titles]
-    for begin, end in _blocks(n):
-        for side, name in enumerate(("lower_velocity_m_s", "upper_velocity_m_s")):
-            rows = data[name][begin:end].values.reshape(end - begin, len(titles), len(at))
-            for k, pair in enumerate(sets):
-                pair[side].add(begin, rows[:, k])
-    return [
-        BandPanel(title, "Frequency of the force", "Velocity", "Hz", "m/s", *_pair(pair, at))
-        for title, pair in zip(titles, sets, strict=True)
-    ]
+    at = data[_GRID].values
+
+    def bounds(begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (data[f"{name}_velocity_m_s"][begin:end].values for name in ("lower", "upper"))
+        return low, high
+
+    return _panels(data, bounds, at, ("Frequency of the force", "Velocity", "Hz", "m/s"))
 
 
 def _ragged(data: "xarray.Dataset", kind: _Curves) -> list[BandPanel]:
-    titles, n = force_texts(data), data.sizes[MEMBER]
-    count = data["n_points"].values.reshape(n, len(titles))
+    n, count = data.sizes[MEMBER], data["n_points"].values
     if not count.sum():
         return []
     at = np.linspace(*_ends(data, kind.x, count.ravel()), _PLACES)
-    sets = [(_Collected(n, len(at)), _Collected(n, len(at))) for _ in titles]
-    row = 0
-    for begin, end in _blocks(n):
-        own = count[begin:end].ravel()
-        rows = slice(row, row + int(own.sum()))
-        row = rows.stop
+    first = np.append(0, np.cumsum(count.reshape(n, -1).sum(axis=1)))
+
+    def bounds(begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        rows, own = slice(first[begin], first[end]), count[begin:end].ravel()
         curve = np.repeat(np.arange(len(own)), own)
         x, y = data[kind.x][rows].values, kind.height(data, rows)
         begins = np.diff(curve, prepend=-1) != 0
         if "point_branch" in data:
             begins |= np.diff(data["point_branch"][rows].values, prepend=-1) != 0
-        bounds = bounds_over(curve, x, y, at, begins, len(own))
-        for side, values in enumerate(bounds):
+        return bounds_over(curve, x, y, at, begins, len(own))
+
+    x_unit = "Hz" if kind.x.endswith("_hz") else "m/s"
+    return _panels(data, bounds, at, (kind.x_label, kind.y_label, x_unit, kind.y_unit))
+
+
+def _panels(
+    data: "xarray.Dataset",
+    bounds: Callable[[int, int], tuple[np.ndarray, np.ndarray]],
+    at: Float[np.ndarray, " place"],
+    words: tuple[str, str, str, str],
+) -> list[BandPanel]:
+    """A panel for each force, from the lowest and highest values of some members at a time."""
+    titles, n = force_texts(data), data.sizes[MEMBER]
+    sets = [(_Collected(n, len(at)), _Collected(n, len(at))) for _ in titles]
+    for begin, end in _blocks(n):
+        for side, values in enumerate(bounds(begin, end)):
             by_force = values.reshape(end - begin, len(titles), len(at))
             for k, pair in enumerate(sets):
                 pair[side].add(begin, by_force[:, k])
-    x_unit = "Hz" if kind.x.endswith("_hz") else "m/s"
     return [
-        BandPanel(title, kind.x_label, kind.y_label, x_unit, kind.y_unit, *_pair(pair, at))
-        for title, pair in zip(titles, sets, strict=True)
+        BandPanel(title, *words, *_pair(pair, at)) for title, pair in zip(titles, sets, strict=True)
     ]
 
 
-def _identified(data: "xarray.Dataset", name: str) -> BandPanel:
+def _identified(data: "xarray.Dataset", name: str) -> list[BandPanel]:
     """Identified curves over their median velocity at each share of the amplitude range."""
-    velocity = np.nanmedian(data["velocity_m_s"].values, axis=0)
-    n = data.sizes[MEMBER]
-    sample = _Collected(n, len(velocity))
-    for begin, end in _blocks(n):
-        sample.add(begin, data[name][begin:end].values)
+
+    def bounds(begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        rows = data[name][begin:end].values
+        return rows, rows
+
+    at = np.nanmedian(data["velocity_m_s"].values, axis=0)
     unit = str(data[name].attrs.get("units", ""))
-    label = readable(name)
-    return BandPanel("", "Velocity", label, "m/s", unit, sample.band(velocity), None)
+    return _panels(data, bounds, at, ("Velocity", readable(name), "m/s", unit))
 
 
 def _pair(pair: tuple[_Collected, _Collected], at: np.ndarray) -> tuple[Band, Band | None]:

@@ -50,12 +50,13 @@ def main_effect(
     basis = _levels if listed else _splines
     scale = y.std()
     centred = (y - y.mean()) / scale
-    grams = [_gram(basis(x[k::_GROUPS], knots), centred[k::_GROUPS]) for k in range(_GROUPS)]
-    every = _Gram.total(grams)
-    share = every.share()
-    without = np.array([every.less(one).share() for one in grams])
+    # Sums over members from which a fit follows: products of the basis, the output and one.
+    table = np.column_stack([basis(x, knots), centred, np.ones(len(y))])
+    groups = [table[k::_GROUPS].T @ table[k::_GROUPS] for k in range(_GROUPS)]
+    every = np.sum(groups, axis=0)
+    coefficients, covariance, share = _fit(every)
+    without = np.array([_fit(every - one)[2] for one in groups])
     std = np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2))
-    coefficients, covariance = every.fit()
     rows = basis(at, knots)
     error = np.sqrt(np.maximum(np.sum((rows @ covariance) * rows, axis=1), 0.0))
     mean = y.mean() + scale * (rows @ coefficients)
@@ -75,49 +76,14 @@ def correlated_pairs(quantities: dict[str, Float[np.ndarray, " member"]]) -> lis
     return [(names[i], names[j]) for i, j in zip(*np.nonzero(np.triu(found, 1)), strict=True)]
 
 
-class _Gram(NamedTuple):
-    """Sums over members from which a least-squares fit follows."""
-
-    basis: Float[np.ndarray, "place place"]
-    with_output: Float[np.ndarray, " place"]
-    output: float  # Σ y
-    squared: float  # Σ y²
-    n: int
-
-    @classmethod
-    def total(cls, parts: "list[_Gram]") -> "_Gram":
-        return cls(*(sum(column[1:], column[0]) for column in zip(*parts, strict=True)))
-
-    def less(self, part: "_Gram") -> "_Gram":
-        return _Gram(
-            self.basis - part.basis,
-            self.with_output - part.with_output,
-            self.output - part.output,
-            self.squared - part.squared,
-            self.n - part.n,
-        )
-
-    def fit(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients and their covariance; a place without members has neither."""
-        inverse = np.linalg.pinv(self.basis, rcond=1e-10, hermitian=True)
-        coefficients = inverse @ self.with_output
-        freedom = max(self.n - len(coefficients), 1)
-        return coefficients, inverse * self._left(coefficients) / freedom
-
-    def _left(self, coefficients: np.ndarray) -> float:
-        """Sum of squared residuals."""
-        return max(float(self.squared - coefficients @ self.with_output), 0.0)
-
-    def share(self) -> float:
-        """Adjusted R²."""
-        coefficients, _ = self.fit()
-        residual = self._left(coefficients) / max(self.n - len(coefficients), 1)
-        variance = (self.squared - self.output**2 / self.n) / (self.n - 1)
-        return float(1.0 - residual / variance)
-
-
-def _gram(rows: np.ndarray, y: np.ndarray) -> _Gram:
-    return _Gram(rows.T @ rows, rows.T @ y, float(y.sum()), float(y @ y), len(y))
+def _fit(sums: Float[np.ndarray, "sum sum"]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Coefficients, their covariance and the adjusted R²; a place without members has neither."""
+    basis, with_output, n = sums[:-2, :-2], sums[:-2, -2], sums[-1, -1]
+    inverse = np.linalg.pinv(basis, rcond=1e-10, hermitian=True)
+    coefficients = inverse @ with_output
+    left = max(sums[-2, -2] - coefficients @ with_output, 0.0) / max(n - len(coefficients), 1)
+    variance = (sums[-2, -2] - sums[-2, -1] ** 2 / n) / (n - 1)
+    return coefficients, inverse * left, float(1.0 - left / variance)
 
 
 def _knots(x: Float[np.ndarray, " member"]) -> Float[np.ndarray, " knot"]:

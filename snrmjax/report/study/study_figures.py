@@ -47,15 +47,22 @@ def distributions_figure(outputs: Sequence[Sequence[Scalar]]) -> Figure:
 
     Arguments: each of `outputs` is one output, for every force.
     """
-    columns = min(_ACROSS, len(outputs))
-    rows = -(-len(outputs) // columns)
-    figure, grid = panels(PAGE if columns > 1 else COLUMN, _ROW * rows + 0.3, rows, columns)
-    for axes, output in zip(grid.flat, outputs, strict=False):
+    figure, every = _grid(len(outputs), _ROW, 0.3)
+    for axes, output in zip(every, outputs, strict=True):
         _histogram(axes, output)
-    for axes in grid.flat[len(outputs) :]:
-        axes.set_visible(False)
     legend(figure)
     return figure
+
+
+def _grid(n: int, row: float, legends: float) -> tuple[Figure, list[Axes]]:
+    """A figure of n panels in rows; heights in inches."""
+    columns = min(_ACROSS, n)
+    rows = -(-n // columns)
+    width = PAGE if columns > 1 else COLUMN
+    figure, grid = panels(width, row * rows + legends, rows, columns)
+    for axes in grid.flat[n:]:
+        axes.set_visible(False)
+    return figure, list(grid.flat[:n])
 
 
 def _histogram(axes: Axes, output: Sequence[Scalar]) -> None:
@@ -158,11 +165,9 @@ def _share(axes: Axes, shown: EffectPanels, name: str) -> None:
 
 def bands_figure(shown: Sequence[BandPanel]) -> Figure:
     """Bands of curves over all members, a panel for each force or curve."""
-    columns = min(_ACROSS, len(shown))
-    rows = -(-len(shown) // columns)
-    figure, grid = panels(PAGE if columns > 1 else COLUMN, 2.8 * rows + 0.4, rows, columns)
+    figure, every = _grid(len(shown), 2.8, 0.4)
     several = any(panel.lower is not None for panel in shown)
-    for panel, axes in zip(shown, grid.flat, strict=False):
+    for panel, axes in zip(shown, every, strict=True):
         alike = [one.upper.most for one in shown if one.y == panel.y]
         y = display_on_axis(np.concatenate(alike), panel.y_unit)
         x = display_on_axis(panel.upper.at, panel.x_unit)
@@ -170,8 +175,6 @@ def bands_figure(shown: Sequence[BandPanel]) -> Figure:
         if panel.lower is not None:
             _band(axes, panel.lower, (x, y), IDENTIFIED, "lowest value")
         name_axes(axes, plain(panel.title), x.labelled(panel.x), y.labelled(panel.y))
-    for axes in grid.flat[len(shown) :]:
-        axes.set_visible(False)
     legend(figure)
     return figure
 
@@ -197,14 +200,11 @@ def failures_figure(
     Arguments: `quantities` in the order in which they tell failed members from whole ones.
     """
     names = list(quantities)
-    n = len(names) + 1
-    columns = min(_ACROSS, n)
-    rows = -(-n // columns)
-    figure, grid = panels(PAGE, 2.6 * rows + 0.5, rows, columns)
-    _map(grid.flat[0], failures, [quantities[name] for name in names[:2]])
+    figure, every = _grid(len(names) + 1, 2.6, 0.5)
+    _map(every[0], failures, [quantities[name] for name in names[:2]])
     second = plain(_named(names[1], units)) if len(names) > 1 else "Number of the member"
-    name_axes(grid.flat[0], "Failed members", plain(_named(names[0], units)), second)
-    for axes, name in zip(grid.flat[1:], names, strict=False):
+    name_axes(every[0], "Failed members", plain(_named(names[0], units)), second)
+    for axes, name in zip(every[1:], names, strict=True):
         found = failure_share(quantities[name], failures.failed)
         middle = 0.5 * (found.edges[1:] + found.edges[:-1])
         shown: Style = {"color": IDENTIFIED, "alpha": 0.35}
@@ -213,8 +213,6 @@ def failures_figure(
         style: Style = {"fmt": "none", "ecolor": "0.3", "elinewidth": 0.8}
         axes.errorbar(middle, 100 * found.share, bars, **style, label="95 % interval")
         name_axes(axes, "", plain(_named(name, units)), "Failed (%)")
-    for axes in grid.flat[n:]:
-        axes.set_visible(False)
     legend(figure)
     return figure
 

@@ -1,103 +1,37 @@
-"""Figures of propagated uncertainty, of where derivatives fail, and of sensitivity indices."""
+"""Figures of propagated uncertainty and of sensitivity indices."""
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
 
 from snrmjax.report.style import (
-    BACKGROUND,
     COLUMN,
-    CURVE,
-    EXCLUDED,
-    LINE,
     PAGE,
     SERIES,
-    SIMULATED,
     SMALL,
     legend,
     name_axes,
     panels,
 )
 from snrmjax.study.uncertainty.propagation import METHOD_NAMES, Propagation
-from snrmjax.study.uncertainty.scatter_study import ScatterStudy
 from snrmjax.study.uncertainty.sensitivity import SobolIndices
-
-_COLOURS = (SERIES[0], SERIES[1], SERIES[2], SIMULATED)  # of the methods
-_ROW = 1.9  # inches: a row of panels
 
 
 def propagation_figure(result: Propagation) -> Figure:
-    """Members of every quantity, first order's normal distribution, and all 95 % ranges.
-
-    Returns the figure. Raises `ValueError` when no quantity has a member.
-    """
-    shown = [q for q in range(len(result.names)) if np.isfinite(result.members.values[:, q]).any()]
-    if not shown:
-        raise ValueError("there is nothing to show: no quantity of any member was found.")
-    columns = min(len(shown), 2)
-    rows = -(-len(shown) // columns)
-    figure, grid = panels(PAGE if columns > 1 else COLUMN, 0.6 + _ROW * rows, rows, columns)
-    for axes, q in zip(grid.flat, shown, strict=False):
-        _distribution(axes, result, q)
-    for axes in grid.flat[len(shown) :]:
+    """Mean and 95 % range of every quantity by first and by second order. Returns the figure."""
+    names = result.quantities.names
+    columns = min(len(names), 2)
+    rows = -(-len(names) // columns)
+    figure, grid = panels(PAGE if columns > 1 else COLUMN, 0.6 + 1.1 * rows, rows, columns)
+    for q, axes in enumerate(grid.flat[: len(names)]):
+        for m, (method, colour) in enumerate(zip(METHOD_NAMES, SERIES, strict=False)):
+            mean, _, lower, upper = result.statistics[m, :, q]
+            axes.plot([lower, upper], [-m, -m], color=colour, linewidth=2.0, label=method)
+            axes.plot(mean, -m, "o", color=colour, markersize=4.0)
+        axes.set_ylim(-1.6, 0.6)
+        axes.set_yticks([])
+        name_axes(axes, "", _label(names[q]), "")
+    for axes in grid.flat[len(names) :]:
         axes.set_visible(False)
-    legend(figure)
-    return figure
-
-
-def _distribution(axes: Axes, result: Propagation, q: int) -> None:
-    values = result.members.values[:, q]
-    values = values[np.isfinite(values)]
-    heights, *_ = axes.hist(values, bins=40, density=True, color=BACKGROUND, label="members")
-    mean, std = result.statistics[0, :2, q]
-    top = float(np.max(heights))
-    if std > 0:
-        x = np.linspace(mean - 3.5 * std, mean + 3.5 * std, 200)
-        density = stats.norm.pdf(x, mean, std)
-        axes.plot(x, density, color=_COLOURS[0], **CURVE, label="first order: normal")
-        top = max(top, float(density.max()))
-    for m, (method, colour) in enumerate(zip(METHOD_NAMES, _COLOURS, strict=True)):
-        middle, _, lower, upper = result.statistics[m, :, q]
-        height = -top * (0.07 + 0.08 * m)
-        name = f"mean and 95 %, {method}"
-        axes.plot([lower, upper], [height] * 2, color=colour, linewidth=2.0, label=name)
-        axes.plot(middle, height, "o", color=colour, markersize=4.0)
-    axes.set_ylim(-top * 0.4, top * 1.08)
-    axes.set_yticks([])
-    name_axes(axes, "", _label(result.names[q]), "Density")
-
-
-def scatter_figure(study: ScatterStudy) -> Figure:
-    """The largest error of first order against the scale of the inputs' scatter.
-
-    Frequencies above, velocities below; dashed what second order errs by; a line at 10 %. Returns
-    the figure.
-    """
-    places: dict[str, list[int]] = {}
-    for q, name in enumerate(study.names):
-        kind = "Frequencies" if name.endswith("_hz") else "Velocities"
-        kind = kind if name.endswith(("_hz", "_m_s")) else "Quantities"
-        places.setdefault(kind, []).append(q)
-    figure, grid = panels(COLUMN, 0.8 + 2.3 * len(places), len(places), 1)
-    for axes, (kind, own) in zip(grid.flat, places.items(), strict=True):
-        for k, q in enumerate(own):
-            colour = SERIES[k % len(SERIES)]
-            first = np.nanmax(study.first_order_error[:, :, q], axis=1)
-            second = np.nanmax(study.second_order_error[:, :, q], axis=1)
-            name = study.names[q].removesuffix("_frequency_hz").removesuffix("_velocity_m_s")
-            # Peak and resonance often err alike: the later ones are thinner, so that both are seen.
-            width = LINE * max(2.0 - 0.4 * k, 0.6)
-            label = name.replace("_", " ")
-            axes.loglog(study.scale, first, color=colour, linewidth=width, label=label)
-            axes.loglog(study.scale, second, "--", color=colour, linewidth=0.8)
-        axes.axhline(0.1, color=EXCLUDED, linewidth=0.8)
-        axes.set_ylim(1e-3, max(2.0, axes.get_ylim()[1]))
-        low, high = np.ceil(np.log2(study.scale[0])), np.floor(np.log2(study.scale[-1]))
-        ticks = 2.0 ** np.arange(low, high + 1)
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.set_xticks([], minor=True)
-        name_axes(axes, kind, "Scatter over the stated one", "Error (dashed: second order)")
     legend(figure)
     return figure
 
@@ -141,13 +75,18 @@ def sensitivity_figure(indices: SobolIndices) -> Figure:
 
 
 def _label(name: str) -> str:
-    """A column's name in words, with its unit.
+    """An output's name in words, with its unit.
 
-    >>> _label("fold_1_frequency_hz")
-    'Fold 1 frequency (Hz)'
+    >>> _label("peak_frequency_hz at 0.01 N")
+    'Peak frequency (Hz) at 0.01 N'
     """
-    for end, unit in (("_hz", " (Hz)"), ("_m_s", " (m/s)")):
-        if name.endswith(end):
-            name = name.removesuffix(end) + unit
-    words = name.replace("_", " ", name.split(" (")[0].count("_"))
-    return words[:1].upper() + words[1:]
+    name, at, force = name.partition(" at ")
+    unit = next((end for end in ("_hz", "_m_s") if name.endswith(end)), "")
+    words = name.removesuffix(unit).replace("_", " ")
+    return (
+        words[:1].upper()
+        + words[1:]
+        + {"_hz": " (Hz)", "_m_s": " (m/s)"}.get(unit, "")
+        + at
+        + force
+    )

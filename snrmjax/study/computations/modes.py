@@ -1,5 +1,6 @@
 """Nonlinear normal modes of the members, and their damped modes."""
 
+import abc
 from typing import ClassVar
 
 import equinox as eqx
@@ -30,23 +31,36 @@ _SUMMARY = {
 }
 
 
-class NormalModes(AbstractComputation):
-    """The undamped nonlinear normal mode of interest up to a frequency (rad/s)."""
+class AbstractModes(AbstractComputation):
+    """A nonlinear mode of every member, point by point."""
 
-    kind: ClassVar[str] = "nnm"
     members_a_chunk: ClassVar[int] = 32
     driven: ClassVar[bool] = False
-
-    to_frequency: float
-    harmonic_order: int = eqx.field(static=True, default=9)
+    further: ClassVar[tuple[str, str, str]]  # what a point has beside frequency and velocity
 
     def outputs(self) -> dict[str, Output]:
         """See `AbstractComputation.outputs`."""
-        return {**_SUMMARY, "point_energy_j": Output(_AT, "f8", "J", "energy of the motion")}
+        name, unit, meaning = self.further
+        return {**_SUMMARY, name: Output(_AT, "f8", unit, meaning)}
 
     def rows(self, members: Members) -> dict[str, np.ndarray]:
         """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **_nothing("point_energy_j"))
+        none = _rows(CurveStatus.INVALID, np.zeros(0), np.zeros(0))
+        return one_by_one(members, self._one, **none, **{self.further[0]: np.zeros(0)})
+
+    @abc.abstractmethod
+    def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
+        """The rows of one member."""
+
+
+class NormalModes(AbstractModes):
+    """The undamped nonlinear normal mode of interest up to a frequency (rad/s)."""
+
+    kind: ClassVar[str] = "nnm"
+    further: ClassVar[tuple[str, str, str]] = ("point_energy_j", "J", "energy of the motion")
+
+    to_frequency: float
+    harmonic_order: int = eqx.field(static=True, default=9)
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         found = nonlinear_normal_mode(model, self.to_frequency, harmonic_order=self.harmonic_order)
@@ -54,23 +68,14 @@ class NormalModes(AbstractComputation):
         return {**_rows(found.status, found.frequency, speed), "point_energy_j": found.energy}
 
 
-class DampedModes(AbstractComputation):
+class DampedModes(AbstractModes):
     """The damped nonlinear mode of interest up to a velocity (m/s)."""
 
     kind: ClassVar[str] = "damped_nnm"
-    members_a_chunk: ClassVar[int] = 32
-    driven: ClassVar[bool] = False
+    further: ClassVar[tuple[str, str, str]] = ("point_damping_ratio", "1", "damping ratio")
 
     largest_velocity: float
     harmonic_order: int = eqx.field(static=True, default=9)
-
-    def outputs(self) -> dict[str, Output]:
-        """See `AbstractComputation.outputs`."""
-        return {**_SUMMARY, "point_damping_ratio": Output(_AT, "f8", "1", "damping ratio")}
-
-    def rows(self, members: Members) -> dict[str, np.ndarray]:
-        """See `AbstractComputation.rows`."""
-        return one_by_one(members, self._one, **_nothing("point_damping_ratio"))
 
     def _one(self, model: Structure, force: np.ndarray | None, seed: int) -> dict:
         found = damped_normal_mode(model, self.largest_velocity, harmonic_order=self.harmonic_order)
@@ -90,8 +95,3 @@ def _rows(status: CurveStatus, frequency: np.ndarray, speed: np.ndarray) -> dict
         "point_frequency_hz": frequency / HERTZ,
         "point_velocity_m_s": speed,
     }
-
-
-def _nothing(further: str) -> dict:
-    none = _rows(CurveStatus.INVALID, np.zeros(0), np.zeros(0))
-    return {**none, further: np.zeros(0)}

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from snrmjax.model.structures import Structure
 from snrmjax.simulate.balance.labelled import HERTZ
@@ -222,22 +222,40 @@ def velocity_bounds(
     curves: Sequence[ResponseCurve], frequencies: Float[np.ndarray, " frequency"]
 ) -> Float[np.ndarray, "bound frequency"]:
     """Lowest and highest velocity of a response at given frequencies (rad/s), NaN outside it."""
-    low, high = np.full(len(frequencies), np.inf), np.full(len(frequencies), -np.inf)
-    for one in curves:
-        speed = np.abs(one.velocity[:, 1, 0])
-        begin, end = one.frequency[:-1], one.frequency[1:]
-        for k in np.flatnonzero(begin != end).tolist():
-            left, right = sorted((begin[k], end[k]))
-            inside = slice(*np.searchsorted(frequencies, [left, right], side="left"))
-            share = (frequencies[inside] - begin[k]) / (end[k] - begin[k])
-            value = speed[k] + share * (speed[k + 1] - speed[k])
-            low[inside] = np.minimum(low[inside], value)
-            high[inside] = np.maximum(high[inside], value)
-        for edge in (0, -1) if len(speed) else ():
-            at = frequencies == one.frequency[edge]
-            low[at], high[at] = np.fmin(low[at], speed[edge]), np.fmax(high[at], speed[edge])
-    missing = ~np.isfinite(high)
-    return np.where(missing, np.nan, np.array([low, high]))
+    x = np.concatenate([one.frequency for one in curves])
+    speed = np.concatenate([np.abs(one.velocity[:, 1, 0]) for one in curves])
+    begins = np.concatenate([np.arange(len(one.frequency)) == 0 for one in curves])
+    low, high = bounds_over(np.zeros(len(x), dtype=int), x, speed, frequencies, begins, 1)
+    return np.concatenate([low, high])
+
+
+def bounds_over(
+    curve: Int[np.ndarray, " row"],
+    x: Float[np.ndarray, " row"],
+    y: Float[np.ndarray, " row"],
+    at: Float[np.ndarray, " place"],
+    begins: Bool[np.ndarray, " row"],
+    n_curves: int,
+) -> tuple[Float[np.ndarray, "curve place"], Float[np.ndarray, "curve place"]]:
+    """Lowest and highest y of curves made of polylines at rising places x, NaN outside them.
+
+    Arguments: `curve` is the number of the curve of every point, `begins` whether a point begins a
+    polyline.
+    """
+    same = ~begins[1:]
+    x0, x1, y0, y1 = (part[same] for part in (x[:-1], x[1:], y[:-1], y[1:]))
+    first = np.searchsorted(at, np.minimum(x0, x1), side="left")
+    count = np.searchsorted(at, np.maximum(x0, x1), side="right") - first
+    segment = np.repeat(np.arange(len(x0)), count)
+    place = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count - first, count)
+    width = np.where(x1 == x0, 1.0, x1 - x0)
+    value = y0[segment] + (at[place] - x0[segment]) / width[segment] * (y1 - y0)[segment]
+    of_curve = curve[1:][same][segment]
+    low, high = np.full((n_curves, len(at)), np.inf), np.full((n_curves, len(at)), -np.inf)
+    np.minimum.at(low, (of_curve, place), value)
+    np.maximum.at(high, (of_curve, place), value)
+    none = ~np.isfinite(high)
+    return np.where(none, np.nan, low), np.where(none, np.nan, high)
 
 
 def _at_folds(curves: Sequence[ResponseCurve]) -> Float[np.ndarray, "quantity fold"]:

@@ -1,136 +1,254 @@
-"""Quantities of uncertain inputs: what uncertainty is propagated to."""
+"""Quantities of uncertain numbers with both derivatives: events of a response, or any function."""
 
-import abc
-from collections.abc import Callable
-from enum import IntEnum
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
-from snrmjax.numerics.blocks import by_blocks, mapped
-from snrmjax.numerics.compiled import jitted
-from snrmjax.study.uncertainty.uncertain_inputs import UncertainInputs
+from snrmjax.model.parameters import checked_names, with_parameters
+from snrmjax.model.structures import Structure
+from snrmjax.numerics.compiled import compiled
+from snrmjax.simulate.balance.labelled import HERTZ
+from snrmjax.simulate.continuation.response_curve import ResponseCurve
+from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
+from snrmjax.simulate.solutions.periodic_motion import periodic_motion
+from snrmjax.study.variations import AbstractVariation
 
-_BLOCK = 64  # members that one call works on
-
-
-class MemberStatus(IntEnum):
-    """What became of one quantity of one member."""
-
-    FOUND = 0
-    REPLACED = 1  # the motion could not be followed; the whole response curve has one in its place
-    CEASED = 2  # neither followed nor on the whole response curve
-    IMPOSSIBLE = 3  # inputs that no structure has, such as a negative damping ratio
-    NOT_FINITE = 4  # a function's value is NaN or infinite
+FORCE = "force_n"
+EventKind = Literal["peak", "fold", "phase_resonance"]
+ModelOf = Callable[[dict[str, Array]], Structure]
 
 
-MEMBER_MESSAGE: dict[MemberStatus, str] = {
-    MemberStatus.FOUND: "found",
-    MemberStatus.REPLACED: "another motion in place of the nominal one, which two folds or peaks"
-    " that merge, or an internal resonance, end on the way to these inputs",
-    MemberStatus.CEASED: "no such motion: two folds or peaks merge on the way to these inputs",
-    MemberStatus.IMPOSSIBLE: "impossible inputs (a natural frequency, damping ratio or force that"
-    " is not positive)",
-    MemberStatus.NOT_FINITE: "a value that is not finite",
-}
+class Quantities(eqx.Module):
+    """Named quantities about z = 0, by the standard normal numbers z of what is uncertain.
 
-
-class Expansion(NamedTuple):
-    """Quantities about z = 0, the nominal inputs, by the standard normal numbers z."""
-
-    value: Float[np.ndarray, " quantity"]
-    gradient: Float[np.ndarray, "quantity input"]
-    hessian: Float[np.ndarray, "quantity input input"]
-
-
-class SolvedMembers(NamedTuple):
-    """Quantities of members; NaN where the status is neither `FOUND` nor `REPLACED`."""
-
-    values: Float[np.ndarray, "member quantity"]
-    status: Int[np.ndarray, "member quantity"]  # a `MemberStatus` each
-
-
-class AbstractQuantities(eqx.Module):
-    """Named quantities as functions of uncertain inputs."""
-
-    inputs: eqx.AbstractVar[UncertainInputs]
-    names: eqx.AbstractVar[tuple[str, ...]]
-    units: eqx.AbstractVar[tuple[str, ...]]
-
-    @abc.abstractmethod
-    def expansion(self) -> Expansion:
-        """Values, gradients and Hessians at the nominal inputs."""
-
-    @abc.abstractmethod
-    def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
-        """The quantities of every member."""
-
-    @abc.abstractmethod
-    def gradients(
-        self, z: Float[np.ndarray, "member input"]
-    ) -> tuple[SolvedMembers, Float[np.ndarray, "member quantity input"]]:
-        """The quantities of every member and their derivatives by z."""
-
-
-class FunctionQuantities(AbstractQuantities):
-    """The results of a differentiable JAX function of the inputs' values.
-
-    `function` takes a vector of inputs and gives one of quantities; NaN says that it failed.
-
-    >>> import jax.numpy as jnp
-    >>> from snrmjax.study.uncertainty.uncertain_inputs import correlated_inputs
-    >>> inputs = correlated_inputs(["a", "b"], [1.0, 2.0], [[0.01, 0.0], [0.0, 0.04]])
-    >>> area = FunctionQuantities(lambda x: x[:1] * x[1], inputs, ("area",), ("m^2",))
-    >>> area.expansion().gradient.round(12).tolist()
-    [[0.2, 0.2]]
+    Every uncertain number has its median at z = 0, which for a lognormal one is below its mean.
     """
 
-    function: Callable[[Float[Array, " input"]], Float[Array, " quantity"]]
-    inputs: UncertainInputs
+    value: Float[np.ndarray, " quantity"] = eqx.field(converter=np.asarray)
+    gradient: Float[np.ndarray, "quantity input"] = eqx.field(converter=np.asarray)
+    hessian: Float[np.ndarray, "quantity input input"] = eqx.field(converter=np.asarray)
     names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
-
-    def expansion(self) -> Expansion:
-        """See `AbstractQuantities`."""
-        value, gradient, hessian = _expanded(self, jnp.zeros(len(self.inputs.names)))
-        return Expansion(np.asarray(value), np.asarray(gradient), np.asarray(hessian))
-
-    def members(self, z: Float[np.ndarray, "member input"]) -> SolvedMembers:
-        """See `AbstractQuantities`."""
-        (values,) = by_blocks(lambda rows: (_values(self, rows),), _BLOCK, np.asarray(z))
-        return _finite_members(values)
-
-    def gradients(self, z: Float[np.ndarray, "member input"]) -> tuple[SolvedMembers, np.ndarray]:
-        """See `AbstractQuantities`."""
-        values, slopes = by_blocks(lambda rows: _with_slopes(self, rows), _BLOCK, np.asarray(z))
-        return _finite_members(values), slopes
-
-    def at(self, z: Float[Array, " input"]) -> Float[Array, " quantity"]:
-        """The quantities at standard normal numbers."""
-        return self.function(self.inputs.values(z))
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
 
-def _finite_members(values: np.ndarray) -> SolvedMembers:
-    finite = np.isfinite(values)
-    status = np.where(finite, int(MemberStatus.FOUND), int(MemberStatus.NOT_FINITE))
-    return SolvedMembers(np.where(finite, values, np.nan), status)
+def function_quantities(
+    function: Callable[[Float[Array, " input"]], Float[Array, " quantity"]],
+    varied: Sequence[AbstractVariation],
+    names: Sequence[str],
+) -> Quantities:
+    """The results of a JAX function of a vector of the uncertain numbers.
+
+    >>> from snrmjax.study.variations import normal
+    >>> varied = normal("a", 1.0, 0.1), normal("b", 2.0, 0.2)
+    >>> area = function_quantities(lambda x: x[:1] * x[1], varied, ["area_m2"])
+    >>> area.gradient.round(12).tolist()
+    [[0.2, 0.2]]
+    """
+    value, gradient, hessian = map(np.asarray, _of_function(function, tuple(varied)))
+    return Quantities(value, gradient, hessian, tuple(names))
 
 
-@jitted
-def _expanded(quantities: FunctionQuantities, z: Array) -> tuple[Array, Array, Array]:
-    slopes = jax.jacfwd(quantities.at)
-    return quantities.at(z), slopes(z), jax.jacfwd(slopes)(z)
+def response_quantities(
+    model: Structure,
+    varied: Sequence[AbstractVariation],
+    from_frequency: float,
+    to_frequency: float,
+    *,
+    force: float | None = None,
+    kinds: Sequence[EventKind] = ("peak", "fold", "phase_resonance"),
+    harmonic_order: int = 9,
+    model_of: ModelOf | None = None,
+) -> Quantities:
+    """Frequency (Hz) and velocity (m/s) of a response's events, by uncertain numbers.
+
+    The response at their medians is traced once. Of it are taken the highest peak of the
+    velocity fundamental at the first sensor, every fold in order along the curve and the strongest
+    phase resonance. Each solves the harmonic balance with its condition (see `periodic_motion`),
+    whose first and second derivatives follow from the implicit function theorem.
+
+    Arguments: `varied` as in a `Study`, by the names of `snrmjax.model.parameter_names` and
+    "force_n"; frequencies in rad/s, the range of the nominal response; `force` in N, unless it is
+    uncertain; `model_of`, a differentiable JAX function that makes the model of the numbers by
+    name, where they are no parameters of `model` (dimensions, say).
+    Returns `Quantities`; kinds of which the nominal curve has none are in its `notes`.
+    Raises `ValueError` for unknown names or kinds, a force that is missing or given twice, and
+    where the nominal curve has none of the events.
+    Validity: derivatives know nothing of what happens away from the medians (folds that merge,
+    another peak that becomes the highest): a `Study` of the same `varied` does.
+
+    >>> from snrmjax.model import flat_beam
+    >>> from snrmjax.study.variations import normal
+    >>> beam, varied = flat_beam(), [normal("mode_1.damping_ratio", 0.05, 0.005)]
+    >>> found = response_quantities(beam, varied, 480.0, 520.0, force=2e-4, harmonic_order=1)
+    >>> found.names[:2]
+    ('peak_frequency_hz', 'peak_velocity_m_s')
+    """
+    for kind in kinds:
+        if kind not in get_args(EventKind):
+            raise ValueError(f"`kinds` must be out of {get_args(EventKind)}, but has {kind!r}.")
+    inputs = _Inputs(tuple(varied))
+    for name in inputs.names:
+        if inputs.names.count(name) > 1:
+            raise ValueError(f"{name} varies twice.")
+    checked = [name for name in inputs.names if name != FORCE]
+    if checked and model_of is None:
+        checked_names(model, checked)
+    if (force is None) != (FORCE in inputs.names):
+        verb = "do not have" if force is None else "have"
+        raise ValueError(f"`force` must be given once, but it is {force!r} and `varied` {verb} it.")
+    load = np.asarray(1.0 if force is None else force, dtype=np.float64)
+    nominal = _Nominal(model, load, None if model_of is None else _series(model_of, inputs))
+    settings = ResponseSettings(harmonic_order=harmonic_order, stability=False)
+    middle, middle_force = nominal.at(inputs, jnp.zeros(len(inputs.names)))
+    (curves,) = forced_response_batch(
+        middle, float(middle_force), from_frequency, to_frequency, settings=settings
+    ).curves
+    parts, names, notes = [], [], []
+    for kind in dict.fromkeys(kinds):
+        events = _events(curves, kind)
+        if not events:
+            notes.append(
+                f"the nominal response has no {kind.replace('_', ' ')} from"
+                f" {from_frequency / HERTZ:.5g} to {to_frequency / HERTZ:.5g} Hz"
+            )
+        for number, (curve, k) in enumerate(events, 1):
+            name = {"phase_resonance": "resonance", "fold": f"fold_{number}"}.get(kind, kind)
+            *part, converged = _of_event(nominal, inputs, kind, curve.point(k))
+            if not bool(converged):
+                notes.append(f"{name} was not found again from the curve and is left out")
+                continue
+            parts.append(part)
+            names += [f"{name}_frequency_hz", f"{name}_velocity_m_s"]
+    if not parts:
+        raise ValueError(f"nothing to propagate to: {'; '.join(notes) or 'no kinds'}.")
+    value, gradient, hessian = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Quantities(value, gradient, hessian, tuple(names), tuple(notes))
 
 
-@jitted
-def _values(quantities: FunctionQuantities, z: Array) -> Array:
-    return mapped(quantities.at, z)
+def _events(curves: Sequence[ResponseCurve], kind: EventKind) -> list[tuple[ResponseCurve, int]]:
+    """Where the events are: folds in order, of others the one with the largest velocity."""
+    every = [(curve, int(k)) for curve in curves for k in curve.at_events(kind)]
+    if kind == "fold" or not every:
+        return every
+    return [max(every, key=lambda at: float(np.abs(at[0].velocity[at[1], 1, 0])))]
 
 
-@jitted
-def _with_slopes(quantities: FunctionQuantities, z: Array) -> tuple[Array, Array]:
-    return mapped(lambda row: (quantities.at(row), jax.jacfwd(quantities.at)(row)), z)
+class _Inputs(NamedTuple):
+    """What is uncertain, as a function of standard normal numbers."""
+
+    varied: tuple[AbstractVariation, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for one in self.varied for name in one.names)
+
+    def values(self, z: Float[Array, " input"]) -> Float[Array, " input"]:
+        parts = jnp.split(z, np.cumsum([len(one.names) for one in self.varied])[:-1])
+        each = zip(self.varied, parts, strict=True)
+        return jnp.concatenate([one.at(part) for one, part in each])
+
+    def by_name(self, z: Float[Array, " input"]) -> dict[str, Array]:
+        return dict(zip(self.names, self.values(z), strict=True))
+
+
+class _Series(NamedTuple):
+    """A model whose numbers are a quadratic of z: all that two derivatives at z = 0 ask for.
+
+    A beam is condensed by many steps: within the program of a response they would be compiled
+    anew for every kind of event.
+    """
+
+    template: Structure
+    numbers: Float[Array, " number"]
+    slopes: Float[Array, "number input"]
+    curvature: Float[Array, "number input input"]
+
+    def model(self, z: Float[Array, " input"]) -> Structure:
+        """The model at z."""
+        bends = jnp.einsum("nij,i,j->n", self.curvature, z, z)
+        numbers = self.numbers + self.slopes @ z + 0.5 * bends
+        arrays, others = eqx.partition(self.template, _is_number)
+        return eqx.combine(ravel_pytree(arrays)[1](numbers), others)
+
+
+class _Nominal(NamedTuple):
+    """Model and force as functions of z."""
+
+    own: Structure
+    force: Float[np.ndarray, ""]  # N, where it is not uncertain
+    series: _Series | None  # where what is uncertain are no numbers of the model
+
+    def at(self, inputs: _Inputs, z: Float[Array, " input"]) -> tuple[Structure, Float[Array, ""]]:
+        """Model and force at standard normal numbers."""
+        values, model = inputs.values(z), self.own
+        own = [k for k, name in enumerate(inputs.names) if name != FORCE]
+        if self.series is not None:
+            model = self.series.model(z)
+        elif own:
+            model = with_parameters(model, [inputs.names[k] for k in own], values[np.array(own)])
+        if FORCE in inputs.names:
+            return model, values[inputs.names.index(FORCE)]
+        return model, jnp.asarray(self.force)
+
+
+def _series(model_of: ModelOf, inputs: _Inputs) -> _Series:
+    zero = jnp.zeros(len(inputs.names))
+    return _Series(model_of(inputs.by_name(zero)), *_of_model(model_of, inputs))
+
+
+def _is_number(leaf: object) -> bool:
+    return isinstance(leaf, float) or eqx.is_inexact_array(leaf)
+
+
+def _derivatives(
+    function: Callable[[Array], tuple[Array, Any]], inputs: _Inputs
+) -> tuple[Any, ...]:
+    """Value, gradient and Hessian at z = 0 of the first result, then the second as it is."""
+
+    def value(z: Array) -> tuple[Array, tuple[Array, Any]]:
+        found, rest = function(z)
+        return found, (found, rest)
+
+    def slopes(z: Array) -> tuple[Array, tuple]:
+        gradient, (found, rest) = jax.jacfwd(value, has_aux=True)(z)
+        return gradient, (found, gradient, rest)
+
+    hessian, known = jax.jacfwd(slopes, has_aux=True)(jnp.zeros(len(inputs.names)))
+    found, gradient, rest = known
+    return found, gradient, hessian, rest
+
+
+@compiled
+def _of_function(
+    function: Callable[[Array], Array], varied: tuple[AbstractVariation, ...]
+) -> tuple[Array, ...]:
+    inputs = _Inputs(varied)
+    return _derivatives(lambda z: (function(inputs.values(z)), None), inputs)[:3]
+
+
+@compiled
+def _of_model(model_of: ModelOf, inputs: _Inputs) -> tuple[Array, ...]:
+    def numbers(z: Array) -> tuple[Array, None]:
+        return ravel_pytree(eqx.filter(model_of(inputs.by_name(z)), _is_number))[0], None
+
+    return _derivatives(numbers, inputs)[:3]
+
+
+@compiled
+def _of_event(
+    nominal: _Nominal, inputs: _Inputs, kind: EventKind, start: tuple
+) -> tuple[Array, ...]:
+    """Frequency (Hz) and velocity with derivatives, and whether the motion was found."""
+
+    def pair(z: Array) -> tuple[Array, Array]:
+        model, force = nominal.at(inputs, z)
+        motion = periodic_motion(model, force, start, condition=kind)
+        return jnp.stack([motion.frequency / HERTZ, motion.amplitude]), motion.converged
+
+    return _derivatives(pair, inputs)

@@ -10,8 +10,6 @@ import pytest
 import snrmjax as sj
 from snrmjax.cli import main
 from snrmjax.io.reduction.beam_file import (
-    PointMassEntry,
-    SupportStiffness,
     is_beam_file,
     read_beam_description,
 )
@@ -40,17 +38,25 @@ midspan = 0.5
 distribution = "uniform"
 """
 MASS = "[[point_mass]]\nat = 0.5\nmass_kg = 1e-3\n"
+MASS_KEYS = ("mass_kg", "inertia_kg_m2")
 SPRINGS = "{ axial_n_m = 1e6, transverse_n_m = 1e7 }"
+
+
+def supports_of(numbers):
+    keys = ("axial_n_m", "transverse_n_m", "rotation_nm_rad")
+    return [[numbers[f"supports.{side}.{key}"] for key in keys] for side in ("left", "right")]
 
 
 def test_a_beam_file_says_what_the_description_has(tmp_path):
     path = tmp_path / "beam.toml"
     path.write_text(BEAM)
     beam = read_beam_description(path)
-    held = SupportStiffness(np.inf, np.inf, np.inf)
-    assert beam.supports == (held, held)
-    assert (beam.name, beam.young, beam.thickness) == ("flat beam", 204.8e9, 0.000508)
-    assert (beam.radius, beam.load_scale, beam.force_at, beam.damping_ratio) == (None,) * 4
+    numbers = dict(beam.numbers)
+    assert supports_of(numbers) == [[np.inf] * 3] * 2
+    assert (beam.name, numbers["material.young_pa"]) == ("flat beam", 204.8e9)
+    assert numbers["section.thickness_m"] == 0.000508
+    assert "geometry.radius_m" not in numbers
+    assert (beam.load_scale, beam.force_at, beam.damping_ratio) == (None,) * 3
     assert (beam.modes, beam.degree, beam.sensors) == ((1, 3), 3, (("midspan", 0.5),))
     text = BEAM.replace("elements", "radius_m = 11.43\nelements").replace(
         'right = "clamped"', f"right = {SPRINGS}"
@@ -65,10 +71,13 @@ def test_a_beam_file_says_what_the_description_has(tmp_path):
         + MASS
     )
     beam = read_beam_description(path)
-    assert beam.supports == (SupportStiffness(np.inf, 0, 50), SupportStiffness(1e6, 1e7, 0.0))
-    assert beam.point_masses == (PointMassEntry(0.5, 1e-3, 2e-8), PointMassEntry(0.5, 1e-3, 0.0))
+    numbers = dict(beam.numbers)
+    assert supports_of(numbers) == [[np.inf, 0, 50], [1e6, 1e7, 0.0]]
+    assert beam.masses_at == (0.5, 0.5)
+    masses = [numbers[f"point_mass_{k}.{key}"] for k in (1, 2) for key in MASS_KEYS]
+    assert masses == [1e-3, 2e-8, 1e-3, 0.0]
     assert beam.sensors == (("midspan", 0.5), ("quarter", 0.25))
-    assert (beam.radius, beam.load_scale, beam.degree) == (11.43, 0.3, 5)
+    assert (numbers["geometry.radius_m"], beam.load_scale, beam.degree) == (11.43, 0.3, 5)
     assert (beam.force_at, beam.damping_ratio) == (0.25, (0.05, 0.001))
 
 

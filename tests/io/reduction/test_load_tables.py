@@ -36,23 +36,11 @@ def test_nodal_displacements_and_a_mass_matrix_give_the_known_potential(folder):
     check(folder)
 
 
-def test_a_filter_modal_displacements_nodal_loads_and_npz_give_the_same(folder):
-    folder.replace("modes.toml", 'mass = "mass.csv"', 'filter = "filter.csv"')
-    folder.write("filter.csv", filter=folder.truth.filter)
-    check(folder)
+def test_modal_displacements_give_the_same(folder):
     force, q = np.asarray(folder.cases.force), np.asarray(folder.cases.modal_displacement)
     folder.write("cases.csv", case=list(folder.cases.names), f=force, q=q)
     check(folder)
-    loads = force @ folder.truth.filter  # F = M Φ f
-    folder.write("cases.csv", case=list(folder.cases.names), load=loads, q=q)
-    check(folder)
-    (folder.path / "cases.csv").unlink()
-    inverse = np.linalg.inv(folder.truth.map)
-    arrays = {"shapes": folder.truth.shapes, "mass": inverse.T @ inverse}
-    np.savez(
-        folder.path / "cases.npz", load=loads, displacement=folder.cases.displacement, **arrays
-    )
-    folder.replace("modes.toml", 'shapes = "shapes.csv"\nfilter = "filter.csv"\n', "")
+    folder.replace("modes.toml", 'shapes = "shapes.csv"\nmass = "mass.csv"\n', "")
     check(folder)
 
 
@@ -125,22 +113,6 @@ def twice(folder):
     (folder.path / "cases.csv").write_text("\n".join([*rows, rows[1]]) + "\n")
 
 
-def no_npz(folder):
-    (folder.path / "cases.csv").unlink()
-    (folder.path / "cases.npz").write_text("not an archive")
-
-
-def both(folder):
-    np.savez(folder.path / "cases.npz", force=np.zeros((2, 2)))
-
-
-def crooked_load(folder):
-    force, q = np.asarray(folder.cases.force), np.asarray(folder.cases.modal_displacement)
-    loads = force @ folder.truth.filter
-    loads[4, 0] += np.abs(loads).max()
-    folder.write("cases.csv", case=list(folder.cases.names), load=loads, q=q)
-
-
 def still(folder):
     rows = [row.split(",") for row in folder.load_rows()]
     rows[1:] = [[row[0], row[1], "0.0", *row[3:]] for row in rows[1:]]
@@ -166,8 +138,6 @@ BAD_TABLES = [
     (lambda folder: (folder.path / "modes.toml").unlink(), "modes.toml does not exist"),
     (lambda folder: (folder.path / "cases.csv").unlink(), "cases.csv does not exist"),
     (lambda folder: (folder.path / "mass.csv").unlink(), "mass.csv does not exist"),
-    (both, "both cases.csv and cases.npz"),
-    (no_npz, "cases.npz is not an NPZ file"),
     (edit("modes.toml", "frequency_hz", "frequencies_hz"), "unknown key 'frequencies_hz' (did"),
     (edit("modes.toml", "frequency_hz = [", "frequency_hz = [-"), "must be positive"),
     (edit("modes.toml", "[1, 3]", "[1, 1]"), "2 different whole numbers"),
@@ -181,7 +151,7 @@ BAD_TABLES = [
     (edit("cases.csv", "u_2", "u_3"), "the column 'u_3' twice"),
     (edit("cases.csv", "u_2", "v_2"), "unknown column 'v_2'"),
     (edit("cases.csv", "u_1,u_2,u_3,u_4", "u_1,u_2,u_3,u_5"), "lacks the column `u_4`"),
-    (edit("cases.csv", "f_1,f_2", "q_1,q_2"), "neither `f_1 …` nor `load_1 …`"),
+    (edit("cases.csv", "f_1,f_2", "q_1,q_2"), "cases.csv has no `f_1 …`"),
     (
         edit("cases.csv", "+1 at 0.5,", "+1 at 0.5,x"),
         "`f_1` must be a number, but row 2 of cases.csv",
@@ -192,7 +162,10 @@ BAD_TABLES = [
     (scaled(5, range(3, 7), -1.0), "contradict +1 +2 at 0.5 (against their force"),
     (scaled(2, range(3, 7), 1e3), "another unit"),
     (every(1e3), "do not belong together"),
-    (crooked_load, "outside them"),
+    (edit("cases.csv", "u_1,u_2,u_3,u_4", "a,b,c,d"), "unknown column 'a'"),
+    (lambda folder: folder.write("cases.csv", f=np.ones((2, 3)), q=np.ones((2, 2))), "has 3 modes"),
+    (lambda folder: folder.write("cases.csv", f=np.ones((2, 2)), u=np.ones((2, 3))), "has 3 degr"),
+    (lambda folder: folder.write("cases.csv", f=np.ones((2, 2))), "no `q_1 …` or `u_1 …`"),
     (still, "the force of mode 3 is zero in every load case"),
     (unsolved, "none of the 16 load cases has a solution"),
 ]

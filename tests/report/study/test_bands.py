@@ -5,7 +5,8 @@ import pytest
 import xarray as xr
 
 from snrmjax.report.study import bands
-from snrmjax.report.study.bands import band_panels, bounds_over
+from snrmjax.report.study.bands import band_panels
+from snrmjax.study.computations.responses import bounds_over
 
 SIZES = np.linspace(0.5, 1.5, 41)  # one for each member: the median is 1, 95 % are within 0.475
 GRID = np.linspace(10.0, 20.0, 11)

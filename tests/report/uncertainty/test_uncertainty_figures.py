@@ -1,56 +1,61 @@
 """Figures of uncertainty show the numbers of their results."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 import snrmjax as sj
 
 
-def quantities(function=None):
-    inputs = sj.study.correlated_inputs(["a", "b"], [1.0, 2.0], np.diag([0.04, 0.01]))
-    function = function or (lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]))
-    names, units = ("fold_1_frequency_hz", "peak_velocity_m_s"), ("Hz", "m/s")
-    return sj.study.FunctionQuantities(function, inputs, names, units)
-
-
-SETTINGS = sj.study.PropagationSettings(members=128)
+def indices(output):
+    varied = [sj.study.normal("a", 1.0, 0.2), sj.study.normal("b", 2.0, 0.1)]
+    sampling = {"method": "saltelli"}
+    described = {"variations": [{"names": one.names} for one in varied], "sampling": sampling}
+    model = sj.model.structure(sj.model.linear_modes([1.0], [0.1], [[1.0]], [1.0]))
+    study = sj.study.Study(
+        *("both", model, sj.study.NormalModes(2.0), tuple(varied)),
+        sj.study.Sampling("saltelli", 4 * 64),
+        model_of=lambda values: model,
+    )
+    table = sj.study.planned(study).table
+    outputs = {"fold_1_frequency_hz": table.prod(axis=1), "peak_velocity_m_s": table[:, 0] ** 2}
+    data = {name: (("member",), output * values) for name, values in outputs.items()}
+    return sj.study.sobol_indices(
+        xr.Dataset(data, attrs={"study": json.dumps({"study": described})})
+    )
 
 
 def test_every_range_of_a_propagation_is_drawn_where_it_is():
-    result = sj.study.propagate_uncertainty(quantities(), SETTINGS)
-    figure = result.plot()
+    varied = [sj.study.normal("a", 1.0, 0.2), sj.study.normal("b", 2.0, 0.1)]
+    found = sj.study.propagate_uncertainty(
+        sj.study.function_quantities(
+            lambda x: jnp.stack([x[0] * x[1], x[0] ** 2]),
+            varied,
+            ["fold_1_frequency_hz", "peak_velocity_m_s"],
+        )
+    )
+    figure = found.plot()
     for q, axes in enumerate(figure.axes):
         drawn = [line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 2]
-        assert np.array(drawn) == pytest.approx(result.statistics[:, 2:, q])
-        assert sum(bar.get_height() * bar.get_width() for bar in axes.patches) == pytest.approx(1)
+        assert np.array(drawn) == pytest.approx(found.statistics[:, 2:, q])
     assert [axes.get_xlabel() for axes in figure.axes] == [
         "Fold 1 frequency (Hz)",
         "Peak velocity (m/s)",
     ]
-    nothing = quantities(lambda x: jnp.full(2, jnp.nan) * x)
-    with pytest.raises(ValueError, match="no quantity of any member was found"):
-        sj.study.propagate_uncertainty(nothing, SETTINGS).plot()
-
-
-def test_errors_are_drawn_against_the_scatter():
-    study = sj.study.scatter_study(quantities(), np.array([0.5, 1.0, 2.0]), SETTINGS)
-    frequencies, velocities = study.plot().axes
-    for q, axes in enumerate((frequencies, velocities)):
-        assert axes.lines[0].get_xdata() == pytest.approx(study.scale)
-        worst = study.first_order_error[:, :, q].max(axis=1)
-        assert axes.lines[0].get_ydata() == pytest.approx(worst)
-    assert (frequencies.get_title(loc="left"), velocities.get_title(loc="left")) == (
-        "Frequencies",
-        "Velocities",
-    )
 
 
 def test_indices_are_drawn_as_bars():
-    indices = sj.study.sobol_indices(quantities(), base_rows=64)
-    for q, axes in enumerate(indices.plot().axes):
+    found = indices(1.0)
+    figure = found.plot()
+    for q, axes in enumerate(figure.axes):
         widths = [bar.get_width() for bar in axes.patches]
-        assert widths == pytest.approx([*indices.first[q], *indices.total[q]])
-    still = quantities(lambda x: 0.0 * x)
+        assert widths == pytest.approx([*found.first[q], *found.total[q]])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [
+        "Fold 1 frequency (Hz)",
+        "Peak velocity (m/s)",
+    ]
     with pytest.raises(ValueError, match="no quantity has indices"):
-        sj.study.sobol_indices(still, base_rows=64).plot()
+        indices(np.zeros(4 * 64)).plot()

@@ -1,124 +1,88 @@
-"""Sobol' indices and bounds by derivatives, against closed forms."""
+"""Sobol' indices of a study's members, against closed forms."""
 
-import sys
+import json
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
-from snrmjax.model.modes import linear_modes
-from snrmjax.model.potential import polynomial_potential
-from snrmjax.model.structures import structure
-from snrmjax.study.uncertainty.followed_motions import response_quantities
-from snrmjax.study.uncertainty.quantities import FunctionQuantities
-from snrmjax.study.uncertainty.sensitivity import derivative_bounds, sobol_indices
-from snrmjax.study.uncertainty.uncertain_inputs import correlated_inputs, uncertain_inputs
+from snrmjax.study.sampling import Sampling, drawn_members
+from snrmjax.study.uncertainty.sensitivity import sobol_indices
+from snrmjax.study.variations import joint_normal, lognormal, normal, uniform
 
 A, B = 7.0, 0.1  # of Ishigami's function
-
-
-def ishigami():
-    """sin x₁ + a sin² x₂ + b x₃⁴ sin x₁, x uniform from −π to π; and a constant."""
-    inputs = correlated_inputs(
-        ["x1", "x2", "x3"], np.zeros(3), np.eye(3) * np.pi**2 / 3, ["uniform"] * 3
-    )
-
-    def function(x):
-        first = jnp.sin(x[0])
-        return jnp.stack([first + A * jnp.sin(x[1]) ** 2 + B * x[2] ** 4 * first, 0.0 * x[0]])
-
-    return FunctionQuantities(function, inputs, ("ishigami", "constant"), ("", ""))
-
-
 PI4 = np.pi**4
 VARIANCE = A**2 / 8 + B * PI4 / 5 + B**2 * PI4**2 / 18 + 0.5
 FIRST = np.array([0.5 * (1 + B * PI4 / 5) ** 2, A**2 / 8, 0.0]) / VARIANCE
 TOTAL = FIRST + np.array([1.0, 0.0, 1.0]) * B**2 * PI4**2 * 8 / 225 / VARIANCE
-SQUARES = np.array(
-    [
-        0.5 * (1 + 2 * B * PI4 / 5 + B**2 * PI4**2 / 9),
-        A**2 / 2,
-        8 * B**2 * np.pi**6 / 7,
-    ]
-)
+X = tuple(uniform(name, -np.pi, np.pi) for name in ("x1", "x2", "x3"))
+
+
+def studied(varied, members, *functions, seed=1, method="saltelli"):
+    """The data set of a study whose outputs are functions of the varied quantities."""
+    table = drawn_members(varied, Sampling(method, members), seed)
+    outputs = {f"y{k}": (("member",), one(table)) for k, one in enumerate(functions)}
+    names = [{"names": one.names} for one in varied]
+    described = {"study": {"variations": names, "sampling": {"method": method}}}
+    return xr.Dataset(outputs, attrs={"study": json.dumps(described)})
+
+
+def ishigami(x):
+    """sin x₁ + a sin² x₂ + b x₃⁴ sin x₁, x uniform from −π to π."""
+    return np.sin(x[:, 0]) * (1 + B * x[:, 2] ** 4) + A * np.sin(x[:, 1]) ** 2
 
 
 def test_sobol_indices_of_ishigamis_function():
-    found = sobol_indices(ishigami(), base_rows=2048, seed=1)
-    # SALib's intervals are of random members; those of a sequence are well inside them. Exact
-    # indices: Ishigami & Homma (1990), as in SALib's documentation 0.3139, 0.4424, 0.
+    data = studied(X, 5 * 2048, ishigami, lambda x: 0.0 * x[:, 0])
+    found = sobol_indices(data, seed=1)
+    # The intervals are of random members; those of a sequence are well inside them. Exact indices:
+    # Ishigami & Homma (1990), 0.3139, 0.4424, 0.
     assert pytest.approx([0.3139, 0.4424, 0.0], abs=5e-5) == FIRST
     assert np.all(np.abs(found.first[0] - FIRST) < found.first_half_width[0] + 1e-12)
     assert np.all(np.abs(found.total[0] - TOTAL) < found.total_half_width[0])
     assert np.all(found.total_half_width[0] < 0.07)
     assert found.variance[0] == pytest.approx(VARIANCE, rel=0.02)
     assert np.all(np.isnan(found.first[1]))
-    assert found.to_xarray()["total"].sel(quantity="ishigami", input="x3") == pytest.approx(
+    assert found.to_xarray()["total"].sel(quantity="y0", input="x3") == pytest.approx(
         TOTAL[2], abs=0.02
     )
     assert "first" in repr(found)
 
 
-def test_bounds_by_derivatives_of_ishigamis_function():
-    found = derivative_bounds(ishigami(), members=4096)
-    # (width/π)² = 4 of an input from −π to π. Members of a sequence: 1 %.
-    assert found.mean_square[0] == pytest.approx(SQUARES, rel=0.02)
-    assert found.bound[0] == pytest.approx(4 * SQUARES / VARIANCE, rel=0.02)
-    miss = (found.bound[0] - 4 * SQUARES / VARIANCE) / found.bound_std[0]
-    assert np.abs(miss).max() < 5
-    assert np.all(found.bound[0] >= TOTAL)
-    assert "total index at most" in repr(found)
+def test_shares_of_a_product_of_lognormal_numbers():
+    # With s² the variance of the logarithms the first index of input i is
+    # (e^s_i² − 1)/(e^Σs² − 1).
+    std = np.array([0.05, 0.2, 0.1])
+    varied = [lognormal(name, 1.0, one) for name, one in zip("abc", std, strict=True)]
+    found = sobol_indices(studied(varied, 5 * 256, lambda x: np.prod(x, axis=1)))
+    square = np.log1p(std**2)
+    first = np.expm1(square) / (np.exp(square.sum()) - 1)
+    assert np.all(np.abs(found.first[0] - first) < found.first_half_width[0])
+    assert found.rows.tolist() == [256]
 
 
-def test_shares_and_bounds_of_a_linear_peak_are_those_of_a_product_of_lognormal_numbers():
-    # |V| = F φ b/(2ζω): with s² the variance of the logarithms, Var = (e^Σs² − 1) E², the first
-    # index of input i is (e^s_i² − 1)/(e^Σs² − 1) and its bound s_i² e^Σs²/(e^Σs² − 1).
-    model = structure(linear_modes([2.0], [0.02], [[1.2]], [1.5]), polynomial_potential({}, 1))
-    std = {"mode_1.natural_frequency": 0.1, "mode_1.damping_ratio": 0.004, "force_n": 0.012}
-    inputs = uncertain_inputs(model, std, force=0.12, marginals=dict.fromkeys(std, "lognormal"))
-    peak = response_quantities(
-        model, inputs, 0.5, 8.0, kinds=("phase_resonance",), harmonic_order=1
-    )
-    square = np.log1p((inputs.std / inputs.mean) ** 2)
-    whole = np.exp(square.sum())
-    found = sobol_indices(peak, base_rows=256)
-    first = np.expm1(square) / (whole - 1)
-    assert np.all(np.abs(found.first[1] - first) < found.first_half_width[1])
-    assert found.rows.tolist() == [256, 256]
-    # The frequency is ω alone.
-    assert found.total[0] == pytest.approx([1.0, 0.0, 0.0], abs=0.02)
-    bound = derivative_bounds(peak, members=512)
-    assert bound.bound[1] == pytest.approx(square * whole / (whole - 1), rel=0.02)
-    assert bound.bound[1].sum() > 1
-    # dV/dF = V/F, of independent lognormal numbers.
-    nominal = 1.2 * 1.5 / (2 * 0.02 * 2.0)
-    by_force = nominal**2 * np.exp(3 * (square[0] + square[1]))
-    assert bound.mean_square[1, 2] == pytest.approx(by_force, rel=0.02)
+def test_quantities_that_vary_together_are_one_input():
+    pair = joint_normal(["a", "b"], [0.0, 0.0], [[1.0, 0.8], [0.8, 1.0]])
+    found = sobol_indices(studied((pair, normal("c", 0.0, 1.0)), 4 * 1024, lambda x: x.sum(axis=1)))
+    # Var(a + b) = 3.6 beside Var(c) = 1.
+    assert found.input_names == ("a, b", "c")
+    np.testing.assert_allclose(found.first[0], [3.6 / 4.6, 1 / 4.6], atol=0.02)
+    np.testing.assert_allclose(found.total[0], found.first[0], atol=0.02)
 
 
 def test_rows_without_a_value_are_left_out_whole():
-    inputs = correlated_inputs(["x", "y"], [1.0, 0.0], np.eye(2))
-    root = FunctionQuantities(lambda x: jnp.sqrt(x[:1]) + x[1], inputs, ("root",), ("",))
-    found = sobol_indices(root, base_rows=256)
+    varied = (normal("x", 1.0, 1.0), normal("y", 0.0, 1.0))
+    with np.errstate(invalid="ignore"):
+        data = studied(varied, 4 * 256, lambda x: np.sqrt(x[:, 0]) + x[:, 1])
+    found = sobol_indices(data)
     # x is drawn twice in a row, P(x < 0) = 0.1587: (1 − 0.1587)² of the rows stay.
     assert found.rows[0] / 256 == pytest.approx(0.708, abs=0.02)
-    assert any("29 % of the base rows are left out" in note for note in found.notes)
-    assert derivative_bounds(root, members=512).found[0] == pytest.approx(0.8413 * 512, abs=4)
+    assert any("29 % of the rows are left out" in note for note in found.notes)
 
 
-def test_correlated_inputs_and_wrong_numbers_are_refused():
-    both = correlated_inputs(["x", "y"], [0, 0], [[1, 0.5], [0.5, 1]])
-    total = FunctionQuantities(lambda x: x[:1] + x[1], both, ("sum",), ("",))
-    for verb in (sobol_indices, derivative_bounds):
-        with pytest.raises(ValueError, match="independent inputs only"):
-            verb(total)
-    with pytest.raises(ValueError, match="a power of two from 16 on, but is 100"):
-        sobol_indices(ishigami(), base_rows=100)
-    with pytest.raises(ValueError, match="8 times a power of two"):
-        derivative_bounds(ishigami(), members=100)
-
-
-def test_without_salib_one_sentence_says_how_to_install_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "SALib.analyze", None)
-    with pytest.raises(ImportError, match=r"pip install 'snrmjax\[sensitivity\]'"):
-        sobol_indices(ishigami())
+def test_other_members_are_refused():
+    with pytest.raises(ValueError, match="the study's sampling is random"):
+        sobol_indices(studied(X, 100, ishigami, method="random"))
+    for members in (100, 5 * 24, 5 * 8):
+        with pytest.raises(ValueError, match=r"5 times a power of two of members .* 80 at least"):
+            studied(X, members, ishigami)

@@ -1,0 +1,282 @@
+"""A study on disk: its plan, the chunks of its members, and the data set that is made of them.
+
+Beside the data set `study.zarr` lies `study.zarr.parts` with `plan.json`, which says what the study
+is, and a file a chunk. Every file takes its name when it is whole.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from snrmjax.io.files import write_atomically
+from snrmjax.study.computations.base import MEMBER, TEXT, Output, joined
+from snrmjax.study.identity import differences, model_hash
+from snrmjax.study.study import FORCE, PlannedStudy
+
+_BLOCK = 1 << 16  # rows of a ragged variable that are one file
+_TARGET = 1 << 20  # numbers that one file of a member's variable holds at most
+_TOGETHER = 1 << 25  # bytes of chunks that are written together
+_DIGEST = "collected.txt"
+_UNITS = {"natural_frequency": "rad/s", "frequency_hz": "Hz", FORCE: "N"}
+
+
+class StudyFolder(NamedTuple):
+    """Where a study is kept: the data set `out`, and beside it the chunks it is made of."""
+
+    out: Path
+
+    @property
+    def work(self) -> Path:
+        """The folder of the plan and the chunks."""
+        return self.out.with_name(f"{self.out.name}.parts")
+
+    @property
+    def plan(self) -> Path:
+        """What the study is."""
+        return self.work / "plan.json"
+
+    @property
+    def chunks(self) -> Path:
+        """The folder of the chunks."""
+        return self.work / "chunks"
+
+    def chunk(self, number: int) -> Path:
+        """The file of a chunk."""
+        return self.chunks / f"{number:08d}.npz"
+
+
+def write_study_plan(folder: StudyFolder, described: Mapping[str, object]) -> None:
+    """Write what the study is beside its chunks, once."""
+    folder.chunks.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder.plan, json.dumps(described, indent=1, sort_keys=True) + "\n")
+
+
+def read_study_plan(folder: StudyFolder) -> dict[str, Any] | None:
+    """What the study that is kept there is; None where there is none.
+
+    Raises `ValueError` where the plan cannot be read.
+    """
+    if not folder.plan.exists():
+        return None
+    try:
+        return dict(json.loads(folder.plan.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"{folder.plan} is damaged: remove {folder.work} to compute the study anew."
+        ) from error
+
+
+def write_chunk(folder: StudyFolder, number: int, rows: Mapping[str, np.ndarray]) -> None:
+    """Write the rows of a chunk.
+
+    Raises `OSError` where it cannot be written; nothing is left behind then.
+    """
+    temporary = folder.chunks / f".{uuid.uuid4().hex}.tmp"
+    try:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **rows)
+        os.replace(temporary, folder.chunk(number))
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def whole_chunks(folder: StudyFolder, n_chunks: int) -> tuple[list[int], list[Path]]:
+    """The numbers of the chunks that are there and whole, and files that are not."""
+    numbers = [k for k in range(n_chunks) if folder.chunk(k).exists()]
+    damaged = [k for k in numbers if not _is_whole(folder.chunk(k))]
+    return sorted({*numbers} - {*damaged}), [folder.chunk(k) for k in damaged]
+
+
+def _is_whole(chunk: Path) -> bool:
+    try:
+        with zipfile.ZipFile(chunk) as parts:
+            return parts.testzip() is None
+    except (OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
+        return False
+
+
+def _read_chunk(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
+
+
+def stored_description(folder: StudyFolder) -> dict[str, Any] | None:
+    """What the study of a data set is; None where there is none. Raises `ValueError` if foreign."""
+    if not folder.out.exists():
+        return None
+    try:
+        found = json.loads((folder.out / ".zattrs").read_text(encoding="utf-8"))
+        return dict(json.loads(found["study"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{folder.out} is no data set of a study: choose another --out."
+        ) from error
+
+
+def is_collected(folder: StudyFolder, described: Mapping[str, Any]) -> bool:
+    """Whether the data set is there, of this study, and as it was written."""
+    stored = stored_description(folder)
+    if stored is None or differences(described, stored):
+        return False
+    known = folder.work / _DIGEST
+    if not known.exists():  # the chunks were cleared away: the data set stands alone
+        return not folder.chunks.exists()
+    return known.read_text(encoding="utf-8") == _digest(folder.out)
+
+
+def collect_chunks(
+    planned: PlannedStudy, folder: StudyFolder, described: Mapping[str, Any]
+) -> None:
+    """Write the data set of all chunks; it appears whole or not at all.
+
+    Memory is bounded by a few chunks. Raises `OSError` on a full disk.
+    """
+    from filelock import FileLock
+
+    building = folder.work / "collecting.zarr"
+    with FileLock(folder.work / ".collecting"):  # of shards that end at once one is enough
+        if is_collected(folder, described):
+            return
+        shutil.rmtree(building, ignore_errors=True)
+        try:
+            _write_store(planned, described, building, folder)
+            digest = _digest(building)
+            if folder.out.exists():
+                shutil.rmtree(folder.out)
+            os.replace(building, folder.out)
+        finally:
+            shutil.rmtree(building, ignore_errors=True)
+        write_atomically(folder.work / _DIGEST, digest)
+    for leftover in folder.chunks.glob(".*.tmp"):  # of writers that were stopped
+        leftover.unlink(missing_ok=True)
+
+
+def _digest(store: Path) -> str:
+    """What the files of a data set are known by."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in store.rglob("*") if path.is_file()):
+        digest.update(path.relative_to(store).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _write_store(
+    planned: PlannedStudy, described: Mapping[str, Any], path: Path, folder: StudyFolder
+) -> None:
+    import zarr
+
+    study = planned.study
+    group = zarr.create_group(path, zarr_format=2)
+    _write_labels(group, planned)
+    axes = study.computation.axes()
+    sizes = {MEMBER: len(planned.table), **{name: len(axis.values) for name, axis in axes.items()}}
+    outputs = study.computation.outputs()
+    ragged = {one.dimensions[0] for one in outputs.values()} - {MEMBER}
+    for dimension in ragged:
+        text = f"first row of the member along `{dimension}`; n_{dimension}s is how many"
+        counted = outputs[f"n_{dimension}s"].dimensions
+        outputs[f"first_{dimension}"] = Output(counted, "i8", "1", text)
+    chunks = [folder.chunk(k) for k in range(study.n_chunks)]
+    widest, totals = _first_look(chunks, outputs, ragged)
+    arrays = {}
+    for name, one in outputs.items():
+        shape = tuple({**sizes, **totals}[d] for d in one.dimensions)
+        dtype = f"<U{widest[name]}" if one.kind == TEXT else one.kind
+        block = _BLOCK if one.dimensions[0] in ragged else _member_block(study.chunk_size, shape)
+        arrays[name] = _array(group, name, one, shape, dtype, block)
+    begin = dict.fromkeys((MEMBER, *ragged), 0)
+    for rows in _together(chunks):
+        for dimension in ragged:
+            count = rows[f"n_{dimension}s"]
+            ends = begin[dimension] + np.cumsum(count.ravel(), dtype=np.int64)
+            rows[f"first_{dimension}"] = ends.reshape(count.shape) - count
+        written = {}
+        for name, array in arrays.items():
+            dimension = outputs[name].dimensions[0]
+            written[dimension] = begin[dimension] + len(rows[name])
+            array[begin[dimension] : written[dimension]] = rows[name].astype(array.dtype)
+        begin = written
+    group.attrs.update(
+        {
+            "coordinates": " ".join(study.names),
+            "title": study.name,
+            "computed": study.computation.kind,
+            "study": json.dumps(described, sort_keys=True),
+            "model_hash": model_hash(study),
+            **{f"{name}_version": v for name, v in described["versions"].items()},
+        }
+    )
+    zarr.consolidate_metadata(path, zarr_format=2)
+
+
+def _first_look(
+    chunks: Iterable[Path], outputs: Mapping[str, Output], ragged: Iterable[str]
+) -> tuple[dict[str, int], dict[str, int]]:
+    """The longest text of every variable of text, and how many rows each ragged dimension has."""
+    widest = {name: 1 for name, one in outputs.items() if one.kind == TEXT}
+    totals = dict.fromkeys(ragged, 0)
+    for chunk in chunks:
+        with np.load(chunk, allow_pickle=False) as rows:
+            for name in widest:
+                widest[name] = max(widest[name], rows[name].dtype.itemsize // 4)
+            for dimension in totals:
+                totals[dimension] += int(np.sum(rows[f"n_{dimension}s"]))
+    return widest, totals
+
+
+def _together(chunks: Iterable[Path]) -> Iterator[dict[str, np.ndarray]]:
+    """The rows of the chunks in order, of several at once where they are small."""
+    waiting: list[dict[str, np.ndarray]] = []
+    for chunk in chunks:
+        waiting.append(_read_chunk(chunk))
+        if sum(part.nbytes for rows in waiting for part in rows.values()) > _TOGETHER:
+            yield joined(waiting)
+            waiting = []
+    if waiting:
+        yield joined(waiting)
+
+
+def _write_labels(group: Any, planned: PlannedStudy) -> None:
+    """Coordinates: the varied quantities, and the axes that all members share."""
+    labels = {}
+    for name, column in zip(planned.study.names, planned.table.T, strict=True):
+        unit = next((u for end, u in _UNITS.items() if name.endswith(end)), "")
+        labels[name] = (column, Output((MEMBER,), "f8", unit, "varied"))
+    for name, axis in planned.study.computation.axes().items():
+        labels[name] = (axis.values, Output((name,), "f8", axis.unit, axis.meaning))
+    for name, (values, one) in labels.items():
+        _array(group, name, one, values.shape, "f8", _BLOCK)[:] = values
+
+
+def _member_block(chunk: int, shape: Sequence[int]) -> int:
+    """Members that one file of the data set holds: whole chunks of the study."""
+    return chunk * max(_TARGET // (chunk * int(np.prod(shape[1:], dtype=int)) or 1), 1)
+
+
+def _array(
+    group: Any, name: str, one: Output, shape: tuple[int, ...], dtype: str, block: int
+) -> Any:
+    from numcodecs import Zstd
+
+    return group.create_array(
+        name,
+        shape=shape,
+        chunks=(max(min(block, shape[0]), 1), *(max(n, 1) for n in shape[1:])),
+        dtype=np.dtype(dtype),
+        # With a checksum: a file that is damaged is not read as numbers.
+        compressors=Zstd(level=3, checksum=True),
+        fill_value=np.nan if one.kind == "f8" else None,
+        attributes={
+            "_ARRAY_DIMENSIONS": list(one.dimensions),
+            "long_name": one.meaning,
+            **({"units": one.unit} if one.unit else {}),
+        },
+    )
