@@ -6,19 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose import evidence, priors
-from snrmjax.diagnose.checks.cross_validation import rms_misfit
-from snrmjax.diagnose.checks.patterns import neighbour_noise
+from snrmjax.diagnose.checks.residuals import neighbour_noise, rms_misfit
 from snrmjax.diagnose.decide import most_probable
-from snrmjax.diagnose.misfit.corrected_records import (
+from snrmjax.diagnose.misfit.effect_fit import (
+    EffectFit,
     already_added,
+    at_phases_of,
+    baseline_fit,
     likely_errors,
     with_harmonics,
     without_errors,
-)
-from snrmjax.diagnose.misfit.effect_fit import (
-    EffectFit,
-    at_phases_of,
-    baseline_fit,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.predictions import Predictions

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.cross_validation import HeldOutLevels, missed_levels
 from snrmjax.diagnose.checks.doubts import (
     Doubt,
     acts_both_ways,
@@ -22,9 +21,8 @@ from snrmjax.diagnose.checks.doubts import (
     part_of,
     wider_than_measured,
 )
-from snrmjax.diagnose.checks.level_forces import LevelForces
-from snrmjax.diagnose.checks.patterns import left_curve, pattern
-from snrmjax.diagnose.checks.shared_gains import doubts_on_gains
+from snrmjax.diagnose.checks.gains import LevelForces, doubts_on_gains
+from snrmjax.diagnose.checks.residuals import HeldOutLevels, left_curve, missed_levels, pattern
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN, Weights
 from snrmjax.diagnose.misfit.effect_fit import baseline_fit
 from snrmjax.diagnose.search.locating import Located, power_of_answer

@@ -8,48 +8,52 @@ import numpy as np
 from jaxtyping import Float
 
 from snrmjax.diagnose.answers import Search, best_answer
-from snrmjax.diagnose.checks.cross_validation import (
-    held_out_levels,
-    held_out_places,
-    rms_misfit,
-    without_level,
-)
-from snrmjax.diagnose.checks.level_forces import (
+from snrmjax.diagnose.checks.gains import (
+    gain_found,
     level_gains,
+    notes_on_found_mass,
     notes_on_level_forces,
+    notes_on_stated_parameters,
     suspected_level_forces,
     with_forces_that_acted,
 )
-from snrmjax.diagnose.checks.patterns import neighbour_noise, tolerated
-from snrmjax.diagnose.checks.shared_gains import (
-    gain_found,
-    notes_on_found_mass,
-    notes_on_stated_parameters,
+from snrmjax.diagnose.checks.residuals import (
+    held_out_levels,
+    held_out_places,
+    neighbour_noise,
+    rms_misfit,
+    tolerated,
+    without_level,
 )
-from snrmjax.diagnose.completed_model import CompletedModel, CompletedStatus, completed_model
 from snrmjax.diagnose.decide import Verdict, decide, imitations_of
-from snrmjax.diagnose.design.recommendation import recommendation, recommended_test
+from snrmjax.diagnose.design.discriminating_test import recommendation, recommended_test
 from snrmjax.diagnose.diagnosis_result import (
     Answer,
     Checks,
+    CompletedModel,
+    CompletedStatus,
     Diagnosis,
     Estimate,
     ForceMisfit,
     FormerAnswer,
     Gap,
+    completed_model,
     what_changed,
 )
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
 from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
-from snrmjax.diagnose.misfit.corrected_records import at_reference
-from snrmjax.diagnose.misfit.drive_voltage import FREE_GAIN_STD, driven_by_voltage, with_first_gain
-from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, baseline_fit
+from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
-from snrmjax.diagnose.misfit.reference import with_reference
+from snrmjax.diagnose.misfit.reference import (
+    FREE_GAIN_STD,
+    driven_by_voltage,
+    with_first_gain,
+    with_reference,
+)
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, FoundEffects
+from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -129,7 +133,8 @@ def diagnose_model(
             found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
         )
     if rival is not None and rival.is_better:
-        freed = answered.found.misfit.predictions.with_level_forces_free(rival.places)
+        own = found.misfit.predictions
+        freed = dataclasses.replace(own, free_level_forces=rival.places)
         found, weights = search.answered(freed)[:2]
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
     free = locate_misfit(misfit, found.baseline)
@@ -163,7 +168,6 @@ def diagnose_model(
         probabilities=dict(judgement.probabilities),
     )
     without, refused = _completed_without_levels(misfit, model, fit)
-    unconverged = _unconverged(found)
     if former is not None:
         notes.append(what_changed(former, answer.probabilities))
     if gain is not None and answer.effects:
@@ -184,7 +188,7 @@ def diagnose_model(
     notes += [*notes_without_phases(chosen, phase, misfit.level_numbers), *predictions.chosen.notes]
     notes += [*notes_on_stated_parameters(misfit, fit), *notes_on_found_mass(misfit, fit)]
     notes += _notes_on_answer(model, completed, refused, fit)
-    notes += _notes_on_fits(found, unconverged)
+    notes += _notes_on_fits(found)
     diagnosis = Diagnosis(
         verdict=judgement.verdict,
         answer=answer,
@@ -204,9 +208,7 @@ def diagnose_model(
             rms_misfit(misfit, fit),
             *(levels or (None, None)),
         ),
-        checks=Checks(
-            found.p_value, float(np.sqrt(neighbours.variance)), without, len(unconverged)
-        ),
+        checks=Checks(found.p_value, float(np.sqrt(neighbours.variance)), without),
         detection_limits=detection_limits(misfit, fit, scales, excluded),
         table=found.table,
         notes=tuple(note for note in notes if note),
@@ -411,29 +413,12 @@ def _frequency_shift(model: Structure, completed: Structure) -> float:
     return float(jnp.sqrt(square)) - 1
 
 
-def _unconverged(found: FoundEffects) -> list[float]:
-    """How far each fit without a minimum is behind the best of its step, by the criterion."""
-    return [
-        max(one.gain for one in step) - row.gain
-        for step in found.table
-        for row in step
-        if not row.status.found_minimum
-    ]
-
-
-def _notes_on_fits(found: FoundEffects, behind: list[float]) -> list[str]:
-    notes, rows = [], [row for step in found.table for row in step]
+def _notes_on_fits(found: FoundEffects) -> list[str]:
+    rows = [row for step in found.table for row in step]
     lost = sorted({row.kind for row in rows if row.status is MinimisationStatus.NOT_FINITE})
-    behind = [one for one in behind if np.isfinite(one)]
-    near = sum(one < AS_GOOD for one in behind)
-    if behind:
-        effect = "all were clearly worse than the best, so the answer does not depend on them."
-        if near:
-            effect = f"{near} may be as good as the best, so the answer may depend on them."
-        notes.append(f"{len(behind)} of {len(rows)} trial fits stopped early; {effect}")
-    if lost:
-        notes.append(
-            f"{', '.join(lost)} could not be fitted: with no starting point does the model have "
-            "the measured motions."
-        )
-    return notes
+    if not lost:
+        return []
+    return [
+        f"{', '.join(lost)} could not be fitted: with no starting point does the model have the "
+        "measured motions."
+    ]

@@ -1,26 +1,30 @@
 """What a diagnosis finds: the answer, how well it is known, and what would decide what is open."""
 
+import dataclasses
 import textwrap
 from collections.abc import Iterable, Mapping
+from enum import StrEnum
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from snrmjax.diagnose.checks.cross_validation import HeldOut
-from snrmjax.diagnose.checks.level_forces import LevelGain, level_forces_sentence
-from snrmjax.diagnose.completed_model import CompletedStatus
+from snrmjax.diagnose.checks.gains import LevelGain, level_forces_sentence
+from snrmjax.diagnose.checks.residuals import HeldOut
 from snrmjax.diagnose.decide import Verdict, verdict_sentence
 from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest
-from snrmjax.diagnose.laws.law_table import DrawnLaw
+from snrmjax.diagnose.laws.law_search import DrawnLaw
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.measure.states import SteadyStates
-from snrmjax.model.effects import EFFECTS
+from snrmjax.model.effects import EFFECTS, effect_parameters, make_effect
+from snrmjax.model.parameters import parameter_rules, with_parameters
 from snrmjax.model.structures import Structure
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
+from snrmjax.numerics.rules import Rule
 
 AS_NOISE = 1.3
 """Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
@@ -28,6 +32,52 @@ AS_NOISE = 1.3
 _WIDTH = 98  # of the notes, columns
 _LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
 _LIKELY = 0.05  # probability from which on an answer is mentioned
+
+
+class CompletedStatus(StrEnum):
+    """Whether there is a completed model."""
+
+    COMPLETED = "completed"
+    NOTHING_ADDED = "nothing_added"  # the model as given
+    NOT_PHYSICAL = "not_physical"  # the parameters that fit best are none of a structure
+
+
+class CompletedModel(NamedTuple):
+    """The model with what was found, or why there is none."""
+
+    model: Structure | None
+    status: CompletedStatus
+    reason: str = ""
+
+
+def completed_model(
+    model: Structure,
+    baseline: Mapping[str, float],
+    kinds: tuple[str, ...],
+    values: Mapping[str, float],
+) -> CompletedModel:
+    """The model with effects added and its own parameters at their most likely values.
+
+    Arguments: `baseline` has new values of the model's own parameters, `values` those of the
+    added effects, both by name. Where one of them is none that a structure can have, such as a
+    negative frequency, there is no model but a reason.
+    """
+    if not kinds:
+        return CompletedModel(model, CompletedStatus.NOTHING_ADDED)
+    try:
+        for name, value in baseline.items():
+            for rule in (Rule("finite", np.isfinite), *parameter_rules(model, name)):
+                if not rule.good(value):
+                    raise ValueError(f"`{name}` must be {rule.expected}, but is {value:.4g}.")
+        added = tuple(
+            make_effect(kind, {name: values[f"{kind}.{name}"] for name in effect_parameters(kind)})
+            for kind in kinds
+        )
+    except ValueError as error:
+        return CompletedModel(None, CompletedStatus.NOT_PHYSICAL, str(error))
+    moved = with_parameters(model, tuple(baseline), jnp.array(list(baseline.values())))
+    completed = dataclasses.replace(moved, effects=(*model.effects, *added))
+    return CompletedModel(completed, CompletedStatus.COMPLETED)
 
 
 class Estimate(NamedTuple):
@@ -66,7 +116,6 @@ class Checks(NamedTuple):
     p_value: float  # of the misfit that is left
     noise_scale: float  # that neighbouring states show, over the stated noise
     completed_without: dict[int, Structure]  # by level: completed without a level's states
-    unconverged_fits: int  # of the candidates in the table
 
 
 class ForceMisfit(NamedTuple):
@@ -167,7 +216,12 @@ class Diagnosis(AbstractResult):
         ]
         if self.decide_by:
             lines.append(f"to decide: {self.decide_by}")
-        lines.append(f"status: {self._status()}")
+        status = f"fit {self.answer.status.value.replace('_', ' ')}"
+        if self.answer.completed_status is CompletedStatus.NOTHING_ADDED:
+            status = "nothing was added to the model"
+        elif self.answer.completed_status is CompletedStatus.NOT_PHYSICAL:
+            status += ", but no structure can have these parameters: there is no completed model"
+        lines.append(f"status: {status}")
         if self.notes:
             lines.append("notes:")
             for note in self.notes:
@@ -182,16 +236,6 @@ class Diagnosis(AbstractResult):
             if value >= _LEAST_LISTED
         ]
         return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
-
-    def _status(self) -> str:
-        """How the fit and those it was compared with ended."""
-        status = f"fit {_words(self.answer.status)}"
-        if self.answer.completed_status is CompletedStatus.NOTHING_ADDED:
-            status = "nothing was added to the model"
-        elif self.answer.completed_status is CompletedStatus.NOT_PHYSICAL:
-            status += ", but no structure can have these parameters: there is no completed model"
-        tried, early = sum(len(step) for step in self.table), self.checks.unconverged_fits
-        return f"{status}; {early} of {tried} compared fits stopped early" if early else status
 
     def variables(self) -> Mapping[str, Variable]:
         """See `AbstractResult.variables`."""
@@ -268,10 +312,6 @@ def probability_in_words(probability: float) -> str:
 def _texts(texts: Iterable[str]) -> np.ndarray:
     """Texts as an array of texts, without any of them too."""
     return np.array(list(texts), dtype=np.str_)
-
-
-def _words(status: MinimisationStatus | CompletedStatus) -> str:
-    return status.value.replace("_", " ")
 
 
 class FormerAnswer(NamedTuple):

@@ -15,11 +15,12 @@ from snrmjax.diagnose.diagnosis_result import AS_NOISE, Diagnosis, FormerAnswer
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
 from snrmjax.diagnose.held_velocity import held_curves, holds_response
+from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     predict_levels,
 )
-from snrmjax.diagnose.search.detection_limits import beyond_data, scales_of_motions
+from snrmjax.diagnose.search.detection_limits import beyond_data
 from snrmjax.diagnose.search.locating import Located
 from snrmjax.diagnose.search.model_search import TriedEffect
 from snrmjax.io.diagnosis_results import summarise_diagnosis
@@ -323,8 +324,10 @@ def _step(number_of: int, count: int) -> str:
 def _limits_section(diagnosis: Diagnosis) -> Section:
     rows, misfit, scales = [], diagnosis.force_misfit, None
     if diagnosis.completed is not None:
-        modes = diagnosis.completed.modes
-        scales = scales_of_motions(modes, diagnosis.data, misfit.rows, misfit.sensor)
+        modes, data = diagnosis.completed.modes, diagnosis.data
+        columns = (np.abs(data.velocity[:, misfit.sensor]), data.frequency, data.force)
+        of_states = (np.asarray(column)[misfit.rows] for column in columns)
+        scales = scales_of_motions(modes, misfit.sensor, *of_states)
     for name, limit in sorted(diagnosis.detection_limits.items()):
         kind, parameter = name.split(".", 1)
         size = (number(limit, 2), _unit(kind, parameter))

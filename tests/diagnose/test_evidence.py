@@ -163,7 +163,7 @@ def test_evidence_of_an_effect_is_the_integral_over_its_prior(misfit, fit):
     """By quadrature over the strength, every prediction computed anew."""
     one = candidate("quadratic_damping", scales_of(misfit.predictions))
     strength = fit.values[0] * np.linspace(0.5, 1.5, 41)
-    rows, _ = misfit.evaluated(misfit.predictions.group, fit.labels, strength[:, None])
+    rows, _ = misfit.evaluated(fit.labels, strength[:, None])
     shared = misfit.noise.shared
     covariance = np.eye(misfit.n_rows) + shared @ shared.T
     logs = multivariate_normal.logpdf(rows, cov=covariance)

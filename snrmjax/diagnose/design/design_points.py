@@ -150,11 +150,9 @@ def _needed(
 ) -> tuple[Complex[np.ndarray, " state"], Complex[np.ndarray, "state harmonic"]]:
     """The force that motions need under a fit, for one newton recorded, and their harmonics."""
     predictions = predictions_of(misfit.model, data)
-    group = predictions.group
-    values, own = group.values.copy(), misfit.baseline_parameters(fit.rows)
-    for name, value in (own | dict(zip(fit.labels, fit.values.tolist(), strict=True))).items():
-        values[group.place(name)] = value
-    columns = predictions.of(group, values[None]).columns[0]
+    own = misfit.baseline_parameters(fit.rows)
+    values = np.append(list(own.values()), fit.values)
+    columns = predictions.of(predictions.group.at((*own, *fit.labels), values)[None]).columns[0]
     parts = columns[:, 0::2] + 1j * columns[:, 1::2]
     first = len(predictions.chosen.sensors)  # the reference sensor's harmonics come first
     higher = parts[:, first : first + len(HARMONICS)]
@@ -164,12 +162,9 @@ def _needed(
 
 def columns_of(predictions: Predictions, fit: EffectFit) -> Predicted | None:
     """Columns of all states under a fit's parameters; None where no program has all its effects."""
-    group = predictions.group
-    if not set(fit.labels) <= set(group.names):
+    if not set(fit.labels) <= set(predictions.group.names):
         return None
-    values = group.values.copy()
-    values[[group.place(label) for label in fit.labels]] = fit.values
-    return predictions.of(group, values[None], fit.labels)
+    return predictions.of(predictions.group.at(fit.labels, fit.values)[None], fit.labels)
 
 
 class Rows(NamedTuple):

@@ -9,24 +9,31 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from snrmjax.diagnose import priors
-from snrmjax.diagnose.checks.cross_validation import (
+from snrmjax.diagnose.checks.residuals import (
+    UNLIKELY,
     HeldOut,
     HeldOutLevels,
     chi_square_of_level,
     held_out_by,
     held_out_places,
-    rows_of_level,
-)
-from snrmjax.diagnose.checks.patterns import (
-    UNLIKELY,
     left_curve,
     neighbour_noise,
     pattern,
+    rows_of_level,
     tolerated,
 )
 from snrmjax.diagnose.laws.law_prior import LawPosterior, posterior
-from snrmjax.diagnose.laws.law_search import LawFit, fit_laws, problem_of, secants_of
-from snrmjax.diagnose.laws.law_table import SURE, DrawnLaw, drawn_tables, law_effects, law_kind
+from snrmjax.diagnose.laws.law_search import (
+    SURE,
+    DrawnLaw,
+    LawFit,
+    drawn_tables,
+    fit_laws,
+    law_effects,
+    law_kind,
+    problem_of,
+    secants_of,
+)
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, baseline_fit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit

@@ -75,7 +75,7 @@ def law_columns(
     stated, j = p.stated, p.model.modes.mode_of_interest + 1
     linear = (f"mode_{j}.natural_frequency", f"mode_{j}.damping_ratio")
     names = tuple(dict.fromkeys((*stated, *linear)))
-    values = jnp.asarray([p.group.values[p.group.place(name)] for name in names])
+    values = jnp.asarray(p.group.values[p.group.places(names)])
     own = _Settings(names, p.compared)
     slopes = []
     for some in (knots.displacement, knots.velocity):

@@ -6,11 +6,8 @@ Numbers that share a few errors are decorrelated at a cost in proportion to the 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.special import chdtrc
-
-from snrmjax.diagnose.misfit.predictions import Predictions
-from snrmjax.identify.calibrate.calibration_states import whitened_columns
 
 
 class SharedCovariance(NamedTuple):
@@ -147,35 +144,6 @@ class NoiseModel(NamedTuple):
         covariance = np.linalg.pinv(scaled.T @ scaled + np.diag(known / size**2), hermitian=True)
         at = slopes.shape[1] + place
         return float(np.sqrt(max(covariance[at, at], 0.0))) / size[at]
-
-
-def noise_model(
-    predictions: Predictions,
-    by_error: Float[np.ndarray, "state column input"],
-    phasors: Complex[np.ndarray, "state part"],
-    baseline: Float[np.ndarray, "state column prior"],
-    by_linear: Float[np.ndarray, "state column two"],
-) -> NoiseModel:
-    """The noise of states with errors of the baseline model and of whole levels.
-
-    Arguments: slopes `by_error` of the states and `phasors`, of the model that passes errors on;
-    `baseline` are slopes by the baseline's own parameters, times their 1σ; `by_linear` are slopes
-    by natural frequency and damping ratio.
-    """
-    states, levels = predictions.chosen.states, predictions.chosen.n_levels
-    whiten, known = predictions.whitened_for(by_error, phasors)
-    n_sensors = np.asarray(states.velocity).shape[1]
-    gain = by_error[:, :, 1 : n_sensors + 1].sum(axis=2)
-    phase = by_error[:, :, n_sensors + 1 :].sum(axis=2)
-    member = (np.asarray(states.level)[:, None] == np.arange(levels)).astype(float)
-    slopes, level_std = (gain, phase, *np.moveaxis(by_linear, 2, 0)), predictions.model.level_stds
-    kinds = [k for k, std in enumerate(level_std) if std > 0]
-    parts = [level_std[k] * slopes[k][:, :, None] * member[:, None, :] for k in kinds]
-    every = np.concatenate([baseline, *parts], axis=2)
-    shared_kind = np.append(np.full(baseline.shape[2], -1), np.repeat(kinds, levels)).astype(int)
-    own = np.asarray(whitened_columns(whiten, every))[known]
-    state, column = np.nonzero(known)
-    return NoiseModel(whiten, known, shared_covariance(own), shared_kind, state, column)
 
 
 def chi_square_p_value(chi_square: float, freedom: int) -> float:

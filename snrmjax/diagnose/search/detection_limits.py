@@ -3,18 +3,15 @@
 from collections.abc import Collection
 
 import numpy as np
-from jaxtyping import Int
 
-from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate, motion_scales
+from snrmjax.diagnose.misfit.candidates import EffectCandidate, candidate
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, unfitted
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import DETECTED
-from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import VISIBLE_CHANGE, MotionScales
 from snrmjax.model.effect_shape import shape_of, starts_of
 from snrmjax.model.effects import EFFECTS, effect_parameters
-from snrmjax.model.modes import LinearModes
 
 _TRIALS = 4  # of a limit
 _BEYOND = 10.0  # times all that was measured: effects that must be larger cannot be detected
@@ -76,12 +73,3 @@ def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales
     shape = shape_of(effect)
     order = 1 if shape is None else shape.strength_order
     return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > _BEYOND)
-
-
-def scales_of_motions(
-    modes: LinearModes, data: SteadyStates, rows: Int[np.ndarray, " state"], sensor: int
-) -> MotionScales:
-    """Typical sizes of measured motions: of some rows, at one sensor."""
-    speed = np.abs(np.asarray(data.velocity)[rows, sensor])
-    omega, force = np.asarray(data.frequency)[rows], np.asarray(data.force)[rows]
-    return motion_scales(modes, sensor, speed, omega, force)

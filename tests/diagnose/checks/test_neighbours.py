@@ -12,7 +12,7 @@ from truths.made_up_misfits import (
     noise,
 )
 
-from snrmjax.diagnose.checks.patterns import neighbour_noise, tolerated
+from snrmjax.diagnose.checks.residuals import neighbour_noise, tolerated
 
 
 def test_the_order_of_rows_does_not_change_the_noise_of_neighbours():

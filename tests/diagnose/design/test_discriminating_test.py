@@ -23,8 +23,11 @@ from snrmjax.diagnose.design.design_points import (
     predicted_test,
     refitted_chi_square,
 )
-from snrmjax.diagnose.design.discriminating_test import DiscriminatingTest, discriminating_test
-from snrmjax.diagnose.design.recommendation import recommendation
+from snrmjax.diagnose.design.discriminating_test import (
+    DiscriminatingTest,
+    discriminating_test,
+    recommendation,
+)
 from snrmjax.diagnose.evidence import weights_of
 from snrmjax.diagnose.misfit.candidates import only_by_calibration
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
