@@ -129,9 +129,7 @@ def diagnose_model(
     found, weights = answered.found, answered.weights
     as_recorded, rival = found, None
     if predictions.chosen.noise_stated and estimable:
-        rival = suspected_level_forces(
-            found, tolerated(neighbour_noise(found.misfit, found.fit).variance)
-        )
+        rival = suspected_level_forces(found, tolerated(neighbour_noise(found.misfit, found.fit)))
     if rival is not None and rival.is_better:
         own = found.misfit.predictions
         freed = dataclasses.replace(own, free_level_forces=rival.places)
@@ -140,7 +138,7 @@ def diagnose_model(
     free = locate_misfit(misfit, found.baseline)
     weights = weights.with_imitations(len(imitations_of(found, free.parts)))
     neighbours = neighbour_noise(misfit, fit)
-    levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours.variance))
+    levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
     parameters = _estimates(misfit, fit)
     errors = {name: one.std for name, one in parameters.items()}
     gains = level_gains(misfit, fit)
@@ -208,7 +206,7 @@ def diagnose_model(
             rms_misfit(misfit, fit),
             *(levels or (None, None)),
         ),
-        checks=Checks(found.p_value, float(np.sqrt(neighbours.variance)), without),
+        checks=Checks(found.p_value, float(np.sqrt(neighbours)), without),
         detection_limits=detection_limits(misfit, fit, scales, excluded),
         table=found.table,
         notes=tuple(note for note in notes if note),
@@ -352,15 +350,15 @@ def _completed_without_levels(
     misfit: WeightedMisfit, model: Structure, fit: EffectFit
 ) -> tuple[dict[int, Structure], list[int]]:
     """By level: the model completed by the other levels; and the levels where that is none."""
-    found, refused = {}, []
+    found, refused, numbers = {}, [], misfit.level_numbers
     for place in held_out_places(misfit) if fit.kinds else ():
-        one = without_level(misfit, fit, place)
-        values = dict(zip(fit.labels, one.values.tolist(), strict=True))
-        completed = completed_model(model, one.baseline, fit.kinds, values)
+        values, baseline = without_level(misfit, fit, place)
+        own, level = dict(zip(fit.labels, values.tolist(), strict=True)), int(numbers[place])
+        completed = completed_model(model, baseline, fit.kinds, own)
         if completed.model is None:
-            refused.append(one.level)
+            refused.append(level)
         else:
-            found[one.level] = completed.model
+            found[level] = completed.model
     return found, refused
 
 

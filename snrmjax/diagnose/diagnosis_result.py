@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.gains import LevelGain, level_forces_sentence
 from snrmjax.diagnose.checks.residuals import HeldOut
 from snrmjax.diagnose.decide import Verdict, verdict_sentence
@@ -25,9 +26,6 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import Rule
-
-AS_NOISE = 1.3
-"""Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
 
 _WIDTH = 98  # of the notes, columns
 _LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
@@ -207,7 +205,7 @@ class Diagnosis(AbstractResult):
             unit = "" if stated == "1" else stated
             lines.append(f"{name} = {value:.4g} ± {std:.2g} {unit}".rstrip())
         lines.append(f"misfit: {gap.before:.3g} before, {gap.after:.3g} after, in units of noise")
-        if self.parameters and gap.after > AS_NOISE:
+        if self.parameters and gap.after > priors.AS_NOISE:
             lines[-1] += "; the ± above holds only if the noise is as stated"
         lines += [
             f"level {out.level}, left out: {out.before:.3g} before, {out.after:.3g} after"

@@ -61,6 +61,36 @@ stand alone one may be wrong."""
 REJECTED = 1e-3
 """Probability by chance below which a check refutes: some thirty checks are made of a test."""
 
+CONTRADICTED = 4.0
+"""1σ between the power of amplitude in the data and that of a law: curves of a few knots are no
+exact powers."""
+
+PULLED = 2.0
+"""1σ of a stated parameter, by which an answer may move it without a word."""
+
+MOVED_GAIN = 0.05
+"""Of the logarithm of a free gain, by which a right law moves what smooth curves gave."""
+
+FAR_GAIN = 3.0
+"""Ratio of a gain to its first value, beyond which the answer has moved it away."""
+
+FAR_MASS = 3.0
+"""1σ of a modal mass of which none is stated, beyond which it explains no gain."""
+
+AS_NOISE = 1.3
+"""Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
+
+FAR_MISSED = 2.0
+"""Times the noise, from which on a top level that was left out proves nothing of a law."""
+
+MISSED, MISSED_BY_ONE = 0.05, 0.01
+"""Probability by chance of a level that was left out: below the first it counts against an answer
+that another law could imitate, below the second against one of several."""
+
+TOLERATED_VARIANCE = 1.7
+"""Over the stated one, that neighbouring states may show: stated too small by a third, noise is no
+sign of further physics."""
+
 OPEN = 0.1
 """Share of their probability that refuted answers keep: checks rest on approximations too."""
 

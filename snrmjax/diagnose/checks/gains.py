@@ -1,7 +1,7 @@
 """Gains that an answer moves: of the force of single levels, of all forces, of the modal mass."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -77,16 +77,6 @@ class LevelForces(NamedTuple):
         )
 
 
-class _Beside(NamedTuple):
-    """A fit beside gains of the forces of levels."""
-
-    criterion: float
-    places: tuple[int, ...]  # of the levels
-    square: float  # χ²
-    kinds: tuple[str, ...]
-    n_free: int  # degrees of freedom
-
-
 def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | None:
     """The answer with gains of the forces of fewer than half the levels, where it explains as much.
 
@@ -97,19 +87,53 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
     Arguments: `noise` is the variance, over the stated one, that counts as noise.
     Validity: three levels or more, whose phases and forces were measured.
     """
-    misfit = found.misfit
-    arms = misfit.noise.decorrelated(_of_forces(misfit)).T
-    own = found.fit.criterion(misfit.n_rows)
-    every = [_beside(misfit, fit, arms) for fit in _distinct(found)]
-    tried = [one for one in every if one.places]
-    if not tried:
-        return None
-    best = min(tried, key=lambda one: one.criterion)
-    lead, chance = own - best.criterion, chi_square_p_value(best.square / noise, best.n_free)
-    if lead < -AS_GOOD or chance < priors.REJECTED:
-        return None
-    levels = tuple(int(misfit.level_numbers[place]) for place in best.places)
-    return LevelForces(best.places, levels, best.kinds, lead)
+    misfit, chosen = found.misfit, found.misfit.predictions.chosen
+    member = np.asarray(chosen.states.level) == np.arange(chosen.n_levels)[:, None]
+    of_forces = member[:, :, None] * misfit.passed_on.by_error[None, :, :, 0]
+    arms = misfit.noise.decorrelated(misfit.noise.noise_units(of_forces)).T
+    own, cost = found.fit.criterion(misfit.n_rows), float(np.log(misfit.n_rows))
+    fits: dict[frozenset[str], EffectFit] = {}
+    for fit in (found.baseline, found.fit, *found.considered):
+        known = fits.get(frozenset(fit.kinds))
+        if np.isfinite(fit.chi_square) and (known is None or fit.chi_square < known.chi_square):
+            fits[frozenset(fit.kinds)] = fit
+    best, lead = None, -AS_GOOD
+    for fit in fits.values():
+        places, square = _beside(misfit, fit, arms)
+        n = len(fit.values) + len(places)
+        ahead = own - (square + n * cost)
+        if places and ahead >= lead:
+            levels = tuple(int(misfit.level_numbers[place]) for place in places)
+            best, lead = LevelForces(places, levels, fit.kinds, ahead), ahead
+            chance = chi_square_p_value(square / noise, misfit.n_rows - n)
+    return None if best is None or chance < priors.REJECTED else best
+
+
+def _beside(
+    misfit: WeightedMisfit, fit: EffectFit, arms: Float[np.ndarray, "row level"]
+) -> tuple[tuple[int, ...], float]:
+    """The levels whose gains a fit needs beside it, and χ² with them."""
+    left = misfit.noise.decorrelated(fit.rows)
+    own = misfit.noise.decorrelated(fit.slopes.T).T
+
+    def square(places: tuple[int, ...]) -> float:
+        columns = np.concatenate([own, arms[:, list(places)]], axis=1)
+        if not columns.shape[1]:
+            return float(left @ left)
+        size = np.linalg.norm(columns, axis=0)
+        scaled = columns / np.where(size > 0, size, 1.0)
+        steps = np.linalg.lstsq(scaled, left, rcond=1e-10)[0]
+        return float(np.sum((left - scaled @ steps) ** 2))
+
+    places: tuple[int, ...] = ()
+    least, levels = square(()), range(arms.shape[1])
+    while len(places) < (len(levels) - 1) // 2:  # of two that disagree nothing says which is wrong
+        others = [(square((*places, k)), (*places, k)) for k in levels if k not in places]
+        best, chosen = min(others)
+        if least - best - np.log(misfit.n_rows) <= DETECTED:
+            break
+        least, places = best, chosen
+    return tuple(sorted(places)), least
 
 
 def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
@@ -160,58 +184,7 @@ def with_forces_that_acted(data: SteadyStates, gains: Mapping[int, LevelGain]) -
     return dataclasses.replace(data, force=data.force * jnp.asarray(gain))
 
 
-def _of_forces(misfit: WeightedMisfit) -> Float[np.ndarray, "level row"]:
-    """What a relative error of the force of one level adds to the rows."""
-    chosen = misfit.predictions.chosen
-    member = np.asarray(chosen.states.level) == np.arange(chosen.n_levels)[:, None]
-    return misfit.noise.noise_units(member[:, :, None] * misfit.passed_on.by_error[None, :, :, 0])
-
-
-def _distinct(found: FoundEffects) -> Iterable[EffectFit]:
-    """The best fit of every set of effects that was considered."""
-    best: dict[frozenset[str], EffectFit] = {}
-    for fit in (found.baseline, found.fit, *found.considered):
-        kinds = frozenset(fit.kinds)
-        if np.isfinite(fit.chi_square) and (
-            kinds not in best or fit.chi_square < best[kinds].chi_square
-        ):
-            best[kinds] = fit
-    return best.values()
-
-
-def _beside(
-    misfit: WeightedMisfit, fit: EffectFit, arms: Float[np.ndarray, "row level"]
-) -> _Beside:
-    """A fit with gains of those levels that it needs."""
-    left = misfit.noise.decorrelated(fit.rows)
-    own = misfit.noise.decorrelated(fit.slopes.T).T
-    cost = float(np.log(misfit.n_rows))
-
-    def square(places: tuple[int, ...]) -> float:
-        columns = np.concatenate([own, arms[:, list(places)]], axis=1)
-        if not columns.shape[1]:
-            return float(left @ left)
-        size = np.linalg.norm(columns, axis=0)
-        scaled = columns / np.where(size > 0, size, 1.0)
-        steps = np.linalg.lstsq(scaled, left, rcond=1e-10)[0]
-        return float(np.sum((left - scaled @ steps) ** 2))
-
-    places: tuple[int, ...] = ()
-    least, levels = square(()), range(arms.shape[1])
-    while len(places) < (len(levels) - 1) // 2:  # of two that disagree nothing says which is wrong
-        others = [(square((*places, k)), (*places, k)) for k in levels if k not in places]
-        best, chosen = min(others)
-        if least - best - cost <= DETECTED:
-            break
-        least, places = best, chosen
-    n = len(fit.values) + len(places)
-    return _Beside(least + n * cost, tuple(sorted(places)), least, fit.kinds, misfit.n_rows - n)
-
-
-_PULLED = 2.0  # 1σ of a stated parameter, by which an answer may move it without a word
-_MOVED_GAIN = 0.05  # of its logarithm, by which a right law moves a gain that smooth curves gave
-_FAR_MASS = 3.0  # of 1σ of a modal mass of which none is stated, beyond which it is no reason
-_FAR_GAIN = 3.0  # ratio of a gain to the first one, beyond which the answer has moved it away
+_REMEDY = f"{REMEDY_OF_GAIN[0].lower()}{REMEDY_OF_GAIN[1:]}"
 
 
 class GainFound(NamedTuple):
@@ -265,10 +238,10 @@ def modal_mass_found(misfit: WeightedMisfit, fit: EffectFit) -> ModalMassFound |
 def notes_on_found_mass(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
     """That the data ask for another modal mass than the model's, inside its stated error."""
     found = modal_mass_found(misfit, fit)
-    if found is None or abs(found.value - found.model) <= _PULLED * found.std:
+    if found is None or abs(found.value - found.model) <= priors.PULLED * found.std:
         return ()
     beyond = ""
-    if abs(found.value / found.model - 1) > _PULLED * found.stated_std:
+    if abs(found.value / found.model - 1) > priors.PULLED * found.stated_std:
         beyond = ", which is farther than that: check the linear test"
     return (
         f"the data say that the modal mass is {found.value:.4g} ± {found.std:.2g} kg; the model "
@@ -285,11 +258,37 @@ def doubts_on_gains(
 
     A gain of the force that the data do not determine, or that has moved far from its first value;
     a strength smaller than its own 1σ; and a gain that stands for what an error of the modal mass,
-    of which none is stated, could be as well. Arguments: `std` of the effects' parameters by name.
+    of which none is stated, could be as well: where the model states the mass's error the fit has
+    it, and a gain beyond that is one. Arguments: `std` of the effects' parameters by name.
     """
     of_gain = _on_gain(misfit, fit)
     found = [] if of_gain is None else [of_gain]
-    return [*found, *_on_strengths(fit, std), *_on_modal_mass(misfit, fit)]
+    strengths = {kind: fit.of_kind(kind)[0] for kind in fit.kinds}
+    for kind, strength in strengths.items():
+        own = std[parameter_labels(kind)[0]]
+        if own > abs(strength):
+            found.append(
+                Doubt(
+                    f"these data do not determine {kind}: its strength is {abs(strength):.2g} with "
+                    f"a 1σ of {own:.2g}, larger than itself.",
+                    "measure at more amplitudes and frequencies",
+                )
+            )
+    modes, sensor = misfit.model.modes, misfit.predictions.chosen.sensors[0]
+    j = modes.mode_of_interest
+    mass = 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
+    for kind, gain in strengths.items() if modes.modal_mass_std is None else ():
+        far = priors.FAR_MASS * UNSTATED_MODAL_MASS_STD
+        if FORCE_OR_SENSOR_GAIN in EFFECTS[kind].confusions and abs(np.log1p(gain)) <= far:
+            found.append(
+                Doubt(
+                    f"{kind} of {gain:+.2g} may be the modal mass: with {mass / (1 + gain):.4g} kg "
+                    f"in place of the model's {mass:.4g} kg, of which no error is stated "
+                    "(`modal_mass_std`), the model needs no such effect.",
+                    SIZE_OF_RESPONSE.separated_by,
+                )
+            )
+    return found
 
 
 def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
@@ -297,31 +296,27 @@ def _on_gain(misfit: WeightedMisfit, fit: EffectFit) -> Doubt | None:
     gain = gain_found(misfit, fit)
     if gain is None:
         return None
-    if not 1 / _FAR_GAIN < gain.value < _FAR_GAIN:
+    if not 1 / priors.FAR_GAIN < gain.value < priors.FAR_GAIN:
         reason = (
             f"the answer needs {gain.value:.2g} times the force that smooth curves need: with a "
             "force of any size almost any law fits, so the force gain cannot be determined beside "
             "it."
         )
-        return Doubt(reason, _remedy(), refutes=True)
+        return Doubt(reason, _REMEDY, refutes=True)
     said = force_gain_undetermined(gain.std, gain.farthest)
-    if not said and abs(np.log(gain.value)) > _MOVED_GAIN:
+    if not said and abs(np.log(gain.value)) > priors.MOVED_GAIN:
         reason = (
             f"the answer moves the force gain by {100 * (gain.value - 1):+.2g} %: smooth curves of "
             "amplitude need the former one, and beside a free gain these data hardly determine the "
             "law."
         )
-        return Doubt(reason, _remedy())
+        return Doubt(reason, _REMEDY)
     if not said:
         return None
     if force_gain_determined(gain.std) is Determination.NOT_AT_ALL:
-        return Doubt(said, _remedy(), refutes=True)
+        return Doubt(said, _REMEDY, refutes=True)
     reason = "the force gain, which these data hardly determine, may be a part of the answer."
-    return Doubt(reason, _remedy())
-
-
-def _remedy() -> str:
-    return f"{REMEDY_OF_GAIN[0].lower()}{REMEDY_OF_GAIN[1:]}"
+    return Doubt(reason, _REMEDY)
 
 
 def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[str, ...]:
@@ -330,7 +325,8 @@ def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[
     pulled = [
         f"`{name}` by {step:+.2g} times its 1σ of {std:.2g}"
         for (name, (_, std)), step in zip(misfit.predictions.stated.items(), moved, strict=False)
-        if abs(step) > _PULLED and not name.endswith(".participation")  # said of the modal mass
+        if abs(step) > priors.PULLED
+        and not name.endswith(".participation")  # said of the modal mass
     ]
     if not pulled:
         return ()
@@ -338,46 +334,3 @@ def notes_on_stated_parameters(misfit: WeightedMisfit, fit: EffectFit) -> tuple[
         f"the answer moves {', '.join(pulled)}, as the model states it: check the linear test, or "
         "whether it was of another assembly.",
     )
-
-
-def _on_modal_mass(misfit: WeightedMisfit, fit: EffectFit) -> list[Doubt]:
-    """That a gain of force or sensor does what a wrong modal mass of the model does.
-
-    Where the model states the mass's error the fit has it, and a gain beyond that is one.
-    """
-    modes, found = misfit.model.modes, []
-    sensor, j = misfit.predictions.chosen.sensors[0], modes.mode_of_interest
-    mass = 1 / abs(float(modes.mode_shape[sensor, j] * modes.participation[j]))
-    values = dict(zip(fit.labels, fit.values.tolist(), strict=True))
-    for kind in fit.kinds if modes.modal_mass_std is None else ():
-        if FORCE_OR_SENSOR_GAIN not in EFFECTS[kind].confusions:
-            continue
-        gain = values[parameter_labels(kind)[0]]
-        if abs(np.log1p(gain)) > _FAR_MASS * UNSTATED_MODAL_MASS_STD:
-            continue
-        found.append(
-            Doubt(
-                f"{kind} of {gain:+.2g} may be the modal mass: with {mass / (1 + gain):.4g} kg in "
-                f"place of the model's {mass:.4g} kg, of which no error is stated "
-                "(`modal_mass_std`), the model needs no such effect.",
-                SIZE_OF_RESPONSE.separated_by,
-            )
-        )
-    return found
-
-
-def _on_strengths(fit: EffectFit, std: Mapping[str, float]) -> list[Doubt]:
-    """Effects whose strength is smaller than its own 1σ."""
-    values, found = dict(zip(fit.labels, fit.values.tolist(), strict=True)), []
-    for kind in fit.kinds:
-        strength = parameter_labels(kind)[0]
-        size, own = abs(values[strength]), std[strength]
-        if own > size:
-            found.append(
-                Doubt(
-                    f"these data do not determine {kind}: its strength is {size:.2g} with a 1σ of "
-                    f"{own:.2g}, larger than itself.",
-                    "measure at more amplitudes and frequencies",
-                )
-            )
-    return found

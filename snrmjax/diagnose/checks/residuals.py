@@ -15,9 +15,6 @@ from snrmjax.diagnose.misfit.noise_model import chi_square_p_value, shared_covar
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.diagnose.search.model_search import FoundEffects
 
-_MISSED, _MISSED_BY_ONE = 0.05, 0.01  # by chance: beside a doubt, and beside other answers
-_AS_NOISE, _FAR = 1.3, 2.0  # times the noise, that a level is missed
-
 
 class HeldOut(NamedTuple):
     """Root-mean-square misfit of one level in units of its predicted scatter."""
@@ -38,26 +35,32 @@ def held_out(
     baseline's stated uncertainty are predicted too; its own gain and phase are not. `noise` is
     the variance over the stated one for which probabilities are given.
     """
-    out = rows_of_level(misfit, level)
-    before, _ = _chi_square_of(misfit, baseline, out)
-    return held_out_by(misfit, level, before, _chi_square_of(misfit, fit, out), noise)
+    kept = ~rows_of_level(misfit, level)
+    before, after = (_refitted(misfit, one, kept)[1:] for one in (baseline, fit))
+    return held_out_by(misfit, level, before, after, noise)
 
 
 def held_out_by(
-    misfit: WeightedMisfit, level: int, before: float, after: tuple[float, float], noise: float
+    misfit: WeightedMisfit,
+    level: int,
+    before: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row any"]],
+    after: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row any"]],
+    noise: float,
 ) -> HeldOut:
-    """A level left out of a fit by its χ²: `before` and `after` any effect.
+    """A level left out, by fits to the others: `before` and `after` any effect.
 
-    `after` is what `chi_square_of_level` returns.
+    Of each all rows, and the root of the covariance of the parameters' part of them.
     """
-    n_out = int(rows_of_level(misfit, level).sum())
-    known, open_too = after
+    out = rows_of_level(misfit, level)
+    first, _ = _chi_square_of_level(misfit, *before, out)
+    known, open_too = _chi_square_of_level(misfit, *after, out)
+    n = int(out.sum())
     return HeldOut(
         int(misfit.level_numbers[level]),
-        float(np.sqrt(before / n_out)),
-        float(np.sqrt(known / n_out)),
-        chi_square_p_value(known / noise, n_out),
-        chi_square_p_value(open_too / noise, n_out),
+        float(np.sqrt(first / n)),
+        float(np.sqrt(known / n)),
+        chi_square_p_value(known / noise, n),
+        chi_square_p_value(open_too / noise, n),
     )
 
 
@@ -92,21 +95,14 @@ def held_out_levels(
     return HeldOutLevels(*(held_out(misfit, baseline, fit, place, noise) for place in places))
 
 
-class FitWithoutLevel(NamedTuple):
-    """A fit's parameters, and the baseline's, by all levels but one."""
-
-    level: int
-    values: Float[np.ndarray, " parameter"]
-    baseline: dict[str, float]
-
-
-def without_level(misfit: WeightedMisfit, fit: EffectFit, level: int) -> FitWithoutLevel:
-    """One step from the whole fit to the best one without a level's rows."""
+def without_level(
+    misfit: WeightedMisfit, fit: EffectFit, level: int
+) -> tuple[Float[np.ndarray, " parameter"], dict[str, float]]:
+    """A fit's parameters, and the baseline's: one step to the best fit without a level's rows."""
     kept = ~rows_of_level(misfit, level)
     change, rows, _ = _refitted(misfit, fit, kept)
     values = np.clip(fit.values + change, fit.lower, fit.upper)
-    number = int(misfit.level_numbers[level])
-    return FitWithoutLevel(number, values, misfit.baseline_parameters(rows, kept))
+    return values, misfit.baseline_parameters(rows, kept)
 
 
 def rms_misfit(misfit: WeightedMisfit, fit: EffectFit) -> float:
@@ -146,25 +142,13 @@ def _refitted(
     return change / size, fit.rows + scaled @ change, scaled @ root
 
 
-def _chi_square_of(
-    misfit: WeightedMisfit, fit: EffectFit, out: Bool[np.ndarray, " row"]
-) -> tuple[float, float]:
-    """χ² of rows left out, with the fitted parameters taken as known and as uncertain."""
-    _, rows, root = _refitted(misfit, fit, ~out)
-    return chi_square_of_level(misfit, rows, root, out)
-
-
-def chi_square_of_level(
+def _chi_square_of_level(
     misfit: WeightedMisfit,
     rows: Float[np.ndarray, " row"],
     root: Float[np.ndarray, "row any"],
     out: Bool[np.ndarray, " row"],
 ) -> tuple[float, float]:
-    """χ² of rows left out, given the others, with parameters taken as known and as uncertain.
-
-    Arguments: `rows` of a fit to the others; `root` of the covariance of the parameters' part of
-    the rows.
-    """
+    """χ² of rows left out, given the others, with parameters taken as known and as uncertain."""
     given = misfit.noise.covariance.given_rows(~out)
     left, spread = given.decorrelated(rows), given.decorrelated(root.T).T
     known = float(left @ left)
@@ -192,10 +176,10 @@ def missed_levels(
             return [_refuting(held.level, held.after)]
     chance = inner.uncertain_p_value if parts_missing else inner.p_value
     worse = inner.after > inner.before and chance < priors.REJECTED
-    alike = doubted and (inner.p_value < _MISSED or inner.after > _AS_NOISE)
-    if worse or alike or (unclear and inner.uncertain_p_value < _MISSED_BY_ONE):
+    alike = doubted and (inner.p_value < priors.MISSED or inner.after > priors.AS_NOISE)
+    if worse or alike or (unclear and inner.uncertain_p_value < priors.MISSED_BY_ONE):
         return [_refuting(inner.level, inner.after)]
-    if outer.after < _FAR or outer.p_value >= priors.REJECTED:
+    if outer.after < priors.FAR_MISSED or outer.p_value >= priors.REJECTED:
         return []
     return [
         Doubt(
@@ -214,12 +198,6 @@ def _refuting(level: int, missed: float) -> Doubt:
         f"measure level {level} again, and further levels around it",
         refutes=True,
     )
-
-
-UNLIKELY = priors.REJECTED
-_OF_AMPLITUDE, _OF_TEST = 6, 8  # knots of free curves
-_RESOLUTION = 1e-6  # of singular values: directions that an answer has already
-_TOLERATED = 1.7  # variance over the stated one that neighbouring states may show
 
 
 def pattern(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
@@ -247,9 +225,9 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
     if chosen.phase_unknown.any():
         return None  # sizes are not linear in a curve
     speed = np.abs(np.asarray(chosen.states.velocity)[:, 0])
-    amplitude = hat_functions(np.log(speed), _OF_AMPLITUDE)
+    amplitude = hat_functions(np.log(speed), 6)
     order = np.argsort(np.argsort(chosen.rows)).astype(float)
-    of_test = hat_functions(order, _OF_TEST)
+    of_test = hat_functions(order, 8)
     curves = (
         ("the stiffness as a free function of the amplitude", 0, amplitude),
         ("the damping as a free function of the amplitude", 1, amplitude),
@@ -269,7 +247,7 @@ def left_curve(misfit: WeightedMisfit, fit: EffectFit) -> str | None:
             ratio = max(gain, 0.0) / n_own / (rest / n_free)
             found.append((float(fdtrc(n_own, n_free, ratio)), name))
     chance, name = min(found, default=(1.0, ""))
-    if chance * len(curves) >= UNLIKELY:
+    if chance * len(curves) >= priors.REJECTED:
         return None
     return (
         f"{name} still explains a part of the misfit that is left (probability by chance "
@@ -287,7 +265,7 @@ def _by_level(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> str | 
     groups = [mine for mine in groups if mine.any() and not mine.all()]
     for mine in groups:
         ratio = np.mean(left[mine] ** 2) / np.mean(left[~mine] ** 2)
-        if fdtrc(mine.sum(), (~mine).sum(), ratio) < UNLIKELY / len(groups):
+        if fdtrc(mine.sum(), (~mine).sum(), ratio) < priors.REJECTED / len(groups):
             name = misfit.level_numbers[int(level[mine][0])]
             force = bool(of_force[mine][0])
             what = f"level {name} is" if force else f"the harmonics of level {name} are"
@@ -318,7 +296,7 @@ def _by_direction(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> st
     with_it = np.sum(force * unit, axis=1)
     across = force[:, 1] * unit[:, 0] - force[:, 0] * unit[:, 1]
     ratio = float(np.sum(with_it**2) / np.sum(across**2))
-    if not fdtrc(len(with_it), len(with_it), ratio) < UNLIKELY:
+    if not fdtrc(len(with_it), len(with_it), ratio) < priors.REJECTED:
         return None
     return (
         f"the misfit that is left is {np.sqrt(ratio):.2g} times as large in the direction of a "
@@ -336,7 +314,7 @@ def _of_neighbours(misfit: WeightedMisfit, left: Float[np.ndarray, " row"]) -> s
             continue
         square = np.mean(np.concatenate(parts) ** 2)
         common = sum(float(some[:-1] @ some[1:]) for some in parts) / number / square
-        if ndtr(-common * np.sqrt(number)) < UNLIKELY / 2:
+        if ndtr(-common * np.sqrt(number)) < priors.REJECTED / 2:
             order = "in the order of the test" if of_test else "along the resonance"
             return (
                 f"the misfits of neighbouring states {order} are correlated ({common:.2f}): those "
@@ -372,47 +350,29 @@ def _basis(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row a
     if not columns.shape[1]:
         return scaled
     left, values, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, values > _RESOLUTION * values[0]])
+    return np.asarray(left[:, values > 1e-6 * values[0]])
 
 
-class NeighbourNoise(NamedTuple):
-    """Noise that neighbouring states show."""
-
-    variance: float  # over the stated one
-    std: float  # 1σ of the variance
-
-
-def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> NeighbourNoise:
-    """Variance of the force's misfit by second differences along every level.
+def neighbour_noise(misfit: WeightedMisfit, fit: EffectFit) -> float:
+    """Variance of the force's misfit, over the stated one, by second differences along levels.
 
     What varies smoothly from state to state, explained or not, does not enter; errors that states
     share are taken out first. Where phases are those of the fit, which may be wrong, the order of
     the test counts too: noise is smooth in neither.
     """
     left = misfit.noise.without_shared(fit.rows)
-    unsure = misfit.predictions.chosen.phase_unknown.any()
-    return min(_scatter(misfit, left, of_test=k) for k in ((False, True) if unsure else (False,)))
-
-
-def _scatter(
-    misfit: WeightedMisfit, left: Float[np.ndarray, " row"], *, of_test: bool
-) -> NeighbourNoise:
-    """Variance by second differences in one order of the states."""
-    squares = [
-        (some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6
-        for some in along(misfit, left, of_test=of_test)
-        if len(some) > 2
-    ]
-    if not squares:
-        return NeighbourNoise(1.0, np.inf)
-    every = np.concatenate(squares)
-    # Jumps and kinks are not noise: beyond four times the median's 1σ they are cut off.
-    limit = 16 * np.median(every) / 0.4549
-    # Neighbouring differences share states: about half as many are independent.
-    value = float(np.mean(np.minimum(every, limit)))
-    return NeighbourNoise(value, value * float(np.sqrt(2 / (0.51 * len(every)))))
+    found = []
+    for of_test in (False, True) if misfit.predictions.chosen.phase_unknown.any() else (False,):
+        parts = [some for some in along(misfit, left, of_test=of_test) if len(some) > 2]
+        if not parts:
+            return 1.0
+        squares = [(some[:-2] - 2 * some[1:-1] + some[2:]) ** 2 / 6 for some in parts]
+        every = np.concatenate(squares)
+        # Jumps and kinks are not noise: beyond four times the median's 1σ they are cut off.
+        found.append(float(np.mean(np.minimum(every, 16 * np.median(every) / 0.4549))))
+    return min(found)
 
 
 def tolerated(noise: float) -> float:
     """Variance that counts as noise: stated a little too small it is no sign of further physics."""
-    return float(np.clip(noise, 1.0, _TOLERATED))
+    return float(np.clip(noise, 1.0, priors.TOLERATED_VARIANCE))

@@ -10,10 +10,8 @@ from jaxtyping import Bool, Float
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.checks.residuals import (
-    UNLIKELY,
     HeldOut,
     HeldOutLevels,
-    chi_square_of_level,
     held_out_by,
     held_out_places,
     left_curve,
@@ -82,16 +80,16 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
         return None
     parts = fit.posterior.parts
     # Each with errors passed on as it passes them. Effects that fit were refuted otherwise.
-    rejected = found.p_value < UNLIKELY
+    rejected = found.p_value < priors.REJECTED
     if rejected and fit.criterion > found.fit.criterion(misfit.n_rows) - DETECTED:
         return None
     as_effect = _as_effect_fit(fit)
     neighbours = neighbour_noise(fit.misfit, as_effect)
     freedom = round(fit.misfit.n_rows - fit.posterior.freedom)
     p_value = chi_square_p_value(as_effect.chi_square, freedom)
-    structure = pattern(fit.misfit, as_effect) if p_value < UNLIKELY else None
-    allowed = tolerated(neighbours.variance) if structure is None else 1.0
-    if chi_square_p_value(as_effect.chi_square / allowed, freedom) < UNLIKELY:
+    structure = pattern(fit.misfit, as_effect) if p_value < priors.REJECTED else None
+    allowed = tolerated(neighbours) if structure is None else 1.0
+    if chi_square_p_value(as_effect.chi_square / allowed, freedom) < priors.REJECTED:
         return None
     if left_curve(fit.misfit, as_effect) is not None:
         return None
@@ -102,8 +100,8 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
         levels = HeldOutLevels(*pairs)
         # The top one is predicted by extrapolation, of which a law of any shape promises nothing.
         inner = levels.inner
-        worse = inner.after > inner.before and inner.p_value < UNLIKELY
-        if worse or inner.uncertain_p_value < UNLIKELY / 2:
+        worse = inner.after > inner.before and inner.p_value < priors.REJECTED
+        if worse or inner.uncertain_p_value < priors.REJECTED / 2:
             return None
     laws = tuple(drawn_tables(fit))
     effects = law_effects(fit, fit.secants)
@@ -124,7 +122,7 @@ def law_answer(found: FoundEffects, model: Structure) -> LawAnswer | None:
         fit=as_effect,
         misfit=fit.misfit,
         p_value=p_value,
-        noise=neighbours.variance,
+        noise=neighbours,
         levels=levels,
         completed=completed,
         completed_without=completed_without,
@@ -164,13 +162,12 @@ def _without(fit: LawFit, place: int) -> LawPosterior:
 
 def _held_out(fit: LawFit, place: int, without: LawPosterior, noise: float) -> HeldOut:
     """A level left out of the fit, predicted by the others."""
-    misfit, out = fit.misfit, rows_of_level(fit.misfit, place)
+    misfit = fit.misfit
     values, vectors = np.linalg.eigh(without.covariance)
     root = _arms(fit) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     none = np.zeros((misfit.n_rows, 0))
-    before, _ = chi_square_of_level(misfit, baseline_fit(misfit).rows, none, out)
-    after = chi_square_of_level(misfit, _rows(fit, without), root, out)
-    return held_out_by(misfit, place, before, after, noise)
+    before = baseline_fit(misfit).rows, none
+    return held_out_by(misfit, place, before, (_rows(fit, without), root), noise)
 
 
 def _completed(
