@@ -51,9 +51,8 @@ from snrmjax.diagnose.misfit.reference import (
     with_reference,
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
-from snrmjax.diagnose.search.detection_limits import detection_limits
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import FoundEffects
+from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -135,14 +134,14 @@ def diagnose_model(
         freed = dataclasses.replace(own, free_level_forces=rival.places)
         found, weights = search.answered(freed)[:2]
     misfit, fit = at_phases_of(found.misfit, found.fit), found.fit
-    free = locate_misfit(misfit, found.baseline)
-    weights = weights.with_imitations(len(imitations_of(found, free.parts)))
+    located = locate_misfit(misfit, found.baseline)
+    weights = weights.with_imitations(len(imitations_of(found, located)))
     neighbours = neighbour_noise(misfit, fit)
     levels = held_out_levels(misfit, found.baseline, fit, tolerated(neighbours))
     parameters = _estimates(misfit, fit)
     errors = {name: one.std for name, one in parameters.items()}
     gains = level_gains(misfit, fit)
-    judgement = decide(found, weights, free.parts, levels, errors, None if gains else rival)
+    judgement = decide(found, weights, located, levels, errors, None if gains else rival)
     test = None
     # Without phases the first measurement to recommend is that of the phases.
     if judgement.verdict is Verdict.AMBIGUOUS and not unknown.any():
@@ -200,7 +199,7 @@ def diagnose_model(
             phases=not unknown.any(),
         ),
         discriminating_test=test,
-        located=free.parts,
+        located=located,
         gap=Gap(
             rms_misfit(as_recorded.misfit, as_recorded.baseline),
             rms_misfit(misfit, fit),

@@ -58,6 +58,13 @@ AS_GOOD = 0.01
 """Odds to the best answer down to which another one belongs to the class: of a hundred names that
 stand alone one may be wrong."""
 
+DETECTED = 10.0
+"""Gain of Schwarz's criterion from which on an effect counts as detected: odds of 150 to one pay
+for the choice among some thirty effects."""
+
+AS_GOOD_BY_CRITERION = 6.0
+"""Difference of Schwarz's criterion within which two models count as equally good: odds of 20."""
+
 REJECTED = 1e-3
 """Probability by chance below which a check refutes: some thirty checks are made of a test."""
 

@@ -21,9 +21,8 @@ from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     predict_levels,
 )
-from snrmjax.diagnose.search.detection_limits import beyond_data
 from snrmjax.diagnose.search.locating import Located
-from snrmjax.diagnose.search.model_search import TriedEffect
+from snrmjax.diagnose.search.model_search import TriedEffect, beyond_data
 from snrmjax.io.diagnosis_results import summarise_diagnosis
 from snrmjax.io.files import write_summary
 from snrmjax.io.models import write_model

@@ -14,7 +14,7 @@ from snrmjax.diagnose.misfit.candidates import parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import FREE_LEVEL_FORCE_STD, WeightedMisfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED, FoundEffects
+from snrmjax.diagnose.search.model_search import FoundEffects
 from snrmjax.identify.checks.instruments import (
     REMEDY_OF_GAIN,
     Determination,
@@ -50,7 +50,7 @@ class LevelForces(NamedTuple):
     @property
     def is_better(self) -> bool:
         """Whether the data prefer it clearly."""
-        return self.lead > AS_GOOD
+        return self.lead > priors.AS_GOOD_BY_CRITERION
 
     @property
     def names(self) -> str:
@@ -82,7 +82,8 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
 
     Every answer that the search considered is solved once more beside gains, in the linear
     approximation; levels are added while Schwarz's criterion falls by `DETECTED`. None where no
-    such answer fits, or where its criterion is behind that of `found` by more than `AS_GOOD`.
+    such answer fits, or where its criterion is behind that of `found` by more than
+    `AS_GOOD_BY_CRITERION`.
 
     Arguments: `noise` is the variance, over the stated one, that counts as noise.
     Validity: three levels or more, whose phases and forces were measured.
@@ -97,7 +98,7 @@ def suspected_level_forces(found: FoundEffects, noise: float) -> LevelForces | N
         known = fits.get(frozenset(fit.kinds))
         if np.isfinite(fit.chi_square) and (known is None or fit.chi_square < known.chi_square):
             fits[frozenset(fit.kinds)] = fit
-    best, lead = None, -AS_GOOD
+    best, lead = None, -priors.AS_GOOD_BY_CRITERION
     for fit in fits.values():
         places, square = _beside(misfit, fit, arms)
         n = len(fit.values) + len(places)
@@ -130,7 +131,7 @@ def _beside(
     while len(places) < (len(levels) - 1) // 2:  # of two that disagree nothing says which is wrong
         others = [(square((*places, k)), (*places, k)) for k in levels if k not in places]
         best, chosen = min(others)
-        if least - best - np.log(misfit.n_rows) <= DETECTED:
+        if least - best - np.log(misfit.n_rows) <= priors.DETECTED:
             break
         least, places = best, chosen
     return tuple(sorted(places)), least

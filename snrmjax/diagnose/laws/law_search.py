@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.laws.law_columns import TABLES, LawColumns, LawKnots, law_columns
 from snrmjax.diagnose.laws.law_prior import (
     PARTS,
@@ -15,9 +16,8 @@ from snrmjax.diagnose.laws.law_prior import (
     best_processes,
     posterior,
 )
-from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
+from snrmjax.diagnose.misfit.predictions import scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.diagnose.search.model_search import AS_GOOD, DETECTED
 from snrmjax.model.effect_base import AbstractEffect
 from snrmjax.model.effect_metadata import Argument
 from snrmjax.model.library.free_laws import (
@@ -29,13 +29,6 @@ from snrmjax.model.library.free_laws import (
 )
 
 _KNOTS = 24
-_FIRST = 0.25  # knot, over the smallest amplitude that was measured; the last is at the largest
-_FIRST_SLIP = 0.1  # slip displacement, over the smallest amplitude
-_MOST = 3  # parts of a law
-_STARTS = 2  # parts from which further ones are sought
-_ROUNDS, _HALVINGS = 6, 5
-_SEARCHED = 3  # rounds in which parts are chosen
-_SETTLED = 0.05  # rms change of the rows, in units of noise, that ends the rounds
 
 
 class LawFit(NamedTuple):
@@ -85,7 +78,13 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     of the instruments, and Masing's rule ties the damping of slip to its stiffness.
     """
     predictions, scales = misfit.predictions, scales_of(misfit.predictions)
-    knots = knots_of(predictions)
+    # Over the measured range of motion of the mode of interest.
+    states, modes = predictions.chosen.states, predictions.model.modes
+    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
+    v = np.abs(np.asarray(states.velocity)[:, 0] / shape)
+    q = v / np.asarray(states.frequency)
+    ranges = ((q, 0.25), (v, 0.25), (q, 0.1))  # the first knots over the smallest amplitude
+    knots = LawKnots(*(np.geomspace(k * s.min(), s.max(), _KNOTS) for s, k in ranges))
     units = {}
     for name, part in PARTS.items():
         is_stiffness = part.tables[0] in (0, 5)
@@ -101,15 +100,15 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     settled = False
     parts: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
-    for number in range(_ROUNDS):
+    for number in range(6):
         problem = law_problem(misfit, columns, secants, knots, units)
         # First one part alone: errors are not passed on yet as the law does.
-        if number < _SEARCHED:
-            parts, rivals = _parts(problem, 1 if number == 0 else _MOST)
+        if number < 3:
+            parts, rivals = _parts(problem, 1 if number == 0 else 3)
         found = posterior(problem, parts)
         aim = secants_of(parts, found.mean, units)
         change = (aim - secants).reshape(-1)
-        for _ in range(_HALVINGS):
+        for _ in range(5):
             ahead = law_columns(predictions, knots, aim, everything, columns)
             if np.isfinite(ahead.columns).all():
                 break
@@ -119,12 +118,12 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
         # A step that changes no row any more, in the weighting of the step before.
         moved = (columns.by_secant.reshape(*columns.columns.shape, -1) @ change)[None]
         moved = misfit.noise.decorrelated(misfit.noise.noise_units(moved)[0])
-        settled = bool(np.sqrt(np.mean(moved**2)) < _SETTLED)
+        settled = bool(np.sqrt(np.mean(moved**2)) < 0.05)
         secants, columns = aim, ahead
         misfit = misfit.reweighted(columns.passed_on)
         if settled and number > 0:
             break
-        if number + 1 >= _SEARCHED and not _is_one(parts):
+        if number >= 2 and not _is_one(parts):
             return None
     if not _is_one(parts):
         return None
@@ -141,19 +140,6 @@ def _is_one(parts: Sequence[str]) -> bool:
 def _class_of(part: str) -> str:
     """Of a part, what it is a function of: "odd spring" and "even spring" are of one law."""
     return part.split()[-1]
-
-
-def knots_of(predictions: Predictions) -> LawKnots:
-    """Knots over the measured range of motion of the mode of interest."""
-    states, modes = predictions.chosen.states, predictions.model.modes
-    shape = float(modes.mode_shape[predictions.chosen.sensors[0], modes.mode_of_interest])
-    v = np.abs(np.asarray(states.velocity)[:, 0] / shape)
-    q = v / np.asarray(states.frequency)
-
-    def between(size: np.ndarray, first: float) -> np.ndarray:
-        return np.geomspace(first * float(size.min()), float(size.max()), _KNOTS)
-
-    return LawKnots(between(q, _FIRST), between(v, _FIRST), between(q, _FIRST_SLIP))
 
 
 def law_problem(
@@ -177,21 +163,11 @@ def law_problem(
             for table, sign in zip(part.tables, part.signs, strict=True)
         ]
         whole.append(units[name] * sum(signed))
-        place[name] = np.log(knots_of_table(knots, part.tables[0]))
+        place[name] = np.log(knots[(0, 0, 1, 1, 0, 2)[part.tables[0]]])
     both = noise.decorrelated(np.column_stack([*whole, rows]).T, kept).T
     columns_of, left = both[:, :-1], both[:, -1]
     gram, pull = columns_of.T @ columns_of, -columns_of.T @ left
     return LawProblem(gram, pull, float(left @ left), place)
-
-
-def problem_of(fit: LawFit, kept: Bool[np.ndarray, " row"]) -> LawProblem:
-    """The problem of a fitted law by some of the rows."""
-    return law_problem(fit.misfit, fit.columns, fit.secants, fit.knots, fit.units, kept)
-
-
-def knots_of_table(knots: LawKnots, table: int) -> Float[np.ndarray, " knot"]:
-    """Where a table of secants has its knots."""
-    return knots[(0, 0, 1, 1, 0, 2)[table]]
 
 
 def secants_of(
@@ -214,8 +190,8 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
     order = sorted(PARTS, key=lambda part: alone[part])
     best: tuple[str, ...] = (order[0],)
     cost = alone[order[0]]
-    rivals = tuple(part for part in order[1:] if alone[part] < cost + AS_GOOD)
-    for first in order[:_STARTS]:
+    rivals = tuple(part for part in order[1:] if alone[part] < cost + priors.AS_GOOD_BY_CRITERION)
+    for first in order[:2]:
         own: tuple[str, ...] = (first,)
         own_cost = alone[first]
         while len(own) < most:
@@ -223,10 +199,10 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
                 part: best_processes(problem, (*own, part))[1] for part in PARTS if part not in own
             }
             added = min(costs, key=lambda part: costs[part])
-            if costs[added] > own_cost - DETECTED:
+            if costs[added] > own_cost - priors.DETECTED:
                 break
             own, own_cost = (*own, added), costs[added]
-        if own_cost < cost - (DETECTED if len(own) > len(best) else 0.0):
+        if own_cost < cost - (priors.DETECTED if len(own) > len(best) else 0.0):
             best, cost = own, own_cost
     return best, rivals if len(best) == 1 else ()
 
@@ -234,15 +210,13 @@ def _parts(problem: LawProblem, most: int) -> tuple[tuple[str, ...], tuple[str, 
 SURE = 1.96
 """1σ of a 95 % band."""
 
-_TWO_SIDED = {"even spring"}
-_KINDS = {
+LAW_KINDS = {
     "odd spring": StiffnessLaw.kind,
     "even spring": UnevenStiffnessLaw.kind,
     "odd damper": DampingLaw.kind,
     "film": DisplacementDampingLaw.kind,
     "slip": SlipLaw.kind,
 }
-_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
 class DrawnLaw(NamedTuple):
@@ -264,28 +238,13 @@ class DrawnLaw(NamedTuple):
     passing: float | None = None  # m/s
 
 
-class _Table(NamedTuple):
-    """Modal force of one kind of law, linear in the secants, where it is given."""
-
-    parts: tuple[str, ...]
-    argument: Argument
-    at: np.ndarray
-    force: np.ndarray
-    std: np.ndarray
-
-
-def law_kind(part: str) -> str:
-    """The kind of effect that a part of a law becomes."""
-    return _KINDS[part]
-
-
 def law_effects(fit: LawFit, secants: Float[np.ndarray, "table knot"]) -> list[AbstractEffect]:
     """Effects of the model, one for the springs, one for the dampers and so on, by importance."""
     found: list[AbstractEffect] = []
     x, v, s = (jnp.asarray(knots) for knots in fit.knots)
     w = jnp.asarray(secants)
     for group in _grouped(fit.posterior.parts):
-        two_sided = bool(_TWO_SIDED & set(group))
+        two_sided = "even spring" in group
         if group[0].endswith("spring"):
             own = UnevenStiffnessLaw(x, w[0] * x, w[1] * x) if two_sided else None
             found.append(own or StiffnessLaw(x, w[0] * x))
@@ -344,7 +303,7 @@ def _modal_table(
     n = len(knots.slip)
     eye = np.eye(len(post.parts) * n)
     tables = secants_of(post.parts, eye, fit.units)  # secant, table, knot
-    two_sided = bool(_TWO_SIDED & set(group))
+    two_sided = "even spring" in group
     if group == ("slip",):
         at = knots.displacement
         force = -np.einsum("ek,kx->ex", tables[:, 5], np.maximum(at - knots.slip[:, None], 0.0))
@@ -384,20 +343,12 @@ def _words(group: tuple[str, ...], at: np.ndarray, force: np.ndarray, std: np.nd
         order = np.argsort(np.abs(at[there]))
         x, f = np.abs(at[there])[order], signed[there][order]
         seen = np.abs(f) > SURE * std[there][order]
-        for start, sign in _turns(f, seen):
-            text += f", {more if sign > 0 else less} from {_short(x[start], unit)}{side}"
+        last = 0.0
+        for k in np.flatnonzero(seen):  # where a force that is sure begins, or changes its sign
+            if np.sign(f[k]) != last:
+                last = np.sign(f[k])
+                prefixes = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+                size, prefix = next((pair for pair in prefixes if x[k] >= pair[0]), prefixes[-1])
+                from_there = f"from {x[k] / size:.2g} {prefix}{unit}{side}"
+                text += f", {more if last > 0 else less} {from_there}"
     return text
-
-
-def _turns(force: np.ndarray, seen: Bool[np.ndarray, " knot"]) -> list[tuple[int, float]]:
-    """Where a force that is sure begins, and where it changes its sign."""
-    found: list[tuple[int, float]] = []
-    for k in np.flatnonzero(seen):
-        if not found or np.sign(force[k]) != found[-1][1]:
-            found.append((int(k), float(np.sign(force[k]))))
-    return found
-
-
-def _short(value: float, unit: str) -> str:
-    size, prefix = next(((s, p) for s, p in _PREFIXES if value >= s), _PREFIXES[-1])
-    return f"{value / size:.2g} {prefix}{unit}"

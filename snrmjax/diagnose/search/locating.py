@@ -12,12 +12,6 @@ from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
 from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
-_SEEN = 2.0  # 1σ beyond which a free curve counts as changed at an amplitude
-_STEP = 0.01
-_POWERS = np.arange(-4.0, 8.0, _STEP)  # of amplitude, among which one is looked for
-_TELLING = 16.0  # of χ², that a power must explain to be reported
-_RULE = StepRule(steps=30, settled=0.02)  # of a fit of curves to sizes
-_STRAIGHT = 0.02  # of a change, by which straight pieces miss a power
 
 
 class Located(NamedTuple):
@@ -30,20 +24,7 @@ class Located(NamedTuple):
     exponent_std: float | None = None
 
 
-class FreeFit(NamedTuple):
-    """Stiffness and damping as free functions of amplitude, on top of the baseline."""
-
-    chi_square: float
-    freedom: int
-    parts: tuple[Located, ...]
-
-    @property
-    def p_value(self) -> float:
-        """Probability by chance of what no function of amplitude explains."""
-        return chi_square_p_value(self.chi_square, self.freedom)
-
-
-def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
+def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...]:
     """Fit free curves of stiffness and damping to the force, and test every part by itself.
 
     Where sizes alone are compared, states off resonance determine the stiffness and those near it
@@ -105,7 +86,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> FreeFit:
             parts.append(
                 Located(f"harmonic_{order}", (float(where.min()), float(where.max())), p_value)
             )
-    return FreeFit(float(free), n_force - 2 * _FREE, tuple(parts))
+    return tuple(parts)
 
 
 def power_of_answer(
@@ -119,7 +100,7 @@ def power_of_answer(
     if misfit.predictions.chosen.phase_unknown.any():
         return None  # sizes are not linear in what an answer changes
     alone = baseline._replace(rows=baseline.rows - fit.rows)
-    powers = [one.exponent for one in locate_misfit(misfit, alone).parts if one.part == part]
+    powers = [one.exponent for one in locate_misfit(misfit, alone) if one.part == part]
     return powers[0] if powers else None
 
 
@@ -207,9 +188,9 @@ class _Rows:
                 for rows, slopes in pairs
             ]
 
-        anywhere = np.full(len(start), np.inf)
+        anywhere, rule = np.full(len(start), np.inf), StepRule(steps=30, settled=0.02)
         points = start[None]
-        (end,) = minimise(linearised, points, linearised(points), (-anywhere, anywhere), _RULE)
+        (end,) = minimise(linearised, points, linearised(points), (-anywhere, anywhere), rule)
         covariance = self.chi_square(curves.at(end.point)[0], end.linearised.slopes)[2]
         return end.sum_of_squares, end.point, covariance
 
@@ -219,7 +200,7 @@ def _range(
 ) -> tuple[float, float]:
     curve = hats @ values
     std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, covariance, hats), 0.0))
-    seen = np.abs(curve) > _SEEN * std
+    seen = np.abs(curve) > 2 * std
     where = speed[seen] if seen.any() else speed
     return float(where.min()), float(where.max())
 
@@ -232,16 +213,19 @@ def power_of_amplitude(
     Least squares on the curve with its full covariance: uncertainty of the linear parameters
     moves every amplitude alike, and changes that are not significant by themselves are kept.
     """
-    straight = (_STRAIGHT * values) ** 2 + 1e-12 * np.trace(covariance)
+    step = 0.01
+    powers = np.arange(-4.0, 8.0, step)
+    # Straight pieces miss a power by a fiftieth of the change.
+    straight = (0.02 * values) ** 2 + 1e-12 * np.trace(covariance)
     doubt = covariance + np.diag(straight)
     root = np.linalg.inv(np.linalg.cholesky(doubt))
-    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, _POWERS))
+    curve, shapes = root @ values, root @ np.exp(np.outer(logarithm, powers))
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < _TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
+    if explained[best] < 16 or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
-    if below[0] == 0 or below[-1] == len(_POWERS) - 1:
+    if below[0] == 0 or below[-1] == len(powers) - 1:
         return None, None
-    return float(_POWERS[best]), float(0.5 * (_POWERS[below[-1]] - _POWERS[below[0]]) + _STEP / 2)
+    return float(powers[best]), float(0.5 * (powers[below[-1]] - powers[below[0]]) + step / 2)
