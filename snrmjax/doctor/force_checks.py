@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from snrmjax.doctor.checked_states import CheckedStates
 from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, percent, rows_in_words
-from snrmjax.doctor.judgement import Judged
+from snrmjax.doctor.judgement import CheckedStates, Judged
 from snrmjax.doctor.priors import CERTAIN, CLEARLY, FORCE_FALLS, FORCE_HARMONIC, HELD, TOGETHER
 from snrmjax.identify.test_model.states import TestStates
 from snrmjax.measure.states import SteadyStates

@@ -19,11 +19,7 @@ from snrmjax.measure.recordings.steps import Step, recognise_steps
 from snrmjax.measure.recordings.time_recording import TimeRecording
 from snrmjax.measure.recordings.tone_track import track_tone
 
-_MOST = 2**23  # samples of a channel that are looked at
-_FEWEST_CYCLES = 3.5  # of a step
-_HIGHEST, _FOLDED = 12, 60  # harmonic of the force; one whose image is looked for
-_FEW_BLOCKS = 4  # of a step, which have no scatter of their own to compare with
-_MAINS = (50.0, 60.0)  # Hz
+_HIGHEST = 12  # harmonic of the force
 
 
 def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]:
@@ -35,7 +31,7 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
         for c in recording.channels
         if c.quantity in ("velocity", "acceleration", "displacement")
     ]
-    stop = min(recording.n_samples, _MOST)
+    stop = min(recording.n_samples, 2**23)
     values = {c: recording.values([c], 0, stop)[0] for c in (*forces, *motions)}
     found = [one for c, x in values.items() if (one := _flat_runs(x, f"{name}, channel {c}"))]
     notes = [f"{name}: only the first {stop} samples were looked at."] * (
@@ -55,8 +51,7 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
     steps = [
         one
         for one in _joined(steps, rate)
-        if one.stop <= stop
-        and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= _FEWEST_CYCLES
+        if one.stop <= stop and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= 3.5
     ]
     if not steps:
         return found, [*notes, f"{name}: no step of four cycles was recognised."]
@@ -239,7 +234,7 @@ def _unsettled(
         jumps = np.diff(rest, 2) if len(rest) > 4 else rest
         noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
         change = float(abs(slope) / abs(z[-1]))
-        few = len(v) <= _FEW_BLOCKS
+        few = len(v) <= 4
         # Without a scatter of its own a step must move by more.
         believed = change > 2.5 * STILL_MOVING if few else abs(slope) > CERTAIN * noise
         if change > STILL_MOVING:
@@ -317,9 +312,9 @@ def _folded(x: np.ndarray, steps: list[Step], rate: float, where: str) -> list[F
             if size < 2 * CERTAIN * float(np.median(around)):
                 continue
             f = float(hertz[k])
-            if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in _MAINS):
+            if any(abs(f - m * round(f / m)) < 1.0 and f < 8.5 * m for m in (50.0, 60.0)):
                 continue
-            orders = np.arange(int(rate / 2 / f0) + 1, _FOLDED)
+            orders = np.arange(int(rate / 2 / f0) + 1, 60)
             alias = np.abs(orders * f0 - rate * np.round(orders * f0 / rate))
             off = np.abs(alias - f)
             if len(orders) and off.min() < 1.5 * rate / n + 1e-4 * f0 * orders[off.argmin()]:
