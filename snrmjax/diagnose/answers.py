@@ -10,11 +10,9 @@ from snrmjax.diagnose.checks.residuals import neighbour_noise, rms_misfit
 from snrmjax.diagnose.decide import most_probable
 from snrmjax.diagnose.misfit.effect_fit import (
     EffectFit,
-    already_added,
     at_phases_of,
     baseline_fit,
     likely_errors,
-    with_harmonics,
     without_errors,
 )
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
@@ -114,7 +112,7 @@ class Search(NamedTuple):
             freedom = found[0].n_rows - len(found[1].values)
             if chi_square_p_value(found[1].chi_square, freedom) > priors.REJECTED:
                 return found
-        none = np.zeros_like(already_added(misfit.predictions))
+        none = np.zeros_like(misfit.predictions.added)
         plain = without_errors(misfit, fit, self.data, none)
         other = self._corrected(plain, refitted(plain, self.scales, fit))
         both = [pair for pair in (found, other) if pair is not None]
@@ -131,7 +129,7 @@ class Search(NamedTuple):
             added = likely_errors(misfit, fit.rows)
             if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
                 return None
-            moved = np.max(np.abs(added - already_added(misfit.predictions)), initial=0.0)
+            moved = np.max(np.abs(added - misfit.predictions.added), initial=0.0)
             if moved < 0.003:  # relative or rad: the misfit is straight
                 return misfit, fit
             misfit = without_errors(misfit, fit, self.data, added)
@@ -170,7 +168,8 @@ def with_more_harmonics(answered: Answered, search: Search) -> Answered:
     stated = found.misfit.predictions.chosen.noise_stated
     if not kinked or (stated and not leaves_more_than_noise(answered)):
         return answered
-    many = with_harmonics(found.misfit.predictions, search.data, MANY_HARMONICS)
+    now = found.misfit.predictions
+    many = now.of_records(search.data, now.added, MANY_HARMONICS)
     winner = refitted(weighted_misfit(many), search.scales, found.fit)
     if winner.chi_square > 0.9 * found.fit.chi_square:
         return answered

@@ -1,7 +1,6 @@
 """The whole diagnosis: locate the misfit, find effects that explain it, and check the answer."""
 
 import dataclasses
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,8 +40,8 @@ from snrmjax.diagnose.diagnosis_result import (
     what_changed,
 )
 from snrmjax.diagnose.laws.law_answer import LawAnswer, law_answer
-from snrmjax.diagnose.misfit.amplitudes import notes_without_phases
 from snrmjax.diagnose.misfit.effect_fit import EffectFit, at_phases_of, at_reference, baseline_fit
+from snrmjax.diagnose.misfit.noise_model import notes_without_phases
 from snrmjax.diagnose.misfit.predictions import Predictions, predictions_of, scales_of
 from snrmjax.diagnose.misfit.reference import (
     FREE_GAIN_STD,
@@ -52,7 +51,7 @@ from snrmjax.diagnose.misfit.reference import (
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
+from snrmjax.diagnose.search.model_search import detection_limits
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
@@ -62,9 +61,6 @@ from snrmjax.model.structures import Structure
 from snrmjax.numerics.blocks import on_one_core
 from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 
-_LOOSE = 0.1  # relative 1σ of a force's gain, beyond which no close mode is compared
-_LEAST_STATES = 6
-_OTHER_MODE = 0.1  # relative shift of a natural frequency that is no error of a linear test
 _FEW = 2  # effects of an answer beside which no law is drawn
 
 
@@ -109,7 +105,12 @@ def diagnose_model(
         notes += of_gain
     predictions = predictions_of(model, data, force_gain_std)
     unknown = predictions.chosen.phase_unknown[:, 0]
-    _check_number_of_states(unknown)
+    n, least = len(unknown), 6
+    if 2 * n - unknown.sum() < 2 * least:
+        raise ValueError(
+            f"a diagnosis needs at least {least} usable steady states, or {2 * least} where phases "
+            f"are unknown, not {n}."
+        )
     # Beside an unknown gain nothing says which level's force is off.
     estimable = force_gain_std == 0 and not predictions.chosen.phase_unknown.any()
     predictions = with_reference(predictions)
@@ -225,6 +226,15 @@ def diagnose_model(
 def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
     """A diagnosis with a drawn law in place of effects that do not explain the data."""
     misfit, nothing = law.misfit, baseline_fit(law.misfit)
+    # A law has its share of what is outside the library, and of effects in whose place it stands.
+    kept = {
+        name: p
+        for name, p in diagnosis.probabilities.items()
+        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
+    }
+    outside = 1 - sum(kept.values())
+    kept |= {"+".join(law.kinds): law.share * outside}
+    kept |= {Verdict.UNKNOWN.value: (1 - law.share) * outside}
     answer = diagnosis.answer._replace(
         effects=law.kinds,
         candidates=((law.kinds[0], *law.rivals), *((kind,) for kind in law.kinds[1:])),
@@ -233,7 +243,7 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
         completed=law.completed,
         completed_status=CompletedStatus.COMPLETED,
         laws=law.laws,
-        probabilities=_with_probability_of_law(diagnosis.probabilities, law),
+        probabilities=dict(sorted(kept.items(), key=lambda pair: -pair[1])),
     )
     checks = diagnosis.checks._replace(
         p_value=law.p_value,
@@ -255,36 +265,12 @@ def _with_law(diagnosis: Diagnosis, law: LawAnswer) -> Diagnosis:
     )
 
 
-def _with_probability_of_law(
-    probabilities: Mapping[str, float], law: LawAnswer
-) -> dict[str, float]:
-    """A law's share of what is outside the library, and of the effects in whose place it stands."""
-    apart = {
-        name: p
-        for name, p in probabilities.items()
-        if name != Verdict.UNKNOWN.value and len(name.split("+")) <= _FEW
-    }
-    outside = 1 - sum(apart.values())
-    own = "+".join(law.kinds)
-    found = {**apart, own: law.share * outside, Verdict.UNKNOWN.value: (1 - law.share) * outside}
-    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
-
-
-def _check_number_of_states(phase_unknown: np.ndarray) -> None:
-    n_states = len(phase_unknown)
-    if 2 * n_states - phase_unknown.sum() < 2 * _LEAST_STATES:
-        raise ValueError(
-            f"a diagnosis needs at least {_LEAST_STATES} usable steady states, or "
-            f"{2 * _LEAST_STATES} where phases are unknown, not {n_states}."
-        )
-
-
 def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> set[str]:
     """Kinds of effects that are not looked for."""
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
-    if force_gain_std > _LOOSE:  # beside a force that may be nothing a mode could be all one sees
+    if force_gain_std > 0.1:  # beside a force that may be nothing a mode could be all one sees
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
     if not phases:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
@@ -302,9 +288,15 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
         )
     found = predictions.reference.posterior.differing if predictions.reference else (False,) * 4
     free = np.where(predictions.unstated_levels, predictions.level_sizes, 0.0)
+    units = (100.0, 180 / np.pi, 50.0, 100.0)
+    words = (" % in gain", "° in phase", " % in frequency", " % in damping")
     seen, allowed = (
-        _level_sizes(*np.where(found, free, 0.0)),
-        _level_sizes(*np.where(found, 0.0, free)),
+        ", ".join(
+            f"{unit * size:.2g}{word}"
+            for unit, size, word in zip(units, sizes, words, strict=True)
+            if size > 0
+        )
+        for sizes in (np.where(found, free, 0.0), np.where(found, 0.0, free))
     )
     if seen:
         notes.append(
@@ -317,17 +309,6 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
             "them in [measurement] if they are known."
         )
     return notes
-
-
-def _level_sizes(gain: float, phase: float, stiffness: float, damping: float) -> str:
-    """1σ of levels' errors in words."""
-    parts = [
-        *([f"{100 * gain:.2g} % in gain"] if gain > 0 else []),
-        *([f"{np.degrees(phase):.2g}° in phase"] if phase > 0 else []),
-        *([f"{50 * stiffness:.2g} % in frequency"] if stiffness > 0 else []),
-        *([f"{100 * damping:.2g} % in damping"] if damping > 0 else []),
-    ]
-    return ", ".join(parts)
 
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
@@ -382,7 +363,7 @@ def _notes_on_answer(
 ) -> list[str]:
     notes = []
     shift = _frequency_shift(model, completed.model or model)
-    if abs(shift) > _OTHER_MODE:
+    if abs(shift) > 0.1:  # no linear test errs so much
         notes.append(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
             "of another mode?"

@@ -246,33 +246,27 @@ class Diagnosis(AbstractResult):
         ranges = np.array([p.velocity_range for p in self.located]).reshape(-1, 2)
         exponent = np.array(powers, dtype=float).reshape(-1, 2)
         names = list(self.parameters)
-        of_row, of_part, of_parameter = ("candidate",), ("part",), ("parameter",)
+        columns = {
+            "candidate": (_texts(row.kind for row in rows), "", "effect compared"),
+            "step": ([number for number, _ in tried], "1", "step of the search"),
+            "gain": ([r.gain for r in rows], "1", "fall of Schwarz's criterion"),
+            "chi_square": ([r.chi_square for r in rows], "1", "χ² that is left"),
+            "fit_status": (_texts(r.status.value for r in rows), "", "end of the fit"),
+            "part": (_texts(p.part for p in self.located), "", "part of the misfit"),
+            "velocity_low_m_s": (ranges[:, 0], "m/s", "lowest velocity affected"),
+            "velocity_high_m_s": (ranges[:, 1], "m/s", "highest velocity affected"),
+            "p_value": ([p.p_value for p in self.located], "1", "by chance"),
+            "exponent": (exponent[:, 0], "1", "power of amplitude"),
+            "exponent_std": (exponent[:, 1], "1", "1σ of the power"),
+            "parameter": (_texts(names), "", "parameter of an effect"),
+            "value": ([p.value for p in self.parameters.values()], "unit", "in `unit`"),
+            "value_std": ([p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"),
+            "unit": (_texts(map(unit_of, names)), "", "of the value"),
+        }
+        of = np.repeat(self.coordinates, (5, 6, 4)).tolist()
         return {
-            "candidate": Variable(of_row, _texts(row.kind for row in rows), "", "effect compared"),
-            "step": Variable(of_row, [number for number, _ in tried], "1", "step of the search"),
-            "gain": Variable(of_row, [r.gain for r in rows], "1", "fall of Schwarz's criterion"),
-            "chi_square": Variable(of_row, [r.chi_square for r in rows], "1", "χ² that is left"),
-            "fit_status": Variable(
-                of_row, _texts(r.status.value for r in rows), "", "end of the fit"
-            ),
-            "part": Variable(
-                of_part, _texts(p.part for p in self.located), "", "part of the misfit"
-            ),
-            "velocity_low_m_s": Variable(of_part, ranges[:, 0], "m/s", "lowest velocity affected"),
-            "velocity_high_m_s": Variable(
-                of_part, ranges[:, 1], "m/s", "highest velocity affected"
-            ),
-            "p_value": Variable(of_part, [p.p_value for p in self.located], "1", "by chance"),
-            "exponent": Variable(of_part, exponent[:, 0], "1", "power of amplitude"),
-            "exponent_std": Variable(of_part, exponent[:, 1], "1", "1σ of the power"),
-            "parameter": Variable(of_parameter, _texts(names), "", "parameter of an effect"),
-            "value": Variable(
-                of_parameter, [p.value for p in self.parameters.values()], "unit", "in `unit`"
-            ),
-            "value_std": Variable(
-                of_parameter, [p.std for p in self.parameters.values()], "unit", "1σ, in `unit`"
-            ),
-            "unit": Variable(of_parameter, _texts(map(unit_of, names)), "", "of the value"),
+            name: Variable((dimension,), *column)
+            for dimension, (name, column) in zip(of, columns.items(), strict=True)
         }
 
     def attributes(self) -> Mapping[str, str | float | int]:

@@ -10,11 +10,6 @@ from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates, steady_states
 from snrmjax.model.structures import Structure
 
-_POINTS = 81  # of a curve
-_ORDER = 5  # harmonics of the motion
-_SAME_FORCE = 0.05  # relative: further from a level's force a state is drawn pale
-_RESPONSE_CONTROLLED = 0.2  # share of states away from their level's force, that makes a test one
-
 
 class HeldCurve(NamedTuple):
     """The force that holds one velocity amplitude, over frequency."""
@@ -41,7 +36,7 @@ def held_curves(
     for number in numbers:
         mine = good & (level == number)
         held = float(np.median(speed[mine]))
-        for one in np.linspace(omega[mine].min(), omega[mine].max(), _POINTS):
+        for one in np.linspace(omega[mine].min(), omega[mine].max(), 81):
             rows.append((number, one, float(np.median(force[mine])), held))
     of, at, load, held_speed = (np.array(column) for column in zip(*rows, strict=True))
     seen = np.arange(len(data.sensors)) == sensor
@@ -53,7 +48,7 @@ def held_curves(
         sensors=data.sensors,
         measured=np.tile(seen, (len(of), 1)),
     )
-    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=_ORDER).force))
+    needed = np.abs(np.asarray(inverse_force(model, states, harmonic_order=5).force))
     return [
         HeldCurve(int(k), float(held_speed[of == k][0]), at[of == k], needed[of == k] / force_gain)
         for k in numbers
@@ -64,7 +59,7 @@ def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
     """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
     force, each = np.asarray(data.force), np.asarray(list(forces))
     away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
-    return ~(away > _SAME_FORCE)
+    return ~(away > 0.05)
 
 
 def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
@@ -75,7 +70,7 @@ def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bo
     if not predicted:
         return False
     same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > _RESPONSE_CONTROLLED) and _velocity_is_steadier(data)
+    return bool(np.mean(~same) > 0.2) and _velocity_is_steadier(data)
 
 
 def _velocity_is_steadier(data: SteadyStates) -> bool:

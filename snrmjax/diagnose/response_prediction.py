@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -15,9 +16,6 @@ from snrmjax.simulate.continuation.continuation import CurveStatus
 from snrmjax.simulate.continuation.response_curve import ResponseCurve
 from snrmjax.simulate.solutions.forced_response import ResponseSettings, forced_response_batch
 from snrmjax.simulate.virtual_test.recording import acting_force, recorded_curves
-
-ORDER = 5  # harmonics of the responses
-_REACH = 0.3  # of the measured range of frequencies, added at both ends
 
 
 class PhaseResonance(NamedTuple):
@@ -61,11 +59,9 @@ def predict_levels(diagnosis: Diagnosis, model: Structure) -> LevelPredictions:
     """
     if diagnosis.completed is None:
         raise ValueError("there is no completed model to simulate: see the notes of the diagnosis.")
-    data, sensor = diagnosis.data, diagnosis.force_misfit.sensor
-    models = LevelModels(model, diagnosis.completed, diagnosis.checks.completed_without)
-    simulated = level_simulations(models, data, sensor, diagnosis.answer.force_gain)
-    before, after = ([c for one in curves for c in one] for curves in simulated[:2])
-    return LevelPredictions(level_responses(simulated, data, sensor), before, after)
+    sensor, without = diagnosis.force_misfit.sensor, diagnosis.checks.completed_without
+    own = (diagnosis.completed, diagnosis.data, sensor, without, diagnosis.answer.force_gain)
+    return predicted_levels(model, *own)
 
 
 def level_forces(data: SteadyStates, sensor: int = 0) -> dict[int, float]:
@@ -102,40 +98,29 @@ def responses(
     `models` is one for all forces or one for each, with the same kinds of effects.
     """
     frequency = np.asarray(data.frequency)
-    reach = _REACH * (frequency.max() - frequency.min())
+    reach = 0.3 * (frequency.max() - frequency.min())
     ends = (float(frequency.min() - reach), float(frequency.max() + reach))
     each = [models] * len(forces) if isinstance(models, Structure) else list(models)
     loads = [acting_force(model, force) for model, force in zip(each, forces, strict=True)]
-    settings = ResponseSettings(harmonic_order=ORDER, stability=False)
+    settings = ResponseSettings(harmonic_order=5, stability=False)
     batch = forced_response_batch(models, loads, *ends, settings=settings)
     return [recorded_curves(*pair) for pair in zip(each, batch.curves, strict=True)]
 
 
-class Simulated(NamedTuple):
-    """Responses of every level: of both models, and of those completed without a level."""
+def predicted_levels(
+    model: Structure,
+    completed: Structure,
+    data: SteadyStates,
+    sensor: int,
+    without_level: Mapping[int, Structure] = MappingProxyType({}),
+    force_gain: float = 1.0,
+) -> LevelPredictions:
+    """Measured and predicted resonances of every level, under the levels' forces.
 
-    before: list[list[ResponseCurve]]
-    after: list[list[ResponseCurve]]
-    without_level: dict[int, list[ResponseCurve]]
-
-
-class LevelModels(NamedTuple):
-    """The models whose responses are compared with the measured levels."""
-
-    before: Structure  # as given
-    after: Structure  # completed
-    without_level: Mapping[int, Structure] = MappingProxyType({})  # completed without a level
-
-
-def level_simulations(
-    models: LevelModels, data: SteadyStates, sensor: int, force_gain: float = 1.0
-) -> Simulated:
-    """Responses under the levels' forces, before and after.
-
+    A level that was left out of the fit is predicted by the model completed without it;
     `force_gain` is acting force over recorded one for the completed models. One program follows
     all responses: in the model before the effects are there without strength.
     """
-    model, completed, without_level = models
     forces = level_forces(data, sensor)
     every, seen = list(forces.values()), [level for level in forces if level in without_level]
     after = [completed] * len(every) + [without_level[level] for level in seen]
@@ -144,9 +129,24 @@ def level_simulations(
     own = float(modes.natural_frequency[j]), float(modes.damping_ratio[j])
     idle = tuple(e.idle(*own) for e in completed.effects[len(model.effects) :])
     same = dataclasses.replace(model, effects=(*model.effects, *idle))
-    found = responses([*[same] * len(every), *after], data, [*every, *loads])
-    old, new = found[: len(every)], found[len(every) :]
-    return Simulated(old, new[: len(every)], dict(zip(seen, new[len(every) :], strict=True)))
+    found, n = responses([*[same] * len(every), *after], data, [*every, *loads]), len(every)
+    held_out, rows = dict(zip(seen, found[2 * n :], strict=True)), []
+    for (level, force), old, new in zip(forces.items(), found[:n], found[n : 2 * n], strict=True):
+        best = held_out.get(level, new)
+        rows.append(
+            LevelResponse(
+                level,
+                force,
+                measured_resonance(data, level, sensor),
+                simulated_resonance(old, sensor),
+                simulated_resonance(best, sensor),
+                level in held_out,
+                _complete(old) and _complete(best),
+                simulated_resonance(new, sensor),
+            )
+        )
+    curves = (list(chain(*some)) for some in (found[:n], found[n : 2 * n]))
+    return LevelPredictions(rows, *curves)
 
 
 def measured_resonance(data: SteadyStates, level: int, sensor: int) -> PhaseResonance:
@@ -208,31 +208,6 @@ def _in_phase(curve: ResponseCurve, sensor: int) -> list[tuple[float, float]]:
         size = (1 - share) * real[k] + share * real[k + 1]
         found.append((float(size), float((1 - share) * frequency[k] + share * frequency[k + 1])))
     return found
-
-
-def level_responses(simulated: Simulated, data: SteadyStates, sensor: int) -> list[LevelResponse]:
-    """Measured and predicted resonances of every level.
-
-    A level that was left out of the fit is predicted by the model completed without it.
-    """
-    rows = []
-    for (level, force), old, new in zip(
-        level_forces(data, sensor).items(), simulated.before, simulated.after, strict=True
-    ):
-        own = simulated.without_level.get(level, new)
-        rows.append(
-            LevelResponse(
-                level,
-                force,
-                measured_resonance(data, level, sensor),
-                simulated_resonance(old, sensor),
-                simulated_resonance(own, sensor),
-                level in simulated.without_level,
-                _complete(old) and _complete(own),
-                simulated_resonance(new, sensor),
-            )
-        )
-    return rows
 
 
 def _complete(curves: Sequence[ResponseCurve]) -> bool:

@@ -8,11 +8,10 @@ priors (orthogonal distance regression: Boggs, Byrd & Schnabel, doi:10.1137/0908
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from snrmjax.diagnose.misfit.candidates import EffectCandidate, coordinates, parameter_labels
 from snrmjax.diagnose.misfit.predictions import Predictions, scales_of
@@ -204,7 +203,7 @@ def without_errors(
 
     `data` are the records as they were measured.
     """
-    return misfit.about(_at(misfit.predictions, data, added), values_of(misfit, fit))
+    return misfit.about(misfit.predictions.of_records(data, added), values_of(misfit, fit))
 
 
 def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
@@ -221,18 +220,7 @@ def at_reference(old: Predictions, data: SteadyStates) -> Predictions:
     own = found.corrections[:, 1:] - found.level_errors[level][:, :2]
     added[reference.rows, 1 : n_sensors + 1] = own[:, [0]]
     added[reference.rows, n_sensors + 1 :] = own[:, [1]]
-    return _at(old, data, added)
-
-
-def with_harmonics(old: Predictions, data: SteadyStates, harmonics: int) -> Predictions:
-    """The same predictions by motions with other harmonics."""
-    return _at(old, data, already_added(old), harmonics)
-
-
-def already_added(predictions: Predictions) -> Float[np.ndarray, "state input"]:
-    """What is added to the records of some predictions."""
-    added = predictions.added
-    return np.zeros_like(np.asarray(predictions.chosen.states.error)) if added is None else added
+    return old.of_records(data, added)
 
 
 def likely_errors(
@@ -257,38 +245,3 @@ def likely_errors(
     unknown = np.asarray(misfit.predictions.chosen.phase_unknown)[:, 0]
     added[unknown] = 0.0  # of sizes alone nothing is straight
     return np.where(np.isfinite(added), added, 0.0)
-
-
-def _at(
-    old: Predictions,
-    data: SteadyStates,
-    added: Float[np.ndarray, "state input"],
-    harmonics: int | None = None,
-) -> Predictions:
-    """Predictions of records with something added to them; it counts once they are weighted."""
-    corrected = with_corrected_records(data, old.chosen.rows, old.chosen.sensors, added)
-    return old.of_records(corrected, added, harmonics)
-
-
-def with_corrected_records(
-    data: SteadyStates,
-    rows: Int[np.ndarray, " state"],
-    sensors: tuple[int, ...],
-    added: Float[np.ndarray, "state input"],
-) -> SteadyStates:
-    """The data with errors of velocities and phases taken away, of the states in `rows`."""
-    told: Any = jax.tree.map(np.asarray, data)
-    n = len(sensors)
-    size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
-    size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
-    back = np.argsort(sensors)
-    size, turn = size[:, back], turn[:, back]
-    orders = np.array(data.harmonic_order, dtype=int)
-    found: SteadyStates = dataclasses.replace(
-        told,
-        velocity=told.velocity * (size * np.exp(1j * turn)),
-        velocity_std=told.velocity_std * size,
-        harmonics=told.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
-        harmonic_std=told.harmonic_std * size,
-    )
-    return found

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from snrmjax.diagnose.misfit import programs
-from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import candidate, motion_scales, parameter_labels
+from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
 from snrmjax.identify.calibrate.calibration_states import (
     CalibrationStates,
     ComparedColumns,
@@ -98,12 +98,10 @@ class Predictions:
     stated: dict[str, tuple[float, float]]  # the baseline's uncertain parameters: value and 1σ
     group: Group
     motions: programs.Stored
+    added: Float[np.ndarray, "state input"]  # to logarithms of velocities and phases as recorded
     reference: Any = None  # `misfit.reference.Reference`, once it is known
     level_sizes: tuple[float, ...] = (0.0,) * 4  # 1σ of `LEVEL_ERRORS` that the noise takes
     unstated_levels: tuple[bool, ...] = (False,) * 4  # which of them nobody stated
-    added: Float[np.ndarray, "state input"] | None = (
-        None  # to log velocities and phases as recorded
-    )
     # What is added to the columns for that: errors that the records were corrected for still count.
     offset: Float[np.ndarray, "state column"] | None = None
     error_scale: float = 1.0  # of errors over those that were stated or assumed
@@ -111,8 +109,6 @@ class Predictions:
 
     def carried_back(self, by_error: Float[np.ndarray, "state column input"]) -> "Predictions":
         """The same as the records have it, by what errors do to the columns."""
-        if self.added is None:
-            return self
         offset = -np.einsum("sci,si->sc", by_error, self.added)
         return dataclasses.replace(self, offset=offset)
 
@@ -122,12 +118,13 @@ class Predictions:
         added: Float[np.ndarray, "state input"],
         harmonics: int | None = None,
     ) -> "Predictions":
-        """The same of other records of the same states, to which something was added.
+        """The same of records to which something was added; it counts once they are weighted.
 
-        `harmonics` are those of the motions: as before if None.
+        Arguments: `data` as they were measured; `harmonics` of the motions, as before if None.
         """
         order = self.compared.harmonic_order if harmonics is None else harmonics
-        own = _records(self.given, data, order, self.error_scale)
+        corrected = with_corrected_records(data, self.chosen.rows, self.chosen.sensors, added)
+        own = _records(self.given, corrected, order, self.error_scale)
         return dataclasses.replace(self, **own, added=added)
 
     def with_errors_scaled(self, factor: float) -> "Predictions":
@@ -285,6 +282,7 @@ def predictions_of(
         model=model,
         given=model,
         **records,
+        added=np.zeros_like(records["chosen"].states.error),
         level_numbers=np.asarray(data.level)[records["chosen"].rows],
         force_gain_std=force_gain_std,
         stated={
@@ -401,3 +399,27 @@ def _widened(chosen: ComparedColumns) -> tuple[list[np.ndarray], tuple[int, ...]
 def scales_of(predictions: Predictions) -> MotionScales:
     """Typical sizes of the measured motions."""
     return motion_scales(predictions.model, predictions.chosen)
+
+
+def with_corrected_records(
+    data: SteadyStates,
+    rows: Int[np.ndarray, " state"],
+    sensors: tuple[int, ...],
+    added: Float[np.ndarray, "state input"],
+) -> SteadyStates:
+    """The data with errors of velocities and phases taken away, of the states in `rows`."""
+    told: Any = jax.tree.map(np.asarray, data)
+    n = len(sensors)
+    size, turn = np.ones((data.n_states, n)), np.zeros((data.n_states, n))
+    size[rows], turn[rows] = np.exp(added[:, 1 : n + 1]), added[:, n + 1 :]
+    back = np.argsort(sensors)
+    size, turn = size[:, back], turn[:, back]
+    orders = np.array(data.harmonic_order, dtype=int)
+    found: SteadyStates = dataclasses.replace(
+        told,
+        velocity=told.velocity * (size * np.exp(1j * turn)),
+        velocity_std=told.velocity_std * size,
+        harmonics=told.harmonics * size[:, :, None] * np.exp(1j * turn[:, :, None] * orders),
+        harmonic_std=told.harmonic_std * size,
+    )
+    return found

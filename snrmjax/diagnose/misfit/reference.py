@@ -156,27 +156,21 @@ FREE_GAIN_STD = 1.0
 """Relative 1σ of a force gain that is unknown."""
 
 
-class FirstGain(NamedTuple):
-    """States with a force in N by a first value of the gain."""
-
-    data: SteadyStates
-    gain: float  # N/V
-    notes: tuple[str, ...]
-
-
 def driven_by_voltage(data: SteadyStates) -> bool:
     """Whether the force is known as a drive voltage only."""
     force, drive = np.asarray(data.force), np.asarray(data.drive)
     return bool(not np.any(np.isfinite(force)) and np.any(np.isfinite(drive)))
 
 
-def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
-    """The states with a force by a first value of the unknown gain, which must stay free.
+def with_first_gain(
+    model: Structure, data: SteadyStates
+) -> tuple[SteadyStates, float, tuple[str, ...]]:
+    """The states with a force by a first value (N/V) of the unknown gain, and notes on it.
 
-    It is the median, over the states, of the force that the model needs for the measured motion
-    over the drive voltage; and, where phases are known, what smooth curves of amplitude make of
-    that: with a gain of the force all of the dynamic stiffness grows, but not the part of the known
-    modal mass.
+    The gain must stay free. It is the median, over the states, of the force that the model needs
+    for the measured motion over the drive voltage; and, where phases are known, what smooth curves
+    of amplitude make of that: with a gain of the force all of the dynamic stiffness grows, but not
+    the part of the known modal mass.
 
     Raises `ValueError` where the model has no such motions.
     """
@@ -206,4 +200,4 @@ def with_first_gain(model: Structure, data: SteadyStates) -> FirstGain:
         f"the force is known as a drive voltage only: about {gain:.4g} N/V by {by}. The gain "
         "is fitted too: a 1 % error of the gain looks like 1 % of damping."
     )
-    return FirstGain(driven(gain), gain, (note, doubt) if doubt else (note,))
+    return driven(gain), gain, (note, doubt) if doubt else (note,)

@@ -171,7 +171,7 @@ def weighted_misfit(predictions: Predictions) -> WeightedMisfit:
     errors = ErrorPropagation(*plain.by_error(plain.group.values), slopes)
     missing = _of_missing_force(plain, baseline.columns, errors.by_error)
     passed_on = _by_reference(plain, errors._replace(by_error=errors.by_error + missing))
-    if plain.added is not None:
+    if np.any(plain.added):
         plain = plain.carried_back(passed_on.by_error)
         baseline, _ = _baseline_of(plain)
     return _weighted(plain, baseline, errors, passed_on, {})

@@ -12,9 +12,9 @@ from truths.balanced_sets import HERE, KEYS, balanced, files, linear_model, quad
 
 import snrmjax as sj
 from snrmjax.cli import diagnose
-from snrmjax.diagnose.misfit.amplitudes import Sizes, sizes_of
 from snrmjax.diagnose.misfit.candidates import candidate, parameter_labels
 from snrmjax.diagnose.misfit.effect_fit import at_phases_of, fit_effect, unfitted
+from snrmjax.diagnose.misfit.noise_model import Sizes, sizes_of
 from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 from snrmjax.identify.calibrate.calibration import calibrate_model
