@@ -51,7 +51,7 @@ from snrmjax.diagnose.misfit.reference import (
 )
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit, weighted_misfit
 from snrmjax.diagnose.search.locating import locate_misfit
-from snrmjax.diagnose.search.model_search import detection_limits
+from snrmjax.diagnose.search.model_search import FoundEffects, detection_limits
 from snrmjax.identify.calibrate.calibration_states import ASSUMED_ERROR
 from snrmjax.measure.phase_convention import naming_wrong_phases
 from snrmjax.measure.states import SteadyStates
