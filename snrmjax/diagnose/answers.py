@@ -122,7 +122,7 @@ class Search(NamedTuple):
         self, misfit: WeightedMisfit, fit: EffectFit
     ) -> tuple[WeightedMisfit, EffectFit] | None:
         """The fit where nothing moves any more; None where no errors explain the records."""
-        moved = np.inf
+        moved, straight = np.inf, 0.003  # relative or rad
         for _ in range(6):
             if not np.isfinite(fit.chi_square):
                 return None
@@ -130,7 +130,7 @@ class Search(NamedTuple):
             if np.max(np.abs(added), initial=0.0) > priors.FARTHEST_ERROR:
                 return None
             moved = np.max(np.abs(added - misfit.predictions.added), initial=0.0)
-            if moved < 0.003:  # relative or rad: the misfit is straight
+            if moved < straight:
                 return misfit, fit
             misfit = without_errors(misfit, fit, self.data, added)
             fit = refitted(misfit, self.scales, fit)

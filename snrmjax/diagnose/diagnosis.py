@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.answers import Search, best_answer
 from snrmjax.diagnose.checks.gains import (
     gain_found,
@@ -270,7 +271,7 @@ def excluded_kinds(model: Structure, force_gain_std: float, *, phases: bool) -> 
     excluded = {effect.kind for effect in model.effects}
     if force_gain_std > 0:  # of a gain that is not known none can be missing, nor of the mass
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.like_force_gain}
-    if force_gain_std > 0.1:  # beside a force that may be nothing a mode could be all one sees
+    if force_gain_std > priors.LOOSE_GAIN:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.follows_force}
     if not phases:
         excluded |= {kind for kind, effect in EFFECTS.items() if effect.only_phase}
@@ -363,7 +364,7 @@ def _notes_on_answer(
 ) -> list[str]:
     notes = []
     shift = _frequency_shift(model, completed.model or model)
-    if abs(shift) > 0.1:  # no linear test errs so much
+    if abs(shift) > priors.OTHER_MODE:
         notes.append(
             f"the model's natural frequency is off by {100 * shift:.0f} %: are these measurements "
             "of another mode?"

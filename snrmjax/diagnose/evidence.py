@@ -272,11 +272,22 @@ def discrepancies(misfit: WeightedMisfit) -> Iterator[Float[np.ndarray, "row any
     of_test = hat_functions(order, 8)[noise.state]
     linear = misfit.by_linear
     yield _scaled(np.concatenate([linear[:, [k]] * amplitude for k in (0, 1)], axis=1))
-    harmonics = list(_harmonics(misfit, phase, amplitude))
+    harmonics = []
+    for place, number in enumerate(chosen.orders):  # both parts, that turn with the fundamental
+        first = 2 * (len(chosen.sensors) + place)
+        for turn in (1.0, 1j):
+            unit, columns = turn * np.exp(1j * number * phase), np.zeros((1, *noise.known.shape))
+            columns[0, :, first], columns[0, :, first + 1] = unit.real, unit.imag
+            harmonics.append(noise.noise_units(columns)[0][:, None] * amplitude)
     if harmonics:
         yield _scaled(np.concatenate(harmonics, axis=1))
     yield _scaled(linear[:, [0]] * of_test)
-    yield _scaled(_along_levels(misfit, phase))
+    level, along = np.asarray(chosen.states.level), []
+    for number in np.unique(level):
+        mine, curves = level == number, np.zeros((len(level), 4))
+        curves[mine] = hat_functions(phase[mine], 4)
+        along += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
+    yield _scaled(np.concatenate(along, axis=1))
 
 
 def hat_functions(
@@ -285,32 +296,6 @@ def hat_functions(
     """Piecewise linear curves with equally many states between any two knots."""
     at = np.quantile(where, np.linspace(0, 1, knots)) + 1e-9 * np.arange(knots)
     return np.stack([np.interp(where, at, row) for row in np.eye(knots)], axis=1)
-
-
-def _harmonics(
-    misfit: WeightedMisfit, phase: Float[np.ndarray, " state"], amplitude: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Of every harmonic both parts, at phases that turn with the fundamental."""
-    noise, chosen = misfit.noise, misfit.predictions.chosen
-    n_sensors = len(chosen.sensors)
-    for place, number in enumerate(chosen.orders):
-        first = 2 * (n_sensors + place)
-        for turn in (1.0, 1j):
-            unit = turn * np.exp(1j * number * phase)
-            columns = np.zeros(noise.known.shape)
-            columns[:, first], columns[:, first + 1] = unit.real, unit.imag
-            yield noise.noise_units(columns[None])[0][:, None] * amplitude
-
-
-def _along_levels(misfit: WeightedMisfit, phase: Float[np.ndarray, " state"]) -> np.ndarray:
-    noise, level = misfit.noise, np.asarray(misfit.predictions.chosen.states.level)
-    parts = []
-    for number in np.unique(level):
-        mine = level == number
-        curves = np.zeros((len(level), 4))
-        curves[mine] = hat_functions(phase[mine], 4)
-        parts += [(noise.column == k)[:, None] * curves[noise.state] for k in (0, 1)]
-    return np.concatenate(parts, axis=1)
 
 
 def _scaled(columns: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from snrmjax.diagnose import priors
 from snrmjax.diagnose.response_prediction import LevelResponse
 from snrmjax.identify.calibrate.inverse_force import inverse_force
 from snrmjax.measure.states import SteadyStates, steady_states
@@ -59,7 +60,7 @@ def at_curve_force(data: SteadyStates, forces: Iterable[float]) -> np.ndarray:
     """Which steady states were measured within 5 % of one of some forces (N), or of none known."""
     force, each = np.asarray(data.force), np.asarray(list(forces))
     away = np.min(np.abs(force[:, None] / each - 1.0), axis=1)
-    return ~(away > 0.05)
+    return ~(away > priors.SAME_FORCE)
 
 
 def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bool:
@@ -70,7 +71,7 @@ def holds_response(data: SteadyStates, predicted: Sequence[LevelResponse]) -> bo
     if not predicted:
         return False
     same = at_curve_force(data, [one.force for one in predicted])
-    return bool(np.mean(~same) > 0.2) and _velocity_is_steadier(data)
+    return bool(np.mean(~same) > priors.HELD_RESPONSE) and _velocity_is_steadier(data)
 
 
 def _velocity_is_steadier(data: SteadyStates) -> bool:

@@ -84,6 +84,23 @@ FAR_GAIN = 3.0
 FAR_MASS = 3.0
 """1σ of a modal mass of which none is stated, beyond which it explains no gain."""
 
+LOOSE_GAIN = 0.1
+"""Relative 1σ of a force's gain, beyond which no close mode is looked for: beside a force that may
+be nothing a mode could be all that one sees."""
+
+OTHER_MODE = 0.1
+"""Relative shift of a natural frequency that is no error of a linear test."""
+
+TELLING = 16.0
+"""Of χ², that a power of amplitude must explain to be reported: 4σ."""
+
+BEYOND_DATA = 10.0
+"""Times all that was measured: effects that must be larger cannot be detected."""
+
+SAME_FORCE, HELD_RESPONSE = 0.05, 0.2
+"""Relative distance from its level's force up to which a state was measured at it, and share of
+states beyond, from which on a test may hold the response."""
+
 AS_NOISE = 1.3
 """Times the noise, up to which a misfit counts as noise; beyond it every 1σ is too small."""
 

@@ -194,13 +194,13 @@ def any_mass(states: TestStates, log_jacobian: float = 0.0, *, far: bool = False
 
 def _about(states: TestStates, start: float, log_jacobian: float, steps: int = 3) -> Scale:
     """The likeliest modal mass from some on: forces are divided by it until it stays."""
-    mass, std = start, np.inf
+    mass, std, reach = start, np.inf, 0.3  # of ln κ, within which it is linear
     for _ in range(steps):
         scale = mass
         judged = judge(with_mass(states, scale)._replace(mass_std=ANY_MASS), log_jacobian)
         step, std = judged.posterior.modal_mass
         mass = scale * max(step, 1 / _GUESSED)
-        if abs(np.log(mass / scale)) < 0.3:  # what is linear reaches as far
+        if abs(np.log(mass / scale)) < reach:
             break
     return Scale(judged, mass, std / step if step > 0 else np.inf)
 

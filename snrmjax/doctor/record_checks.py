@@ -7,6 +7,8 @@ from snrmjax.doctor.findings import FORCE_HARMONICS, Finding, Repair, percent
 from snrmjax.doctor.force_checks import fall
 from snrmjax.doctor.priors import (
     CERTAIN,
+    FEW_BLOCKS,
+    FEWEST_CYCLES,
     FLAT_TOP,
     FOLDED_LINE,
     FORCE_FALLS,
@@ -51,26 +53,27 @@ def record_findings(recording: TimeRecording) -> tuple[list[Finding], list[str]]
     steps = [
         one
         for one in _joined(steps, rate)
-        if one.stop <= stop and (one.stop - one.start) * one.frequency / (2 * np.pi * rate) >= 3.5
+        if one.stop <= stop and _cycles(one, rate) >= FEWEST_CYCLES
     ]
     if not steps:
         return found, [*notes, f"{name}: no step of four cycles was recognised."]
+    where = {c: f"{name}, channel {c}" for c in values}
     clipped = {one.where for one in found}
-    for c, x in values.items():
-        where = f"{name}, channel {c}"
-        if where not in clipped and (one := _flat_cycles(x, steps, rate, where)):
-            found.append(one)
-    found += _harmonics(values[force], steps, rate, f"{name}, channel {force}")
+    flat = [_flat_cycles(values[c], steps, rate, w) for c, w in where.items() if w not in clipped]
+    found += [one for one in flat if one is not None]
+    clipped = {one.where for one in found}
+    found += _harmonics(values[force], steps, rate, where[force])
     for c in motions:
-        where = f"{name}, channel {c}"
-        found += _unsettled(values[force], values[c], steps, rate, where)
-        found += _dropped(values[force], values[c], steps, rate, where)
+        found += _unsettled(values[force], values[c], steps, rate, where[c])
+        found += _dropped(values[force], values[c], steps, rate, where[c])
     for c in (force, *motions):
-        if all(
-            one.where != f"{name}, channel {c}" or one.kind != "clipped_channel" for one in found
-        ):
-            found += _folded(values[c], steps, rate, f"{name}, channel {c}")
+        if where[c] not in clipped:
+            found += _folded(values[c], steps, rate, where[c])
     return found, notes
+
+
+def _cycles(step: Step, rate: float) -> float:
+    return (step.stop - step.start) * step.frequency / (2 * np.pi * rate)
 
 
 def _joined(steps: list[Step], rate: float) -> list[Step]:
@@ -220,8 +223,7 @@ def _unsettled(
     """Steps whose response still moves at their end, more than its blocks scatter."""
     moving, over_noise = [], []
     for one in steps:
-        cycles = (one.stop - one.start) * one.frequency / (2 * np.pi * rate)
-        rows = _middle(one, min(1.0, max(0.3, 5 / cycles)))
+        rows = _middle(one, min(1.0, max(0.3, 5 / _cycles(one, rate))))
         v, _ = _demodulated(x, rows, one.frequency, rate)
         f, _ = _demodulated(force, rows, one.frequency, rate)
         if len(v) < 3 or not np.all(np.abs(f) > 0):
@@ -234,7 +236,7 @@ def _unsettled(
         jumps = np.diff(rest, 2) if len(rest) > 4 else rest
         noise = float(np.sqrt(np.mean(np.abs(jumps) ** 2) / 6 / np.sum(place**2)))
         change = float(abs(slope) / abs(z[-1]))
-        few = len(v) <= 4
+        few = len(v) <= FEW_BLOCKS
         # Without a scatter of its own a step must move by more.
         believed = change > 2.5 * STILL_MOVING if few else abs(slope) > CERTAIN * noise
         if change > STILL_MOVING:

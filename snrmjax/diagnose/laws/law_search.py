@@ -97,7 +97,7 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     columns = law_columns(predictions, knots, secants, everything)
     if not np.isfinite(columns.columns).all():
         return None
-    settled = False
+    settled, nothing = False, 0.05  # rms change of the rows, in units of noise
     parts: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
     for number in range(6):
@@ -118,7 +118,7 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
         # A step that changes no row any more, in the weighting of the step before.
         moved = (columns.by_secant.reshape(*columns.columns.shape, -1) @ change)[None]
         moved = misfit.noise.decorrelated(misfit.noise.noise_units(moved)[0])
-        settled = bool(np.sqrt(np.mean(moved**2)) < 0.05)
+        settled = bool(np.sqrt(np.mean(moved**2)) < nothing)
         secants, columns = aim, ahead
         misfit = misfit.reweighted(columns.passed_on)
         if settled and number > 0:

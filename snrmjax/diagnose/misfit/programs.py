@@ -152,8 +152,8 @@ def missed(
             0, n_wanted + 1, lambda k, now: found(k, *now), (start_of(near), none)
         )[1]
         change = columns[:, 1:] - columns[:, :1]
-        # By 1e-9 of a column solutions may differ by chance.
-        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < 1e-9)
+        chance = 1e-9  # of a column, by which solutions may differ
+        seen = (jnp.arange(n_directions) < n_wanted) & ~(jnp.abs(change) < chance)
         return columns[:, 0], jnp.where(seen, change / _STEP, 0.0)
 
     return jax.vmap(one)(asked.state, asked.trial)

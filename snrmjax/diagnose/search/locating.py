@@ -1,15 +1,16 @@
 """Which part of the force balance disagrees: stiffness, damping, harmonics, or none of them."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.misfit.effect_fit import EffectFit
 from snrmjax.diagnose.misfit.noise_model import chi_square_p_value
 from snrmjax.diagnose.misfit.weighted_misfit import WeightedMisfit
-from snrmjax.numerics.levenberg_marquardt import StepRule, minimise
 
 _FREE = 6  # of a free curve of amplitude
 
@@ -39,7 +40,7 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     hats = np.stack([np.interp(amplitude, knots, row) for row in np.eye(_FREE)], axis=1)
     rows = np.where(of_force, base.rows, 0.0)
     force = _Rows(misfit, of_force)
-    nothing = force.chi_square(rows, np.zeros((len(rows), 0)))[0]
+    nothing = float(np.sum(force.decorrelated(rows) ** 2))
     both = [_curves(misfit, rows, hats, [k]) for k in range(2)]
     alone = [force.fitted(curves, np.zeros(_FREE)) for curves in both]
     starts = (np.append(alone[0][1], np.zeros(_FREE)), np.append(np.zeros(_FREE), alone[1][1]))
@@ -53,15 +54,13 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
     for k, name in enumerate(("stiffness", "damping")):
         p_value = chi_square_p_value(alone[1 - k][0] - free, _FREE)
         if p_value < priors.REJECTED:
-            own = slice(k * _FREE, (k + 1) * _FREE)
-            parts.append(
-                Located(
-                    name,
-                    _range(speed, hats, values[own], covariance[own, own]),
-                    p_value,
-                    *power_of_amplitude(knots, values[own], covariance[own, own]),
-                )
-            )
+            some = slice(k * _FREE, (k + 1) * _FREE)
+            own, spread = values[some], covariance[some, some]
+            std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, spread, hats), 0.0))
+            seen = np.abs(hats @ own) > 2 * std
+            where = speed[seen] if seen.any() else speed
+            ends = float(where.min()), float(where.max())
+            parts.append(Located(name, ends, p_value, *power_of_amplitude(knots, own, spread)))
     n_force = int(of_force.sum())
     left = chi_square_p_value(free, n_force - 2 * _FREE)
     everywhere = (float(speed.min()), float(speed.max()))
@@ -76,10 +75,8 @@ def locate_misfit(misfit: WeightedMisfit, base: EffectFit) -> tuple[Located, ...
         mine = (noise.column >= first) & (noise.column < first + 2)
         if not mine.any():
             continue
-        square = _Rows(misfit, mine).chi_square(
-            np.where(mine, base.rows, 0.0), np.zeros((len(rows), 0))
-        )[0]
-        p_value = chi_square_p_value(square, int(mine.sum()))
+        left_of = _Rows(misfit, mine).decorrelated(np.where(mine, base.rows, 0.0))
+        p_value = chi_square_p_value(float(left_of @ left_of), int(mine.sum()))
         if p_value < priors.REJECTED:
             large = np.abs(base.rows[mine]) > 2.5
             where = speed[noise.state[mine][large]] if large.any() else speed
@@ -141,14 +138,6 @@ def _curves(
     )
 
 
-class _Linearised(NamedTuple):
-    """The problem at some values of the curves."""
-
-    slopes: Float[np.ndarray, "row value"]
-    residuals: Float[np.ndarray, " kept"]
-    jacobian: Float[np.ndarray, "kept value"]
-
-
 class _Rows:
     """Least squares on some of the rows."""
 
@@ -163,10 +152,8 @@ class _Rows:
     def chi_square(
         self, rows: np.ndarray, columns: Float[np.ndarray, "row column"]
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        left = self.decorrelated(rows)
-        if not columns.shape[1]:
-            return float(left @ left), np.zeros(0), np.zeros((0, 0))
-        arms = self.decorrelated(columns)
+        """χ², the most likely values of some columns, and their covariance."""
+        left, arms = self.decorrelated(rows), self.decorrelated(columns)
         size = np.linalg.norm(arms, axis=0)
         size = np.where(size > 0, size, 1.0)
         inverse = np.linalg.pinv((arms / size).T @ (arms / size), rcond=1e-10, hermitian=True)
@@ -181,28 +168,11 @@ class _Rows:
         if not np.any(curves.weight > 0):
             return self.chi_square(curves.rows, curves.arms)
 
-        def linearised(points: np.ndarray) -> list[_Linearised]:
-            pairs = [curves.at(values) for values in points]
-            return [
-                _Linearised(slopes, self.decorrelated(rows), self.decorrelated(slopes))
-                for rows, slopes in pairs
-            ]
+        def part(k: int) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda values: self.decorrelated(curves.at(values)[k])
 
-        anywhere, rule = np.full(len(start), np.inf), StepRule(steps=30, settled=0.02)
-        points = start[None]
-        (end,) = minimise(linearised, points, linearised(points), (-anywhere, anywhere), rule)
-        covariance = self.chi_square(curves.at(end.point)[0], end.linearised.slopes)[2]
-        return end.sum_of_squares, end.point, covariance
-
-
-def _range(
-    speed: np.ndarray, hats: np.ndarray, values: np.ndarray, covariance: np.ndarray
-) -> tuple[float, float]:
-    curve = hats @ values
-    std = np.sqrt(np.maximum(np.einsum("sk,kl,sl->s", hats, covariance, hats), 0.0))
-    seen = np.abs(curve) > 2 * std
-    where = speed[seen] if seen.any() else speed
-    return float(where.min()), float(where.max())
+        found = least_squares(part(0), start, part(1), method="lm")
+        return 2 * float(found.cost), found.x, self.chi_square(*curves.at(found.x))[2]
 
 
 def power_of_amplitude(
@@ -223,7 +193,7 @@ def power_of_amplitude(
     explained = (curve @ shapes) ** 2 / np.sum(shapes**2, axis=0)
     best = int(np.argmax(explained))
     left = float(curve @ curve - explained[best])
-    if explained[best] < 16 or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
+    if explained[best] < priors.TELLING or chi_square_p_value(left, _FREE - 2) < priors.REJECTED:
         return None, None
     below = np.flatnonzero(explained > explained[best] - 1.0)
     if below[0] == 0 or below[-1] == len(powers) - 1:

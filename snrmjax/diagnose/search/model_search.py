@@ -226,7 +226,7 @@ def _promising(
     share = 0.02 if misfit.predictions.sizes.alone.any() else 0.25
     few = 4.0  # of χ², that is worth a fit; beyond the first eight such a share of the largest
     least = max(few, share * max((gain for gain, _ in changes), default=0.0))
-    worth = [few if n < 8 else least for n in range(len(changes))]
+    worth = [*[few] * 8, *[least] * len(changes)][: len(changes)]
     return [c for (gain, c), need in zip(changes, worth, strict=True) if gain > need]
 
 
@@ -412,11 +412,11 @@ def beyond_data(effect: type[AbstractEffect], limit: float, scales: MotionScales
     which relative strengths alone are judged.
     """
     unit = next(iter(effect.parameters().values())).unit
-    if not np.isfinite(limit) or (unit == "1" and limit > 10):
+    if not np.isfinite(limit) or (unit == "1" and limit > priors.BEYOND_DATA):
         return True
     starts = [] if scales is None else starts_of(effect, scales)
     if not starts or not starts[0][0]:
         return False
     shape = shape_of(effect)
     order = 1 if shape is None else shape.strength_order
-    return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > 10)
+    return bool(VISIBLE_CHANGE * (limit / abs(starts[0][0])) ** order > priors.BEYOND_DATA)
