@@ -37,9 +37,9 @@ class LawPart(NamedTuple):
 PARTS = {
     "odd spring": LawPart((0, 1), (1.0, 1.0)),
     "even spring": LawPart((0, 1), (1.0, -1.0)),
-    "odd damper": LawPart((2, 3), (1.0, 1.0)),
-    "film": LawPart((4,), (1.0,)),
-    "slip": LawPart((5,), (1.0,), not_negative=True),
+    "odd damper": LawPart((2,), (1.0,)),
+    "film": LawPart((3,), (1.0,)),
+    "slip": LawPart((4,), (1.0,), not_negative=True),
 }
 """Parts of laws, by what they are called here; tables are those of `LawColumns`.
 

@@ -87,14 +87,13 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
     knots = LawKnots(*(np.geomspace(k * s.min(), s.max(), _KNOTS) for s, k in ranges))
     units = {}
     for name, part in PARTS.items():
-        is_stiffness = part.tables[0] in (0, 5)
+        is_stiffness = part.tables[0] in (0, 4)
         size = scales.change / (1.0 if is_stiffness else scales.frequency)
         units[name] = np.full(_KNOTS, size)
     # Where the linear frequency was measured, little slips.
     units["slip"] = units["slip"] * knots.slip / knots.slip[-1]
-    everything = np.ones(TABLES, dtype=bool)
     secants = np.zeros((TABLES, _KNOTS))
-    columns = law_columns(predictions, knots, secants, everything)
+    columns = law_columns(predictions, knots, secants)
     if not np.isfinite(columns.columns).all():
         return None
     settled, nothing = False, 0.05  # rms change of the rows, in units of noise
@@ -109,7 +108,7 @@ def fit_laws(misfit: WeightedMisfit) -> LawFit | None:
         aim = secants_of(parts, found.mean, units)
         change = (aim - secants).reshape(-1)
         for _ in range(5):
-            ahead = law_columns(predictions, knots, aim, everything, columns)
+            ahead = law_columns(predictions, knots, aim, columns)
             if np.isfinite(ahead.columns).all():
                 break
             aim = 0.5 * (aim + secants)
@@ -163,7 +162,7 @@ def law_problem(
             for table, sign in zip(part.tables, part.signs, strict=True)
         ]
         whole.append(units[name] * sum(signed))
-        place[name] = np.log(knots[(0, 0, 1, 1, 0, 2)[part.tables[0]]])
+        place[name] = np.log(knots[(0, 0, 1, 0, 2)[part.tables[0]]])
     both = noise.decorrelated(np.column_stack([*whole, rows]).T, kept).T
     columns_of, left = both[:, :-1], both[:, -1]
     gram, pull = columns_of.T @ columns_of, -columns_of.T @ left
@@ -251,9 +250,9 @@ def law_effects(fit: LawFit, secants: Float[np.ndarray, "table knot"]) -> list[A
         elif group[0].endswith("damper"):
             found.append(DampingLaw(v, w[2] * v))
         elif group[0] == "film":
-            found.append(DisplacementDampingLaw(x, w[4]))
+            found.append(DisplacementDampingLaw(x, w[3]))
         else:
-            found.append(SlipLaw(s, jnp.maximum(w[5], 0.0)))
+            found.append(SlipLaw(s, jnp.maximum(w[4], 0.0)))
     return found
 
 
@@ -306,9 +305,9 @@ def _modal_table(
     two_sided = "even spring" in group
     if group == ("slip",):
         at = knots.displacement
-        force = -np.einsum("ek,kx->ex", tables[:, 5], np.maximum(at - knots.slip[:, None], 0.0))
+        force = -np.einsum("ek,kx->ex", tables[:, 4], np.maximum(at - knots.slip[:, None], 0.0))
     elif group == ("film",):
-        at, force = knots.displacement, passing * tables[:, 4]
+        at, force = knots.displacement, passing * tables[:, 3]
     else:
         first = PARTS[group[0]].tables[0]
         at = knots.velocity if group[0].endswith("damper") else knots.displacement
