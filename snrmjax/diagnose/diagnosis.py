@@ -314,8 +314,6 @@ def _notes_on_noise(predictions: Predictions) -> list[str]:
 
 def _estimates(misfit: WeightedMisfit, fit: EffectFit) -> dict[str, Estimate]:
     """The effects' parameters and their 1σ."""
-    if not fit.labels:
-        return {}
     arms = misfit.noise.decorrelated(fit.slopes.T).T
     size = np.linalg.norm(arms, axis=0)
     size = np.where(size > 0, size, 1.0)

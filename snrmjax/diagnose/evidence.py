@@ -193,10 +193,7 @@ def marginal_of(
     known, unknown = np.full(arms.shape[1], -1), np.full(columns.shape[1], len(LEVELS))
     group = np.concatenate([known, noise.shared_kind, unknown])
     left, own = noise.decorrelated(fit.rows), noise.decorrelated(arms.T).T
-    promised = 0.0
-    if own.shape[1]:
-        step = np.linalg.lstsq(own, left, rcond=1e-10)[0]
-        promised = float(np.sum((own @ step) ** 2))
+    promised = float(np.sum((own @ np.linalg.lstsq(own, left, rcond=1e-10)[0]) ** 2))
     # Of answers under other noise: at a fit that explains its records χ² is the square of their
     # distance from it, whatever its own slopes are, and these are no part of the units.
     units = -misfit.n_rows * float(np.log(misfit.predictions.error_scale))

@@ -119,8 +119,6 @@ def _beside(
 
     def square(places: tuple[int, ...]) -> float:
         columns = np.concatenate([own, arms[:, list(places)]], axis=1)
-        if not columns.shape[1]:
-            return float(left @ left)
         size = np.linalg.norm(columns, axis=0)
         scaled = columns / np.where(size > 0, size, 1.0)
         steps = np.linalg.lstsq(scaled, left, rcond=1e-10)[0]

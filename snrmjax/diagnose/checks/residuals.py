@@ -126,12 +126,9 @@ def _refitted(
     Returns the change of the parameters, all rows after it, and the root of its covariance: what
     independent unit errors of the change add to all rows.
     """
-    slopes = fit.slopes
-    if not slopes.shape[1]:
-        return np.zeros(0), fit.rows, slopes
-    size = np.linalg.norm(slopes, axis=0)
+    size = np.linalg.norm(fit.slopes, axis=0)
     size = np.where(size > 0, size, 1.0)
-    scaled = slopes / size
+    scaled = fit.slopes / size
     both = misfit.noise.decorrelated(np.column_stack([scaled, fit.rows]).T, kept)
     arms, left = both[:-1].T, both[-1]
     matrix = arms.T @ arms

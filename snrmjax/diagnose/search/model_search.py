@@ -295,10 +295,7 @@ def screened(
     Returns the fall and the candidate with its best starts so scaled.
     """
     changes = misfit.noise.noise_units(misfit.start_changes(candidate))
-    if beside.slopes.shape[1]:
-        basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
-    else:
-        basis = np.zeros((misfit.n_rows, 0))
+    basis = np.linalg.qr(misfit.noise.decorrelated(beside.slopes.T).T)[0]
     left = misfit.noise.decorrelated(beside.rows)
     moves = np.flatnonzero(np.isfinite(changes).all(axis=1))
     if not moves.size:
