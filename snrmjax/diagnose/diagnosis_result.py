@@ -27,10 +27,6 @@ from snrmjax.numerics.levenberg_marquardt import MinimisationStatus
 from snrmjax.numerics.result import AbstractResult, Variable
 from snrmjax.numerics.rules import Rule
 
-_WIDTH = 98  # of the notes, columns
-_LISTED, _LEAST_LISTED = 5, 0.01  # answers with their probabilities
-_LIKELY = 0.05  # probability from which on an answer is mentioned
-
 
 class CompletedStatus(StrEnum):
     """Whether there is a completed model."""
@@ -199,7 +195,7 @@ class Diagnosis(AbstractResult):
         """See `AbstractResult.summary`."""
         gap, inner, outer = self.gap, self.gap.interpolated, self.gap.extrapolated
         lines = [f"Diagnosis: {self.verdict_sentence}"]
-        lines += textwrap.wrap(f"probability: {self.most_probable()}", _WIDTH)
+        lines += textwrap.wrap(f"probability: {self.most_probable()}", 98)
         for name, (value, std) in self.parameters.items():
             stated = unit_of(name)
             unit = "" if stated == "1" else stated
@@ -223,15 +219,15 @@ class Diagnosis(AbstractResult):
         if self.notes:
             lines.append("notes:")
             for note in self.notes:
-                lines += textwrap.wrap(note, _WIDTH, initial_indent="- ", subsequent_indent="  ")
+                lines += textwrap.wrap(note, 98, initial_indent="- ", subsequent_indent="  ")
         return tuple(lines)
 
     def most_probable(self) -> str:
         """The answers with the largest probabilities, each once."""
         listed = [
             f"{name.replace('+', ' with ')} {probability_in_words(value)}"
-            for name, value in list(self.probabilities.items())[:_LISTED]
-            if value >= _LEAST_LISTED
+            for name, value in list(self.probabilities.items())[:5]
+            if value >= 0.01
         ]
         return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
 
@@ -317,7 +313,8 @@ class FormerAnswer(NamedTuple):
 
 def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> str:
     """What further states did to the answers that were likely before, in one sentence."""
-    likely = [name for name, p in former.probabilities.items() if p >= _LIKELY]
+    least = 0.05  # of a probability that is mentioned
+    likely = [name for name, p in former.probabilities.items() if p >= least]
     both = [
         f"{name} {100 * former.probabilities[name]:.0f} % → "
         f"{100 * probabilities.get(name, 0):.0f} %"
@@ -327,7 +324,7 @@ def what_changed(former: FormerAnswer, probabilities: Mapping[str, float]) -> st
     new = [
         f"{name} now {100 * p:.0f} %"
         for name, p in probabilities.items()
-        if p >= _LIKELY and name not in former.probabilities
+        if p >= least and name not in former.probabilities
     ]
     before = " and ".join(former.effects) or "no effect"
     return (
