@@ -224,10 +224,11 @@ class Diagnosis(AbstractResult):
 
     def most_probable(self) -> str:
         """The answers with the largest probabilities, each once."""
+        least = 0.01
         listed = [
             f"{name.replace('+', ' with ')} {probability_in_words(value)}"
             for name, value in list(self.probabilities.items())[:5]
-            if value >= 0.01
+            if value >= least
         ]
         return f"{probability_in_words(self.probability)} of this verdict ({', '.join(listed)})"
 

@@ -1,5 +1,7 @@
 """Time records: limits, transients, harmonics and drop-outs of the force, folded frequencies."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
@@ -142,24 +144,15 @@ def _middle(step: Step, share: float = 0.5) -> slice:
     return slice(int(step.stop - share * length), int(step.stop - 0.02 * length))
 
 
-def _demodulated(
-    x: np.ndarray, rows: slice, frequency: float, rate: float, order: int = 1
-) -> tuple[np.ndarray, float]:
-    """Phasors of neighbouring cycles against the record's own clock, and cycles of each."""
-    cycle = 2 * np.pi * rate / frequency
-    n = rows.stop - rows.start
+def _demodulated(x: np.ndarray, rows: slice, frequency: float, rate: float) -> np.ndarray:
+    """Phasors of neighbouring cycles against the record's own clock."""
+    cycle, n = 2 * np.pi * rate / frequency, rows.stop - rows.start
     blocks = max(1, min(int(n / cycle), 32))
-    edges = rows.start + np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(
-        int
-    )
-    time = np.arange(rows.start, edges[-1]) / rate
-    turn = np.exp(-1j * order * frequency * time)
-    part = x[rows.start : edges[-1]]
-    sums = [
-        2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b])
-        for a, b in zip(edges[:-1] - rows.start, edges[1:] - rows.start, strict=True)
-    ]
-    return np.array(sums), n / cycle / blocks
+    edges = np.round(np.arange(blocks + 1) * int(n / cycle / blocks) * cycle).astype(int)
+    part = x[rows.start : rows.start + edges[-1]]
+    turn = np.exp(-1j * frequency * (rows.start + np.arange(len(part))) / rate)
+    ends = itertools.pairwise(edges)
+    return np.array([2 * np.mean((part[a:b] - part[a:b].mean()) * turn[a:b]) for a, b in ends])
 
 
 def _flat_cycles(x: np.ndarray, steps: list[Step], rate: float, where: str) -> Finding | None:
@@ -224,8 +217,7 @@ def _unsettled(
     moving, over_noise = [], []
     for one in steps:
         rows = _middle(one, min(1.0, max(0.3, 5 / _cycles(one, rate))))
-        v, _ = _demodulated(x, rows, one.frequency, rate)
-        f, _ = _demodulated(force, rows, one.frequency, rate)
+        v, f = (_demodulated(c, rows, one.frequency, rate) for c in (x, force))
         if len(v) < 3 or not np.all(np.abs(f) > 0):
             continue
         z = v / f

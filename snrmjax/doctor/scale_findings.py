@@ -112,10 +112,12 @@ def _mixed_units() -> Iterator[_MixedUnit]:
 
     The likely one first: a number of the small unit read as one of the large, then the reverse.
     """
-    responses = (("g", "m/s²", 9.80665), ("mm", "m", 1e-3), ("µm", "m", 1e-6))
-    responses = (*responses, ("inches", "m", 0.0254))
-    forces = (("mN", "N", 1e3), ("kN", "N", 1e-3), ("pounds", "N", 1 / 4.4482216))
-    every = [("response", *one) for one in responses] + [("force", *one) for one in forces]
+    every = (
+        *(("response", "g", "m/s²", 9.80665), ("response", "mm", "m", 1e-3)),
+        *(("response", "µm", "m", 1e-6), ("response", "inches", "m", 0.0254)),
+        *(("force", "mN", "N", 1e3), ("force", "kN", "N", 1e-3)),
+        ("force", "pounds", "N", 1 / 4.4482216),
+    )
     yield from (_MixedUnit(*one) for one in every)
     yield from (_MixedUnit(of, other, unit, 1 / mass) for of, unit, other, mass in every)
 

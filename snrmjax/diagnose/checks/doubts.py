@@ -91,6 +91,12 @@ def doubts(
         for kind in effects
         if kind in wide
     ]
+    return found + _of_several(effects)
+
+
+def _of_several(effects: tuple[str, ...]) -> list[Doubt]:
+    """What effects may stand for together."""
+    found = []
     if len(effects) > 2:
         found.append(Doubt("three effects together can fit most laws.", WIDER))
     alike = [

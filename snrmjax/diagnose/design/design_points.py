@@ -83,14 +83,16 @@ def predicted_test(
     predictions = predictions_of(misfit.model, found, misfit.predictions.force_gain_std)
     rows = tuple(whose[good] == number for number in range(len(points)))
     phases = np.angle(np.asarray(found.velocity)[:, sensor])
-    ends: list[tuple[float, ...]] = []
-    for mine in rows:  # where the phase is zero
-        order = np.flatnonzero(mine)[np.argsort(phases[mine])]
-        columns = (np.asarray(part)[order] for part in (found.force, found.frequency))
-        at = [np.interp(0.0, phases[order], column) if order.size else np.nan for column in columns]
-        ends.append(tuple(map(float, at)))
+    at_resonance = []
+    for column in (found.force, found.frequency):  # where the phase is zero; NaN without states
+        own = []
+        for mine in rows:
+            order = np.flatnonzero(mine)[np.argsort(phases[mine])]
+            known = order.size > 0
+            own.append(float(np.interp(0.0, phases[order], column[order])) if known else np.nan)
+        at_resonance.append(tuple(own))
     passed_on = with_errors_passed_on(weighted_misfit(predictions), fit)
-    return PredictedTest(passed_on, rows, *zip(*ends, strict=True), floor)
+    return PredictedTest(passed_on, rows, at_resonance[0], at_resonance[1], floor)
 
 
 def _states(

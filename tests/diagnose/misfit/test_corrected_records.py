@@ -14,10 +14,9 @@ from snrmjax.diagnose.misfit.effect_fit import (
     baseline_fit,
     fit_effect,
     likely_errors,
-    with_corrected_records,
     without_errors,
 )
-from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of
+from snrmjax.diagnose.misfit.predictions import predictions_of, scales_of, with_corrected_records
 from snrmjax.diagnose.misfit.reference import with_reference
 from snrmjax.diagnose.misfit.weighted_misfit import weighted_misfit
 
