@@ -79,7 +79,7 @@ def diagnose_model(
     Works in the force balance: the measured fundamental is prescribed, harmonic balance finds the
     other harmonics, and the force that this motion needs is compared with the measured one. The
     library's effects are fitted with the baseline's parameters free inside their stated errors
-    and the levels' errors inside theirs; Schwarz's criterion decides. Answers that a linear mode
+    and the levels' errors inside theirs; their evidence decides. Answers that a linear mode
     nearby could have caused are compared with one.
 
     `force_gain_std` is the relative 1σ of a gain that all forces share: 1 where it is unknown.
@@ -91,7 +91,7 @@ def diagnose_model(
     amplitude explain. Where no effect of the library explains the data, a law that does is drawn
     from them (`laws.law_answer`), if their noise and their forces are known. Where gains of the
     forces of single levels explain the data better than any effects, the answer is found beside
-    them (`level_forces`); where they explain them as well, they are said first.
+    them (`checks.gains`); where they explain them as well, they are said first.
 
     Returns a `Diagnosis`; `decide.decide` has the rules of its verdict. Raises `ValueError`
     for too few states, an unknown force or sensors other than the model's.

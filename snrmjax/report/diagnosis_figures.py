@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from snrmjax.diagnose import priors
 from snrmjax.diagnose.diagnosis_result import Diagnosis
-from snrmjax.diagnose.held_velocity import HeldCurve, at_curve_force
+from snrmjax.diagnose.response_prediction import HeldCurve, at_curve_force
 from snrmjax.io.units import DEGREE, HERTZ
 from snrmjax.measure.states import SteadyStates
 from snrmjax.model.effect_base import (

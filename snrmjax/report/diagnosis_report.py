@@ -14,11 +14,12 @@ from snrmjax.diagnose.diagnosis import diagnose_model
 from snrmjax.diagnose.diagnosis_result import Diagnosis, FormerAnswer
 from snrmjax.diagnose.diagnosis_result import probability_in_words as in_words
 from snrmjax.diagnose.evidence import NOISE_REJECTED, NONE, UNKNOWN
-from snrmjax.diagnose.held_velocity import held_curves, holds_response
 from snrmjax.diagnose.misfit.candidates import scales_of_motions
 from snrmjax.diagnose.priors import AS_NOISE
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
+    held_curves,
+    holds_response,
     predict_levels,
 )
 from snrmjax.diagnose.search.locating import Located

@@ -9,11 +9,11 @@ from truths import one_mode
 
 import snrmjax as sj
 from snrmjax.diagnose import response_prediction
-from snrmjax.diagnose.held_velocity import holds_response
 from snrmjax.diagnose.misfit.predictions import with_idle_effects
 from snrmjax.diagnose.response_prediction import (
     LevelResponse,
     PhaseResonance,
+    holds_response,
     level_forces,
     measured_resonance,
     predicted_levels,

@@ -137,15 +137,13 @@ def _beside(
 
 def level_gains(misfit: WeightedMisfit, fit: EffectFit) -> dict[int, LevelGain]:
     """By level: the acting force over the recorded one, where the misfit leaves it free."""
-    places = misfit.predictions.free_level_forces
-    if not places:
-        return {}
-    first = misfit.first_level_force
-    gains = {}
+    predictions, gains = misfit.predictions, {}
+    # Among the shared errors they come after the baseline's and a gain of all forces.
+    first = len(predictions.stated) + (predictions.force_gain_std > 0)
     moved = misfit.noise.shared_errors(fit.rows)
-    for k, place in enumerate(places):
-        value = 1 + FREE_LEVEL_FORCE_STD * float(moved[first + k])
-        std = FREE_LEVEL_FORCE_STD * misfit.noise.shared_std(fit.slopes, first + k)
+    for k, place in enumerate(predictions.free_level_forces, first):
+        value = 1 + FREE_LEVEL_FORCE_STD * float(moved[k])
+        std = FREE_LEVEL_FORCE_STD * misfit.noise.shared_std(fit.slopes, k)
         gains[int(misfit.level_numbers[place])] = LevelGain(value, std)
     return gains
 

@@ -70,11 +70,6 @@ class WeightedMisfit:
         """Numbers of the levels in the data."""
         return np.unique(self.predictions.level_numbers)
 
-    @property
-    def first_level_force(self) -> int:
-        """Place of the first force of a level that is free among the shared errors."""
-        return len(self.predictions.stated) + (self.predictions.force_gain_std > 0)
-
     def chi_square(self, rows: Float[np.ndarray, " row"]) -> float:
         """χ² of misfits in units of noise."""
         return float(np.sum(self.noise.decorrelated(rows) ** 2))
